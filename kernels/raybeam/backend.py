@@ -19,7 +19,7 @@ from .scan import Collector, Scan
 
 
 class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
-    """The requested backend cannot be used on this machine; the message says why."""
+    """The requested backend cannot be used on this machine, for the reason in the message."""
 
 
 @dataclass(frozen=True)
@@ -68,16 +68,18 @@ class Backend(ABC):
     @classmethod
     @abstractmethod
     def missing(cls) -> str:
-        """Return why this backend cannot be used and the remedy; "" if usable."""
+        """Return why this backend cannot be used and the remedy, or "" if it can be used."""
 
     @classmethod
     def build(cls) -> str:
-        """Return the versions that the bits of results depend on, besides NumPy's; "" for none."""
+        """Return the versions besides NumPy's that the bits of results depend on, "" for none."""
         return ""
 
     @classmethod  # noqa: B027 - other backends have nothing to limit
     def limit_memory(cls, device: int | None, share: float) -> None:
-        """Have this process take at most a share of a device's memory; without a device, nothing.
+        """Have this process take at most a share of a device's memory.
+
+        Without a device, nothing is limited.
 
         A share of 1 or more sets no limit.
         """

@@ -20,8 +20,8 @@ CAST = np.dtype(
     [
         ("mesh", "i8"),  # `MESH` records
         ("instances", "i8"),  # `INSTANCE` records; 0 for a single mesh without a transform
-        ("directions", "i8"),  # of beams: float64 (3, rows), unit vectors
-        ("origins", "i8"),  # of beams, relative to the sensor: float64 (3, rows), metres
+        ("directions", "i8"),  # float64 (3, rows): unit vectors of beams
+        ("origins", "i8"),  # float64 (3, rows): origins of beams, relative to the sensor, metres
         ("positions", "i8"),  # float64 (3, poses), metres
         ("rotations", "i8"),  # float64 (9, poses): matrices to the scene's axes, by rows
         ("delays", "i8"),  # float64 (rays_per_pose,), seconds after the pose's time
@@ -33,7 +33,7 @@ CAST = np.dtype(
         ("first", "i8"),  # row of ray 0 in the pattern, counted in sub-rays
         ("subrays", "i8"),  # sub-rays of each beam
         ("shares", "i8"),  # float64 (5, lanes_per_beam): `SubRays.loop_table`
-        ("lanes_per_beam", "i8"),  # of a tile: `subrays` in whole vectors
+        ("lanes_per_beam", "i8"),  # lanes of a beam in a tile: `subrays` in whole vectors
         ("offsets", "i8"),  # float64 (2, rows): angles of beams, added to the angles in `shares`
         ("has_axis", "i8"),  # whether `axis` defines the directions across and up of sub-rays
         ("has_starts", "i8"),  # whether sub-rays start off their beam's origin
@@ -43,11 +43,11 @@ CAST = np.dtype(
         ("shares_origin", "i8"),  # whether all rays start at the position of a single pose
         ("tile", "i8"),  # memory of a tile, at a multiple of 64
         ("tile_rays", "i8"),
-        ("lanes", "i8"),  # of a `TilePlan`: int64 (groups, tile_rays)
-        ("shifts", "i8"),  # of a `TilePlan`: int64 (groups,)
+        ("lanes", "i8"),  # int64 (groups, tile_rays): `TilePlan.lanes`
+        ("shifts", "i8"),  # int64 (groups,): `TilePlan.shifts`
         ("groups", "i8"),
         ("firing", "i8"),  # rays of a firing
-        ("firings", "i8"),  # of a tile
+        ("firings", "i8"),  # firings per tile
         ("top", "i8"),  # address of the nodes of the tree over the instances
         ("t_min", "f8"),  # closest and farthest distance of a hit, local
         ("t_max", "f8"),
@@ -77,7 +77,7 @@ MESH = np.dtype(
 MASK_HEIGHT, NODES, BLOCKS, LEAF_CORNERS, ORDER = 3, 5, 6, 7, 8
 INSTANCE = np.dtype(
     [
-        ("matrix", "f8", 12),  # to the mesh's coordinates
+        ("matrix", "f8", 12),  # map to the mesh's coordinates
         ("mesh", "i8"),  # address of the `MESH`
         ("first", "i8"),  # the mesh's first row in `index`
     ]
@@ -127,7 +127,7 @@ class Cast:
         self._arrays: list[AnyArray] = []
 
     def address_of(self, array: AnyArray | None) -> int:
-        """Return the address of an array, converted to contiguous float64; 0 for None."""
+        """Return the address of an array, converted to contiguous float64, or 0 for None."""
         if array is None:
             return 0
         self._arrays.append(np.ascontiguousarray(array, np.float64))
@@ -162,7 +162,7 @@ class Cast:
         record["shares_origin"] = len(poses) == 1 and origins is None and motion is None
 
     def set_pattern(self, pattern: Pattern, poses: Poses, first: int) -> float:
-        """Write a pattern, poses and the row of ray 0; return the maximum offset of a start.
+        """Write a pattern, poses and the row of ray 0, and return the maximum offset of a start.
 
         The offset, metres, is the largest component of the vectors from a beam's origin to the
         starts of its sub-rays; 0 without such starts.

@@ -92,7 +92,7 @@ class RayCaster:
         Raises
         ------
         ValueError
-            If there is no instance, or a transform is not an invertible, finite (3, 4) or (4, 4)
+            If no instance is given, or a transform is not an invertible, finite (3, 4) or (4, 4)
             matrix; the message has the instance's number.
         BackendUnavailable
             If the requested backend cannot be used; the message says what to install.
@@ -192,7 +192,7 @@ class RayCaster:
         Raises
         ------
         IndexError
-            If there is no such instance; no instance has moved then.
+            If an instance does not exist; no instance has moved then.
         ValueError
             If a transform is invalid, or the caster has a single mesh without a transform; no
             instance has moved then.

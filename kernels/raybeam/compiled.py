@@ -1,4 +1,4 @@
-"""Loops that numba compiles; without numba, plain Python a hundred times slower."""
+"""Loops that numba compiles, or plain Python a hundred times slower without numba."""
 
 from __future__ import annotations
 
@@ -32,7 +32,10 @@ except ImportError:
 
 
 def _has_cache() -> bool:
-    """Return whether numba has a folder for compiled code; else each process compiles for 20 s."""
+    """Return whether numba has a folder for compiled code.
+
+    Without a folder each process compiles for 20 s.
+    """
     try:
         njit(cache=True)(_has_cache)
     except (RuntimeError, TypeError):  # neither beside this file nor in the user's home; no numba
@@ -89,7 +92,7 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return tuple(number for stat in stats for number in (stat.st_mtime_ns, stat.st_size))
 
 
-_WAIT_S = 60.0  # in all, for processes that compile: a process may have been stopped
+_WAIT_S = 60.0  # total for processes that compile: a process may have been stopped
 _STEP_S = 0.02
 _held = [0]  # depth of nested holds of the lock, by the thread that has numba's lock
 _locked = [""]  # folder whose lock this process has
@@ -98,11 +101,11 @@ _patience = [_WAIT_S]  # rest of the wait in this process; 0 after a wait in vai
 
 @contextmanager
 def _compile_lock(folder: str) -> Iterator[None]:
-    """Let a single process compile at a time; further processes then load the compiled code.
+    """Let a single process compile at a time, so that further processes load the compiled code.
 
     A hundred workers, on any machines, that start with an empty folder compile each loop once.
     """
-    with global_compiler_lock:  # for threads; compiling a loop may compile further loops
+    with global_compiler_lock:  # keeps threads apart; compiling a loop may compile further loops
         file = None
         collects = gc.isenabled()
         gc.disable()  # an eighth of the time: numba keeps most of the objects of a compilation
@@ -130,7 +133,7 @@ def _compile_lock(folder: str) -> Iterator[None]:
             if file is not None:
                 _locked[0] = ""
                 with suppress(OSError):
-                    fcntl.flock(file, fcntl.LOCK_UN)  # also of a child that was forked meanwhile
+                    fcntl.flock(file, fcntl.LOCK_UN)  # for a forked child, too
                 file.close()
 
 
@@ -210,7 +213,7 @@ def _save_compiled(cache: Any, signature: Any, code: Any) -> None:
 
 
 def compiled(*signature: Any) -> Callable[[Any], Any]:
-    """Compile a function for signatures of numba; without a signature, on the first call."""
+    """Compile a function for signatures of numba or, without a signature, on the first call."""
     if njit is None:
         return lambda function: function
 
@@ -261,7 +264,9 @@ def stage(function: Any) -> Any:
 
 
 def _inner(function: Any, **options: Any) -> Any:
-    """Compile a function that only compiled functions may call; Python may call its `py_func`.
+    """Compile a function for calls by compiled functions only.
+
+    Python may call its `py_func`.
 
     Wrappers for Python would take long to compile, and so would a version for each literal number.
     """

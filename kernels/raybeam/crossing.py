@@ -105,7 +105,9 @@ class BodyHits(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """Nearest hits of rays (n,) on moving bodies; of equal distances, the lowest body.
+    """Nearest hits of rays (n,) on moving bodies.
+
+    Of bodies at equal distances, the lowest number counts.
 
     Attributes
     ----------
@@ -124,7 +126,7 @@ class Nearest(NamedTuple):
 
     @classmethod
     def without_hits(cls, limits: Floats) -> Nearest:
-        """Create rays without a hit; hits count before distances `limits` (n,), metres."""
+        """Create rays without a hit, for hits before distances `limits` (n,), metres."""
         n = len(limits)
         return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 

@@ -51,7 +51,9 @@ class _CastChunk(NamedTuple):
 
 
 class CudaBackend(Backend):
-    """The traversal of intersect.cu, a thread for each ray; only kept hits leave the device.
+    """The traversal of intersect.cu, a thread for each ray.
+
+    Only the hits that are kept leave the device.
 
     Kernels and copies use the thread's current stream, and every call ends with a copy to the
     host, for which CuPy waits: when it returns, the device no longer uses the call's memory.
@@ -71,7 +73,7 @@ class CudaBackend(Backend):
 
     @classmethod
     def missing(cls) -> str:
-        """Return why CuPy or CUDA cannot be used and the remedy; "" if usable."""
+        """Return why CuPy or CUDA cannot be used and the remedy, or "" if they can be used."""
         if importlib.util.find_spec("cupy") is None:
             return f"CuPy is not installed: {install_command('cupy-cuda12x')} or cupy-cuda13x"
         try:
@@ -161,7 +163,10 @@ class CudaBackend(Backend):
 
     @staticmethod
     def load_cupy() -> Any:
-        """Load CuPy on first use; tests replace the module."""
+        """Load CuPy on first use.
+
+        Tests replace the module.
+        """
         import cupy
 
         return cupy
@@ -181,7 +186,7 @@ class CudaBackend(Backend):
             return ClosestHits(*(array.get() for array in columns))
 
     def _ray_table(self, rays: Rays) -> tuple[Any, Any]:
-        """Copy rays to the device; return origins, (3, n) or (3, 1) if shared, and directions."""
+        """Copy rays to the device, and return origins (3, n) or, if shared, (3, 1), and directions."""
         tables = (np.ascontiguousarray(table.T) for table in (rays.origins, rays.directions))
         origins, directions = map(self._cupy.asarray, tables)
         return origins, directions
@@ -260,13 +265,13 @@ class CudaBackend(Backend):
             else:  # the kernel has no sub-rays
                 rays = cp.asarray(host_rays(scan, start, stop))
             return DeviceNearest(
-                rays,
-                cp.asarray(time_index),
-                cp.full(n, end, np.float64),
-                cp.full(n, -1, np.int64),
-                cp.zeros(n, np.int32),
-                cp.zeros(n, np.int32),
-                cp,
+                rays=rays,
+                time_index=cp.asarray(time_index),
+                distance=cp.full(n, end, np.float64),
+                body=cp.full(n, -1, np.int64),
+                instance=cp.zeros(n, np.int32),
+                triangle=cp.zeros(n, np.int32),
+                cupy=cp,
             )
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
@@ -305,7 +310,7 @@ class CudaBackend(Backend):
     def _replace(
         self, hits: tuple[Any, Any, Any], start: int, n: int, other_hits: OtherHits | None
     ) -> tuple[Any, ...]:
-        """Replace hits of a cast behind `other_hits`; return arguments of the kernel `pack`."""
+        """Replace hits of a cast behind `other_hits`, and return arguments of the kernel `pack`."""
         if other_hits is None:
             return self._no_other_hits
         span = slice(*np.searchsorted(other_hits.ray, [start, start + n]))
@@ -394,7 +399,7 @@ class CudaBackend(Backend):
     ) -> tuple[Any, Any, Any]:
         """Return local distance, table row and instance of closest hits, on the device.
 
-        `table` are origins and directions of n rays, `limits` those of the distance, metres.
+        `table` has origins and directions of n rays; `limits` are limits of the distance, metres.
         """
         t = self._cupy.empty(n)
         row = self._cupy.empty(n, np.int32)
@@ -408,7 +413,7 @@ class CudaBackend(Backend):
     def _cast_chunk(
         self, scan: Scan, start: int, stop: int, groups: Groups, other_hits: OtherHits | None
     ) -> _CastChunk:
-        """Cast rays `start` to `stop` of a scan, and count the hits; nothing is waited for."""
+        """Cast rays `start` to `stop` of a scan, and count the hits, without waiting."""
         rays = _table(self._make_rays(scan, start, stop))
         hits = self._cast(rays, stop - start, (scan.t_min, scan.t_max))
         replacing = self._replace(hits, start, stop - start, other_hits)
@@ -422,7 +427,7 @@ class CudaBackend(Backend):
         groups: Groups,
         other_hits: tuple[Any, ...],
     ) -> _CastChunk:
-        """Count the hits of a cast up to each ray, and start to copy those of groups to the host.
+        """Count the hits of a cast up to each ray, and start to copy counts of groups to the host.
 
         Hits are closed up by these sums in ray order, not by atomics: the same bytes on every run.
         """
@@ -431,7 +436,16 @@ class CudaBackend(Backend):
         sums = cp.cumsum(hits[1] != -1, dtype=np.int32)
         span, later_starts = groups.spans(start, start + n)
         cuts = PendingCopy(cp, sums[cp.asarray(np.append(later_starts, n) - 1)])
-        return _CastChunk(start, rays, hits, other_hits, sums, span, later_starts, cuts)
+        return _CastChunk(
+            start=start,
+            rays=rays,
+            hits=hits,
+            other_hits=other_hits,
+            sums=sums,
+            span=span,
+            later_starts=later_starts,
+            cuts=cuts,
+        )
 
     def _pack(
         self,
@@ -507,7 +521,10 @@ def _table_arguments(table: tuple[Any, Any]) -> tuple[Any, np.int64, Any, np.int
 
 
 def _listed_rays(start: int, table: tuple[Any, Any], ray: Any) -> tuple[Any, Any]:
-    """Return origins and directions, (3, k), of rays of a table, of which the first is `start`."""
+    """Return origins and directions, (3, k), of rays of a table.
+
+    Ray `start` is in its first column.
+    """
     origins, directions = (column.take(ray - start, axis=1) for column in table)
     return origins, directions
 
@@ -554,7 +571,10 @@ def _headers() -> bool:
 
 
 def _device(cupy: Any, number: int | None) -> Any:
-    """Return the device with a number, or the current device; ValueError for a wrong number."""
+    """Return the device with a number, or the current device.
+
+    Raises ValueError for a wrong number.
+    """
     count = cupy.cuda.runtime.getDeviceCount()
     if number is not None and not 0 <= number < count:
         raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")

@@ -20,7 +20,7 @@ from .tree import build_tree
 if TYPE_CHECKING:
     from .deforming_loops import DeformingTree
 
-_PAD = 1e-6  # of the mesh's size, around boxes: far more than rounding to float32
+_PAD = 1e-6  # share of the mesh's size, around boxes: far more than rounding to float32
 _LEAF_SIZE = 4
 
 

@@ -59,7 +59,7 @@ _TREE = named_tuple_type(
 
 @compiled("void(f8[:, :, ::1], i8[:, ::1], i4[::1], i4[:, ::1], f8, f4[:, :, :, ::1])")
 def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
-    """Write the boxes of all nodes from each frame to the next to `boxes`, see `DeformingTree`.
+    """Write the boxes of all nodes from each frame to the next to `boxes`, for a `DeformingTree`.
 
     Boxes are larger than the triangles by `pad`, metres.
     """
@@ -90,7 +90,7 @@ def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-d
 
 @stage
 def _enter(box, origin, inverse, reach, entry_distances):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Write the distances at which a ray enters the boxes of a node's children; inf for a miss.
+    """Write the distances at which a ray enters the boxes of a node's children, or inf for a miss.
 
     `box` is the address of the boxes, float32 (6, `WIDTH`); `entry_distances` is the address of the
     output, float64 (`WIDTH`,). `inverse` is 1 over the ray's direction; the ray ends at the
@@ -114,7 +114,7 @@ def _enter(box, origin, inverse, reach, entry_distances):  # type: ignore[no-unt
 
 @inlined
 def _inverse(d):  # type: ignore[no-untyped-def]
-    """Return 1 over a component of a direction; a large number for 0."""
+    """Return 1 over a component of a direction, or a large number for 0."""
     return 1 / (d if abs(d) >= _TINY else _TINY)
 
 
@@ -122,7 +122,7 @@ def _inverse(d):  # type: ignore[no-untyped-def]
 def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-def]
     """Return a vertex at a share of the time from a frame to the next, 0 to 1.
 
-    Returns three coordinates, metres, of which `axis` is the last.
+    Returns three coordinates, metres, with `axis` last.
     """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0

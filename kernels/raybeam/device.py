@@ -123,7 +123,7 @@ def to_device(cupy: Any, array: AnyArray) -> Any:
 
 
 class _Pinned:
-    """Count of page-locked bytes in use by this process; threads may share it."""
+    """Count of page-locked bytes in use by this process, for threads to share."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()  # a finalizer may run while its thread holds the lock
@@ -146,11 +146,11 @@ _pinned = _Pinned()
 
 
 def host_array(cupy: Any, count: int, kind: DTypeLike) -> AnyArray:
-    """Return an array (count,) in page-locked memory, to which the device can write directly.
+    """Return an array (count,) in page-locked memory, for the device to write to directly.
 
     The memory goes back to CuPy's pool when the last view of it has gone. While readers hold
-    `PINNED_BYTES`, further arrays are in ordinary memory, to which copies take longer: memory that
-    is page-locked is lost to all other processes of the machine.
+    `PINNED_BYTES`, further arrays are in ordinary memory. Copies to ordinary memory take longer,
+    but page-locked memory is lost to all other processes of the machine.
     """
     size = max(count * np.dtype(kind).itemsize, 1)
     if not _pinned.take(size):

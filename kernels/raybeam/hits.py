@@ -65,8 +65,8 @@ class ScanReturns:
         int64 (g,): number of hits of each group, kept or not.
     tally
         int64 (face_count,): hits of each triangle, kept or not, whichever instance shows it: the
-        rows of all meshes in sequence, in the order in which instances use the meshes. None if
-        not requested.
+        rows of all meshes in sequence, in their order of first use by instances. None if not
+        requested.
     instance
         int32 (k,): as in `Hits`.
     """
@@ -83,7 +83,7 @@ class ScanReturns:
 
 
 def join_hits(parts: list[Part]) -> Part:
-    """Join the hits of parts, in order; a single part is not copied."""
+    """Join the hits of parts, in order, without a copy of a single part."""
     if len(parts) == 1:
         return parts[0]
     no_ints = np.zeros(0, np.int32)

@@ -10,7 +10,7 @@ from pathlib import Path
 def install_command(*requirements: str) -> str:
     """Return the command that installs requirements, such as ``pye57>=0.4``, here.
 
-    Environments of uv have no pip, and those of conda may lack it.
+    Environments of uv have no pip, and environments of conda may lack it.
     """
     words = [f'"{word}"' if {*word} & {*"[]<>="} else word for word in requirements]
     pip_install = " ".join(["pip install", *words])

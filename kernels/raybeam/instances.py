@@ -25,7 +25,8 @@ from .opacity import Opacity
 from .poses import determinants
 from .tree import PAD
 
-MAX_TRIANGLES = 2**28 - 1  # of all meshes: positions in a tree have 31 bits, 3 of them for a leaf
+# Limit for all meshes together: positions in a tree have 31 bits, 3 of them for a leaf.
+MAX_TRIANGLES = 2**28 - 1
 _FLAT = 1e-9  # share of the volume of its columns below which a transform is singular
 
 
@@ -103,7 +104,7 @@ class MeshFrames:
 
     @classmethod
     def of_instances(cls, meshes: tuple[LocalMesh, ...], mesh: Indices) -> MeshFrames:
-        """Return the frames of the meshes of instances; arguments as in `Scene`."""
+        """Return the frames of the meshes of instances, for arguments as in `Scene`."""
         frames = [local.frame for local in meshes]
         scale = np.array([frame.scale for frame in frames])[mesh]
         lower = np.array([frame.lower for frame in frames])[mesh] / scale[:, None]
@@ -119,7 +120,7 @@ class Scene:
     Attributes
     ----------
     meshes
-        Each mesh once, in the order in which instances use the meshes.
+        Each mesh once, in the order of its first use by an instance.
     mesh
         intp (n,): number of each instance's mesh.
     frame
@@ -218,7 +219,7 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
     Raises
     ------
     ValueError
-        If there is no instance, a transform is invalid, or the meshes have too many triangles.
+        If no instance is given, a transform is invalid, or the meshes have too many triangles.
     """
     listed = list(instances)
     if not listed:
@@ -256,7 +257,10 @@ def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
 
 
 def _matrix(number: int, transform: ArrayLike | None) -> Floats:
-    """Return a transform as float64 (3, 4); ValueError for a wrong shape or type."""
+    """Return a transform as float64 (3, 4).
+
+    Raises ValueError for a wrong shape or type.
+    """
     if transform is None:
         return np.eye(3, 4)
     return np.asarray(_matrices(np.array([number]), np.asarray(transform)[None])[0])
@@ -284,7 +288,10 @@ def _matrices(numbers: Integers, values: AnyArray) -> Floats:
 
 
 def _check_regular(numbers: Integers, transforms: Floats) -> None:
-    """Check transforms (n, 3, 4) of instances `numbers` (n,); ValueError if singular."""
+    """Check transforms (n, 3, 4) of instances `numbers` (n,).
+
+    Raises ValueError for a singular transform.
+    """
     finite = np.isfinite(transforms).all(axis=(1, 2))
     if not finite.all():
         row = int(finite.argmin())
@@ -334,7 +341,15 @@ def _nested_scene(
     to_scene = np.empty((len(mesh), 3, 4))
     to_scene[:, :, :3] = rotation_scale * (frame.scale / scale)[:, None, None]
     to_scene[:, :, 3] = offset * -frame.scale
-    return Scene(meshes, mesh, frame, matrices.reshape(-1, 12), boxes, to_scene, mesh_frames)
+    return Scene(
+        meshes=meshes,
+        mesh=mesh,
+        frame=frame,
+        matrices=matrices.reshape(-1, 12),
+        boxes=boxes,
+        to_scene=to_scene,
+        mesh_frames=mesh_frames,
+    )
 
 
 def _scene_frame(centre: Floats, shift: Floats, half: Floats) -> tuple[Frame, Floats]:

@@ -20,7 +20,7 @@ _FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflow
 
 @dataclass(frozen=True)
 class Layout:
-    """Tables of meshes; the head of intersect.cu describes the columns.
+    """Tables of meshes, with the columns that the head of intersect.cu describes.
 
     Attributes
     ----------
@@ -78,18 +78,18 @@ def lay_out(meshes: tuple[LocalMesh, ...]) -> Layout:
     corners = [mesh.corners[t.order] for mesh, t in zip(meshes, trees, strict=True)]
     faces = [mesh.index[t.order] for mesh, t in zip(meshes, trees, strict=True)]
     return Layout(
-        _nodes(tree),
-        _joined([_records(table) for table in corners]),
-        _joined(corners).reshape(-1, 9),
-        _joined(faces),
-        roots,
-        max(map(stack_need, trees)),
-        join_masks([mesh.opacity for mesh in meshes], [tree.order for tree in trees]),
+        nodes=_nodes(tree),
+        triangles=_joined([_records(table) for table in corners]),
+        corners=_joined(corners).reshape(-1, 9),
+        faces=_joined(faces),
+        roots=roots,
+        stack=max(map(stack_need, trees)),
+        masks=join_masks([mesh.opacity for mesh in meshes], [tree.order for tree in trees]),
     )
 
 
 def lay_out_instances(scene: Scene, roots: Ints) -> InstanceTables:
-    """Build the tree over the instances, and return the tables; dummies for a plain scene."""
+    """Build the tree over the instances, and return the tables, or dummies for a plain scene."""
     if scene.matrices is None:
         return InstanceTables(
             np.zeros((1, 32), np.float32), np.zeros((1, 20)), scene.frame.table, 0
@@ -107,7 +107,7 @@ def lay_out_instances(scene: Scene, roots: Ints) -> InstanceTables:
 
 
 def _joined(tables: list[AnyArray]) -> AnyArray:
-    """Return the concatenation of tables; a single table is not copied."""
+    """Return the concatenation of tables, without a copy of a single table."""
     return tables[0] if len(tables) == 1 else np.concatenate(tables)
 
 
@@ -124,7 +124,7 @@ def _records(corners: Floats) -> Floats32:
     """Return first corner, two edges, and bounds of the test's rounding errors, by triangle.
 
     With u = 2**-24, coordinates within [-1, 1], unit directions d, edges e and g, and
-    t = origin - corner, each of which is rounded to float32 first:
+    t = origin - corner, with each value rounded to float32 first:
 
     - ``det = e . (d x g)`` is off by at most 10 u |e| |g|;
     - ``b = t . (d x g)`` by 40 u |g|: |t| reaches 3.5 and is off by 7 u, the cross product is
@@ -152,7 +152,7 @@ def _records(corners: Floats) -> Floats32:
 def stack_need(tree: WideTree) -> int:
     """Return the maximum of waiting nodes on a descent: siblings at each level above."""
     used = (tree.lower[:, 0] <= tree.upper[:, 0]).sum(axis=1)
-    waiting = np.zeros(len(tree.child), np.int64)  # in the order of processing
+    waiting = np.zeros(len(tree.child), np.int64)  # one number for each node
     level = np.array([0])
     max_waiting = 0
     while len(level):

@@ -40,7 +40,7 @@ class LoopFiles(IndexDataCacheFile):
     """
 
     def __init__(self, folder: str, name: str, stamp: object) -> None:
-        # Names of their own: numba and earlier versions of this package cannot read the index.
+        # Special names: numba and earlier versions of this package cannot read the index.
         super().__init__(folder, f"{name}.checked", stamp)
 
     def load(self, key: Any) -> Any:
@@ -55,7 +55,10 @@ class LoopFiles(IndexDataCacheFile):
         return pickle.loads(code)  # noqa: S301 - fits its checksum
 
     def save(self, key: Any, data: Any) -> None:
-        """Write the compiled code of a signature, then the index; OSError if that is impossible."""
+        """Write the compiled code of a signature, then the index.
+
+        Raises OSError if that is impossible.
+        """
         entries = self._load_index()  # {signature: name of the file of its code, its checksum}
         if key in entries:
             name = entries[key][0]
@@ -69,7 +72,7 @@ class LoopFiles(IndexDataCacheFile):
         self._save_index(entries)
 
     def _load_index(self) -> dict[Any, tuple[str, bytes]]:
-        """Return the entries of the index; none of a missing, damaged or outdated index."""
+        """Return the entries of the index, or none if it is missing, damaged or outdated."""
         content = self._content(self._index_name)
         if content is None:
             return {}
@@ -90,7 +93,7 @@ class LoopFiles(IndexDataCacheFile):
         self._write(self._index_path, _checksum(pickled) + pickled)
 
     def _content(self, name: str) -> bytes | None:
-        """Return the content of a file of the folder; None if it cannot be read."""
+        """Return the content of a file of the folder, or None if it cannot be read."""
         try:
             return Path(self._data_path(name)).read_bytes()
         except OSError:

@@ -114,7 +114,9 @@ class LocalMesh:
 
 
 def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = None) -> LocalMesh:
-    """Check a mesh and convert vertices to local coordinates; `Mesh` lists the errors.
+    """Check a mesh and convert vertices to local coordinates.
+
+    `Mesh` lists the errors.
 
     Parameters
     ----------
@@ -149,7 +151,15 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     upper = by_triangle.max(axis=0).reshape(3, 3).max(axis=0) + PAD
     frame = Frame(centre, scale, lower, upper)
     checked = None if opacity is None else check_opacity(opacity, face_count, index)
-    return LocalMesh(frame, points, rows, corners, index, face_count, checked)
+    return LocalMesh(
+        frame=frame,
+        points=points,
+        rows=rows,
+        corners=corners,
+        index=index,
+        face_count=face_count,
+        opacity=checked,
+    )
 
 
 def centre_and_scale(lower: Floats, upper: Floats) -> tuple[Floats, float]:
@@ -167,14 +177,17 @@ def _has_area(corners: Floats) -> Bools:
 
 
 def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
-    """Return faces as int64 (f, 3); ValueError for a wrong shape or row, or too many faces."""
+    """Return faces as int64 (f, 3).
+
+    Raises ValueError for a wrong shape or row, or too many faces.
+    """
     rows = np.asarray(faces)
     if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows) or rows.dtype.kind not in "iu":
         raise ValueError(
             "faces must be integers (rows of vertices) of shape (f, 3), at least one triangle, "
             f"not {rows.dtype} {rows.shape}."
         )
-    if len(rows) >= 2**28:  # positions in the tree have 31 bits, of which a leaf takes 3
+    if len(rows) >= 2**28:  # positions in the tree have 31 bits; a leaf takes 3 of them
         raise ValueError(f"{len(rows)} triangles are too many: the limit is {2**28 - 1}.")
     invalid = np.flatnonzero(((rows < 0) | (rows >= vertex_count)).any(axis=1))
     if len(invalid):

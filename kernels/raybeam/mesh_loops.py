@@ -37,7 +37,7 @@ def enter_instance(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @inlined
 def corners_of(table, triangle, axis):  # type: ignore[no-untyped-def]
-    """Return the three corners of a triangle, each as three coordinates of which `axis` is last.
+    """Return the three corners of a triangle, each as three coordinates with `axis` last.
 
     `triangle` is the row in `table`.
     """

@@ -140,7 +140,7 @@ def hits_on(
 
 
 def listed_hits_on(moving: Moving, scan: Scan, times: Callable[[Ints], Floats]) -> BodyHits:
-    """Return the hits of `hits_on`, without the rays that hit no body; the arguments are the same.
+    """Return the hits of `hits_on`, for the same arguments, without the rays that hit no body.
 
     Without host memory for each ray, if all shapes are on a device.
     """
@@ -310,7 +310,7 @@ class _CellPoses(NamedTuple):
 
 
 class _RayPairs(NamedTuple):
-    """Pairs of a ray and a body whose box the ray passes, see `Crossing`."""
+    """Pairs of a ray and a body whose box the ray passes, as in `Crossing`."""
 
     row: Ints  # (m,), number of the ray in the chunk
     body: Ints  # (m,), number of the body
@@ -332,7 +332,7 @@ class _Chunk:
         self._nearest = nearest
 
     def cast(self, bodies: Ints) -> None:
-        """Cast the rays on those of the bodies that are present; write nearer hits."""
+        """Cast the rays on the bodies that are present, and write nearer hits."""
         first, last = self._moving.presence[bodies].T
         present = bodies[(first <= self._times.max()) & (last >= self._times.min())]
         if len(present):
@@ -376,7 +376,7 @@ class _Chunk:
         return samples
 
     def _sampled_boxes(self, bodies: Ints, times: Floats) -> Floats:
-        """Return the boxes (b, s, 12) of bodies (b,) at times (b, s), see `BodySamples`."""
+        """Return the boxes (b, s, 12) of bodies (b,) at times (b, s), as in `BodySamples`."""
         moving = self._moving
         body = np.repeat(bodies, times.shape[1])
         table = moving.poses(body, times.ravel())
@@ -411,7 +411,14 @@ class _Chunk:
                 assert moving.frames is not None, "of bodies that deform"
                 frame = moving.frames(body, self._times[row])
             crossing = Crossing(
-                self._rays, row, body, pairs.pose[rows], pairs.poses, boxes[number], limits, frame
+                rays=self._rays,
+                row=row,
+                body=body,
+                pose=pairs.pose[rows],
+                poses=pairs.poses,
+                box=boxes[number],
+                limits=limits,
+                frame=frame,
             )
             caster.cast_crossing(crossing, self._nearest)
 
@@ -457,7 +464,7 @@ class _Chunk:
             pose = pose[present]
             pair = pair[present]
         late = pairs.straddles[pair]
-        if late.all():  # of a lidar whose lasers take turns
+        if late.all():  # true for a lidar whose lasers take turns
             return _RayPairs(row, body, np.arange(len(row)), moving.poses(body, times[row]))
         late_rows = np.flatnonzero(late)
         pose[late_rows] = pairs.poses.shape[1] + np.arange(len(late_rows))
@@ -466,7 +473,7 @@ class _Chunk:
 
 
 def _rotations(poses: Floats) -> Floats:
-    """Return the rotations (m, 3, 3) from the bodies' axes of poses (12, m), see `Moving.poses`."""
+    """Return the rotations (m, 3, 3) from the bodies' axes of poses (12, m) of `Moving.poses`."""
     return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
 
 

@@ -219,7 +219,7 @@ def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa
 # Loops write to arrays that are long enough: numba takes 8 s to compile slices and copies.
 @compiled(types.int64(_f64_2, _f64_2, _SAMPLES, types.float64, _i64_2))
 def _pair_cells(wide_cells, cells, samples, reach, pairs):  # type: ignore[no-untyped-def]
-    """Write pairs (2, k) of a cell and a body that may meet; return the number of pairs k."""
+    """Write pairs (2, k) of a cell and a body that may meet, and return the number of pairs k."""
     sample_of_cell, boxes, spheres = samples
     count = 0
     # Pointers: views of arrays would be counted, which takes longer than the comparisons.
@@ -257,8 +257,8 @@ def cells_near_bodies(
     Parameters
     ----------
     wide_cells, cells
-        float64 (w, 15) and (c, 15), from `cells_of`: cells of `WIDE` times as many rays, most of
-        which rule out all their cells at once, and cells of `CELL` rays.
+        float64 (w, 15) and (c, 15), from `cells_of`: cells of `WIDE` times as many rays, and cells
+        of `CELL` rays. Most wide cells rule out all their cells at once.
     samples
         The bodies.
     reach
@@ -348,7 +348,7 @@ def _sphere_around(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa:
 
 @stage
 def _near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
-    """Write whether each ray of a cell passes through the sphere around a body; return how many do.
+    """Write which rays of a cell pass through the sphere around a body, and return their number.
 
     `rays` is the address of the cell's first ray in (6, n). `x`, `y`, `z` and `radius` are of the
     sphere, metres. The output `near`, 0 or 1, is the address of int64 (`CELL`,).
@@ -388,7 +388,7 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
     """Write the rays that pass through boxes to `ray_pairs`, with the pair of each.
 
     Returns the number of columns written: number of the ray, and of the pair of a cell and a body.
-    `near` is memory for a cell. Arguments are those of `rays_through_boxes`.
+    `near` is memory for a cell. The other arguments are as in `rays_through_boxes`.
     """
     cell, pose_of_pair, shape, pads = pairs
     written = 0

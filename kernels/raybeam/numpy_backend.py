@@ -29,13 +29,13 @@ _WIDTH = 8
 _LEAF_SIZE = 4
 _BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller blocks need more calls
 _ACROSS = 4.0  # local units: more than the diagonal of any scene
-_SHIFT = 32  # of the instance in keys of hits, see `_Best`
+_SHIFT = 32  # keys of hits have the instance from this bit on (`_Best`)
 _SLACK = 2.0**-20  # margin of distance limits in float32: far more than their rounding
 
 
 @dataclass
 class _Best:
-    """Closest hits so far, or candidates; an entry for each ray.
+    """Closest hits so far, or candidates, with an entry for each ray.
 
     Attributes
     ----------
@@ -133,7 +133,10 @@ class _Pairs:
     enter: Floats32
 
     def select(self, rows: Indices) -> _Pairs:
-        """Return the pairs in rows; rows are distinct, so as many rows as pairs select all."""
+        """Return the pairs in rows.
+
+        Rows are distinct, so as many rows as pairs select all.
+        """
         if len(rows) == len(self.ray):
             return self
         return _Pairs(self.ray.take(rows), self.node.take(rows), self.enter.take(rows))
@@ -375,13 +378,13 @@ def _packet(
     )
     inverse = np.float32(1) / components
     return _Packet(
-        entry,
-        start * inverse,
-        inverse,
-        (components < 0).astype(np.intp),
-        _limit(np.broadcast_to(t_max, len(entry)), entry),
-        exact.shear(origins, directions),
-        visit,
+        entry=entry,
+        scaled_origin=start * inverse,
+        inverse=inverse,
+        near_side=(components < 0).astype(np.intp),
+        limit=_limit(np.broadcast_to(t_max, len(entry)), entry),
+        sheared=exact.shear(origins, directions),
+        visit=visit,
     )
 
 

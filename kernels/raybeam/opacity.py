@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import Bools, Bytes, Floats, Floats32, Indices, Ints, Ints32
 
-_MAX_COORDINATE = 2.0**31  # of texture coordinates, so that none is infinite at a ray
+_MAX_COORDINATE = 2.0**31  # maximum of texture coordinates, so that none is infinite at a ray
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,10 @@ class LocalOpacity:
 
 
 def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpacity:
-    """Check an opacity and select the triangles `index`; ValueError if invalid."""
+    """Check an opacity and select the triangles `index`.
+
+    Raises ValueError for an invalid opacity.
+    """
     mask = np.asarray(opacity.mask)
     uv = np.asarray(opacity.uv)
     if mask.dtype != np.bool_ or mask.ndim != 2 or not mask.size:
@@ -130,7 +133,7 @@ class Masks:
 
 
 def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Masks | None:
-    """Join the opacities of meshes, with triangles in given orders; None if all are opaque.
+    """Join the opacities of meshes, with triangles in given orders, or None if all are opaque.
 
     A mask that meshes share, as the same memory, is stored once.
     """

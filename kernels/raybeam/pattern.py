@@ -15,8 +15,9 @@ from .poses import Poses
 from .rays import check_origins, unit_directions
 from .sub_rays import SubRays
 
-GOLDEN = 0.618033988749895  # of the golden ratio: its multiples, modulo 1, are evenly spread
-_MAX_STEP = 256  # of a guess
+# Fractional part of the golden ratio: its multiples, modulo 1, are evenly spread.
+GOLDEN = 0.618033988749895
+_MAX_STEP = 256  # largest step that is guessed
 _SAMPLES = 384  # consecutive rows that are compared with later rows: more than `_MAX_STEP`
 # Relative differences of squared lengths that count as equal: in float64, in float32, with jitter.
 _EXACT = 1e-9
@@ -122,12 +123,12 @@ class Pattern:
 
     @property
     def directions(self) -> Floats:
-        """Unit vectors (n, 3) of the beams, read-only; the transposed array is contiguous."""
+        """Unit vectors (n, 3) of the beams, read-only, contiguous when transposed."""
         return self._directions.T
 
     @property
     def origins(self) -> Floats | None:
-        """Origins of the beams (n, 3), metres, read-only, transposed contiguous; or None."""
+        """Origins of the beams (n, 3), metres, read-only, contiguous when transposed, or None."""
         return None if self._origins is None else self._origins.T
 
     @cached_property
@@ -146,7 +147,7 @@ class Pattern:
 
 
 def _repetition(directions: Floats) -> int:
-    """Return the step after which the distances between neighbouring rows are the same; 0 if none.
+    """Return the step after which the distances between neighbouring rows are the same, or 0.
 
     `directions` (3, n) are unit vectors. Where a firing has all rings, the head has turned after
     as many rows, and all distances are the same. Where rings follow each other, those within a ring
@@ -182,7 +183,7 @@ def _repetition(directions: Floats) -> int:
 def _least_difference(directions: Floats) -> int:
     """Return the step with the least angles between a row and later rows of a packet.
 
-    `directions` (3, n) are unit vectors, of which 32 rows are sampled.
+    `directions` (3, n) are unit vectors. 32 rows of the directions are sampled.
     """
     rows = directions.shape[1]
     steps = np.arange(1, min(rows // 32, _MAX_STEP) + 1)

@@ -78,7 +78,7 @@ def pattern_rays(
 def checked_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
     """Return origins and directions of rays without checks, by compiled loops if possible.
 
-    `first` is the row of ray 0; `ray` (m,) are numbers of rays. Shapes are those of
+    `first` is the row of ray 0; `ray` (m,) are numbers of rays. The shapes are as in
     `pattern_rays`.
     """
     if not (_numba_is_installed() and len(ray)):

@@ -32,7 +32,7 @@ _GRID_BITS = 21  # a coordinate; three coordinates fill 63 bits
 
 @dataclass(frozen=True)
 class BinaryTree:
-    """Nodes 0 to n-1 are the n boxes, n to 2n-2 inner nodes; the last is the root.
+    """Binary tree: nodes 0 to n-1 are the n boxes, n to 2n-2 inner nodes, the last the root.
 
     Attributes
     ----------
@@ -203,7 +203,10 @@ def _partners(lower: Floats32, upper: Floats32) -> tuple[Indices, Indices]:
 
 @cache
 def _compiled_loops() -> Any:
-    """Return the module of compiled loops, which takes a tenth of the time; None without numba."""
+    """Return the module of compiled loops, or None without numba.
+
+    The loops take a tenth of the time.
+    """
     if find_spec("numba") is None:
         return None
     from . import ploc_loops

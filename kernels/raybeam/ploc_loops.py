@@ -42,7 +42,7 @@ def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
 def merge_pairs(  # type: ignore[no-untyped-def]
     clusters, first, second, next_node, boxes, children, count
 ):
-    """Create nodes of pairs of clusters, and replace the clusters; return how many are left.
+    """Create nodes of pairs of clusters, replace the clusters, and return how many are left.
 
     Parameters
     ----------

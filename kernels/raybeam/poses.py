@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from .arrays import AnyArray, Floats, Indices, Ints
 from .rays import finite_rows, real_rows, refuse_rows
 
-_SLACK = 2e-9  # on products of a rotation's rows
+_SLACK = 2e-9  # tolerance for products of a rotation's rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,9 @@ def check_poses(
     ray_count: int,
     motion: PoseMotion | None = None,
 ) -> Poses:
-    """Check the poses of a number of rays; ValueError for an invalid pose, or too few poses.
+    """Check the poses of a number of rays.
+
+    Raises ValueError for an invalid pose, or too few poses.
 
     `RayCaster.scan` describes the arguments. `Poses` in place of positions have been checked
     before, and are returned as such.
@@ -205,13 +207,16 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
 
 
 def _check_rotations(rotations: ArrayLike) -> Floats:
-    """Return rotations (k, 3, 3) as float64; ValueError for a matrix that deforms or mirrors."""
+    """Return rotations (k, 3, 3) as float64.
+
+    Raises ValueError for a matrix that deforms or mirrors.
+    """
     matrices = by_component(real_rows("rotations", rotations, (3, 3)))
     rows = matrices.transpose(1, 2, 0)
     x, y, z = rows.transpose(1, 0, 2)
     # NaN compares as false.
     with np.errstate(over="ignore", invalid="ignore"):
-        products = (x[:, None] * x + y[:, None] * y) + z[:, None] * z  # of two rows each
+        products = (x[:, None] * x + y[:, None] * y) + z[:, None] * z  # products of two rows each
         deviations = np.abs(products - np.eye(3)[:, :, None])
         orthonormal = (deviations <= _SLACK).all(axis=(0, 1))
         mirrored = orthonormal & ~(determinants(rows) > 0)

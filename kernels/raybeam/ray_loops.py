@@ -1,8 +1,8 @@
 """Rays of a pattern, a tile at a time in compiled loops, with the operations of `plain_rays`.
 
 A ray is a beam of the pattern, or a sub-ray of a beam, cast from a pose. `cast` is a `CAST` record
-(cast_memory.py) and `tile` the address of the memory of a tile with `rays` rays (tile_memory.py),
-to which `floats` and `numbers` point as float64 and int64. Tables that a `CAST` names come as
+(cast_memory.py) and `tile` the address of the memory of a tile with `rays` rays (tile_memory.py).
+`floats` and `numbers` point to this memory as float64 and int64. Tables that a `CAST` names come as
 addresses, with one column for each beam or pose. A vector has four rays.
 """
 
@@ -25,7 +25,7 @@ from .vectors import load, splat, square_root, store
 
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 _LONE = 8  # numbers of a row of the table of shares of a single sub-ray
-_BEAMS = 64  # of a tile of rays that are only computed
+_BEAMS = 64  # beams per tile when rays are only computed
 
 
 class FirstRay(NamedTuple):
@@ -143,7 +143,7 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
 
     The rows of the sub-rays become rows of their beams. `lanes_per_beam` consecutive lanes are of a
     beam. With `offsets` of the beams, radians, rows 1 and 2 of the table of shares are tangents of
-    angles, to which the offsets are added.
+    angles. The offsets are added to these angles.
     """
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -331,7 +331,7 @@ def _apply_rates(tile, rays, first_row, cast):  # type: ignore[no-untyped-def]  
 
 @stage
 def _add_to_origins(tile, rays, table, count, field):  # type: ignore[no-untyped-def]
-    """Add vectors of a table (3, count) to the origins; row `field` has the column of each ray."""
+    """Add vectors of a table (3, count) to the origins, by each ray's column in row `field`."""
     numbers = int64s(tile)
     floats = float64s(tile)
     vectors = float64s(table)
@@ -505,7 +505,7 @@ def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
 
 @inlined
 def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
-    """Return the distance at which a remote ray enters the box from -half to half; 0 for others.
+    """Return the distance at which a remote ray enters the box from -half to half, or 0 for others.
 
     Local; `o` and `d` are the ray's origin and direction.
     """
@@ -533,7 +533,7 @@ def _compute_rays(casts, rays, origins, directions):  # type: ignore[no-untyped-
     direction = row_at(DX, lanes)
     beams = lanes // each
     for start in range(0, count, beams):
-        # Each ray fills the lanes of a beam, of which one is the ray.
+        # Each ray fills the lanes of a beam. One of these lanes is the ray.
         for k in range(beams):
             number = rays[min(start + k, count - 1)]
             first_of_beam = number - (cast.first + number) % cast.subrays
@@ -555,7 +555,7 @@ def compiled_rays(
 ) -> tuple[Floats | None, Floats]:
     """Return origins and directions, float64 (3, m), of rays with numbers (m,).
 
-    Arguments are those of `pattern_rays.checked_rays`. Origins are None if all rays start at the
+    The arguments are as in `pattern_rays.checked_rays`. Origins are None if all rays start at the
     position of a single pose.
     """
     cast = memory.Cast(np.zeros(1, memory.CAST))

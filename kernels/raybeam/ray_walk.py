@@ -127,7 +127,7 @@ def _slab(boxes, base, near_at, axis, inverse, start):  # type: ignore[no-untype
 
 @inlined
 def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Add the children of a node that a ray meets to a list, nearest last; return its length.
+    """Add the children of a node that a ray meets to a list, nearest last, and return its length.
 
     `address` is of the list, which has `count` entries, `nodes` of the nodes, `limit` the distance
     at which the ray ends.
@@ -171,7 +171,7 @@ def _open_node_for_one(tile, address, nodes, node, start, limit, count):  # type
 
 @inlined
 def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test the triangles of a leaf and a ray; return whether it has a closer hit."""
+    """Test the triangles of a leaf and a ray, and return whether it has a closer hit."""
     record = int64s(mesh)
     blocks = float32s(record[BLOCKS])
     block = (code >> LEAF_BITS) * BLOCK
@@ -203,7 +203,7 @@ def _test_leaf_by_one(tile, rays, ray, mesh, instance, code, start):  # type: ig
 
 @part(types.void(*7 * WHOLE))
 def walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting):  # type: ignore[no-untyped-def]
-    """Cast a ray in a mesh; the list of nodes has `waiting` entries of the tree above."""
+    """Cast a ray in a mesh, with `waiting` entries of the tree above in the list of nodes."""
     floats = float64s(tile)
     address = int64s(tile)[_STACK]
     stack = float32s(address)
@@ -263,7 +263,7 @@ def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: 
 
 @part(types.void(*5 * WHOLE))
 def walk_instances_by_one(tile, rays, ray, nodes, instances):  # type: ignore[no-untyped-def]
-    """Cast a ray at all instances; `nodes` is the address of the tree over these."""
+    """Cast a ray at all instances, from the address `nodes` of the tree over the instances."""
     floats = float64s(tile)
     numbers = int64s(tile)
     address = numbers[_STACK]

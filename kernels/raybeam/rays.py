@@ -51,7 +51,9 @@ class Rays:
 
 
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
-    """Check the rays of a caller; ValueError for an invalid ray.
+    """Check the rays of a caller.
+
+    Raises ValueError for an invalid ray.
 
     Parameters
     ----------
@@ -67,7 +69,10 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
 
 
 def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
-    """Return checked origins (n, 3), or (1, 3) if shared; ValueError for another shape."""
+    """Return checked origins (n, 3), or (1, 3) if shared.
+
+    Raises ValueError for another shape.
+    """
     rows = real_rows("origins", origins)
     if len(rows) not in (1, ray_count):
         raise ValueError(
@@ -79,7 +84,10 @@ def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
 
 
 def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
-    """Return the two limits as floats; ValueError unless ``0 <= t_min <= t_max``."""
+    """Return the two limits as floats.
+
+    Raises ValueError unless ``0 <= t_min <= t_max``.
+    """
     t_min = float(t_min)
     t_max = float(t_max)
     if not (0 <= t_min < np.inf and t_min <= t_max):
@@ -91,7 +99,9 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
 
 
 def unit_directions(directions: ArrayLike) -> Floats:
-    """Return directions as new float64 unit vectors (n, 3); ValueError for zero, NaN and inf.
+    """Return directions as new float64 unit vectors (n, 3).
+
+    Raises ValueError for zero, NaN and inf.
 
     The memory is in columns, so that the transposed array is contiguous.
     Each row's result depends only on that row, so that batches may be cut anywhere.
@@ -109,7 +119,7 @@ def unit_directions(directions: ArrayLike) -> Floats:
 
 
 def _normalised(table: Floats) -> Floats:
-    """Normalise checked directions (n, 3); return the same array if all are unit vectors."""
+    """Normalise checked directions (n, 3), or return the same array if all are unit vectors."""
     x, y, z = table.T
     # No einsum or norm, which may fuse multiply and add, so the last bit would depend on the
     # machine.
@@ -128,7 +138,10 @@ def _normalised(table: Floats) -> Floats:
 
 
 def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
-    """Return real numbers (n, *shape), copied only if no array; a single row may omit n."""
+    """Return real numbers (n, *shape), copied only if no array.
+
+    A single row may omit n.
+    """
     rows = np.asarray(values)
     if rows.shape == shape:
         rows = rows[None]
@@ -152,7 +165,7 @@ def refuse_rows(
     is_valid: Callable[[Floats], Bools],
     expected: str,
 ) -> None:
-    """Raise ValueError for the first row that is not valid; the message counts the invalid rows."""
+    """Raise ValueError for the first row that is not valid, and count the invalid rows in it."""
     invalid = [np.zeros(0, np.intp)]
     for start in range(0, len(table), _BLOCK):
         block = _float64(table[start : start + _BLOCK])

@@ -7,7 +7,7 @@ from .cuda_backend import CudaBackend
 from .numpy_backend import NumpyBackend
 from .tile_backend import TileBackend
 
-# In the order in which "auto" tries them. Add new backends here.
+# "auto" tries them in this order. Add new backends here.
 BACKENDS: tuple[type[Backend], ...] = (CudaBackend, TileBackend, NumpyBackend)
 
 
@@ -30,18 +30,18 @@ def backend_build(name: str) -> str:
     Raises
     ------
     ValueError, BackendUnavailable
-        If there is no backend of that name, or the backend cannot be used on this machine.
+        If no backend has that name, or the backend cannot be used on this machine.
     """
     return choose(name).build()
 
 
 def choose(name: str) -> type[Backend]:
-    """Return the backend with a name; for "auto", the first backend that can be used.
+    """Return the backend with a name or, for "auto", the first backend that can be used.
 
     Raises
     ------
     ValueError
-        If there is no backend of that name.
+        If no backend has that name.
     BackendUnavailable
         If the backend cannot be used on this machine.
     """

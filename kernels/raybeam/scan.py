@@ -16,7 +16,7 @@ from .pattern_rays import checked_rays
 from .poses import PoseMotion, Poses, check_poses
 from .rays import Rays, check_interval
 
-_MAX_RAYS = 1 << 32  # of a scan: numbers of rays in `ScanReturns` have 32 bits
+_MAX_RAYS = 1 << 32  # limit for a scan: numbers of rays in `ScanReturns` have 32 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ class Scan:
             yield start, min(start + size, self.count)
 
     def rays(self, start: int, stop: int) -> Rays:
-        """Compute rays `start` to `stop`, with the bits of `pattern_rays`; fill `room` if any."""
+        """Compute rays `start` to `stop`, with the bits of `pattern_rays`. Fill `room`, if any."""
         ray = np.arange(start, stop, dtype=np.int64)
         origins, directions = checked_rays(self.pattern, self.first, ray, self.poses)
         if self.room is not None:
@@ -91,7 +91,10 @@ def check_scan(
     motion: PoseMotion | None = None,
     room: Floats | None = None,
 ) -> Scan:
-    """Check the arguments of a scan; `RayCaster.scan` describes arguments and errors."""
+    """Check the arguments of a scan.
+
+    `RayCaster.scan` describes arguments and errors.
+    """
     start, stop = (0, len(pattern)) if window is None else map(index, window)
     if not 0 <= start <= stop or (stop > start and not len(pattern)):
         raise ValueError(
@@ -106,16 +109,19 @@ def check_scan(
         )
     if index(keep_every) < 1:
         raise ValueError(f"keep_every is {keep_every}: it must be at least 1, to keep all hits.")
+    poses = check_poses(positions, rotations, rays_per_pose, count, motion)
+    t_min, t_max = check_interval(t_min, t_max)
     return Scan(
-        pattern,
-        start % max(len(pattern), 1),
-        count,
-        check_poses(positions, rotations, rays_per_pose, count, motion),
-        *check_interval(t_min, t_max),
-        index(keep_every),
-        np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
-        tally,
-        room,
+        pattern=pattern,
+        first=start % max(len(pattern), 1),
+        count=count,
+        poses=poses,
+        t_min=t_min,
+        t_max=t_max,
+        keep_every=index(keep_every),
+        groups=np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
+        tally=tally,
+        room=room,
     )
 
 
@@ -131,7 +137,7 @@ def host_rays(scan: Scan, start: int, stop: int) -> Floats:
 
 
 class Groups:
-    """Counts of the hits in each group of rays of a scan, of which every n-th hit is kept.
+    """Counts of the hits in each group of rays of a scan that keeps every n-th hit of a group.
 
     Parameters
     ----------
@@ -144,7 +150,7 @@ class Groups:
     def __init__(self, starts: Ints, keep_every: int) -> None:
         self._starts = starts
         self.keep_every = keep_every
-        self.hits = np.zeros(len(starts), np.int64)  # of each group, so far
+        self.hits = np.zeros(len(starts), np.int64)  # hits of each group so far
 
     def spans(self, start: int, stop: int) -> tuple[slice, Ints]:
         """Find the groups that rays `start` to `stop` belong to.
@@ -174,7 +180,8 @@ class Groups:
             int64 (g,): index among each group's hits in the chunk of the first hit to keep, and
             the number of hits to keep.
         """
-        earlier_hits = self.hits[groups].copy()  # in the chunks before; not 0 for the first group
+        # Hits in the chunks before: not 0 for the first group.
+        earlier_hits = self.hits[groups].copy()
         self.hits[groups] += counts
         first_kept = -earlier_hits % self.keep_every
         return first_kept, np.maximum(-((first_kept - counts) // self.keep_every), 0)
@@ -242,7 +249,7 @@ class Collector(Groups):
         triangle: Ints32,
         instance: Ints32,
     ) -> None:
-        """Add the kept hits of a chunk; numbers of rays `ray` are counted from `start`."""
+        """Add the kept hits of a chunk, whose numbers of rays `ray` are counted from `start`."""
         ray_number = ray.astype(np.uint32, copy=False)
         ray_number = ray_number + np.uint32(start) if start else ray_number
         self._parts.append((ray_number, distance, triangle, instance))

@@ -49,7 +49,7 @@ class SubRays:
     def loop_table(self, offsets: Floats | None) -> Floats:
         """Return the table that compiled loops read: shares, or angles, and starts.
 
-        It has 5 rows of whole vectors of 8 sub-rays, of which the last repeats.
+        It has 5 rows of whole vectors of 8 sub-rays. The last sub-ray is repeated to fill a vector.
 
         Rows are shares ahead, across and up, and starts across and up. With `offsets` the shares
         differ by beam: rows 1 and 2 are then angles.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from .cast_memory import Cast
 
 _SHARE = 1 << 14  # rays that a thread casts in a call, if there are several threads
-_BODY_RAYS = 64  # of a tile of rays at bodies
+_BODY_RAYS = 64  # rays per tile of rays at bodies
 _MAX_PLANS = 16
 
 
@@ -41,7 +41,7 @@ class TileBackend(Backend):
 
     @classmethod
     def missing(cls) -> str:
-        """Return why numba cannot be used and the remedy; "" if usable."""
+        """Return why numba cannot be used and the remedy, or "" if it can be used."""
         if importlib.util.find_spec("numba") is None:
             return f"numba is not installed: {install_command('numba')}"
         return ""
@@ -149,7 +149,7 @@ class TileBackend(Backend):
             yield start, stop, self._cast(cast, start, stop, plan)
 
     def _plan(self, scan: Scan) -> TilePlan:
-        """Return the tiles that scans of the same beams share; new ones if there are none."""
+        """Return the tiles that scans of the same beams share, or new ones if none exist."""
         beams = np.asarray(scan.pattern.directions.base)  # shared by copies of a pattern
         key = id(beams), scan.pattern.subrays_per_beam, len(scan)
         known = self._plans.get(key)
@@ -169,7 +169,10 @@ class TileBackend(Backend):
 
     @staticmethod
     def _reach(limits: tuple[float, float], scale: float) -> tuple[float, float]:
-        """Return the limits of distances, local; the farthest is finite: infinity is no hit."""
+        """Return the limits of distances, local.
+
+        The farthest is finite, since infinity means that nothing was hit.
+        """
         t_min, t_max = limits
         return t_min * scale, min(t_max * scale, np.finfo(np.float64).max)
 
@@ -190,7 +193,7 @@ class TileBackend(Backend):
         return cast
 
     def _scan_cast(self, scan: Scan) -> Cast:
-        """Return the `Cast` of a scan; the loops also write the rays to `scan.room`, if any."""
+        """Return the `Cast` of a scan, whose loops also write the rays to `scan.room`, if any."""
         cast = self._memory.Cast(self._base)
         cast.set_pattern(scan.pattern, scan.poses, scan.first)
         if scan.room is not None:

@@ -1,4 +1,4 @@
-"""The loops that cast scans, and rays at moving bodies, tile by tile; hits in the order of rays.
+"""The loops that cast scans, and rays at moving bodies, tile by tile, with hits in ray order.
 
 tile_plan.py says which rays form tiles. The hits of a call go to memory by their numbers; then they
 are written in the order of rays.
@@ -34,15 +34,15 @@ from .tile_loops import cast_tile
 from .tile_memory import KEY, LENGTH, NORM, NUMBER, OX, SUBTILES, T, at, row_at
 
 _T_MIN = at("t_min")
-_TILE_RAYS = 8 * SUBTILES  # of rays at bodies
+_TILE_RAYS = 8 * SUBTILES  # rays per tile of rays at bodies
 
 
 @stage
 def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-def]
-    """Write the numbers of a tile's rays; return whether the tile has one of the `count` rays.
+    """Write the numbers of a tile's rays, and return whether it has one of the `count` rays.
 
-    `lanes` is the address of numbers, to which `first` is added. Numbers below 0 or from `count` on
-    are of rays that are cast with the tile, for nothing.
+    `first` is added to the numbers at the address `lanes`. A number below 0 or from `count` on
+    belongs to a ray that is cast with the tile, for nothing.
     """
     numbers = int64s(tile)
     lane_numbers = int64s(lanes)
@@ -57,7 +57,7 @@ def _number_rays(tile, rays, lanes, first, count):  # type: ignore[no-untyped-de
 
 @stage
 def _reset(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
-    """Write reaches and no hits to the rays of a tile; the reach of rays outside the call is -1."""
+    """Write reaches and no hits to the rays of a tile, with reach -1 for rays outside the call."""
     floats = float64s(tile)
     numbers = int64s(tile)
     t_at = row_at(T, rays)
@@ -73,7 +73,7 @@ def _reset(tile, rays, t_max, count):  # type: ignore[no-untyped-def]
 
 @stage
 def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
-    """Write the hits of a tile to the memory of the call's `count` rays; others to its last row."""
+    """Write the hits of a tile to the memory of the call's `count` rays, others to its last row."""
     floats = float64s(tile)
     numbers = int64s(tile)
     distances = float64s(hits)
@@ -90,7 +90,7 @@ def _keep_hits(tile, rays, hits, count):  # type: ignore[no-untyped-def]
 
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
 def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Cast rays `start` to `stop` of a `CAST`; write the hits in ray order, return their number."""
+    """Cast rays `start` to `stop` of a `CAST`, write hits in ray order, return their number."""
     cast = casts[0]
     address = casts.ctypes.data
     tile = cast.tile
@@ -144,7 +144,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
 
 @inlined
 def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untyped-def]
-    """Write a ray to a lane of a tile, in local coordinates; return the length of its direction.
+    """Write a ray to a lane of a tile, in local coordinates, and return its direction's length.
 
     `origin`, metres, and `direction` are in the axes of the body. The length is 1 but for a sensor
     that turns during a pose.

@@ -108,7 +108,7 @@ def _ray_shear(floats, rays, ray):  # type: ignore[no-untyped-def]
 
 @stage
 def decide_one(tile, rays, ray, mesh, instance, position):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Test a ray and a triangle in float64, and keep a closer hit; return whether it is kept.
+    """Test a ray and a triangle in float64, keep a closer hit, and return whether it is kept.
 
     `instance` is the instance's number times `KEYS_PER_INSTANCE`, `position` of the triangle in
     leaf order.
@@ -156,7 +156,7 @@ def decide_one(tile, rays, ray, mesh, instance, position):  # type: ignore[no-un
 
 @inlined
 def decide_four(tile, rays, ray, axis, corners, position, key):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test four rays from a number on as `decide_one`; return the mask of those that hit.
+    """Test four rays from a number on as `decide_one`, and return the mask of rays that hit.
 
     The rays have the longest axis `axis`, and the mesh has no mask. `corners` points to the corners
     of the mesh in leaf order, `key` is of the triangle.

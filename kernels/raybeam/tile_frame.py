@@ -1,8 +1,8 @@
 """A tile's axes, and its rays, sides and depths in them.
 
-A ray becomes a point (su, sv) of a plane across the tile's mean direction m: its direction is
-(su, sv, 1) in the axes (u, v, m), divided by the component along m. The margins are those of
-tile_loops.py, which also describes the parameters.
+A ray becomes a point (su, sv) of a plane across the tile's mean direction m: its direction is (su,
+sv, 1) in the axes (u, v, m), divided by the component along m. tile_loops.py describes the margins
+and the parameters.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _narrowed(floats, k):  # type: ignore[no-untyped-def]
 
 @stage
 def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
-    """Write the axes of a tile and the point that they start from; return its largest coordinate.
+    """Write the axes of a tile and their starting point, and return its largest coordinate.
 
     `first_row` is the first of six rows with origins and directions.
     """
@@ -121,7 +121,7 @@ def _set_axes(tile, rays, first_row):  # type: ignore[no-untyped-def]
 
 @inlined
 def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
-    """Write the three axes about a direction of any length but zero; return 0."""
+    """Write the three axes about a direction of any length but zero, and return 0."""
     norm = 1 / np.sqrt((x * x + y * y) + z * z)
     x *= norm
     y *= norm
@@ -147,7 +147,7 @@ def _set_frame(singles, x, y, z):  # type: ignore[no-untyped-def]
 
 @stage
 def _flatten(tile, rays, first_row):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write su, sv and the depths of a tile's rays, and their bounds; return the least cosine to m.
+    """Write su, sv and the depths of a tile's rays, with bounds, and return the least cosine to m.
 
     `offset` becomes the maximum, over all rays, of the distance across m between the ray and the
     ray with the same (su, sv) from the tile's point, and of the distance along m.
@@ -268,7 +268,7 @@ def _set_planes(tile):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915
         singles[k + 1] = y1
         singles[k + 2] = z1
         singles[k + 3] = lowest(constant)
-        far = plane < 4  # of a side the farthest corner of a box counts, of the depth the nearest
+        far = plane < 4  # the farthest corner of a box counts for a side, the nearest for the depth
         numbers[_SIDES + 3 * plane] = 24 if (x1 >= 0) == far else 0
         numbers[_SIDES + 3 * plane + 1] = 32 if (y1 >= 0) == far else 8
         numbers[_SIDES + 3 * plane + 2] = 40 if (z1 >= 0) == far else 16
@@ -308,7 +308,7 @@ def limit_depths(tile, rays, subtiles):  # type: ignore[no-untyped-def]  # noqa:
 
 @part(types.int64(*4 * WHOLE))
 def aim(tile, rays, first_row, mask):  # type: ignore[no-untyped-def]
-    """Prepare a tile for a traversal in the coordinates of its rays; return whether it is narrow.
+    """Prepare a tile for a traversal in its rays' coordinates, and return whether it is narrow.
 
     `first_row` is the first of six rows with origins and directions, `mask` of subtiles to cast.
     """

@@ -93,7 +93,7 @@ def _splat_three(singles, k):  # type: ignore[no-untyped-def]
 
 @part(types.int64(*6 * WHOLE, types.float32))
 def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[no-untyped-def]  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Test the triangles of a leaf and the rays of the subtiles of a mask; return those with hits.
+    """Test the triangles of a leaf and the rays of a mask of subtiles, return subtiles with hits.
 
     `code` is of the leaf, `deepest` the greatest depth that a ray reaches, `instance` the number
     of the instance times `KEYS_PER_INSTANCE`.

@@ -19,24 +19,24 @@ TILE = np.dtype(
     [
         # Unit vectors u, v, m of the tile's axes, m ahead, and the point that they start from.
         ("axes", "f4", 12),
-        ("padding", "f4", 1),  # of depths
+        ("padding", "f4", 1),  # padding of depths
         ("offset", "f4", 1),  # maximum offset of a ray from the tile's point, as `aim` describes
         ("spread", "f4", 2),  # factor of errors, see `aim`; and a gap
-        ("bounds", "f4", 4 * SUBTILES),  # of subtiles: lowest and highest su, lowest, highest sv
-        ("tile_bounds", "f4", 8),  # of the tile, and a gap
+        ("bounds", "f4", 4 * SUBTILES),  # subtiles: lowest and highest su, lowest, highest sv
+        ("tile_bounds", "f4", 8),  # bounds of the tile, and a gap
         ("reach", "f4", SUBTILES),  # greatest depth of a subtile's rays
-        ("planes", "f4", 4 * 7 * SUBTILES),  # of a subtile: normal above 0, below 0, and constant
+        ("planes", "f4", 4 * 7 * SUBTILES),  # subtile: normal above 0, below 0, and constant
         ("tile_planes", "f4", 20),  # four sides, and the depth: normal and constant
         ("gap", "f4", 4),
-        ("edges", "f4", 14 * 8),  # of the triangles of a leaf, see `_prepare_leaf`
+        ("edges", "f4", 14 * 8),  # edges of the triangles of a leaf, from `_prepare_leaf`
         ("near", "f4", 8),  # depths of the children of a node
-        ("sides", "i8", 15),  # of boxes: where the coordinate of the farthest corner is, by plane
+        ("sides", "i8", 15),  # where boxes have the coordinate of the farthest corner, by plane
         ("t_min", "f8", 1),  # closest distance of a hit, local
         ("nested", "i8", 1),  # whether the mesh at hand has a transform
         ("skips", "i8", 1),  # tiles left that are cast one by one, see `_cast_in_mesh`
         ("patience", "i8", 1),  # number of such tiles after the last tile that was not cast as one
         ("sums", "f8", 4),
-        ("pairs", "u1", 8 * 8 + 8),  # of a triangle and a subtile
+        ("pairs", "u1", 8 * 8 + 8),  # pairs of a triangle and a subtile
         ("bits", "i8", 256),  # numbers of the bits that are set of each byte, a byte each
         ("stack", "i8", 1),  # address of the nodes that wait: `ENTRY` numbers of 4 bytes each
         ("met", "i8", 1),  # address of the instances that the tile may meet, likewise
@@ -48,7 +48,7 @@ ENTRY = 4  # depth, float32; code of a node or number of an instance, int32; mas
 # Rows of 8 bytes a ray. Local: of the scene.
 OX, OY, OZ, DX, DY, DZ = range(6)  # rays
 T = 6  # distance of the closest hit so far, or the reach; local
-KEY = 7  # of that hit, -1 for none; int64
+KEY = 7  # key of that hit, -1 for none; int64
 # The ray in the coordinates of the mesh at hand, and the length of the direction there before it
 # was made a unit vector.
 IX, IY, IZ, EX, EY, EZ, LENGTH = range(8, 15)
@@ -56,7 +56,7 @@ AXIS, U, V, W, SX, SY, SZ = range(15, 22)  # the shear of triangle.py; the longe
 ROW, POSE, WITHIN = 15, 16, 17  # while rays are made, before their shear; int64
 SURVIVORS = 22  # two rows: what the tests in float32 leave of a leaf; int64
 SU, SV, DM, WM, DEPTH, AXIS_OF_EIGHT = range(24, 30)  # the first five are float32
-NUMBER = 30  # of the ray in the call; int64
+NUMBER = 30  # number of the ray in the call; int64
 NORM = 31  # length of a ray's direction in the axes of a body, before it was made a unit vector
 ROWS = 32
 

@@ -15,9 +15,9 @@ from .arrays import Floats, Ints
 from .pattern_rays import checked_rays
 from .scan import Scan
 
-SUBTILES = 8  # of a tile
+SUBTILES = 8  # subtiles per tile
 _VECTOR = 8  # rays of a vector
-_MAX_LANES = 1 << 20  # of all tiles of a column: a longer firing counts as consecutive rays
+_MAX_LANES = 1 << 20  # limit for all tiles of a column: a longer firing counts as consecutive rays
 _FEW_FIRINGS = 4  # times the shift of a ring: shorter scans would have too many incomplete tiles
 
 
@@ -32,7 +32,7 @@ class TilePlan(NamedTuple):
         Of a tile; a column of tiles starts at each multiple.
     lanes
         int64 (groups, rays): number of each ray of a tile, from the first ray of the tile's first
-        firing on. Each group of rings has tiles of its own.
+        firing on. Each group of rings has separate tiles.
     shifts
         int64 (groups,): by how many firings a group's first tile starts before the first firing.
     """
@@ -55,7 +55,10 @@ def consecutive(subrays: int) -> TilePlan:
 
 
 def _sub_rays(beams: Ints, subrays: int) -> Ints:
-    """Return the numbers of the sub-rays of beams (..., n): those of a beam fill whole vectors."""
+    """Return the numbers of the sub-rays of beams (..., n).
+
+    The sub-rays of a beam fill whole vectors.
+    """
     if subrays == 1:
         return beams
     lanes = -(-subrays // _VECTOR) * _VECTOR
@@ -68,7 +71,7 @@ def plan_tiles(scan: Scan) -> TilePlan:
     subrays = scan.pattern.subrays_per_beam
     step = scan.pattern.step
     firing = step * subrays
-    start = -scan.first % firing  # of the first whole firing
+    start = -scan.first % firing  # first ray of the first whole firing
     whole_firings = (len(scan) - start) // firing
     if step == 1 or whole_firings < 2 or firing * SUBTILES * _VECTOR > _MAX_LANES:
         return consecutive(subrays)

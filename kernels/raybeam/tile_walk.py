@@ -144,7 +144,7 @@ def _unfinished(tile, count):  # type: ignore[no-untyped-def]
 
 @part(types.int64(*5 * WHOLE))
 def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
-    """Cast the rays of the subtiles of a mask in a mesh; return the mask of unfinished subtiles.
+    """Cast the rays of a mask of subtiles in a mesh, and return the mask of unfinished subtiles.
 
     The walk ends early if the tile meets more leaves than it has rays: then the subtiles that may
     meet a node that still waits are unfinished.
@@ -180,7 +180,7 @@ def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
 
 @part(types.int64(*3 * WHOLE))
 def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
-    """Write the instances that a tile may meet, nearest last; return their number.
+    """Write the instances that a tile may meet, nearest last, and return their number.
 
     `nodes` is the address of the tree over the instances, `mask` of the subtiles to cast.
     """

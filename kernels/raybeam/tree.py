@@ -6,8 +6,8 @@ loses a triangle that the ray meets in exact arithmetic:
 With u = 2**-24, local coordinates and origins within [-1, 1] and unit directions, a plane's
 parameter is computed from an origin that is off by u, a reciprocal direction that is off by 2u
 relative, and with up to three more roundings of values up to 2. Expressed as a shift of the
-plane, this is at most 12 u. Boxes are padded by 20 u, of which storing them in float32 takes
-at most u.
+plane, this is at most 12 u. Boxes are padded by 20 u. Storing the boxes in float32 takes at most u
+of the padding.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LEAF_BITS = 3
 
 @dataclass(frozen=True)
 class WideTree:
-    """Nodes with up to `width` children; node 0 is the root.
+    """Nodes with up to `width` children, starting with the root, node 0.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ def build_top(boxes: Floats, width: int) -> WideTree:
 
 
 def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
-    """Join trees in sequence; return the joint tree, and the root of each.
+    """Join trees in sequence, and return the joint tree, and the root of each.
 
     Triangles are numbered over all trees, in order.
     """

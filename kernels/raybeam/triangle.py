@@ -25,7 +25,7 @@ from .arrays import Bools, Floats, Indices
 
 @dataclass(frozen=True)
 class ShearedRays:
-    """Rays prepared for the test; every array has an entry for each ray.
+    """Rays prepared for the test, with an entry for each ray in every array.
 
     Attributes
     ----------
@@ -77,15 +77,15 @@ def shear(origins: Floats, directions: Floats) -> ShearedRays:
     row = np.arange(len(directions))
     component = directions[row, kz]
     return ShearedRays(
-        kx,
-        ky,
-        kz,
-        origins[row, kx],
-        origins[row, ky],
-        origins[row, kz],
-        directions[row, kx] / component,
-        directions[row, ky] / component,
-        1 / component,
+        kx=kx,
+        ky=ky,
+        kz=kz,
+        ox=origins[row, kx],
+        oy=origins[row, ky],
+        oz=origins[row, kz],
+        sx=directions[row, kx] / component,
+        sy=directions[row, ky] / component,
+        sz=1 / component,
     )
 
 

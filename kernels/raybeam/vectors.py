@@ -4,8 +4,8 @@ Numba turns loops over arrays into vector instructions, but not the body of a tr
 it keeps each step of such a loop in memory. A type whose values are LLVM's vectors stays in
 registers. LLVM divides these vectors where a processor's are shorter: SSE and NEON have 4 float32.
 
-A mask is a whole number: bit k belongs to lane k. Pointers are those of `cast_memory.pointer`,
-indices count elements, and no address needs to be aligned.
+A mask is a whole number: bit k belongs to lane k. `cast_memory.pointer` makes pointers, indices
+count elements, and no address needs to be aligned.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ def narrow(context: Any, a: Any, b: Any) -> Any:
 
 @intrinsic
 def lowest_bit(context: Any, mask: Any) -> Any:
-    """Return the number of the lowest bit of a mask that is set; the mask is not 0."""
+    """Return the number of the lowest bit of a mask that is set, for a mask that is not 0."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         return _call(builder, "llvm.cttz.i64", _I64, [arguments[0], ir.IntType(1)(1)])
