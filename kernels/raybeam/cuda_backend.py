@@ -186,7 +186,7 @@ class CudaBackend(Backend):
             return ClosestHits(*(array.get() for array in columns))
 
     def _ray_table(self, rays: Rays) -> tuple[Any, Any]:
-        """Copy rays to the device, and return origins (3, n) or, if shared, (3, 1), and directions."""
+        """Copy rays to the device. Return origins, (3, n) or (3, 1) if shared, and directions."""
         tables = (np.ascontiguousarray(table.T) for table in (rays.origins, rays.directions))
         origins, directions = map(self._cupy.asarray, tables)
         return origins, directions

@@ -95,7 +95,7 @@ class Workers:
     def outcome(self, key, worker):
         batches, _, outcome = self.casts[key]
         if isinstance(outcome, JobError) and len({job for job, _ in batches}) > 1:
-            return Outcome.DIVIDE
+            return Outcome.SEPARATE_JOBS
         if isinstance(outcome, JobError):
             raise outcome
         return outcome

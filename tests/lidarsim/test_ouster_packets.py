@@ -497,7 +497,7 @@ def test_frame_numbers_start_again_after_65_535():
     for revolution in (0, 65_535, 65_536):
         start = revolution * 512
         shots = random_shots(SINGLE, range(start, start + 16))
-        encoder._repeated_frames = 0
+        encoder._frame_offset = 0
         encoder._next_firing = start
         frames += uint(lidar_of(encoder.encode(shots)), 2, 2).tolist()
     assert frames == [0, 65_535, 0]

@@ -157,7 +157,7 @@ def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
     state, arrays = told(view, "state")
     assert (state["title"], state["points"]) == ("a room", 10_000)
     assert state["origin"] == ORIGIN.tolist()
-    assert [*state["scene"]] == ["grey", "hits", "object", "normals"]
+    assert [*state["scene_colours"]] == ["grey", "hits", "object", "normals"]
     assert arrays["sensor0_places"].shape == (POSES, 3)
     assert arrays["rays"].shape == (18, 2, 3)
     assert state["path"] == {"corners": [[1, 1], [5, 7]], "discs": [[1, 6, 0.5]]}
@@ -248,7 +248,9 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     state, arrays = told(view, "state")
     assert (state["actors"], state["statics"]) == ([{"name": "Cart", "class": None}], 2)
     assert len(state["actor_colours"]) == 1
-    assert arrays["mesh0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene"]
+    assert (
+        arrays["mesh0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene_colours"]
+    )
     assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
     assert arrays["actor0_places"][[0, -1]] == pytest.approx(np.array([[1, 1, 0], [5, 1, 0]]))
     assert np.abs(arrays["actor0_turns"][-1]) == pytest.approx([0, 0, half, half])
@@ -280,7 +282,7 @@ def test_without_pictures_sensors_and_sweeps_are_still_shown(tmp_path, spun):
     view = open_result(tmp_path)
     state, arrays = told(view, "state")
     assert state["title"].startswith(tmp_path.name)
-    assert (len(state["sensors"]), state["scene"]) == (1, None)
+    assert (len(state["sensors"]), state["scene_colours"]) == (1, None)
     assert arrays["sensor0_places"] == pytest.approx(spun.pose.positions)
     assert arrays["sweep_begins"] == pytest.approx(spun.begins_ns / 1e9)
     first, last = arrays["sweep_scans"][1:3]
@@ -441,7 +443,7 @@ def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, p
     survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")
     view = View(CloudFile(cloud), pictured, Sweeps.from_survey(survey, scene))
     state, arrays = told(view, "state")
-    assert (state["scene"], "axes of their sensor" in state["note"]) == (None, True)
+    assert (state["scene_colours"], "axes of their sensor" in state["note"]) == (None, True)
     assert not arrays["sensor0_places"].any()  # each sensor is at its own origin
     assert len(pictured.sample_rays) and not len(arrays["rays"]), "which are in the scene's axes"
     assert ["Wall", 0] in told(view, "column", name="object")[0]["labels"]
@@ -590,7 +592,7 @@ def test_a_scene_is_coloured_by_the_materials_of_its_faces(tmp_path):
     content = PictureContent.load(tmp_path / "pictures.npz")
     view = View(HeldPoints(Cloud(np.ones((3, 3)), {})), content)
     header, _ = view.answer("state", {}, bool)
-    assert "material" in header["scene"]
+    assert "material" in header["scene_colours"]
     header, arrays = view.answer("surface", {"colour": "material"}, bool)
     assert [name for name, *_ in header["legend"]["labels"]] == ["no material", "Brick", "Glass"]
     colours = {value: colour for _, colour, value in header["legend"]["labels"]}

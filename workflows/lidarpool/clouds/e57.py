@@ -199,9 +199,9 @@ def read_points(path: Path) -> FilePoints:
     file = pye57.E57(str(path))
     try:
         headers = [file.get_header(number) for number in range(file.scan_count)]
-        count = sum(header.point_count for header in headers)
-        check_count(count)
-        Allowance(input_size(path), _THIN).take(_POINT_BYTES * count)
+        point_count = sum(header.point_count for header in headers)
+        check_count(point_count)
+        Allowance(input_size(path), _THIN).take(_POINT_BYTES * point_count)
         scans = [
             _in_file(_read_scan(file, number, header)) for number, header in enumerate(headers)
         ]

@@ -510,7 +510,9 @@ def plugin_rows(files: Collection[str]) -> list[FormatRow]:
     Plug-ins that cannot be used are left out.
     """
     rows: list[FormatRow] = []
-    for name in plugins_of(GROUP) if files else ():
+    if not files:
+        return rows
+    for name in plugins_of(GROUP):
         with suppress(LidarError):
             rows += [row for row in [row_of(name)] if row.file in files]
     return rows

@@ -41,7 +41,7 @@ class _Part(NamedTuple):
     stop: int  # number of the scan after its last scan
     name: str  # in the storage of the parts
     rows: int  # number of points
-    cells: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
+    cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
 
 
 class CloudWriter:
@@ -179,7 +179,7 @@ class GrowingCloud:
             return
         self._committed_scans += sum(part.stop - part.first for part in parts)
         self._committed_bytes += sum(part.size for part in parts)
-        self._queue.put([_Part(p.first, p.stop, p.name, p.rows, p.cells) for p in parts])
+        self._queue.put([_Part(p.first, p.stop, p.name, p.rows, p.cell_box) for p in parts])
         if self._thread.ident is None:
             self._thread.start()
 
@@ -235,7 +235,7 @@ class GrowingCloud:
     def _append(self, part: _Part) -> None:
         """Append a part with points; begin the file anew if its positions need another type."""
         self._check_room(part)
-        cells = np.array(part.cells, np.int64).reshape(2, 3)
+        cells = np.array(part.cell_box, np.int64).reshape(2, 3)
         if self._points.cells is not None:
             earlier = self._points.cells
             cells = np.stack([np.minimum(cells[0], earlier[0]), np.maximum(cells[1], earlier[1])])

@@ -268,7 +268,9 @@ def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) 
             expected = common
             first = str(part.storage)
             first_fields = part.record["fields"]
-        for shard in part.shards if part is not earlier else ():
+        if part is earlier:
+            continue
+        for shard in part.shards:
             if (first_part := parts_by_shard.setdefault(shard.number, part)) is not part:
                 twice = f"shard {shard} is in {first_part.storage} and in {part.storage}"
                 mistakes.lines.append(f"{twice}: give one of them.")

@@ -213,7 +213,7 @@ def _build(
         placing = _placing(scenario, scene, findings, sensors[0])
         if placing.grid:  # no sensor is given, and the scene is a single object
             sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
-    track_or_poses = track or (SEED_POSES if placing is None else placing.poses)
+    track_or_poses = track or scenario.poses or (placing.poses if placing else SEED_POSES)
     parts = _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg)
     actors = _build_actors(shapes, static.standing, track)
     vehicles = _build_traffic(parts, shapes, static.standing)
@@ -275,7 +275,7 @@ class _SurveyParts(NamedTuple):
     scenario: Scenario
     findings: Findings
     sensors: Sequence[Mounted]
-    # Trajectory of the carrier, local; or poses, world, which `scenario.poses` replace if given.
+    # Trajectory of the carrier, local; or poses, world: the scenario's, else default poses.
     track_or_poses: Track | Sequence[Pose]
     origin: Floats  # (3,), of the scene, world metres
     epsg: int | None  # EPSG code of the rasters' coordinate system
@@ -622,7 +622,7 @@ def _build_survey(
     check_whole((*format_columns, *columns), cloud["keep_every"] or 1)
     track_or_poses = parts.track_or_poses
     track = track_or_poses if isinstance(track_or_poses, Track) else None
-    poses = () if isinstance(track_or_poses, Track) else scenario.poses or track_or_poses
+    poses = () if isinstance(track_or_poses, Track) else track_or_poses
     all_have_noise = all(mounted.noise is not None for mounted in sensors)
     mounted_on_purpose = scenario.sensors or scenario.mount is not None or scenario.sensor.unseen
     needs_no_mounting = not mounted_on_purpose and sensors[0].noise is None

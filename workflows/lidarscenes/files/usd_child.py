@@ -317,7 +317,9 @@ def _poses_up_to(
     halvings that are left.
     """
     step = stop.code - start.code
-    for share in _PROBES if depth else ():
+    if not depth:
+        return [stop]
+    for share in _PROBES:
         pose = _TimedPose(prim, start.code + share * step)
         offset = pose.matrix[:3, 3] - (1 - share) * start.matrix[:3, 3] - share * stop.matrix[:3, 3]
         rotation = Gf.Slerp(share, start.rotation, stop.rotation)
@@ -363,7 +365,9 @@ class Looks:
         materials: list[Any] = [] if prim_material is None else [(prim_material, None)]
         names = {*names_read, *(["displayColor"] if self._colours else [])}
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
-        for subset in subsets if prim.IsA(UsdGeom.Mesh) else ():
+        if not prim.IsA(UsdGeom.Mesh):
+            subsets = []
+        for subset in subsets:
             number, names_read = self._bound(subset.GetPrim())
             if number != prim_material:
                 materials.append((number, len(arrays)))

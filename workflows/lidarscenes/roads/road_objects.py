@@ -114,12 +114,15 @@ class ObjectBuilder:
         size = placement.size
         has_walls = any(outline.heights.any() for outline in outlines)
         if kind in _FLAT and not has_walls:
+            # A marking on the road: its stripes, else its area. A type for markings that states a
+            # height and has no outline is a box, except a parking space.
             if not painted and (outlines or (min(size[:2]) > 0 and size[2] <= 0)):
                 yield from _flat_pieces(element, kind, frame, placement, outlines)
             elif not outlines and size[2] > 0 and kind != "parkingSpace":
                 yield box(size, frame.origin, frame.turn, material)
         elif has_walls or (outlines and kind != UNTYPED):
-            yield _roof(outlines, material)
+            # Outlines with heights are walls and roofs. Outlines without heights are surfaces.
+            yield _walls_and_roofs(outlines, material)
         elif placement.radius > 0 and placement.height > 0:
             yield cylinder(
                 placement.radius, placement.height, frame.origin, frame.turn, material, self._sag_m
@@ -463,8 +466,11 @@ def _outlines(element: Element) -> list[Element]:
     ]
 
 
-def _roof(outlines: Sequence[_Outline], material: str) -> Piece:
-    """Return walls and roofs over outlines; inner outlines are holes of the first outer one."""
+def _walls_and_roofs(outlines: Sequence[_Outline], material: str) -> Piece:
+    """Return walls and roofs over outlines.
+
+    Inner outlines are holes of the first outer outline.
+    """
     outer = [outline for outline in outlines if outline.outer]
     holes = [outline for outline in outlines if not outline.outer and outline.closed]
     pieces = []

@@ -108,7 +108,9 @@ class Storage:
     def local(self, name: str | Path = "") -> Path:
         """Return the path of a file or folder in a local folder, or of the folder itself."""
         path = Path(self.url, name)
-        for ancestor in (path, *path.parents) if self.named else ():
+        if not self.named:
+            return path
+        for ancestor in (path, *path.parents):
             if len(str(ancestor)) <= len(self.named):
                 break
             if ancestor.is_symlink():
@@ -373,7 +375,9 @@ class Storage:
 
     def tidy(self, *, deep: bool = True) -> None:
         """Remove the files of killed writers in a local folder, and in folders below if `deep`."""
-        for folder, folders, files in os.walk(self.local()) if self.is_local else ():
+        if not self.is_local:
+            return
+        for folder, folders, files in os.walk(self.local()):
             for path in (Path(folder, name) for name in (*folders, *files)):
                 if _LEFTOVER.fullmatch(path.name) and not path.is_symlink():
                     self.discard(path.relative_to(self.url).as_posix())

@@ -48,7 +48,9 @@ Transparent = Literal["none", "pass"]
 
 def _checked_names(names: Any, handler: Callable[[Any], Any]) -> Any:
     """Raise ValueError for names of classes that files cannot hold, or that two classes share."""
-    for number, name in names.items() if isinstance(names, Mapping) else ():
+    if not isinstance(names, Mapping):
+        return handler(names)
+    for number, name in names.items():
         valid = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
         unique = [*names.values()].count(name) == 1
         if not (valid and unique and 0 < len(name) < 100 and name.isprintable()):

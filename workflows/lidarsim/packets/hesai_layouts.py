@@ -58,8 +58,9 @@ class Layout:
     def header_bytes(self, dual: bool) -> Ints:
         """Return the bytes of the header."""
         header = np.array(self.header, np.int64)
-        for position, byte in (self.dual_header or {}).items() if dual else ():
-            header[position] = byte
+        if dual and self.dual_header is not None:
+            for position, byte in self.dual_header.items():
+                header[position] = byte
         return header
 
     def dates(self, seconds: Ints) -> NDArray[np.uint8]:

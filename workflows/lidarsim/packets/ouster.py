@@ -266,7 +266,7 @@ class OusterEncoder(PacketEncoder):
         self._serial_number = 122_000_000_000 + crc32(source.name.encode()) % 1_000_000_000
         self._rest: Shots | None = None  # shots that fill no packet yet
         self._next_firing = 0
-        self._repeated_frames = 0  # frames sent less revolutions made
+        self._frame_offset = 0  # number of a frame less the number of its revolution
         self._samples = ImuSamples(source)
 
     def _profile_of_mode(self) -> Profile:
@@ -314,8 +314,8 @@ class OusterEncoder(PacketEncoder):
         first = int(shots.firings[0])
         if first != self._next_firing:  # a station begins, or a frozen sweep is sent again
             groups += self._rest_of_packets()
-            next_frame = -(-self._next_firing // self._columns) + self._repeated_frames
-            self._repeated_frames = next_frame - first // self._columns
+            next_frame = -(-self._next_firing // self._columns) + self._frame_offset
+            self._frame_offset = next_frame - first // self._columns
         self._next_firing = int(shots.firings[-1]) + 1
         joined = shots if self._rest is None else Shots.joined([self._rest, shots])
         count = self._next_firing // COLUMNS_PER_PACKET * COLUMNS_PER_PACKET
@@ -378,7 +378,7 @@ class OusterEncoder(PacketEncoder):
             times_ns = np.pad(times_ns, (before, after))
         revolutions, measurement_ids = np.divmod(firings, self._columns)
         return MeasurementBlocks(
-            revolutions + self._repeated_frames,
+            revolutions + self._frame_offset,
             measurement_ids,
             times_ns,
             valid,

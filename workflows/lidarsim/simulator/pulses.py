@@ -7,7 +7,7 @@ beams; `CastStep`, which finds the hits of all rays; steps that add light of rai
 those that make returns of hits, detect, receive, lose and choose returns. What is kept of them is
 `Scanned`. Steps on reported returns get all beams at once, and returns out of range are removed.
 `BatchPoints` holds it, of which `columns_of` makes columns. If each ray can have one return only
-(`Setup.has_several_returns`), `SceneCaster` itself counts and thins out the hits; on CUDA without
+(`Setup.return_count_varies`), `SceneCaster` itself counts and thins out the hits; on CUDA without
 steps, `DeviceColumns` does all of it.
 """
 
@@ -58,7 +58,7 @@ class PulseCaster:
         self._caster = caster
         self._surfaces = surfaces
         # Known once: copies of this caster have the same materials and the same sensor.
-        self._has_several_returns = setup.has_several_returns
+        self._return_count_varies = setup.return_count_varies
         self.emitter = Emitter(setup)
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
@@ -109,7 +109,7 @@ class PulseCaster:
             return PulseBatch(keys, start, stop, pattern, first_row, poses, firings, self.emitter)
 
         all_beams = batch(0, beam_count)
-        if self._has_several_returns:
+        if self._return_count_varies:
             pose_beams = poses.rays_per_pose or self.setup.sensor.channels
             chunk_beams = max(1, CHUNK_RAYS // (len(self.emitter) * pose_beams)) * pose_beams
             chunk_starts = range(0, beam_count, chunk_beams)
@@ -128,7 +128,10 @@ class PulseCaster:
     def _within_range(self, scanned: Scanned, scan_starts: Ints) -> Scanned:
         """Remove the returns whose ranges, with noise, are outside of the sensor's range.
 
-        The counts and the numbers of the other returns are as if the removed ones were undetected.
+        If `keep_every` is 1, the counts and the numbers of the other returns are as if the removed
+        returns were undetected. If it is larger, returns have been thinned out before: only the
+        removed returns among the kept ones leave the counts, and the choice of the kept returns
+        stays.
         """
         returns = scanned.returns
         sensor = self.setup.sensor

@@ -207,8 +207,10 @@ class Sweeps:
             jump for jump in self.faults if jump.kind == "time_jump" and jump.sensor in sensors
         ]
         since_begin = stamps - begin_ns
+        if not jumps:
+            return np.asarray(since_begin, np.float64)
         smallest_distance = np.full(len(stamps), np.inf)
-        for count in range(1 + len(jumps)) if jumps else ():
+        for count in range(1 + len(jumps)):
             for faults in combinations(jumps, count):
                 candidate = stamps - sum(round((fault.by_s or 0) * 1e9) for fault in faults)
                 stated_stamps = sum((fault.jumps_ns(candidate) for fault in jumps), candidate)

@@ -52,19 +52,19 @@ def hit_colours(
     triangle_density = hit_density(scene, hits)
     pieces, owner, areas, point_density = _divide(corners, hits > 0, points, max_pieces)
     is_counted = np.isfinite(point_density)
-    density = triangle_density[owner]
+    piece_density = triangle_density[owner]
     if point_density[is_counted].any():
-        hit_count = (density * areas)[is_counted].sum()
+        hit_count = (piece_density * areas)[is_counted].sum()
         point_count = (point_density * areas)[is_counted].sum()
-        density[is_counted] = hit_count / point_count * point_density[is_counted]
-    limits = _density_range(density, areas)
-    density = np.repeat(density[:, None], 3, axis=1)
+        piece_density[is_counted] = hit_count / point_count * point_density[is_counted]
+    limits = _density_range(piece_density, areas)
+    corner_density = np.repeat(piece_density[:, None], 3, axis=1)
     if is_counted.any():
-        density[is_counted] = _corner_means(
-            pieces[is_counted], areas[is_counted], density[is_counted]
+        corner_density[is_counted] = _corner_means(
+            pieces[is_counted], areas[is_counted], corner_density[is_counted]
         )
     # Where points were counted, none are grey; elsewhere the hits are known.
-    colours = _density_colours(density, (~is_counted & (hits[owner] > 0))[:, None], limits)
+    colours = _density_colours(corner_density, (~is_counted & (hits[owner] > 0))[:, None], limits)
     return pieces, owner, colours, limits
 
 

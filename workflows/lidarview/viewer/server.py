@@ -336,7 +336,8 @@ def page_server(
 def _open_socket(host: str, port: int) -> socket.socket:
     """Listen on a port, or the next free port; on any port for 0, or if no port is free."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    for candidate in range(port, min(port + _PORTS_TRIED, 65_536)) if port else ():
+    candidates = range(port, min(port + _PORTS_TRIED, 65_536)) if port else range(0)
+    for candidate in candidates:
         with suppress(OSError):
             return socket.create_server((host, candidate), family=family, backlog=128)
     return socket.create_server((host, 0), family=family, backlog=128)

@@ -297,7 +297,7 @@ def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:
     """Return the answers to all questions of a page but for points: {question: packed answer}."""
     header, arrays = view.answer("state", {}, bool)
     answers = {"state?": _packed(header | {"offline": True, "exports": []}, arrays)}
-    questions = [("surface", "colour", value) for value in header["scene"] or ()]
+    questions = [("surface", "colour", value) for value in header["scene_colours"] or ()]
     questions += [("column", "name", value) for value in view.columns]
     labels = [name for name, column in view.columns.items() if column.kind == "label"]
     questions += [("counts", "name", name) for name in labels]

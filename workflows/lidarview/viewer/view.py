@@ -295,7 +295,7 @@ class View:
             "box": box.tolist(),
             "bounds": self._bounds.tolist(),
             "cut": None if shown_box is None else float(shown_box[1, 2]),
-            "scene": pictured
+            "scene_colours": pictured
             and colours_for(pictured.scene, pictured.reflectance, pictured.face_materials),
             "sensors": [
                 {
@@ -460,7 +460,7 @@ class View:
 
     def colouring(self, name: str) -> Colouring:
         """Return the colour scale of a column for all points."""
-        return self._colouring(self._finder, name, Filter(), None, bool)
+        return self._colouring(self._finder, name, Filter(), None, _never_abandoned)
 
     def _colouring(
         self,
@@ -634,6 +634,11 @@ class View:
             limits = self._range_limits[sensor]
             image = range_image(local, ranges, channels, limits)
         return {"low": limits[0], "high": limits[1], "sensor": sensor}, {"image": image}
+
+
+def _never_abandoned() -> bool:
+    """Return False: the answer is awaited to its end."""
+    return False
 
 
 def _read_limits(text: str) -> tuple[float, float]:

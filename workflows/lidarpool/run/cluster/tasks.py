@@ -46,10 +46,10 @@ class Tasks(Generic[T]):
     def take_done(self) -> list[tuple[T, Any]]:
         """Remove the finished tasks; return their purposes and results."""
         finished = {future.key: future for future in self.running if future.status == "finished"}
-        results = []
-        for key, (result, record) in (
-            fetch_available(self._client, [*finished]).items() if finished else ()
-        ):
+        results: list[tuple[T, Any]] = []
+        if not finished:
+            return results
+        for key, (result, record) in fetch_available(self._client, [*finished]).items():
             self.book.add(record)
             results.append((self.running.pop(finished[key]), result))
         return results

@@ -29,7 +29,7 @@ class Outcome(Enum):
     REFUSED = "its worker takes no tasks"
     LATE = "it is late"
     NO_RIG = "its worker has no scene any more"
-    DIVIDE = "its task failed, perhaps because of another job"
+    SEPARATE_JOBS = "its task failed, perhaps because of another job"
 
 
 @dataclass(eq=False)
@@ -47,7 +47,7 @@ class Batch:
     worker: str = ""  # address of the GPU worker
     collector: str = ""  # name of the task of stage 4
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
-    divided: bool = False  # True if it must not be cast with batches of other jobs
+    single_job: bool = False  # True if it must not be cast with batches of other jobs
 
     def __post_init__(self) -> None:
         self.share = len(self) / self.job.scans_per_task  # of the memory of a task

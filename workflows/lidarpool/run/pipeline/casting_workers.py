@@ -293,7 +293,7 @@ class CastingWorkers:
         if was_killed(future):
             return Outcome.DIED
         if status == "error" and len(jobs) > 1:
-            return Outcome.DIVIDE
+            return Outcome.SEPARATE_JOBS
         activity = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
         raise_if_failed(future, activity, JobError)  # the message names the scans
         return Outcome.PENDING

@@ -28,7 +28,7 @@ class CommittedParts:
     @property
     def cells(self) -> Ints | None:
         """Lowest and highest cell of all points, (2, 3); None without points."""
-        cells = [part.cells for part in self.ordered if part.cells]
+        cells = [part.cell_box for part in self.ordered if part.cell_box]
         if not cells:
             return None
         table = np.array(cells, np.int64).reshape(-1, 2, 3)

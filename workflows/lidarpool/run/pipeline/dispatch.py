@@ -189,8 +189,8 @@ class Dispatcher:
 
         If the worker died or no longer has the job's scene, the batches are offered again. If
         casting has failed, and the task had batches of several jobs, they are offered again, too,
-        each in a task with batches of its own job only (`Outcome.DIVIDE`); with batches of a single
-        job, the job fails.
+        each in a task with batches of its own job only (`Outcome.SEPARATE_JOBS`). With batches of a
+        single job, the job fails.
         """
         moved = False
         for key, task_batches in [*self._tasks.items()]:
@@ -201,14 +201,16 @@ class Dispatcher:
             except JobError as error:
                 self.failed.setdefault(task_batches[0].job, error)
                 continue
-            for batch in [*task_batches] if outcome is not Outcome.PENDING else ():
+            if outcome is Outcome.PENDING:
+                continue
+            for batch in [*task_batches]:
                 moved = True
                 if outcome is Outcome.DONE:
                     batch.move(BatchState.CAST)
                     batch.job.cast += len(batch)
                 else:
                     self._offer_again(batch, outcome.value)
-                    batch.divided |= outcome is Outcome.DIVIDE
+                    batch.single_job |= outcome is Outcome.SEPARATE_JOBS
         return moved
 
     def leave_workers(self, locations: TaskLocations) -> None:
@@ -362,7 +364,8 @@ class Dispatcher:
             self._fail_condemned(job)
             if receipt.record is not None:
                 records.append((job, receipt.record))
-        for waiting in self.in_states(BatchState.COLLECTING) if earliest_s else ():
+        waiting_batches = [*self.in_states(BatchState.COLLECTING)] if earliest_s else []
+        for waiting in waiting_batches:
             # A collector takes its batches in order. Batches behind the committed batches had to
             # wait: the time after which they are late starts now.
             if waiting.collector in earliest_s and waiting.since >= earliest_s[waiting.collector]:

@@ -281,7 +281,7 @@ def _group_key(batch: Batch) -> object:
     """
     if batch.deaths:
         return batch
-    return batch.job.number if batch.divided else batch.job.scene_name
+    return batch.job.number if batch.single_job else batch.job.scene_name
 
 
 def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Batch]:

@@ -124,7 +124,7 @@ class Receipt(Scans):
     rows: int  # points
     size: int  # bytes
     hits: int  # of its scans, before thinning out
-    cells: tuple[int, ...]  # lowest and highest as six numbers; empty where there are no points
+    cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
     summaries: bytes  # of its scans, of `summary_type`
     record: TaskRecord | None = None  # the casting task; None for a receipt from the database
     held_at: str = ""  # worker that holds the part because it does not see the storage; else ""

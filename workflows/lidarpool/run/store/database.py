@@ -217,7 +217,7 @@ class RunDatabase:
         if not new:
             return new
         rows = [
-            (p.job, p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cells), p.summaries)
+            (p.job, p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cell_box), p.summaries)
             for _, p in new
         ]
         try:

@@ -225,8 +225,8 @@ class RunStore:
         with explained(f"{self.storage.url} cannot be looked at"):
             self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
         self._strays: dict[int, list[str]] = {}  # {job: names of parts that a run has left}
-        for name in self._sizes if resume else ():
-            if (scans := scans_of(name, self.db.meta["mark"])) is not None:
+        for name in self._sizes:
+            if resume and (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
         if self.db.used:
             self._check_same(self.db.meta)

@@ -60,7 +60,7 @@ class PcapRecording:
         self.sources: list[str] = []  # addresses of sensors, in the order of their first datagrams
         self.ports: dict[str, list[int]] = {}  # of each sensor
         last_ns = 0
-        count = 0
+        packet_count = 0
         for datagram in self._datagrams():
             if datagram.source not in self.ports:
                 self.sources.append(datagram.source)
@@ -68,12 +68,12 @@ class PcapRecording:
             if datagram.port not in ports:
                 ports.append(datagram.port)
             last_ns = max(last_ns, datagram.time_ns)
-            count += 1
-        if not count:
+            packet_count += 1
+        if not packet_count:
             raise LidarError(
                 f"{path} has no UDP datagrams over IPv4: give a recording of a sensor."
             )
-        self.period_ns = last_ns + last_ns // max(1, count - 1)  # of repeating it
+        self.period_ns = last_ns + last_ns // max(1, packet_count - 1)  # of repeating it
 
     def batches(self, length_ns: int) -> Iterator[tuple[int, dict[str, list[Datagrams]]]]:
         """Yield start and datagrams of each span of time, {source: datagrams}."""

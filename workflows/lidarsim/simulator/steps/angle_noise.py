@@ -83,6 +83,6 @@ def angle_errors(noise: Noise, scan: Integers, ray: Integers) -> tuple[Floats, F
 
 def beam_memory(setup: Setup, sizes: Sizes) -> Memory:
     """Return the memory of the directions of deflected beams, in bytes."""
-    if setup.has_several_returns:  # then the beams are deflected batch by batch
+    if setup.return_count_varies:  # then the beams are deflected batch by batch
         return Memory()
     return Memory(retained=32 * sizes.rays, casting=20 * sizes.rays)

@@ -174,11 +174,11 @@ class CastStep(PulseStep):
         super().__init__(setup, caster, surfaces)
         survey = setup.survey
         sensor = setup.sensor
-        self._light = light_of(survey, sensor)
+        self._sensor_light = light_of(survey, sensor)
         self._seed = setup.noise.seed
         table = surfaces.at_wavelength(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
-        air = self._light.extinction
+        air = self._sensor_light.extinction
         self._media = Media(setup.scene, surfaces, table, air) if filled else None
         # Light that can return no more energy than this is not cast again, if there are mirrors.
         self._faintest = FAINTEST * setup.noise.threshold
@@ -204,7 +204,7 @@ class CastStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return True if a ray may have several returns, or no return."""
-        return setup.has_several_returns
+        return setup.return_count_varies
 
     @staticmethod
     def added(setup: Setup) -> float:
@@ -332,7 +332,7 @@ class CastStep(PulseStep):
             triangle,
             light.directions,
             distance,
-            self._light,
+            self._sensor_light,
             light.times,
             actor_trajectories,
             colour,
@@ -391,7 +391,7 @@ class CastStep(PulseStep):
         rows = leaves.rows
         leaf_colour = None if colour is None else colour[rows]
         return self.surfaces.energy(
-            triangle[rows], leaves.cosines, distance[rows], self._light, leaf_colour
+            triangle[rows], leaves.cosines, distance[rows], self._sensor_light, leaf_colour
         )
 
     def _velocities(
@@ -418,7 +418,7 @@ class CastStep(PulseStep):
 
         With media, hits on the surfaces of crowns and hits beyond the sensor's range are left out.
         """
-        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
+        materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         velocity = None
         if light.range_rate is not None:
             along_ray = products(surface_hits.velocities.T, light.directions.T)
@@ -502,7 +502,7 @@ class CastStep(PulseStep):
         """
         from ..casting import surface_loops  # not before: numba takes half a second to import
 
-        materials = self.surfaces.at_wavelength(self._light.wavelength_nm)
+        materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
         if materials.textured and surface_hits.colour is not None:
             bright = luminance(surface_hits.colour[rows])
@@ -527,9 +527,9 @@ class CastStep(PulseStep):
                 materials.specular, materials.passes, ~materials.refracts, materials.leafy
             ),
             surface_loops.OnwardLimits(
-                self._light.wet,
+                self._sensor_light.wet,
                 self._brightest,
-                self._light.extinction,
+                self._sensor_light.extinction,
                 self._faintest if drops_faint else -1.0,
             ),
             share,

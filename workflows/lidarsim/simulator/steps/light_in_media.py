@@ -156,6 +156,7 @@ class RayDifferentials:
         shift = applied(self.position_derivatives, normals) / incoming_cosine[:, None]
         self.position_derivatives = self.position_derivatives - shift[..., None] * incoming[:, None]
         ratio = np.where(mirrored, 1.0, self.index / index)
+        # A mirror turns the component along the normal round: it changes by twice its size.
         bend = np.where(mirrored, 2.0, ratio - ratio**2 * incoming_cosine / outgoing_cosine)
         slope = bend[:, None] * applied(self.direction_derivatives, normals)
         derivatives = ratio[:, None, None] * self.direction_derivatives
@@ -208,8 +209,9 @@ class Media:
         if self.filled[~is_static].any():
             bounds = np.append(bounds, [[[-np.inf] * 3, [np.inf] * 3]], axis=0)
         self._bounds = bounds
-        for angle in self._angles if self.leafy else ():
-            projection(angle, np.ones(1))  # computes and caches the table of the angle
+        if self.leafy:
+            for angle in self._angles:
+                projection(angle, np.ones(1))  # computes and caches the table of the angle
 
     def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
         """Return whether light enters bodies: (n,); `cosines` are between normals and light."""

@@ -39,7 +39,7 @@ class SurfaceMarks(NamedTuple):
 
     solid: Bools  # whether the hit is on a surface that may continue
     starts_return: Bools  # whether a return starts at the hit
-    apart: Bools  # whether the surface of the hit before does not continue; may be `starts_return`
+    starts_surface: Bools  # False if the last hit's surface continues; may be `starts_return`
 
 
 class PulseHits(NamedTuple):
@@ -116,7 +116,7 @@ def _half_way(hit, neighbour, inverse_distance, neighbours):
 
 @stage
 def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C901, PLR0914 - a compiled loop
-    """Clear `marks.apart` at the hits of a beam where the surface of the hit before continues.
+    """Clear `marks.starts_surface` at hits of a beam where the last hit's surface continues.
 
     The hits of the beam are rows `begin` to `stop` of `hits`, `PulseHits`, and of `marks`,
     `SurfaceMarks`; only `solid` hits are considered. Two neighbouring sub-rays hit one surface if
@@ -130,7 +130,7 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
     subrays = neighbours.subrays
     solid = marks.solid
     starts_return = marks.starts_return
-    apart = marks.apart
+    starts_surface = marks.starts_surface
     distance = hits.distance
     row = hits.row
     subray_hits = hits.subray_hits
@@ -173,4 +173,4 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
     for k in range(begin, stop):
         continuing += changes[k - begin]
         if continuing > 0:
-            apart[k] = False
+            starts_surface[k] = False

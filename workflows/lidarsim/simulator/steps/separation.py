@@ -207,7 +207,7 @@ class SeparationStep(PulseStep):
     @staticmethod
     def applies(setup: Setup) -> bool:
         """Return whether rays may have no return or several, and there are no waveforms."""
-        return setup.has_several_returns and not setup.in_waveforms
+        return setup.return_count_varies and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of the hits of a batch."""

@@ -251,11 +251,12 @@ def _sort_by_distance(pulse_hits, count):
 
 
 @inlined
-def _mark_returns(hits, air, count, apart, receiver, neighbours, scratch):
+def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbours, scratch):
     """Mark the hits in `scratch` at which returns start, and write the columns of the hits.
 
-    `count` is the number of hits, and `apart` says whether hits are farther apart than the
-    receiver's gap. A surface that continues from sub-ray to sub-ray is in a single return.
+    `count` is the number of hits. `exceeds_gap` is False if no hit of the beam is farther from
+    another hit than the receiver's gap. A surface that continues from sub-ray to sub-ray is in a
+    single return.
     """
     row = scratch.hits.row
     distance = scratch.hits.distance
@@ -272,7 +273,9 @@ def _mark_returns(hits, air, count, apart, receiver, neighbours, scratch):
         if receiver.with_velocity:
             velocity_k = hits.velocity[row_k] if row_k >= 0 else air.velocity[-1 - row_k]
             scratch.velocity[k] = velocity_k
-        starts_return[k] = k == 0 or (apart and distance[k] - distance[k - 1] > receiver.gap_m)
+        starts_return[k] = k == 0 or (
+            exceeds_gap and distance[k] - distance[k - 1] > receiver.gap_m
+        )
         number += int(starts_return[k])
         if solid[k]:  # surfaces can only continue if they are in several returns
             several |= surface_number >= 0 and surface_number != number
@@ -474,10 +477,10 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, P
             single, count = _single_return(hits, rows, beam, receiver, count, output)
         if not single:
             collected, extent_m = _collect_hits(hits, air, rows, scratch)
-            apart = extent_m > receiver.gap_m
-            if apart:  # few beams hit an edge or graze a surface
+            exceeds_gap = extent_m > receiver.gap_m
+            if exceeds_gap:  # few beams hit an edge or graze a surface
                 _sort_by_distance(scratch.hits, collected)
-            _mark_returns(hits, air, collected, apart, receiver, neighbours, scratch)
+            _mark_returns(hits, air, collected, exceeds_gap, receiver, neighbours, scratch)
             count = _write_returns(collected, beam, receiver, scratch, count, output)
         if loses and count > begin:
             number = keys.first + beam

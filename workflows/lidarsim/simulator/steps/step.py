@@ -113,7 +113,7 @@ class Setup:
         return self.survey.waveform_samples
 
     @property
-    def has_several_returns(self) -> bool:
+    def return_count_varies(self) -> bool:
         """Whether a ray that hits a surface may have no return or several, instead of a single."""
         if self.has(Role.CHANGES | Role.RECEIVES):
             return True

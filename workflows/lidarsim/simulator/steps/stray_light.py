@@ -44,7 +44,7 @@ class StrayLightStep(PulseStep):
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        self._light = light_of(setup.survey, setup.sensor)
+        self._sensor_light = light_of(setup.survey, setup.sensor)
         self._clusters = [*_retro_clusters(setup.scene, surfaces, caster.unseen)]
 
     @staticmethod
@@ -105,10 +105,10 @@ class StrayLightStep(PulseStep):
             float(self.setup.sensor.min_range_m),
             float(self.setup.noise.stray_light),
             float(FAINTEST * self.setup.noise.threshold),
-            float(self._light.extinction),
+            float(self._sensor_light.extinction),
         )
         chosen = np.zeros(NEAREST_TRIANGLES, np.int64)
-        table = self.surfaces.at_wavelength(self._light.wavelength_nm)
+        table = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         for actor, clusters in groupby(self._clusters, key=lambda cluster: cluster.actor):
             rotations = None
             positions = np.zeros(3)

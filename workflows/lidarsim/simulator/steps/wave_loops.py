@@ -48,7 +48,7 @@ class WaveMarks(NamedTuple):
     # `search_waveforms` searches, whether a peak does. `make_returns` clears the marks of hits that
     # continue a surface: then a return starts at each mark.
     starts: Bools
-    apart: Bools  # whether the surface of the hit before does not continue at the hit
+    starts_surface: Bools  # False if the surface of the hit before continues at the hit
     searched: Bools  # whether the hit is `solid`, in a waveform too wide for the closed form
     all_start: Bools  # always True: before a search, `continue_surfaces` takes each hit as a return
 
@@ -543,12 +543,12 @@ def _end_of_beam(beam, begin):
 
 
 @inlined
-def _is_apart(apart, first, end):
-    """Return whether hits `first` to `end` are on more than one surface, by the marks `apart`."""
-    any_apart = False
+def _has_several_surfaces(starts_surface, first, end):
+    """Return whether hits `first` to `end` are on several surfaces, by their marks."""
+    several = False
     for k in range(first + 1, end):
-        any_apart |= apart[k]
-    return any_apart
+        several |= starts_surface[k]
+    return several
 
 
 @compiled()
@@ -557,17 +557,17 @@ def divide_into_waveforms(hits, sigma_m, neighbours, parts):
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
     that of the hit before. A waveform is searched if its hits are farther apart than `NARROW`, and
-    not on one surface. `hits` are `WaveHits`, whose marks `starts`, `apart` and `searched` are
-    written; `sigma_m` is the standard deviation of the system waveform in range, and `neighbours`
-    are `pulse_loops.Neighbours`. `parts` (k, 2) receives the first hit, and the hit after the last,
-    of each waveform to search.
+    not on one surface. `hits` are `WaveHits`, whose marks `starts`, `starts_surface` and `searched`
+    are written. `sigma_m` is the standard deviation of the system waveform in range, and
+    `neighbours` are `pulse_loops.Neighbours`. `parts` (k, 2) receives the first hit, and the hit
+    after the last, of each waveform to search.
     """
     beam = hits.beam
     distance = hits.pulses.distance
     starts = hits.marks.starts
-    apart = hits.marks.apart
+    starts_surface = hits.marks.starts_surface
     searched = hits.marks.searched
-    surface_marks = SurfaceMarks(searched, hits.marks.all_start, apart)
+    surface_marks = SurfaceMarks(searched, hits.marks.all_start, starts_surface)
     count = 0
     begin = 0
     while begin < len(beam):
@@ -576,7 +576,7 @@ def divide_into_waveforms(hits, sigma_m, neighbours, parts):
         first = begin
         for k in range(begin, end):
             starts[k] = k == begin or distance[k] - distance[k - 1] > 2 * CUT * sigma_m
-            apart[k] = True
+            starts_surface[k] = True
             searched[k] = False
         for k in range(begin + 1, end + 1):
             if k < end and not starts[k]:
@@ -593,7 +593,7 @@ def divide_into_waveforms(hits, sigma_m, neighbours, parts):
         last_part = count
         count = first_part
         for part in range(first_part, last_part):
-            if _is_apart(apart, parts[part, 0], parts[part, 1]):
+            if _has_several_surfaces(starts_surface, parts[part, 0], parts[part, 1]):
                 parts[count, 0] = parts[part, 0]
                 parts[count, 1] = parts[part, 1]
                 count += 1

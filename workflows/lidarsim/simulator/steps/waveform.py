@@ -170,7 +170,7 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
     marks = wave_loops.WaveMarks(
         solid=hits.triangle[order] != NO_SURFACE,
         starts=np.empty(count, np.bool_),
-        apart=np.empty(count, np.bool_),
+        starts_surface=np.empty(count, np.bool_),
         searched=np.empty(count, np.bool_),
         all_start=np.ones(count, np.bool_),
     )

@@ -406,10 +406,10 @@ function buildPanel() {
   const parts = [head, panel.progress, panel.facts];
   if (state.results.length) parts.push(section("Results", true, (panel.results = element("div"))));
   parts.push(points);
-  if (state.scene) {
+  if (state.scene_colours) {
     panel.sceneLegend = element("div");
     parts.push(section("Scene", true,
-      menu("colour", [...state.scene, HIDDEN], chosen.scene, (value) => {
+      menu("colour", [...state.scene_colours, HIDDEN], chosen.scene, (value) => {
         chosen.scene = value;
         panel.opacity.set(value === "grey" ? FAINT : 1); // a colour is to be seen
         loadSurface().catch(failed);
@@ -501,7 +501,7 @@ function setClip(limits) {
 }
 
 async function loadSurface() {
-  if (!state.scene) return;
+  if (!state.scene_colours) return;
   const hidden = chosen.scene === HIDDEN;
   picture.actorsHidden = hidden;
   picture.colourActors(chosen.scene);
@@ -899,7 +899,7 @@ function readLink() {
   const words = new URLSearchParams(location.hash.slice(1));
   const columns = state.columns.map((column) => column.name), get = (name) => words.get(name) ?? "";
   if ([...state.colours, HIDDEN].includes(get("colour"))) chosen.colour = get("colour");
-  if ([...(state.scene ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
+  if ([...(state.scene_colours ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
   if (SHOWS.some(([value]) => `${value}` === get("show"))) { chosen.show = get("show"); clock.own = true; }
   if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
   chosen.opacity = words.has("opacity") ? Math.min(1, Math.max(0, +get("opacity") || 0)) : chosen.scene === "grey" ? FAINT : 1;
