@@ -89,7 +89,10 @@ def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPo
 
 
 def check_matrices(matrices: Floats) -> None:
-    """Check that matrices (k, 4, 4) are rigid transforms; LidarError if not."""
+    """Check that matrices (k, 4, 4) are rigid transforms.
+
+    Raises LidarError if not.
+    """
     _check_finite(matrices)
     if not (np.abs(matrices[:, 3] - [0, 0, 0, 1]) <= ROW_SLACK).all():
         raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
@@ -137,7 +140,7 @@ def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPos
 
 
 def _table_of(poses: Any) -> Floats:
-    """Return poses as an array of float64; empty if they are not numbers."""
+    """Return poses as an array of float64, or an empty one if they are not numbers."""
     try:
         return np.asarray(poses, np.float64)
     except (TypeError, ValueError):
@@ -145,13 +148,19 @@ def _table_of(poses: Any) -> Floats:
 
 
 def _check_count(poses: int, names: int) -> None:
-    """Check that there is a pose for each name; LidarError if not."""
+    """Check that there is a pose for each name.
+
+    Raises LidarError if not.
+    """
     if poses != names:
         raise LidarError(f"There are {names} names and {poses} poses: give a pose for each name.")
 
 
 def _check_finite(table: Floats) -> None:
-    """Check that numbers are finite; LidarError, which names the first pose (k, ...), if not."""
+    """Check that numbers are finite.
+
+    Raises LidarError, with the first pose (k, ...), if not.
+    """
     finite = np.isfinite(table).reshape(len(table), -1).all(axis=1)
     if not finite.all():
         first = int(finite.argmin())

@@ -33,16 +33,16 @@ RAY = 28  # hit of a ray
 # A ray that is not cast repeatedly: while it is computed, and afterwards.
 COMPUTED_RAY = 92
 COMPUTED_RAY_RETAINED = 32
-RAY_AMONG_BODIES = 70  # in a scene with instances or actors
+RAY_AMONG_BODIES = 70  # bytes of a ray in a scene with instances or actors
 # Pose of a firing: while it is computed, and afterwards.
 POSE = 140
 POSE_RETAINED = 100
-RETURNS = 1.5  # of a pulse, if all or two are reported; 1.1 to 1.6 in generated woods
-RETURNS_LEAFY = 3.8  # of a pulse, if all are reported and sub-rays meet leaves; 3.3 in a canopy
+RETURNS = 1.5  # returns of a pulse, if all or two are reported; 1.1 to 1.6 in generated woods
+RETURNS_LEAFY = 3.8  # the same, if all are reported and sub-rays meet leaves; 3.3 in a canopy
 # A point, and each byte of its columns, whose sources are float64.
 POINT = 64
 POINT_BYTE = 3.2
-COLOUR = 16  # of a ray, if colours are reflectances
+COLOUR = 16  # bytes of a ray, if colours are reflectances
 # Copies of columns from a device: CuPy rounds page-locked memory up to powers of two, and columns
 # of several runs of scans, by station and sensor, are joined.
 PAGE_LOCKED = 2
@@ -50,22 +50,22 @@ JOINED = 1
 # Descriptions, poses and small arrays.
 SCAN = 500
 STATION = 6000
-HIT_COUNTER = 16  # of a hit counter (`Scene.counters`): two counts
+HIT_COUNTER = 16  # bytes of a hit counter (`Scene.counters`): two counts
 
 # Bytes of a rig, measured on Linux.
-SCENE_TRIANGLE = 80  # of a triangle, in every process that knows the scene
+SCENE_TRIANGLE = 80  # bytes of a triangle, in every process that knows the scene
 # Of a triangle while a caster is built: tiles 250, NumPy 310 (2026-11-28), CUDA 360.
 CASTER_TRIANGLE = 360
-COLOURED_TRIANGLE = 160  # of a triangle with colours
-IMAGE_BYTE = 4  # of each byte of an image
-INSTANCE = 2000  # of an instance, in every process that knows the scene
-POSED_TRIANGLE = 40  # of a triangle in each pose of an animation, in boxes of the tree
-PATTERN_RAY = 48  # of a ray of a period of the head, and of its pattern
+COLOURED_TRIANGLE = 160  # bytes of a triangle with colours
+IMAGE_BYTE = 4  # bytes for each byte of an image
+INSTANCE = 2000  # bytes of an instance, in every process that knows the scene
+POSED_TRIANGLE = 40  # bytes of a triangle in each pose of an animation, in boxes of the tree
+PATTERN_RAY = 48  # bytes of a ray of a period of the head, and of its pattern
 
 
 def rig_bytes(scene: Scene, survey: Survey) -> int:
     """Estimate the memory of a rig, in bytes: scene, tree of the caster, patterns of rays."""
-    # Sensors that see different static objects have trees of their own.
+    # Sensors that see different static objects have separate trees.
     trees = len({static_key(scene, mask) for mask in unseen_objects(scene, survey)})
     triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE * trees) * scene.kept_triangles
     images = {id(image): image.nbytes for mesh in scene.coloured for image in mesh.images}
@@ -168,7 +168,7 @@ def _returns(setup: Setup) -> float:
     if mode == "all":
         added = sum(added_by_step)
     elif reports_two:
-        # The share of pulses to which a step adds a return, if returns are added independently.
+        # The share of pulses that a step adds a return to, if returns are added independently.
         added = sum(1 - float(exp(-count)) for count in added_by_step)
     if not (mode == "all" or reports_two) or not (subrays > 1 or setup.has_onward_light):
         return 1 + added

@@ -63,7 +63,7 @@ class PulseCaster:
         self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
     def moved(self, scene: Scene, surfaces: Surfaces) -> PulseCaster:
-        """Return the caster of the same scans of a scene in which instances have moved."""
+        """Return the caster of the same scans of a scene with moved instances."""
         caster = copy(self)
         caster.setup = replace(self.setup, scene=scene)
         caster._surfaces = surfaces
@@ -86,7 +86,7 @@ class PulseCaster:
         Parameters
         ----------
         scan
-            Number of the first scan, by which random numbers are drawn: of a frozen sensor, the
+            Number of the first scan, a key of random numbers: of a frozen sensor, the
             number of the older scan that is sent again.
         pattern
             Rays of the beams.

@@ -30,7 +30,7 @@ SURFACE = CAUSES.index("surface")
 
 
 def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
-    """Yield the selected rows of each column; None for a column that is None."""
+    """Yield the selected rows of each column, or None for a column that is None."""
     for column in columns:
         if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
             yield column.T.take(rows, axis=-1).T
@@ -87,7 +87,7 @@ class PulseReturns(NamedTuple):
 
     @property
     def height(self) -> Floats:
-        """Heights of returns in the waveform (n,); without waveforms their energies."""
+        """Heights of returns in the waveform (n,), or their energies without waveforms."""
         return required(self.energy if self.amplitude is None else self.amplitude)
 
 
@@ -114,7 +114,7 @@ def joined(parts: list[PulseReturns]) -> PulseReturns:
 
 
 def _column(name: str, parts: list[PulseReturns]) -> AnyArray | None:
-    """Concatenate a column of several tables; None if all tables lack the column."""
+    """Concatenate a column of several tables, or return None if all tables lack the column."""
     columns = [getattr(part, name) for part in parts]
     if all(column is None for column in columns):
         return None

@@ -46,8 +46,8 @@ class _Rays(NamedTuple):
 def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
     """Return whether a sensor's rays are computed once and cast repeatedly, and whether by head.
 
-    `moves` says that the carrier moves. Rays by head are the rays of one firing in the frame of
-    the head, with a pose for each firing; other repeated rays are those of a period of the head in
+    `moves` says that the carrier moves. Rays by head are the rays of one firing in the frame of the
+    head, with a pose for each firing. Other repeated rays are the rays of a period of the head in
     the frame of the carrier.
     """
     fits = 0 < (sensor.period or 0) * sensor.channels <= PATTERN_RAYS
@@ -79,13 +79,13 @@ class Rig:
         options: dict[str, Any],
         known_casters: Sequence[SceneCaster],
     ) -> None:
-        """Set all attributes; trees are built, unless `known_casters` have those of the scene."""
+        """Set all attributes, and build trees unless `known_casters` have the scene's trees."""
         self.scene = scene
         self.survey = survey
         self.options = options
         self._actor_trajectories = ActorTrajectories.from_actors(scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
-        # The parts from which scans are cast, for other tools to look into.
+        # The parts that scans are cast from, for other tools to look into.
         self.surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         # Casters of the sensors, by their numbers.
         self.scene_casters = casters_of_sensors(
@@ -129,7 +129,7 @@ class Rig:
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
-        """Return a rig with new trajectories of the actors; the trees are shared."""
+        """Return a rig with new trajectories of the actors, which shares the trees."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
         rig._actor_trajectories = ActorTrajectories.from_actors(actors)
@@ -150,7 +150,7 @@ class Rig:
             raise
 
     def moved(self, owners: Integers, positions: Floats, rotations: Floats) -> Rig:
-        """Return a rig with the instances of objects `owners` (k,) at poses, see `Scene.moved`.
+        """Return a rig with the instances of objects `owners` (k,) at poses, as `Scene.moved` does.
 
         Objects have no duplicates; poses are positions (k, 3) and rotations (k, 3, 3). The trees
         are shared: this rig must not cast afterwards, and no cast may be under way.
@@ -210,12 +210,12 @@ class Rig:
         return Pattern(directions, origins, step=carried.sensor.ring_step)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
-        """Cast scans `first` to `stop` of the survey; yield the returns of each group of scans.
+        """Cast scans `first` to `stop` of the survey, and yield the returns of each group of scans.
 
         A group is scans of one sensor and station whose firings follow each other. A frozen sensor
         casts the older scans that it sends again, see `Survey.sent_scan`.
         """
-        specs: list[ScanSpec] = []  # of the group
+        specs: list[ScanSpec] = []  # scans of the group
         for spec in map(self.survey.sent_scan, range(first, stop)):
             sequence = (spec.sensor, spec.station, spec.firings[0], spec.repeats)
             last = specs[-1] if specs else spec
@@ -229,7 +229,7 @@ class Rig:
     def returns(
         self, specs: list[ScanSpec], path: Trajectory, late_ns: float = 0.0, *, tally: bool = True
     ) -> BatchPoints | DevicePoints:
-        """Cast consecutive scans of one sensor and station; return their points.
+        """Cast consecutive scans of one sensor and station, and return their points.
 
         At a firing `t` nanoseconds after the start of the station, the carrier is at the pose of
         `path` at `t + late_ns`; actors are at their poses at the time of the firing. Hits of each

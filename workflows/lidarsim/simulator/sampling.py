@@ -175,7 +175,7 @@ class _FewRays(Sensor):
         return self.sampled.directions(rays.firings)[rays.row, rays.channel, None]
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return the origins of sampled rays, (k, 1, 3); None if rays start at the sensor."""
+        """Return the origins of sampled rays, (k, 1, 3), or None if rays start at the sensor."""
         rays = self._rays(firings)
         origins = self.sampled.origins(rays.firings)
         return None if origins is None else origins[rays.row, rays.channel, None]

@@ -147,25 +147,25 @@ class Scanner:
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
     def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
-        """Check the backend and build the rig; `options` are arguments of `Rig`."""
+        """Check the backend and build the rig with `options`, arguments of `Rig`."""
         check_backend_here(options["backend"])
         try:
             self._rig = Rig(scene, survey, **options)
-        except ValueError as error:  # of threads or device
+        except ValueError as error:  # wrong threads or device
             raise LidarError(str(error)) from error
         self._actors = list(scene.actors)
         self._numbers = {name: number for number, name in enumerate(scene.all_names)}
-        # Objects of which all triangles are in instances.
+        # Objects whose triangles are all in instances.
         self._movable = np.zeros(len(scene.names), np.bool_)
         if scene.instances is not None:
             self._movable[scene.instances.owner] = True
             self._movable[scene.face_object] = False
-        # Sweeps share the caster, in which instances are moved.
+        # Sweeps share the caster, and instances are moved in it.
         self._lock = threading.Condition()
         self._casts = 0  # sweeps under way
         self._moves = 0  # moves of instances under way or waiting
         self._unnumbered = 0  # sweeps and images that were scanned without a `number` so far
-        self._revolutions: dict[int, list[ScanSpec]] = {}  # by number
+        self._revolutions: dict[int, list[ScanSpec]] = {}  # {revolution: its scans}
 
     def __getstate__(self) -> dict[str, Any]:
         with self._lock:
@@ -332,7 +332,7 @@ class Scanner:
         *,
         times_s: ArrayLike | None = None,
     ) -> None:
-        """Move actors and instances; sweeps under way still see the earlier poses.
+        """Move actors and instances, while sweeps under way still see the earlier poses.
 
         Bodies that move in one call give the same bytes as bodies that move one by one, which takes
         longer. If a body cannot move, none does.
@@ -356,7 +356,7 @@ class Scanner:
         Raises
         ------
         LidarError
-            If there is no such actor or instance, a name is given twice, an instance would move
+            If the actor or instance does not exist, a name is given twice, an instance would move
             during a sweep, or a rotation mirrors or deforms.
 
         Examples
@@ -404,7 +404,10 @@ class Scanner:
                 self._follow(self._with_moved(actors))
 
     def _numbers_of(self, names: list[str]) -> Indices:
-        """Return the numbers (k,) of actors and instances; LidarError for other or double names."""
+        """Return the numbers (k,) of actors and instances.
+
+        Raises LidarError for other or double names.
+        """
         numbers = np.array([self._numbers.get(name, -1) for name in names], np.intp)
         object_count = len(self._movable)
         movable = numbers >= object_count
@@ -418,7 +421,10 @@ class Scanner:
         return numbers
 
     def _refuse_name(self, name: str, number: int) -> NoReturn:
-        """Raise LidarError for a name of no actor or instance; `number` is -1 for no object."""
+        """Raise LidarError for a name of no actor or instance.
+
+        `number` is -1 for no object.
+        """
         object_count = len(self._movable)
         names = [
             *list(self._numbers)[object_count:],
@@ -430,14 +436,20 @@ class Scanner:
         raise LidarError(f"There is no actor or instance {name!r}.{hint}")
 
     def _with_moved(self, moves: list[tuple[int, Trajectory]]) -> list[Actor]:
-        """Return all actors; some, by index, on new trajectories. The caller holds the lock."""
+        """Return all actors, some of them, by index, on new trajectories.
+
+        The caller holds the lock.
+        """
         actors = self._actors.copy()
         for index, trajectory in moves:
             actors[index] = actors[index].following(trajectory)
         return actors
 
     def _follow(self, actors: list[Actor]) -> None:
-        """Cast with other trajectories of all actors; the caller holds the lock."""
+        """Cast with other trajectories of all actors.
+
+        The caller holds the lock.
+        """
         self._rig = self._rig.with_actors(tuple(actors))
         self._actors = actors
 
@@ -448,7 +460,7 @@ class Scanner:
         rotations: Floats,
         actors: list[tuple[int, Trajectory]],
     ) -> None:
-        """Wait for the sweeps under way and move instances, by object numbers; new sweeps wait.
+        """Wait for sweeps under way and move instances, by object numbers, while new sweeps wait.
 
         Actors, by index, get new trajectories.
         """
@@ -473,7 +485,7 @@ class Scanner:
         `start_s`. Without a `number`, the scans are those of revolution 0 with the random numbers
         of later revolutions, and `count` revolutions of random numbers are used up.
         """
-        revolutions_ahead = 0  # by which random numbers are ahead
+        revolutions_ahead = 0  # so many revolutions are random numbers ahead
         if number is None:
             with self._lock:
                 revolutions_ahead = self._unnumbered
@@ -489,7 +501,7 @@ class Scanner:
     ) -> tuple[list[ScanSpec], float]:
         """Return the scans of revolution `number`, and the delay of its start, nanoseconds.
 
-        Random numbers are those of a revolution that is `revolutions_ahead`, see `ScanSpec.ahead`.
+        A revolution that is `revolutions_ahead` gives the random numbers, by `ScanSpec.ahead`.
         """
         sensor = rig.survey.sensor
         specs = self._revolution(sensor, number)
@@ -516,7 +528,7 @@ class Scanner:
 
     @contextmanager
     def _casting(self) -> Iterator[Rig]:
-        """Yield the current rig; instances are not moved until the context exits."""
+        """Yield the current rig, whose instances are not moved until the context exits."""
         with self._lock:
             self._lock.wait_for(lambda: not self._moves)
             self._casts += 1

@@ -58,7 +58,7 @@ class ActorSurfaces:
     ) -> tuple[Indices, Integers]:
         """Return the indices in `triangle` (n,) of actors' triangles, and the actors: (k,) each.
 
-        Without trajectories, there are no actors, and the arrays are empty.
+        Without trajectories, nothing is an actor, and the arrays are empty.
         """
         if not trajectories:
             return _NO_ROWS, _NO_ROWS

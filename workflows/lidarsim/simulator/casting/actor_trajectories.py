@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class _StraightTracks(NamedTuple):
-    """Tracks of straight segments of n actors; an actor that stands has a single segment."""
+    """Tracks of straight segments of n actors, with a single segment if an actor stands."""
 
     actors: Sequence[int]  # (n,): numbers of the actors
     counts: Ints  # (n,): number of segments of each track
@@ -36,7 +36,7 @@ class _StraightTracks(NamedTuple):
 
 
 def _straight_tracks(trajectories: Sequence[Trajectory]) -> Iterator[_StraightTracks]:
-    """Yield the straight tracks of trajectories, those of a batch and those that stand together.
+    """Yield the straight tracks of trajectories, together for a batch and for standing actors.
 
     Smooth tracks and trajectories of other classes have none.
     """
@@ -107,7 +107,7 @@ def _static_tracks(actors: list[int], trajectories: Sequence[Any]) -> _StraightT
 
 
 class ActorTrajectories(tuple[Trajectory, ...]):
-    """Trajectories of actors, by their numbers; or of a carrier alone.
+    """Trajectories of actors, by their numbers, or of a carrier alone.
 
     Only `from_actors` sets `animated`.
     """

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...base.arrays import Bools, Floats, Indices, Integers, Ints
 
-_Corner = tuple[float, float, float]  # of a triangle that is cut: x, y, z
+_Corner = tuple[float, float, float]  # corner of a triangle that is cut: x, y, z
 
 
 class CutMesh(NamedTuple):
@@ -23,7 +23,7 @@ class CutMesh(NamedTuple):
 
     vertices: Floats  # (v, 3)
     faces: Ints  # (f, 3)
-    origin: Indices  # (f,): ascending, the triangle of the mesh of which each is a part
+    origin: Indices  # (f,): ascending, the triangle of the mesh that each is a part of
 
 
 def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
@@ -40,7 +40,7 @@ def box_planes(region: Floats, transform: Floats | None = None) -> Floats:
 
 
 def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
-    """Return the parts of triangles (f, 3) that are within all planes; None if all are within."""
+    """Return the parts of triangles (f, 3) within all planes, or None if all are within."""
     is_outside = _outside(vertices, planes)[faces]  # (f, 3, 6)
     crossing = is_outside.any(axis=(1, 2))
     if not crossing.any():
@@ -100,7 +100,7 @@ def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner
 
 
 def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
-    """Return the point of an edge on a plane; `first` and `second` are corners and their heights.
+    """Return the point of an edge on a plane, for `first` and `second`, corners with heights.
 
     Neighbouring triangles get the same point of their common edge: its corners are sorted.
     """

@@ -54,7 +54,7 @@ class MediaBodies:
 
     @cached_property
     def static_kinds(self) -> tuple[int, ...]:
-        """Kinds of surfaces of closed static objects, also in instances, that hold a medium."""
+        """Kinds of surfaces of closed static objects, instances included, that hold a medium."""
         table = self._table
         closed, _ = self.solids
         holds_medium = (table.leafy | table.refracts) & closed
@@ -113,6 +113,6 @@ def _closed(vertices: Floats, faces: Integers) -> bool:
 
 
 def _volume(vertices: Floats, faces: Integers) -> float:
-    """Return the volume within a closed surface, m³; negative if its triangles wind inwards."""
+    """Return the volume within a closed surface, m³, negative if its triangles wind inwards."""
     a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
     return float((np.cross(a, b) * c).sum() / 6)

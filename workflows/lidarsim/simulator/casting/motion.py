@@ -32,8 +32,8 @@ class Clock:
 
     firing_starts: Floats  # (f,): start of each firing, nanoseconds
     delays: Floats  # (m,): of each of the m rays of a firing after its start, nanoseconds
-    trajectories: ActorTrajectories  # of the actors, or of the carrier alone
-    start: int = 0  # number of the ray from which `times` counts, from 0 at the first firing
+    trajectories: ActorTrajectories  # trajectories of the actors, or of the carrier alone
+    start: int = 0  # number of the ray that `times` counts from, 0 at the first firing
     subrays: int = 1  # sub-rays of a ray, as `times` numbers them
 
     def times(self, ray: Integers) -> Floats:
@@ -65,11 +65,11 @@ class Firings:
 
     sensor: Sensor
     numbers: Ints  # (f,): counted from the start of the station
-    spec: ScanSpec  # of the first firing
+    spec: ScanSpec  # scan of the first firing
 
     @classmethod
     def from_scans(cls, sensor: Sensor, specs: Sequence[ScanSpec], repetitions: int = 1) -> Firings:
-        """Return the firings of consecutive scans; the whole sequence `repetitions` times."""
+        """Return the firings of consecutive scans, the whole sequence `repetitions` times."""
         numbers = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         if repetitions > 1:
             numbers = np.tile(numbers, repetitions)
@@ -97,11 +97,11 @@ class CastPoses:
     positions: Floats  # (p, 3), or (3,) for all rays, metres
     rotations: Floats | None = None  # (p, 3, 3), or (3, 3) for all rays; None for the identity
     rays_per_pose: int | None = None  # None for a single pose
-    motion: PoseMotion | None = None  # from each pose to the next
-    clock: Clock | None = None  # of the actors; None without actors
+    motion: PoseMotion | None = None  # motion from each pose to the next
+    clock: Clock | None = None  # clock of the actors; None without actors
     by_head: bool = False  # whether the poses are of the head
-    carrier: Clock | None = None  # of a carrier that moves, for its velocities; else None
-    station: int = 0  # of the trajectory of `carrier`
+    carrier: Clock | None = None  # clock of a carrier that moves, for its velocities; else None
+    station: int = 0  # station of the trajectory of `carrier`
 
     @cached_property
     def caster_arguments(self) -> dict[str, Any]:
@@ -123,7 +123,7 @@ class CastPoses:
     def times(self, ray: Integers) -> Floats:
         """Return the firing times of rays (n,) for actors, nanoseconds since the survey's start.
 
-        Zeros if there are no actors.
+        Zeros without actors.
         """
         return np.zeros(len(ray)) if self.clock is None else self.clock.times(ray)
 
@@ -180,7 +180,7 @@ class CastPoses:
 
 
 def along_rings(ray: Ints, channels: int) -> Indices:
-    """Return the order of rays (n,) in which neighbours along a ring follow each other.
+    """Return the order of rays (n,) that puts neighbours along a ring behind each other.
 
     `ray` (n,) are numbers of rays, in the order of firings and channels. The rays of every
     `RING_FIRINGS` firings are ordered by channels, and within a channel as before: such neighbours
@@ -283,7 +283,7 @@ def rotated_about_z(rotations: Floats, spins: Floats) -> Floats:
 def _rotation_vectors(earlier: Floats, later: Floats) -> Floats:
     """Return the rotation vectors (k, 3), radians, from matrices to close matrices (k, 3, 3).
 
-    The vectors are in the scene frame, to which the matrices lead. They are half the sum of the
+    The vectors are in the scene frame, the target of the matrices. They are half the sum of the
     cross products of corresponding axes, whose length is the sine of the angle.
     """
     vectors = np.empty((3, len(earlier))).T

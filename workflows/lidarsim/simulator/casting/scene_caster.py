@@ -57,14 +57,14 @@ class _NearestHits(NamedTuple):
 
 
 class _ActorShapes(NamedTuple):
-    """The s shapes of the a actors of a scene; actors of the same mesh share a shape.
+    """The s shapes of the a actors of a scene, where actors of the same mesh share a shape.
 
     A mesh has a part for its opaque triangles, and a part for each mask, see `parts_of`; a part is
     an instance of the shape's caster.
     """
 
     casters: tuple[RayCaster | Deforming, ...]  # (s,): in the frame of the mesh
-    boxes: Floats  # (s, 2, 3): bounds of the shapes, metres, also of all frames of animations
+    boxes: Floats  # (s, 2, 3): bounds of the shapes in all frames of animations, metres
     part_triangles: Ints32  # (s, p): first triangle of each part, among the triangles of its mesh
     shape: Indices  # (a,): shape of each actor
 
@@ -78,7 +78,7 @@ class CastBodies(NamedTuple):
 
 
 def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
-    """Raise LidarError if this machine lacks a backend of casting; `advice` ends the message."""
+    """Raise LidarError if this machine lacks a backend of casting, with `advice` at the end."""
     # An interrupt during the import of an extension module would look like a missing module.
     with deferred_interrupts():
         backends = {"auto": "", **available_backends()}
@@ -143,7 +143,7 @@ class SceneCaster:
         self._actor_triangles = (static_triangles + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
 
     def with_moved_instances(self, surfaces: Surfaces, instances: Instances) -> None:
-        """Replace surfaces and instances by those of the scene with moved instances.
+        """Take surfaces and instances from the scene with moved instances.
 
         `move_instances` moves the trees.
         """
@@ -156,7 +156,7 @@ class SceneCaster:
 
     @property
     def caster(self) -> RayCaster:
-        """Caster of the static bodies, of which triangles may be cut or left out."""
+        """Caster of the static bodies, with some triangles cut or left out."""
         return self._static.trees.caster
 
     def counters(self) -> tuple[Ints, int]:
@@ -209,9 +209,9 @@ class SceneCaster:
         tally: bool = False,
         room: Floats | None = None,
     ) -> ScanReturns:
-        """Cast rays of a pattern as `RayCaster.scan`, and also on actors.
+        """Cast rays of a pattern as `RayCaster.scan`, at actors too.
 
-        The arguments are those of `RayCaster.scan`; if there are actors, `poses` have a clock.
+        The arguments are as in `RayCaster.scan`; if there are actors, `poses` have a clock.
         `window` are start and stop of the rows of `pattern`, by default all. Hits are at distances
         `t_min` to `t_max`, metres; of each group of rays every n-th is returned, by `keep_every`.
         `groups` are the first rays of the groups. `room` (6, n) receives origins and
@@ -345,7 +345,7 @@ def casters_of_sensors(
     known: Iterable[SceneCaster] = (),
     **options: Any,
 ) -> tuple[SceneCaster, ...]:
-    """Return the casters of the sensors of a survey; sensors that see the same objects share one.
+    """Return the casters of the sensors of a survey, shared by sensors that see the same objects.
 
     Parameters
     ----------
@@ -405,7 +405,7 @@ def casters_of_sensors(
 def move_instances(
     casters: Sequence[SceneCaster], surfaces: Surfaces, instances: Instances, rows: Indices
 ) -> None:
-    """Move instances `rows` to their transforms in `instances`; no scan may be under way.
+    """Move instances `rows` to their transforms in `instances`, while no scan is under way.
 
     Parameters
     ----------
@@ -439,7 +439,7 @@ def _rows_to_keep(counts: Ints, keep_every: int) -> Indices:
 
 
 def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes | None:
-    """Build the casters of the shapes of actors; None without actors.
+    """Build the casters of the shapes of actors, or return None without actors.
 
     `options` are arguments of `RayCaster`.
     """

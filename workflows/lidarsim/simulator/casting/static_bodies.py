@@ -31,7 +31,7 @@ MAX_REACH_M = 50_000.0
 # move that far before trees are built again.
 MARGIN_M = 10_000.0
 _NO_ROWS = np.zeros(0, np.int64)
-_SLACK_M = 200.0  # of the margin, for sensors beside their carrier
+_SLACK_M = 200.0  # part of the margin for sensors beside their carrier
 
 
 def largest_range_m(survey: Survey) -> float:
@@ -72,7 +72,7 @@ class _Trees(NamedTuple):
     first_triangles: Ints32 | None
     # (r,): rows in the scene's instances of the last r instances of the caster, ascending
     rows: Ints
-    # {instance of the caster: the triangle of its mesh of which each triangle is a part}
+    # {instance of the caster: the triangle of its mesh that each triangle is a part of}
     origins: dict[int, Indices]
 
     @property
@@ -188,7 +188,7 @@ class StaticBodies:
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
     def move(self, instances: Instances, rows: Indices) -> None:
-        """Move instances `rows` (m,) to their transforms in `instances`; no cast may be under way.
+        """Move instances `rows` (m,) to their transforms in `instances`. No cast may run.
 
         Trees are built again if an instance leaves for where no sensor reaches, such as a body that
         falls for ever, if it comes from there, or if it was cut.
@@ -224,7 +224,7 @@ class StaticBodies:
     def _build(self, region: Floats | None) -> _Trees:
         """Build the trees of the bodies within a region (2, 3), or of all bodies.
 
-        If there is no body within the region, the trees are those of all bodies.
+        If the region has no body, the trees have all bodies.
         """
         faces = None if region is None else self._cut_faces(region)
         if self._instances is not None:
@@ -240,7 +240,7 @@ class StaticBodies:
         return _Trees(caster, region, None, _NO_ROWS, {0: faces.origin})
 
     def _cut_faces(self, region: Floats) -> CutMesh | None:
-        """Return the parts of the seen faces within a region (2, 3); None if all are within."""
+        """Return the parts of the seen faces within a region (2, 3), or None if all are within."""
         parts = cut(self._vertices, self._faces, box_planes(region))
         if parts is None or self._sees_all_faces:
             return parts

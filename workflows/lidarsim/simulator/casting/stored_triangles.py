@@ -62,7 +62,7 @@ class StoredTriangles:
         return np.ascontiguousarray(inverse(instances.transforms[:, :, :3]).transpose(0, 2, 1))
 
     def moved(self, scene: Scene) -> StoredTriangles:
-        """Return the triangles of a scene in which instances have new transforms."""
+        """Return the triangles of a scene with new transforms of instances."""
         triangles = copy(self)
         triangles._scene = scene
         vars(triangles).pop("normal_matrices", None)
@@ -99,12 +99,12 @@ class StoredTriangles:
         )
 
     def bodies(self) -> tuple[Ints, Floats]:
-        """Return the bodies to which triangles belong, in the order of `SceneCaster`.
+        """Return the bodies that triangles belong to, in the order of `SceneCaster`.
 
         Returns
         -------
         bodies
-            (b, 3): the scene's faces, unless there are no faces, each instance, and all actors as
+            (b, 3): the scene's faces, if any, each instance, and all actors as
             one body. Columns are the first triangle; the object, or -1 if `owners` has the object
             of each triangle; and the row of the first normal in `unit_normals`, or -1 for actors,
             which share normals. In `owners`, actors follow the scene's faces.
@@ -128,7 +128,7 @@ class StoredTriangles:
         return np.concatenate(bodies).astype(np.int64), np.concatenate(normal_matrices)
 
     def objects(self, triangle: Integers) -> Ints32:
-        """Return the objects of triangles (n,): (n,); -1 without a surface."""
+        """Return the objects of triangles (n,): (n,), or -1 without a surface."""
         if self._scene.instances is None:
             return self.owners[triangle]
         return self.locate(triangle).object
@@ -138,7 +138,7 @@ class StoredTriangles:
         return np.searchsorted(self.instance_starts, triangle, side="right") - 1
 
     def counter(self, triangle: Integers) -> Integers:
-        """Return the rows of hit counters (n,), in which hits on triangles (n,) are counted.
+        """Return the rows of hit counters (n,) that count hits on triangles (n,).
 
         Each of the scene's faces has a counter, each instance has a single counter for all its
         triangles, and each triangle of an actor has a counter, in this order: `Scene.counters`.
@@ -153,7 +153,7 @@ class StoredTriangles:
         return np.where(instance >= 0, face_count + instance, face_or_actor)
 
     def count(self, triangle: Integers) -> Ints:
-        """Return the number of hits on triangles (n,) by counters: (counters,), see `counter`."""
+        """Return the number of hits on triangles (n,) by counters: (counters,)."""
         return np.bincount(self.counter(triangle), minlength=self.counters)
 
     @property

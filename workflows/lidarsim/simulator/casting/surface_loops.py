@@ -31,7 +31,7 @@ class TriangleNumbers(NamedTuple):
     instance_objects: Ints32  # (i,)
     instance_rows: Ints  # (i,): stored row of the first triangle of each instance
     actor_shifts: Ints  # (actors,): from numbers of an actor's triangles to stored rows
-    static_objects: int  # number of objects that are no actors
+    static_objects: int  # number of objects that are not actors
 
 
 class TriangleOwners(NamedTuple):
@@ -45,7 +45,7 @@ class TriangleOwners(NamedTuple):
 class HitSurfaces(NamedTuple):
     """Surfaces of hits: (n,) each."""
 
-    row: Ints  # of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
+    row: Ints  # row of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
     kind: Ints32  # number of a material of an object, see `Scene.surface_kinds`
     instance: Ints  # or -1
     run: Ints  # column of the actor's pose in `NormalTables.poses`, or -1; empty without actors
@@ -89,12 +89,12 @@ class OnwardOptics(NamedTuple):
 
 
 class OnwardHits(NamedTuple):
-    """Hits from which light goes on: (n,) each."""
+    """Hits where light goes on: (n,) each."""
 
     kind: Ints32
-    cosines: Floats  # of either sign
+    cosines: Floats  # cosines of either sign
     film: Bools  # whether there may be water; empty without water
-    share: Floats  # of the energy, after the earlier surfaces: light passes each out and back
+    share: Floats  # share of the energy, after the earlier surfaces: light passes each out and back
     distance: Floats  # optical path from the sensor, metres
 
 
@@ -119,7 +119,7 @@ class ActorTriangles(NamedTuple):
 
 
 class JoinedHits(NamedTuple):
-    """Arrays to which the nearest hits are written: (n,) each."""
+    """Arrays that the nearest hits are written to: (n,) each."""
 
     ray: Ints
     distance: Floats  # metres
@@ -349,7 +349,7 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
         x = onward[0, k]
         y = onward[1, k]
         z = onward[2, k]
-        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # as `Pattern` does for all rays
+        if abs((x * x + y * y) + z * z - 1) > UNIT_SLACK:  # `Pattern` does so for all rays
             largest = max(max(abs(x), abs(y)), abs(z))
             x = x / largest
             y = y / largest
@@ -362,7 +362,7 @@ def start_behind(origins, directions, step_m, clear_m, starts, onward):
 
 @compiled()
 def firing_times(ray, start, subrays, firing_starts, delays, times):
-    """Write the firing times of sub-rays `ray` (n,) to `times`; all times are nanoseconds.
+    """Write the firing times of sub-rays `ray` (n,) to `times`, all times in nanoseconds.
 
     Each beam has `subrays` sub-rays, and sub-ray 0 belongs to beam `start`. `firing_starts` are the
     times of firings, and `delays` the times of the beams of a firing after its start.
@@ -408,7 +408,7 @@ def merge(ray, triangle, nearest, actors, output):
 
 @compiled()
 def find_runs(trajectory, times, first_rows, run_numbers):
-    """Write the number of each row's run, and the first row of each run; return the number of runs.
+    """Write each row's run number and each run's first row, and return the number of runs.
 
     In a run, trajectories and times are equal. `trajectory` (n,) are numbers of trajectories; rows
     with numbers below 0 have the run -1, and do not end a run.

@@ -109,7 +109,7 @@ class Surfaces:
         return self._tables[wavelength_nm]
 
     def moved(self, scene: Scene) -> Surfaces:
-        """Return the surfaces of a scene in which instances have new transforms."""
+        """Return the surfaces of a scene with new transforms of instances."""
         assert scene.instances is not None
         surfaces = copy(self)
         surfaces._scene = scene
@@ -242,7 +242,7 @@ class Surfaces:
     def _block_colours(
         self, triangle: Integers, points: Floats, times: Any, trajectories: ActorTrajectories
     ) -> UInts32:
-        """Return the colours of points of a block of hits, see `colours`."""
+        """Return the colours of points of a block of hits, for `colours`."""
         assert self._lookup is not None
         stored_rows, _, instance = self.triangles.locate(triangle)
         on_instances = np.flatnonzero(instance >= 0)
@@ -261,7 +261,7 @@ class Surfaces:
 
     @cached_property
     def _lookup(self) -> Lookup | None:
-        """Colours of the stored triangles; None if the scene has no colours."""
+        """Colours of the stored triangles, or None if the scene has no colours."""
         bodies = self.triangles.stored_bodies
         sizes = [len(faces) for _, faces, _ in bodies]
         colours = join_colours([colours for _, _, colours in bodies], sizes)
@@ -275,7 +275,7 @@ class Surfaces:
         return Lookup(colours, corners)
 
     def kinds(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles (n,): (n,); -1 without a surface."""
+        """Return the kinds of surfaces of triangles (n,): (n,), or -1 without a surface."""
         return self.triangle_kinds.of_triangles(triangle)
 
     def energy(

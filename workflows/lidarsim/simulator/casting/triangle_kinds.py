@@ -32,7 +32,7 @@ class TriangleKinds:
         self.material_kinds = kinds
 
     def of_triangles(self, triangle: Integers) -> Ints32:
-        """Return the kinds of surfaces of triangles (n,): (n,); -1 without a surface.
+        """Return the kinds of surfaces of triangles (n,): (n,), or -1 without a surface.
 
         Names of materials that match the same material of the survey, in an object, are one kind.
         """
@@ -73,7 +73,7 @@ class TriangleKinds:
         return np.concatenate(numbers)
 
     def material_numbers(self, triangle: Integers) -> Ints32:
-        """Return the materials of triangles, as numbers of `Scene.material_names`; -1 for none."""
+        """Return materials of triangles, as numbers of `Scene.material_names`, or -1 for none."""
         rows, objects, _ = self._triangles.locate(triangle)
         kinds = self.material_kinds.first[:-1][objects]
         if self._kind_in_object is not None:
@@ -82,7 +82,7 @@ class TriangleKinds:
 
     @cached_property
     def _number_of_kind(self) -> Ints32:
-        """Number of the name of each kind's material; -1 for none."""
+        """Number of the name of each kind's material, or -1 for none."""
         numbers = {name: number for number, name in enumerate(self._scene.material_names)}
         return np.array([numbers.get(name, -1) for name in self.material_kinds.material], np.int32)
 

@@ -25,7 +25,7 @@ class GridPassage(NamedTuple):
 
 
 class _GridRays(NamedTuple):
-    """Rays of light in the voxels of k grids; the last axis of all arrays is the ray.
+    """Rays of light in the voxels of k grids, with rays along the last axis of all arrays.
 
     Rays leave the table when they meet a leaf or reach their end.
     """
@@ -67,7 +67,7 @@ class Grids:
 
     @classmethod
     def from_instances(cls, shared: Instances | None) -> Grids | None:
-        """Return the grids of instances; None without grids."""
+        """Return the grids of instances, or None without grids."""
         if shared is None or all(part.voxels is None for part in shared.parts):
             return None
         return cls(shared)
@@ -141,7 +141,7 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> GridPassage:
-        """Follow a block of light, see `through`."""
+        """Follow a block of light, for `through`."""
         passage = GridPassage(
             np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
         )
@@ -187,7 +187,7 @@ class Grids:
         length: Floats,
         depth: Floats,
     ) -> _GridRays:
-        """Return the light of a block in the voxels at its start, see `through`."""
+        """Return the light of a block in the voxels at its start, for `through`."""
         to_grid = self._to_grid[instances].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[instances]).transpose(2, 1, 0)
         u, v, w = directions.T[:, None]

@@ -40,5 +40,5 @@ def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
 
 
 def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
-    """Concatenate arrays; a single contiguous array is returned as is."""
+    """Concatenate arrays, or return a single contiguous array as is."""
     return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

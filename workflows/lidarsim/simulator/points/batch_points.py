@@ -46,7 +46,7 @@ class BatchPoints:
         scene: Scene,
         survey: Survey,
         surfaces: Surfaces,
-        specs: list[ScanSpec],  # of consecutive firings
+        specs: list[ScanSpec],  # scans of consecutive firings
         scanned: Scanned,  # rays are numbered from 0 at the first firing
         *,
         pattern: Pattern,
@@ -64,7 +64,7 @@ class BatchPoints:
         counters = np.flatnonzero(counter_hits)
         self.tally = counters, counter_hits[counters]
         self.pulse_returns = scanned.returns
-        self.hits = scanned.hits  # (scans,): returns of each scan, also if they are not kept
+        self.hits = scanned.hits  # (scans,): returns of each scan, kept or not
         self._surfaces = surfaces
         self._pattern = pattern
         self._start = start
@@ -144,7 +144,7 @@ class BatchPoints:
 
     @property
     def _actor_times_ns(self) -> Ints:
-        """Firing times, nanoseconds since the survey's start; zeros if there are no actors."""
+        """Firing times, nanoseconds since the survey's start, or zeros without actors."""
         return (
             self._firing_times_ns
             if self._poses.actor_trajectories
@@ -209,17 +209,17 @@ class BatchPoints:
 
     @property
     def origin_x(self) -> Floats:
-        """Return x of the starts of the rays, see `ray_origins`."""
+        """Return x of the starts of the rays."""
         return self.ray_origins[:, 0]
 
     @property
     def origin_y(self) -> Floats:
-        """Return y of the starts of the rays, see `ray_origins`."""
+        """Return y of the starts of the rays."""
         return self.ray_origins[:, 1]
 
     @property
     def origin_z(self) -> Floats:
-        """Return z of the starts of the rays, see `ray_origins`."""
+        """Return z of the starts of the rays."""
         return self.ray_origins[:, 2]
 
     @cached_property
@@ -389,27 +389,27 @@ class BatchPoints:
 
     @property
     def normal_x(self) -> Floats:
-        """Return x of the normals, see `normals`."""
+        """Return x of the normals."""
         return self.normals[:, 0]
 
     @property
     def normal_y(self) -> Floats:
-        """Return y of the normals, see `normals`."""
+        """Return y of the normals."""
         return self.normals[:, 1]
 
     @property
     def normal_z(self) -> Floats:
-        """Return z of the normals, see `normals`."""
+        """Return z of the normals."""
         return self.normals[:, 2]
 
     @property
     def incidence_deg(self) -> Floats:
-        """Angle between the ray and the normal of its surface, degrees; NaN as in `normals`."""
+        """Angle between the ray and the normal of its surface, degrees, NaN as in `normals`."""
         return np.degrees(arccos(np.minimum(self._facing_normals[1], 1.0)))
 
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
-        """Cosines of incidence, of either sign, and energies; in blocks, to save memory."""
+        """Cosines of incidence, of either sign, and energies, in blocks to save memory."""
         light = light_of(self.survey, self.sensor)
         cosines, energy = np.empty((2, len(self)))
         colours = self._colours if self._surfaces.materials.textured else None
@@ -437,7 +437,7 @@ class BatchPoints:
 
     @cached_property
     def _colours(self) -> UInts32:
-        """Packed colours of the surfaces, see `Surfaces.colours`."""
+        """Packed colours of the surfaces, from `Surfaces.colours`."""
         if self.pulse_returns.colour is not None:
             return self.pulse_returns.colour
         points = self._scene_positions
@@ -492,7 +492,7 @@ class BatchPoints:
 
     @cached_property
     def radial_velocity(self) -> Floats:
-        """Growth of the range, m/s, with noise; NaN for returns that the receiver adds."""
+        """Growth of the range, m/s, with noise, or NaN for returns that the receiver adds."""
         returns = self.pulse_returns
         velocity = returns.velocity
         if velocity is None:
@@ -517,7 +517,7 @@ class BatchPoints:
 
     @property
     def amplitude(self) -> Floats:
-        """Height of the pulse in the waveform; without waveforms the energy."""
+        """Height of the pulse in the waveform, or the energy without waveforms."""
         return (
             self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude
         )
@@ -553,7 +553,7 @@ class BatchPoints:
 
     @property
     def cause(self) -> Bytes:
-        """Cause of the return, see `CAUSES` in `lidarsim.columns.table`."""
+        """Cause of the return, a number of `lidarsim.columns.table.CAUSES`."""
         if self.pulse_returns.cause is None:
             return np.zeros(len(self), np.uint8)
         return self.pulse_returns.cause
@@ -568,5 +568,5 @@ class BatchPoints:
 
     @property
     def material_number(self) -> Ints32:
-        """Number of the material's name among the names of the scene; -1 without a material."""
+        """Number of the material's name among the names of the scene, or -1 without a material."""
         return self._surfaces.triangle_kinds.material_numbers(self.pulse_returns.triangle)

@@ -1,6 +1,6 @@
 """Columns that are computed on the CUDA device: only their values cross the bus, in file types.
 
-The formulas and bits are those of `BatchPoints`. If a survey has further columns, the reported hits
+The formulas and bits are as in `BatchPoints`. If a survey has further columns, the reported hits
 cross the bus as well, and NumPy computes these columns: energies in haze, azimuths and noise, since
 `exp` and `atan2` of a device differ from `elementary` in the last bit. NumPy also computes the
 energies of hits on actors, which depend on the actors' poses; `SceneCaster` finds the hits on
@@ -33,7 +33,7 @@ from ..pulses import Scanned
 from ..returns import SURFACE, PulseReturns
 from .batch_points import BatchPoints
 
-OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
+OPTIONS = "-std=c++17", "-fmad=false"  # options of the compiler
 _BLOCK = 128  # threads
 _ENERGIES = "intensity", "reflectance"
 _TRIANGLE = TABLE["triangle"]
@@ -84,8 +84,8 @@ class DevicePoints:
     counts: Ints  # (scans,): number of points of each scan
     hits: Ints  # (scans,): number of hits of each scan, reported or not
     tally: tuple[Indices, Ints]  # numbers of hit counters that are not 0, and their hits
-    columns: dict[str, AnyArray]  # by name
-    returns: BatchPoints | None  # on the host, if NumPy computes columns
+    columns: dict[str, AnyArray]  # {column name: values}
+    returns: BatchPoints | None  # returns on the host, if NumPy computes columns
 
     def __len__(self) -> int:
         return int(self.counts.sum())
@@ -125,8 +125,8 @@ class SeenBodies:
 class DeviceColumns:
     """Casts surveys whose rays have a single return, and computes columns on the device.
 
-    NumPy computes the columns that the device cannot compute, see the module. `casters` are those
-    of the sensors, by their numbers.
+    NumPy computes the columns that the device cannot compute, as the module says. `casters` are the
+    casters of the sensors, by the sensors' numbers.
     """
 
     def __init__(
@@ -148,11 +148,14 @@ class DeviceColumns:
         self.needs_actor_hits = bool(scene.actors and self.energies)
         bodies, _ = surfaces.triangles.bodies()
         seen = {caster: SeenBodies(caster, bodies) for caster in dict.fromkeys(casters)}
-        self._seen_bodies = [seen[caster] for caster in casters]  # by sensors
+        self._seen_bodies = [seen[caster] for caster in casters]  # one for each sensor
         self._surface_tables: tuple[Any, ...] | None = None
 
     def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
-        """Return a copy for a scene with moved instances; unchanged tables stay on the device."""
+        """Return a copy for a scene with moved instances.
+
+        Unchanged tables stay on the device.
+        """
         moved_columns = copy(self)
         moved_columns._scene = scene
         moved_columns._surfaces = surfaces
@@ -238,7 +241,7 @@ class DeviceColumns:
             t_min=sensor.min_range_m,
             t_max=sensor.max_range_m,
         )
-        images: list[Any] = []  # on the device, as soon as there are hits
+        images: list[Any] = []  # arrays on the device, as soon as there are hits
 
         def take(hits: DeviceHits) -> None:
             if not images:
@@ -272,7 +275,7 @@ class DeviceColumns:
 
 
 def _actor_hits(seen: SeenBodies, scan: Scan, poses: CastPoses) -> OtherHits | None:
-    """Find the hits of a scan on actors that are seen; None without actors.
+    """Find the hits of a scan on actors that are seen, or return None without actors.
 
     All actors are the last body: its triangles count from 0.
     """
@@ -325,7 +328,7 @@ class _ColumnTransfer:
         self._count += len(hits)
 
     def _compute(self, hits: DeviceHits, buffers: _TransferBuffers) -> dict[Column, Any]:
-        """Compute columns of hits on the device; unneeded columns have a single element."""
+        """Compute columns of hits on the device, with a single element in unneeded columns."""
         computed = {*buffers.columns, *([_TRIANGLE] if buffers.hits else [])}
         arrays = {
             column: hits.cupy.empty(len(hits) if column in computed else 1, column.dtype)
@@ -365,7 +368,7 @@ class _ColumnTransfer:
         return np.concatenate([rows for rows, *_ in self._on_actors])
 
     def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
-        """Wait for the values; return {column name: values}, and the hits that NumPy needs.
+        """Wait for the values, and return {column name: values}, and the hits that NumPy needs.
 
         Hits are rays, distances and triangles: of all hits, of those on actors, or of none.
         """
@@ -435,8 +438,8 @@ class _TransferBuffers:
     kernel: Any
     kernel_arguments: tuple[Any, ...]  # arguments between hits and columns
     outbox: Outbox
-    columns: dict[Column, AnyArray]  # with room for all rays
-    hits: list[AnyArray]  # as `_HITS`; empty unless NumPy needs all hits
+    columns: dict[Column, AnyArray]  # columns with room for all rays
+    hits: list[AnyArray]  # arrays as in `_HITS`; empty unless NumPy needs all hits
 
 
 @lru_cache(maxsize=16)

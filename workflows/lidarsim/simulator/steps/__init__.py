@@ -1,1 +1,1 @@
-"""Steps: each is an effect on pulses, in a module of its own with its loops beside it."""
+"""Steps: each is an effect on pulses, in a separate module with its loops beside it."""

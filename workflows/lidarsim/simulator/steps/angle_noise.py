@@ -1,4 +1,4 @@
-"""Errors of the directions in which beams are sent; reported directions have no errors."""
+"""Errors of the directions of sent beams, while reported directions have no errors."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class AngleNoiseStep(PulseStep):
         return beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add random angles to the beams of a batch; return the returns unchanged."""
+        """Add random angles to the beams of a batch, and return the returns unchanged."""
         beams = np.arange(batch.start, batch.stop)
         scan, ray = batch.keys.scan_and_number(beams)
         across, up = angle_errors(self.setup.noise, scan, ray)
@@ -54,11 +54,11 @@ class RippleStep(PulseStep):
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """Return the memory of the directions of beams; 0 if `AngleNoiseStep` counts the memory."""
+        """Return the memory of directions of beams, or 0 if `AngleNoiseStep` counts the memory."""
         return Memory() if setup.noise.angle_deg else beam_memory(setup, sizes)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add the errors of azimuth to the beams of a batch; return the returns unchanged."""
+        """Add the errors of azimuth to the beams of a batch, and return the returns unchanged."""
         noise = self.setup.noise
         sensor = self.setup.sensor
         azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])

@@ -30,8 +30,8 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")
 MAX_PASSES = 16  # surfaces that light passes before it is dropped
-MAX_LEAFY_PASSES = 64  # if there are crowns: light passes the surface of a crown twice
-MAX_REFLECTIONS = 2  # of light, which a mirror may divide each time
+MAX_LEAFY_PASSES = 64  # limit with crowns: light passes the surface of a crown twice
+MAX_REFLECTIONS = 2  # reflections of light, which a mirror may divide each time
 
 
 @dataclass
@@ -53,7 +53,7 @@ class LightPaths:
     # directions of the pieces. None if no light is reflected, and for beams of a single sub-ray.
     mirror_matrices: Floats | None = None
     mirrored: Bytes | None = None  # number of reflections so far, if there are mirrors
-    in_media: LightInMedia | None = None  # if there are media
+    in_media: LightInMedia | None = None  # None without media
     # Growth of the optical path by the motions of the sensor and of the earlier surfaces, m/s, as
     # if the next surface stood still; None if no column stores velocities.
     range_rate: Floats | None = None
@@ -89,16 +89,16 @@ class SurfaceHits(NamedTuple):
     """Hits of light, one for each row of the light: arrays (n,), vectors (n, 3)."""
 
     step_m: Floats  # metres from the origin of the last piece of the path
-    triangle: Ints32  # of a leaf: where the light entered the crown
+    triangle: Ints32  # triangle of a leaf: where the light entered the crown
     distance: Floats  # optical path from the sensor, metres
     colour: UInts32 | None  # packed, see `Surfaces.colours`; None if not needed
     normals: Floats  # unit vectors, scene frame; of a leaf: the direction of the light
-    cosines: Floats  # of the angles between normals and directions, of either sign
+    cosines: Floats  # cosines of the angles between normals and directions, of either sign
     kinds: Ints32  # kinds of surfaces: rows of the table of materials
-    energy: Floats  # that the sensor receives, in the unit of `Surfaces.energy`
+    energy: Floats  # energy at the sensor, in the unit of `Surfaces.energy`
     film: Bools | None  # whether there may be a film of water; None if no surface is wet
     leaves: Indices  # (l,): rows where light meets a leaf within a crown
-    velocities: Floats  # of the surfaces; (0, 3) if they are not needed
+    velocities: Floats  # velocities of the surfaces; (0, 3) if they are not needed
 
 
 class VisibleHits(NamedTuple):
@@ -120,26 +120,26 @@ class Crossings(NamedTuple):
     distance: Floats  # optical path from the sensor, metres
     triangle: Ints32
     normals: Floats
-    cosines: Floats  # of the angles between normals and directions, of either sign
+    cosines: Floats  # cosines of the angles between normals and directions, of either sign
     reflected: Bools  # whether the light of the row is mirrored, else transmitted
     # Velocities of the surfaces, m/s: a moving surface that bends light changes the range rate.
     velocities: Floats | None
 
 
 class OnwardRows(NamedTuple):
-    """Rows of light that continues: arrays (k,); a row occurs twice where the light divides."""
+    """Rows of light that continues: arrays (k,), with a row twice where the light divides."""
 
     rows: Indices
     reflected: Bools  # whether the light of the row is mirrored, else transmitted
-    share: Floats  # as `LightPaths.share`, behind the surface
+    share: Floats  # share behind the surface, like `LightPaths.share`
 
 
 class Deflection(NamedTuple):
     """Light behind surfaces that refract or mirror: arrays (n,), vectors (n, 3)."""
 
     directions: Floats
-    share: Floats  # as `LightPaths.share`, behind the surface
-    mirrored: Bools  # whether light is mirrored, also by total reflection
+    share: Floats  # share behind the surface, like `LightPaths.share`
+    mirrored: Bools  # whether light is mirrored, by total reflection or otherwise
     twice_normals: Floats  # normals times 2 where light is mirrored, else 0
 
 
@@ -196,7 +196,7 @@ class CastStep(PulseStep):
         )
 
     def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
-        """Return the step for a scene in which instances have moved; media have new bounds."""
+        """Return the step for a scene with moved instances, and media with new bounds."""
         if self._media is not None:
             return super().moved(setup, surfaces)
         return self.repointed(setup, surfaces)
@@ -222,7 +222,7 @@ class CastStep(PulseStep):
         return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of the sub-rays of a batch; `returns` are not used."""
+        """Return the hits of the sub-rays of a batch, without using `returns`."""
         cast, rays = self._cast_first(batch)
         first_light = cast.light
         parts: list[VisibleHits] = []
@@ -242,7 +242,7 @@ class CastStep(PulseStep):
 
     @property
     def _reach_m(self) -> float:
-        """Greatest length of a cast ray, metres; inf if there are crowns.
+        """Greatest length of a cast ray, metres, or inf if there are crowns.
 
         The path through a crown ends at the surface on its far side, at any distance.
         """
@@ -260,7 +260,7 @@ class CastStep(PulseStep):
     # -- the first cast ----------------------------------------------------------------------
 
     def _cast_first(self, batch: PulseBatch) -> tuple[CastLight, Floats]:
-        """Cast the sub-rays of a batch; return the light that hits a surface, and all rays.
+        """Cast the sub-rays of a batch, and return the light that hits a surface, and all rays.
 
         The rays are origins, if they are needed, and unit directions of all sub-rays of the batch,
         in the scene frame: (6, s) or (3, s). The light has a row for each of the sub-rays that hit.
@@ -362,7 +362,7 @@ class CastStep(PulseStep):
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
         """Return light that ends at the leaves that it meets, and the leaves.
 
-        The leaves are None if there are no media.
+        The leaves are None without media.
         """
         light = cast.light
         if light.in_media is None:
@@ -401,7 +401,7 @@ class CastStep(PulseStep):
         triangle: Ints32,
         actor_trajectories: ActorTrajectories,
     ) -> Floats:
-        """Return the velocities of surfaces at hits, m/s: (n, 3); (0, 3) if not needed."""
+        """Return the velocities of surfaces at hits, m/s: (n, 3), or (0, 3) if not needed."""
         if light.range_rate is None:
             return np.zeros((0, 3))
         return velocities_of_ends(
@@ -465,7 +465,7 @@ class CastStep(PulseStep):
         visible: VisibleHits,
         subrays_per_beam: int,
     ) -> OnwardLight | None:
-        """Return the light that surfaces transmit or mirror, ready to cast; None if there is none.
+        """Return the light that surfaces transmit or mirror, ready to cast, or None without any.
 
         Rows that are transmitted and mirrored are taken twice, and ordered along rings.
         """
@@ -494,7 +494,7 @@ class CastStep(PulseStep):
     def _divide(
         self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
     ) -> OnwardRows:
-        """Compute the share of light that surfaces transmit or mirror; drop faint light.
+        """Compute the share of light that surfaces transmit or mirror, and drop faint light.
 
         `rows` are rows of the light; `reflected` says which of them are mirrored. Both are
         overwritten. Light is dropped only if there are mirrors, and if no medium refracts: where
@@ -537,7 +537,7 @@ class CastStep(PulseStep):
         return OnwardRows(rows[:count], reflected[:count], share[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
-        """Cast the light behind surfaces; return the light that hits a surface within the range.
+        """Cast the light behind surfaces, and return the light that hits a surface in range.
 
         With crowns, hits beyond the range are returned too: there may be leaves before them.
         """
@@ -643,7 +643,7 @@ class CastStep(PulseStep):
                 crossings.reflected,
             )
             outgoing = refraction.directions
-            share = share * refraction.shares**2  # on the way out and back
+            share = share * refraction.shares**2  # light passes on the way out and back
             mirrored = mirrored | refraction.totally_reflected
         twice_normals = 2 * mirrored[:, None] * crossings.normals
         outgoing = outgoing - crossings.cosines[:, None] * twice_normals

@@ -40,7 +40,7 @@ SLACK_NS = 10.0  # error of the estimated time at which a pulse reaches the rece
 class ReceivedPulses(NamedTuple):
     """Foreign pulses that rays receive: arrays (k,)."""
 
-    row: Indices  # of the receiving rays
+    row: Indices  # row of the receiving rays
     distance: Floats  # at which the pulse appears to the receiver, metres
     energy: Floats  # 1 for a white surface at `REFERENCE_M`
 
@@ -62,7 +62,7 @@ class _Spots(NamedTuple):
     position: Floats  # (n, 3), metres, scene frame
     normal: Floats  # (n, 3), unit vectors
     triangle: Ints32
-    distance: Floats  # from the sensor, metres
+    distance: Floats  # distance from the sensor, metres
 
 
 class _Candidates(NamedTuple):
@@ -93,7 +93,7 @@ class CrosstalkStep(PulseStep):
         self._survey = setup.survey
         self._sensor = setup.sensor
         divergence = setup.reporting.divergence(self._sensor.optics)
-        self._cosine = sin_cos_of(divergence / 2)[1]  # of half the field of view of a ray
+        self._cosine = sin_cos_of(divergence / 2)[1]  # cosine of half the field of view of a ray
         nm = self._sensor.optics.wavelength_nm
         self._other_sensors = [
             number
@@ -102,7 +102,7 @@ class CrosstalkStep(PulseStep):
         ]
 
     def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
-        """Return a copy for a scene in which instances have moved."""
+        """Return a copy for a scene with moved instances."""
         return self.repointed(setup, surfaces)
 
     @staticmethod
@@ -243,7 +243,7 @@ class CrosstalkStep(PulseStep):
     def _spots(
         self, number: int, spec: ScanSpec, span: tuple[float, float], poses: CastPoses
     ) -> _Spots:
-        """Cast the pulses that another sensor fires within a span of time; return their spots."""
+        """Cast the pulses that another sensor fires within a span of time. Return their spots."""
         sensor: Sensor = self._survey.carried[number].sensor
         firings = np.arange(*_firings_in(sensor, self._survey.steps_each[number], span))
         firing_starts = sensor.begins_ns(firings)

@@ -65,7 +65,7 @@ def passes(
 ) -> Bools:
     """Return whether signals (n,) with their noise pass the threshold: (n,).
 
-    The arguments are those of `detected`; the random numbers of the noise are of a purpose.
+    The arguments are as in `detected`; the random numbers of the noise are of a purpose.
     """
     signal = THRESHOLD_SIGMAS * (energy / noise.threshold - 1)
     return np.asarray(signal + normal(noise.seed, purpose, scan, ray, number) > 0)

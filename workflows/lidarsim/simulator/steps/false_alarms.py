@@ -23,9 +23,9 @@ PEAK = Purpose(21, "energy of a false alarm")
 class FalseAlarms(NamedTuple):
     """False alarms of rays: arrays (k,)."""
 
-    row: Indices  # of the rays of the alarms
+    row: Indices  # row of the rays of the alarms
     time_s: Floats  # since the receiver opened, seconds
-    energy: Floats  # on the scale of `Noise.threshold`
+    energy: Floats  # energy on the scale of `Noise.threshold`
 
 
 class FalseAlarmStep(PulseStep):

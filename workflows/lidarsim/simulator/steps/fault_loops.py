@@ -9,7 +9,7 @@ from raybeam.compiled import compiled
 
 @compiled()
 def remaining(ray, times, spans, firing, channel, rows):
-    """Write the rows of returns that no fault takes; return the number of rows.
+    """Write the rows of returns that no fault takes, and return the number of rows.
 
     Rays `ray` (n,), in order, have firing times `times` (n,), nanoseconds. Each of f faults acts in
     a half-open span of times, `spans` (f, 2), and takes returns by masks of firings (f, firings)

@@ -36,7 +36,7 @@ LEAF = Purpose(30, "depth of leaves that light gets through")
 CROWN = Purpose(31, "crown of the leaf, of crowns that overlap")
 MAX_MEDIA = 8  # media around a point that are stored
 MAX_PROBES = 256  # surfaces that a search for the media around a point passes
-UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of the search; parallel to no edge of usual models
+UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # direction of search, unlike edges of usual models
 
 # Random bits of rays for a purpose: (n,).
 Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
@@ -53,9 +53,9 @@ class Rays(NamedTuple):
 
 @dataclass
 class MediaStack:
-    """Media around the light of sub-rays, the innermost first: (n, MAX_MEDIA); -1 for no medium."""
+    """Media around the light of sub-rays, the innermost first: (n, MAX_MEDIA), -1 for no medium."""
 
-    kinds: Ints32  # of the surfaces of the media
+    kinds: Ints32  # kinds of the surfaces of the media
     triangles: Ints32  # through which the light entered
 
     @classmethod
@@ -77,14 +77,14 @@ class MediaStack:
             table[rows, 0] = values
 
     def surround(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium around the media of each of `rows`; full stacks stay as they are."""
+        """Add a medium around the media of each of `rows`, while full stacks stay as they are."""
         depth = (self.kinds[rows] >= 0).sum(axis=1)
         free = depth < MAX_MEDIA
         self.kinds[rows[free], depth[free]] = kinds[free]
         self.triangles[rows[free], depth[free]] = triangles[free]
 
     def leave(self, rows: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stacks of `rows`; return False for rows without the medium."""
+        """Remove a medium from the stacks of `rows`, and return False for rows without it."""
         matches = self.kinds[rows] == kinds[:, None]
         in_stack = matches.any(axis=1)
         rows = rows[in_stack]
@@ -200,7 +200,7 @@ class Media:
                     "leaf_area_density, but its surface has gaps: give a closed one, such as a box "
                     "or a sphere."
                 )
-        # Boxes in which sensors may be within media. A surface of water that is an open sheet has
+        # Boxes that may put sensors within media. A surface of water that is an open sheet has
         # water below at any depth; an actor that holds a medium may be anywhere.
         is_static = owners < len(scene.object_bounds)
         static_kinds = np.flatnonzero(self.filled & is_static)
@@ -214,7 +214,7 @@ class Media:
                 projection(angle, np.ones(1))  # computes and caches the table of the angle
 
     def enters(self, kinds: Ints32, cosines: Floats) -> Bools:
-        """Return whether light enters bodies: (n,); `cosines` are between normals and light."""
+        """Return whether light enters bodies: (n,), by `cosines` between normals and light."""
         return np.asarray((cosines < 0) != self._inwards[kinds])
 
     def stack_at(self, caster: SceneCaster, light: Rays) -> MediaStack:
@@ -295,7 +295,7 @@ class Media:
     def initial_state(
         self, caster: SceneCaster, light: Rays, depths: Floats | None
     ) -> LightInMedia:
-        """Return the state of light at its origin; `depths` (n,) are optical depths to a leaf."""
+        """Return the state of light at its origin, with optical depths to a leaf `depths` (n,)."""
         stack = self.stack_at(caster, light)
         differentials = (
             RayDifferentials.from_directions(light.directions, self.index(stack))
@@ -317,7 +317,7 @@ class Media:
     def behind(
         self, stack: MediaStack, kinds: Ints32, triangles: Ints32, cosines: Floats
     ) -> MediaStack:
-        """Return the media behind surfaces (n,); `cosines` are between normals and light."""
+        """Return the media behind surfaces (n,), by `cosines` between normals and light."""
         behind = stack[np.arange(len(kinds))]
         enters = self.enters(kinds, cosines)
         filled = self.filled[kinds]
@@ -355,8 +355,8 @@ class Media:
 class LightInGrids(NamedTuple):
     """Light among all that passes grids of voxels: arrays (k,)."""
 
-    rows: Indices  # of the light
-    metres: Floats  # to the leaf that the light meets; inf if there is no leaf
+    rows: Indices  # rows of the light
+    metres: Floats  # metres to the leaf that the light meets; inf without a leaf
     remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
 
 
@@ -366,14 +366,14 @@ class Refraction(NamedTuple):
     directions: Floats
     # Share of the light, on one way: transmitted, or mirrored where light is reflected.
     shares: Floats | float
-    totally_reflected: Bools  # with directions as if there were no surface
+    totally_reflected: Bools  # their directions are as if there were no surface
 
 
 class Leaves(NamedTuple):
     """Leaves that light meets: arrays (k,)."""
 
-    rows: Indices  # of the light
-    metres: Floats  # from the start of the span to the leaf
+    rows: Indices  # rows of the light
+    metres: Floats  # metres from the start of the span to the leaf
     triangles: Ints32  # through which the light entered the crown
     cosines: Floats  # mean cosine between light and leaves
 
@@ -385,7 +385,7 @@ class LightInMedia:
     media: Media
     stack: MediaStack
     differentials: RayDifferentials | None  # None if no medium refracts
-    remaining_depth: Floats | None  # (n,): optical depth to a leaf; None if there are no leaves
+    remaining_depth: Floats | None  # (n,): optical depth to a leaf; None without leaves
 
     def __getitem__(self, rows: Integers) -> LightInMedia:
         """Return the state of selected sub-rays."""
@@ -460,7 +460,7 @@ class LightInMedia:
 
         Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. Before, `density`
         (n, MAX_MEDIA) has the optical depth per metre of grids for a leaf area density of 1 m²/m³;
-        afterwards, for the voxel in which light meets a leaf, or 0. Other media keep their values.
+        afterwards, for the voxel where light meets a leaf, or 0. Other media keep their values.
         """
         grids = self.media.grids
         stack = self.stack
@@ -515,7 +515,7 @@ class LightInMedia:
         `cosines` are between normals and directions. Updates the stacks of media: transmitted light
         enters or leaves a medium; reflected and totally reflected light stays in its media.
         Reflected light keeps its direction here. At surfaces of `Media.mirrors`, mirrored light has
-        rows of its own in `reflected`, so totally reflected light in other rows has the share 0.
+        separate rows in `reflected`, so totally reflected light in other rows has the share 0.
         """
         stack_before = self.stack
         self.stack = self.media.behind(self.stack, kinds, triangles, cosines)
@@ -541,7 +541,7 @@ class LightInMedia:
 
 
 def refracted(directions: Floats, normals: Floats, cosines: Floats, ratio: Floats) -> Refraction:
-    """Refract light at surfaces by Snell's law; `ratio` (n,) is the index behind over before.
+    """Refract light at surfaces by Snell's law, with index behind over index before, `ratio` (n,).
 
     Totally reflected light has the direction and share that it would have without a surface.
     """

@@ -26,7 +26,7 @@ class DirtStep(PulseStep):
         return bool(setup.faults("dirt"))
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return hits with the energies behind the dirty window; replace the hits of the batch."""
+        """Return hits with energies behind the dirty window. They replace the hits of the batch."""
         sensor = self.setup.sensor
         beams = np.arange(batch.start, batch.stop)
         transmission = np.ones(len(beams))

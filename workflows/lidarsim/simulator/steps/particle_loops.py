@@ -16,7 +16,7 @@ from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
 
 class ParticleTables(NamedTuple):
-    """Tables of a kind of particles that may be detected, see `air.DetectableParticles`."""
+    """Tables of a kind of particles that may be detected, as `air.DetectableParticles`."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam; the last is 1
     by_range: Floats  # (5, shares): rows as in `air.DetectableParticles.by_range`
@@ -25,7 +25,7 @@ class ParticleTables(NamedTuple):
 
 
 class FogTables(NamedTuple):
-    """Cells of fog that may be detected, see `air.FogCells`."""
+    """Cells of fog that may be detected, as `air.FogCells`."""
 
     begin_m: float  # range of the first cell
     end_m: float  # range where fog ends
@@ -38,8 +38,8 @@ class FogTables(NamedTuple):
 def write_particle(ray, column, quantile, subrays, tables, hits, row):
     """Write the hit of a particle, on a sub-ray, to a row of `hits`, `SampledHits`.
 
-    `column` is the particle's in `tables.by_range`; the `quantile`, in [0, 1), is that of the
-    particle's diameter among particles that may be detected there.
+    `column` is the particle's in `tables.by_range`. The `quantile`, in [0, 1), is the quantile of
+    the particle's diameter among particles that may be detected there.
     """
     by_range = tables.by_range
     exponential = tables.exponential
@@ -87,11 +87,11 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
 
 @compiled()
 def sample_fog(subrays, tables, keys, reach, hits):
-    """Sample the fog return of each beam into `hits`; return their number.
+    """Sample the fog return of each beam into `hits`, and return their number.
 
     `tables` are `FogTables`; `keys` and `reach` are as in `sample_particles`. A beam returns light
-    from the cell with the highest peak before its surface, which is that of its first sub-ray, in
-    the middle. A beam whose surface is nearer than the end of the first cell returns nothing.
+    from the cell with the highest peak before its surface, the surface of its first sub-ray, in the
+    middle. A beam whose surface is nearer than the end of the first cell returns nothing.
     """
     cells = len(tables.energies)
     count = 0

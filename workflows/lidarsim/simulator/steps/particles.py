@@ -49,9 +49,9 @@ PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
 PARTICLE_SUBRAY = Purpose(15, "sub-ray that meets a particle")
 AIR = CAUSES.index("air")
 QUANTILES = 1 << 16  # equal shares of a distribution, in tables
-CACHED_TABLES = 32  # as a scanner builds its casters again whenever an object is moved
+CACHED_TABLES = 32  # kept because a scanner builds its casters again whenever an object is moved
 MAX_FOG_CELLS = 255  # cells of half a pulse's length
-# Standard deviations below and above the highest signal, up to which probabilities are summed.
+# Probabilities are summed up to so many standard deviations below and above the highest signal.
 TAIL_SIGMAS = 6.0
 
 
@@ -122,7 +122,7 @@ class WeatherStep(PulseStep):
         )
 
     def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
-        """Return a copy for a scene in which instances have moved."""
+        """Return a copy for a scene with moved instances."""
         return self.repointed(setup, surfaces)
 
     @staticmethod
@@ -142,7 +142,7 @@ class WeatherStep(PulseStep):
         return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of a batch after hits in the air are sampled, see `add_air_hits`."""
+        """Return the hits of a batch after hits in the air are sampled."""
         air_hits = self.sample_air_hits(
             returns, (batch.start, batch.stop), batch.keys, batch.subrays_per_beam
         )
@@ -236,8 +236,8 @@ def light_reach(
 ) -> Floats:
     """Return ranges that the light of `count` sub-rays reaches, (count,), metres.
 
-    The range is that of the last hit of a sub-ray on a surface; inf without a hit, or if the last
-    surface lets light pass. `hits.ray` are sub-rays, from 0.
+    The range is the distance of the last hit of a sub-ray on a surface. It is inf without a hit, or
+    if the last surface lets light pass. `hits.ray` are sub-rays, from 0.
     """
     ray = hits.ray
     end_distance = hits.distance
@@ -262,7 +262,7 @@ def add_air_hits(
     receives the hits in the air, for `SeparationStep`.
     """
     if returns.velocity is not None:  # the air is at rest
-        first_subray = batch.window[0]  # of the batch, in `batch.beams`
+        first_subray = batch.window[0]  # the batch's first row in `batch.beams`
         rays = batch.subray_poses.rays(batch.beams, air_hits.ray, first_subray)
         air_hits = air_hits._replace(
             velocity=range_rates_of_origins(batch.subray_poses, air_hits.ray, *rays)
@@ -285,7 +285,7 @@ def random_keys(seed: int, purposes: tuple[Purpose, ...], keys: Keys, first: int
 
 
 def room_for_hits(size: int) -> SampledHits:
-    """Return arrays to which loops write up to `size` hits."""
+    """Return arrays that loops write up to `size` hits to."""
     from .pulse_loops import SampledHits
 
     return SampledHits(np.empty(size, np.int64), np.empty(size), np.empty(size))
@@ -340,7 +340,7 @@ def insert_air_hits(
 def _detectable(
     air: Air, kind: Particles, min_energy: float, min_range_m: float, max_range_m: float
 ) -> DetectableParticles | None:
-    """Return the distribution of particles that return at least `min_energy`; None if empty."""
+    """Return the distribution of particles that return at least `min_energy`, or None if empty."""
     tables = seen_by_range(air, kind, min_energy, min_range_m, max_range_m)
     if tables is None:
         return None
@@ -354,7 +354,7 @@ def seen_by_range(
 ) -> tuple[float, Floats] | None:
     """Return the mean number of particles in a beam that return at least `min_energy`, and a table.
 
-    The table is that of `DetectableParticles.by_range`. Returns None without such particles.
+    The table is `DetectableParticles.by_range`. Returns None without such particles.
     """
     distance = geomspace(min_range_m, max(max_range_m, min_range_m * 1.001), NODES)
     detectable = np.flatnonzero(air.rate(kind, min_energy, distance) > 0)
@@ -376,7 +376,7 @@ def seen_by_range(
 
 
 def _poisson(mean: float) -> Floats:
-    """Return the cumulative probabilities of 0, 1, … events of a mean number; the last is 1."""
+    """Return the cumulative probabilities of 0, 1, … events of a mean number, ending with 1."""
     sums = []
     term = exp_of(-mean)
     count = 0
@@ -398,9 +398,9 @@ def _fog_cells(
     max_range_m: float,
     cell_m: float,
 ) -> FogCells | None:
-    """Return the cells of fog that may be detected; None without such cells.
+    """Return the cells of fog that may be detected, or None without such cells.
 
-    `backscatter` is that of fog and dust, 1/(m sr); `cell_m` is half of the pulse's length.
+    `backscatter` of fog and dust is in 1/(m sr); `cell_m` is half of the pulse's length.
     """
     count = int(min((max_range_m - min_range_m) / cell_m, MAX_FOG_CELLS)) if cell_m else 0
     edges = min_range_m + cell_m * np.arange(count + 1, dtype=np.float64)
@@ -436,7 +436,7 @@ def highest_probabilities(signals: Floats) -> Floats:
 
 
 def single(table: Floats) -> Floats:
-    """Round to single precision, in which the error functions of C libraries are the same."""
+    """Round to single precision, where the error functions of C libraries are the same."""
     return table.astype(np.float32).astype(np.float64)
 
 

@@ -1,4 +1,4 @@
-"""Parts that loops over pulses share; each loop is compiled when it is first called."""
+"""Parts that loops over pulses share, where each loop is compiled on its first call."""
 
 # mypy: disable-error-code="no-untyped-def"
 
@@ -14,7 +14,7 @@ SLOPE = 0.5  # largest gap of the planes of one surface, by the distance between
 
 
 class SampledHits(NamedTuple):
-    """Arrays to which loops write sampled hits of sub-rays: (k,) each."""
+    """Arrays for loops to write sampled hits of sub-rays to: (k,) each."""
 
     ray: Ints  # sub-ray
     distance: Floats  # metres
@@ -26,9 +26,12 @@ class SampledHits(NamedTuple):
 
 
 class Neighbours(NamedTuple):
-    """Neighbouring sub-rays of a beam, and planes of hits; without pairs no surface continues."""
+    """Neighbouring sub-rays of a beam, and planes of hits.
 
-    subrays: int  # of a beam
+    Without pairs no surface continues.
+    """
+
+    subrays: int  # number in a beam
     pairs: Ints  # (k, 2): neighbouring sub-rays of a beam
     normals: Floats  # (3, n): of the surfaces of hits
     directions: Floats  # (3, n): of the rays of hits

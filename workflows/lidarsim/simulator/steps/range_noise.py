@@ -1,4 +1,4 @@
-"""Errors of ranges: noise, also of weak returns, range walk, and lasting errors."""
+"""Errors of ranges: noise, of weak returns too, range walk, and lasting errors."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RangeNoiseStep(PulseStep):
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns with their reported ranges."""
-        # The leading edge of a clipped pulse is that of the whole pulse.
+        # The leading edge of a clipped pulse is the leading edge of the whole pulse.
         height = returns.height if self.setup.in_waveforms else returns.energy
         scan, ray = batch.keys.scan_and_number(returns.ray)
         noise = self.setup.noise

@@ -25,7 +25,7 @@ class Pulses(NamedTuple):
 
 @compiled()
 def join_clipped(pulses, remains):
-    """Join overlapping returns of a pulse where a return is clipped; mark the returns that remain.
+    """Join overlapping returns of a pulse where a return is clipped, and mark what remains.
 
     Of joined returns the highest remains, with the energy of all joined returns, and with the
     outermost edges and the smallest distance of the clipped returns. These are written to `pulses`,

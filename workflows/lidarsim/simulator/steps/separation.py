@@ -40,7 +40,7 @@ class Reporting(NamedTuple):
     """Detection and selection of returns."""
 
     mode: Mode = "all"
-    noise: Noise | None = None  # by which returns are lost; None if all are detected
+    noise: Noise | None = None  # noise that returns are lost by; None if all are detected
     keys: Keys | None = None
     first: int = 0  # number, counted as in `keys`, of the beam of sub-ray 0 of the hits
 
@@ -129,7 +129,7 @@ def _receiver(subrays: int, gap_m: float, reporting: Reporting, *, with_velocity
 
 
 def _detection_keys(reporting: Reporting) -> RandomKeys:
-    """Return the keys by which returns are detected, for loops; without starts if none are lost."""
+    """Return the keys of detection for loops, without starts if no returns are lost."""
     from .random_loops import RandomKeys
 
     noise = reporting.noise
@@ -185,7 +185,10 @@ def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> Su
 
 
 def neighbours_of(subrays: int, planes: Planes | None) -> Neighbours:
-    """Return neighbouring sub-rays and planes for loops; without planes no surface continues."""
+    """Return neighbouring sub-rays and planes for loops.
+
+    Without planes no surface continues.
+    """
     from .pulse_loops import Neighbours
 
     if planes is None or subrays == 1:
@@ -206,7 +209,7 @@ class SeparationStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether rays may have no return or several, and there are no waveforms."""
+        """Return whether rays may have no return or several, in a setup without waveforms."""
         return setup.return_count_varies and not setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

@@ -24,7 +24,7 @@ class SubrayHits(NamedTuple):
 
     ray: Ints  # sub-ray
     distance: Floats  # metres
-    energy: Floats  # as if all of the beam were in the hit's sub-ray
+    energy: Floats  # energy as if all of the beam were in the hit's sub-ray
     velocity: Floats  # radial, m/s; empty if returns have none
     solid: Bools  # False for hits of no surface; empty for the table of hits in the air
 
@@ -32,14 +32,14 @@ class SubrayHits(NamedTuple):
 class Receiver(NamedTuple):
     """Resolution, detection and reporting of a receiver."""
 
-    subrays: int  # of a beam
+    subrays: int  # number in a beam
     gap_m: float  # half of the pulse's length: closer hits are one return
     mode: int  # which returns are reported
     with_velocity: bool  # whether returns have velocities
     dropout: float  # share of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # the threshold in standard deviations of the noise
-    quantiles: Floats  # of the normal distribution; empty without detection
+    quantiles: Floats  # quantiles of the normal distribution; empty without detection
 
 
 class _Detection(NamedTuple):
@@ -48,7 +48,7 @@ class _Detection(NamedTuple):
     dropout: float  # share of returns that are lost
     threshold: float  # energy at which half of the returns are detected; 0 without detection
     threshold_sigmas: float  # the threshold in standard deviations of the noise
-    quantiles: Floats  # pointer to those of the normal distribution
+    quantiles: Floats  # pointer to the quantiles of the normal distribution
     lowest: float  # first and last of the quantiles
     highest: float
     loss_start: np.uint64  # starts of hashes, see `random_numbers.starts`
@@ -56,12 +56,12 @@ class _Detection(NamedTuple):
 
 
 class ReturnArrays(NamedTuple):
-    """Arrays to which returns are written: (k,) each."""
+    """Arrays that returns are written to: (k,) each."""
 
     beam: Ints  # number of the ray of the scans, from 0 at sub-ray 0
-    row: Ints  # of the strongest hit; of hits in the air -1, -2, …
+    row: Ints  # row of the strongest hit; of hits in the air -1, -2, …
     distance: Floats  # metres
-    energy: Floats  # of the whole beam
+    energy: Floats  # energy of the whole beam
     velocity: Floats  # radial, m/s
 
     def first(self, count: int) -> ReturnArrays:
@@ -235,7 +235,7 @@ def _collect_hits(hits, air, rows, scratch):
 
 @inlined
 def _sort_by_distance(pulse_hits, count):
-    """Sort the first hits of `pulse_hits` by distance; equally far hits keep their order."""
+    """Sort the first hits of `pulse_hits` by distance, where equally far hits keep their order."""
     row = pulse_hits.row
     distance = pulse_hits.distance
     for k in range(1, count):
@@ -286,7 +286,7 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbours, scratch):
 
 @inlined
 def _write_returns(hit_count, beam, receiver, scratch, count, output):
-    """Write the returns of the first hits in `scratch`; return the number of written returns."""
+    """Write the returns of the first hits in `scratch`, and return how many are written."""
     row = scratch.hits.row
     distance = scratch.hits.distance
     starts_return = scratch.marks.starts_return
@@ -320,7 +320,7 @@ def _write_returns(hit_count, beam, receiver, scratch, count, output):
 
 @inlined
 def _keep(output, k, count):
-    """Move return `k` to the end of the `count` kept returns; return the new number of these."""
+    """Move return `k` to the end of the `count` kept returns, and return their new number."""
     output.beam[count] = output.beam[k]
     output.row[count] = output.row[k]
     output.distance[count] = output.distance[k]
@@ -331,7 +331,7 @@ def _keep(output, k, count):
 
 @inlined
 def _detection_of(receiver, starts):
-    """Return the `_Detection` of a receiver; `starts` are of `RandomKeys`, empty without losses."""
+    """Return the `_Detection` of a receiver. `starts` are of `RandomKeys`, empty without losses."""
     loses = len(starts) > 0
     count = len(receiver.quantiles)
     return _Detection(
@@ -371,7 +371,7 @@ def _detected(energy, scan, number_in_scan, return_index, detection):
 
 @inlined
 def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
-    """Keep the detected returns of a beam, rows `begin` to `stop`; return the next free row.
+    """Keep the detected returns of a beam, rows `begin` to `stop`, and return the next free row.
 
     `scan` and the beam's `number_in_scan` are keys of random numbers, see `_detected`.
     """
@@ -384,7 +384,7 @@ def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
 
 @stage
 def _mark(energy, begin, stop, mode, shown):
-    """Mark which returns of a pulse a mode reports; the nearest of equally strong returns.
+    """Mark which returns of a pulse a mode reports, the nearest of equally strong returns.
 
     "Dual" reports the strongest and the last return; if the strongest is the last, also the
     second strongest. "Two strongest" reports the strongest and the second strongest.
@@ -407,13 +407,13 @@ def _mark(energy, begin, stop, mode, shown):
 
 @inlined
 def _start_of_scan(scan_starts, row):
-    """Return the first beam of a scan by its row; a greater number after the last scan."""
+    """Return the first beam of a scan by its row, or a greater number after the last scan."""
     return scan_starts[row] if row < len(scan_starts) else np.iinfo(np.int64).max
 
 
 @inlined
 def _keep_reported(begin, stop, mode, scratch, output):
-    """Keep the returns of a beam that a mode reports; return the next free row."""
+    """Keep the returns of a beam that a mode reports, and return the next free row."""
     for k in range(begin, stop):
         scratch.energy[k - begin] = output.energy[k]
     _mark(scratch.energy, 0, stop - begin, mode, scratch.shown)
@@ -438,7 +438,7 @@ def mark_reported(ray, energy, mode, shown):
 
 @compiled()
 def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
-    """Write the returns of beams to `output`, `ReturnArrays`, see `separation.separated`.
+    """Write the returns of beams to `output`, `ReturnArrays`, for `separation.separated`.
 
     `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbours` are `Neighbours`,
     `receiver` is a `Receiver`, and `keys` are `RandomKeys`, with starts if returns are lost. Beams

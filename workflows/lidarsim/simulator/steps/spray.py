@@ -46,7 +46,7 @@ BOXES = 10  # boxes of a vehicle that exist at a time
 LASTS_NS = BOXES * BOX_NS  # time after which a box is gone
 DECAY_NS = 4e8  # time in which exp(-1) of the spray is left: drops of a few 0.1 mm fall
 FULL_SPEED_M_S = 25.0  # speed at which spray has the stated density
-MIN_SPEED_M_S = 3.0  # speed below which there is no spray
+MIN_SPEED_M_S = 3.0  # lower speeds make no spray
 STEP_NS = 5e5  # time between the two poses that give the velocity of a vehicle
 
 
@@ -91,7 +91,7 @@ class SprayStep(PulseStep):
         self._raising = [n for n, actor in enumerate(setup.scene.actors) if actor.spray]
 
     def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
-        """Return a copy for a scene in which instances have moved."""
+        """Return a copy for a scene with moved instances."""
         return self.repointed(setup, surfaces)
 
     @staticmethod

@@ -17,7 +17,7 @@ from .pulse_loops import beam_of, scan_row
 from .random_loops import SHIFT_TO_INDEX, bits, uniform
 
 MAX_CLUMPS = 255  # clumps of spray that a beam meets: a ray has so many random numbers
-_GUIDE_PARTS = 1024  # parts of a table in which a column is looked up
+_GUIDE_PARTS = 1024  # parts of a table for looking up a column
 
 
 class CellPairs(NamedTuple):
@@ -41,7 +41,7 @@ class SprayBoxes(NamedTuple):
 
 
 class Crossings(NamedTuple):
-    """Crossings of beams and boxes; the crossings of a beam are consecutive."""
+    """Crossings of beams and boxes, with the crossings of a beam in sequence."""
 
     beam: Ints  # (k,): number of the beam in the batch
     # (3, k): ranges at which the beam enters and leaves the box, metres, and the density of the box
@@ -50,7 +50,7 @@ class Crossings(NamedTuple):
 
 
 class ClumpTables(NamedTuple):
-    """Tables of clumps of spray that may be detected, see `air.DetectableParticles`."""
+    """Tables of clumps of spray that may be detected, as `air.DetectableParticles`."""
 
     mean: float  # detectable clumps that a beam would meet in air of density `Survey.spray_g_m3`
     by_range: Floats  # (5, shares): columns, ascending in range, that hold equal shares of `mean`
@@ -100,7 +100,7 @@ def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a 
 def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
     """Write a crossing of ray `k` and box `b` as row `count`, if `crossings` has room.
 
-    `span` is the result of `_span_in_box`, `time` that of the ray, ns.
+    `span` is the result of `_span_in_box`, `time` the time of the ray, ns.
     """
     if count < len(crossings.beam):
         negative_age_ns = spray_boxes.presence_ns[b, 1] - spray_boxes.lasts_ns - time
@@ -114,7 +114,7 @@ def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
 
 @compiled()
 def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: PLR0914 - a compiled loop
-    """Write where rays (6, n), which end at `reach` (n,), metres, cross boxes; return the number.
+    """Write where rays (6, n), to `reach` (n,), metres, cross boxes, and return the number.
 
     Rows of rays are origins and directions, `times` (n,) are in ns; `pairs` are `CellPairs`, and
     `spray_boxes` `SprayBoxes`. As many crossings are written as `crossings` has room for; all are
@@ -157,10 +157,12 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
 
 @stage
 def _column(ranges, guide, part_m, distance):
-    """Return the first column at a distance or farther; numba's search takes long to compile.
+    """Return the first column at a distance or farther.
 
-    `ranges` are those of the columns, metres, ascending. The search starts at the column of `guide`
-    for the distance, see `_guide`; a part of the guide is `part_m` long.
+    numba's search takes long to compile.
+
+    `ranges` are the ranges of the columns, metres, ascending. The search starts at the column of
+    `guide` for the distance (`_guide`); a part of the guide is `part_m` long.
     """
     column = guide[np.int64(min(distance / part_m, _GUIDE_PARTS))]
     while column < len(ranges) and ranges[column] < distance:
@@ -211,7 +213,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
         clump = 0
         depth = exponential[np.int64(bits(starts[0], scan, number_in_scan, 0) >> SHIFT_TO_INDEX)]
         begin = k
-        max_depth = 0.0  # in columns
+        max_depth = 0.0  # number of columns
         while k < len(beam) and beam[k] == this_beam:
             first_part = min(spans[0, k] / part_m, _GUIDE_PARTS)
             last_part = min(spans[1, k] / part_m, _GUIDE_PARTS)
@@ -224,7 +226,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
         while k < len(beam) and beam[k] == this_beam:
             rate = spans[2, k] * clumps_per_column  # depth of a column in this box
             end = _column(ranges, guide, part_m, spans[1, k])
-            position = np.float64(_column(ranges, guide, part_m, spans[0, k]))  # in columns
+            position = np.float64(_column(ranges, guide, part_m, spans[0, k]))  # counted in columns
             while depth < (end - position) * rate and clump < MAX_CLUMPS:
                 position += depth / rate
                 column = np.int64(position)
@@ -249,8 +251,8 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
 def attenuate(crossings, subrays, extinction, reach, hits):
     """Multiply the energies of `SampledHits` of surfaces by the transmission of spray, both ways.
 
-    `extinction` is that of spray of density 1, 1/m; `reach` (beams * subrays,) is the range that
-    the light of each sub-ray reaches, metres.
+    `extinction` is the extinction of spray of density 1, 1/m; `reach` (beams * subrays,) is the
+    range that the light of each sub-ray reaches, metres.
     """
     beam = crossings.beam
     spans = crossings.spans

@@ -33,7 +33,7 @@ from ..returns import Keys, Planes, PulseReturns
 
 
 class Role(Flag):
-    """Kinds of effects of a step on pulses; each step declares a flag or several."""
+    """Kinds of effects of a step on pulses, of which each step declares a flag or several."""
 
     AIMS = auto()  # deflects beams before they are cast
     ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation of the head, not across and up
@@ -47,11 +47,11 @@ class Role(Flag):
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A sensor of a survey in a scene, by which the steps are chosen."""
+    """A sensor of a survey in a scene. The setup selects the steps."""
 
     scene: Scene
     survey: Survey
-    number: int  # of the sensor
+    number: int  # number of the sensor
     # Roles of all steps that apply, without `Role.FRAME`; None until the steps are chosen.
     roles: Role | None
 
@@ -145,17 +145,17 @@ class Setup:
 class Sizes(NamedTuple):
     """Numbers of rays and returns in memory, if all rays hit a surface."""
 
-    rays: int  # of all scans whose memory is estimated
-    beams: float  # of one `PulseBatch`
-    subrays: int  # of one `PulseBatch`
-    returns: float  # of `rays`
+    rays: int  # rays of all scans whose memory is estimated
+    beams: float  # beams of one `PulseBatch`
+    subrays: int  # sub-rays of one `PulseBatch`
+    returns: float  # returns of `rays`
     points: float  # returns that become points: every n-th, see `Survey.keep_every`
 
 
 class Memory(NamedTuple):
     """Peak memory of casting, in bytes."""
 
-    retained: float = 0.0  # from the step until columns are made of the returns
+    retained: float = 0.0  # bytes from the step until columns are made of the returns
     casting: float = 0.0  # while the beams of a `PulseBatch` are cast
     # after all are cast: while returns are counted, and every n-th is kept
     counting: float = 0.0
@@ -219,15 +219,15 @@ class PulseBatch:
     stop: int  # one past the last
     pattern: Pattern  # rays of beams, in the frame of the head or the carrier
     first: int  # row of beam 0 in the pattern, which repeats
-    poses: CastPoses  # of all beams of the scans
-    firings: Firings  # of all beams of the scans
+    poses: CastPoses  # poses of all beams of the scans
+    firings: Firings  # firings of all beams of the scans
     emitter: Emitter
     # (stop - start, 2): angles added to the directions of beams, radians, see `deflect`
     offsets: Floats | None = None
     # Hits of sub-rays on surfaces, with waveforms also in the air, in the order of sub-rays, which
     # are numbered from 0 at the batch's start.
     hits: PulseReturns | None = None
-    planes: Planes | None = None  # of `hits`; None if beams have a single sub-ray
+    planes: Planes | None = None  # planes of `hits`; None if beams have a single sub-ray
     air: PulseReturns | None = None  # hits in the air that are not among `hits`
 
     def deflect(self, offsets: Floats) -> None:
@@ -239,7 +239,7 @@ class PulseBatch:
         self.offsets = earlier + offsets
 
     def select(self, rows: Indices) -> PulseReturns:
-        """Keep the selected rows of `hits` and `planes`; return the remaining hits."""
+        """Keep the selected rows of `hits` and `planes`, and return the remaining hits."""
         assert self.hits is not None
         self.hits = self.hits.take(rows)
         if self.planes is not None:
@@ -254,9 +254,9 @@ class PulseBatch:
 
     @cached_property
     def beams(self) -> Pattern:
-        """Sub-rays of the batch's beams; without offsets, of all rays of the pattern.
+        """Sub-rays of the batch's beams or, without offsets, of all rays of the pattern.
 
-        The rows of the batch are those of `window`.
+        The rows of the batch are in `window`.
         """
         rows = np.arange(self.first + self.start, self.first + self.stop)
         pattern_rows = None if self.offsets is None else rows
@@ -266,7 +266,7 @@ class PulseBatch:
 
     @property
     def rows(self) -> slice:
-        """Rows of the batch's firings in `firings`; a batch consists of complete firings."""
+        """Rows of the batch's firings in `firings`, in complete firings."""
         channels = self.firings.sensor.channels
         return slice(self.start // channels, self.stop // channels)
 
@@ -303,7 +303,7 @@ class PulseStep(ABC):
     reads: ClassVar[tuple[str, ...]] = ()  # fields of `PulseReturns` that the step uses
     writes: ClassVar[tuple[str, ...]] = ()  # fields that the step adds or changes
     causes: ClassVar[tuple[int, ...]] = ()  # values of `cause` of the returns that the step adds
-    purposes: ClassVar[tuple[Purpose, ...]] = ()  # of the random numbers of the step
+    purposes: ClassVar[tuple[Purpose, ...]] = ()  # purposes of the random numbers of the step
 
     def __init_subclass__(cls) -> None:
         if not getattr(cls, "role", None):
@@ -315,7 +315,7 @@ class PulseStep(ABC):
         self.surfaces = surfaces
 
     def moved(self, setup: Setup, surfaces: Surfaces) -> PulseStep:
-        """Return the step for a scene in which instances have moved, with its setup and surfaces.
+        """Return the step for a scene with moved instances, with its setup and surfaces.
 
         By default, a new step is made; a step that takes long to make, and stores no positions of
         surfaces, returns `repointed`.

@@ -1,4 +1,4 @@
-"""The steps of the simulation, in the order in which pulses pass them."""
+"""The steps of the simulation, in the order that pulses pass them."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from .waveform_samples import RecordingStep
 STEPS: list[type[PulseStep]] = [
     AngleNoiseStep,
     RippleStep,
-    CastStep,  # with mirrors, glass, water and leaves
+    CastStep,  # follows light at mirrors, glass, water and leaves
     WeatherStep,  # rain, snow, fog and dust; light that is lost on its way: casting/surfaces.py
     SprayStep,
-    DirtStep,  # on the window
-    SeparationStep,  # makes returns of hits, if there are no waveforms
+    DirtStep,  # dirt on the window
+    SeparationStep,  # makes returns of hits, without waveforms
     WaveformStep,  # makes returns of hits otherwise
     DetectionStep,
     StrayLightStep,

@@ -92,7 +92,7 @@ class StrayLightStep(PulseStep):
     def _strongest(self, batch: PulseBatch, times: Floats) -> StrayLight:
         """Return the strongest stray light of the central rays of beams.
 
-        `times` (n,) are those of the beams, ns. Points are in the axes of the scene frame.
+        `times` (n,) are the times of the beams, ns. Points are in the axes of the scene frame.
         """
         from . import stray_loops  # not before: numba takes half a second to import
 
@@ -165,7 +165,7 @@ class _Bounds(NamedTuple):
 
     middles: Floats  # (k, 3)
     centre: Floats  # (3,): of a ball around the triangles
-    radius: float  # of the ball, metres
+    radius: float  # radius of the ball, metres
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ def _retro_clusters(
     owners = surfaces.triangle_kinds.material_kinds.object
     if unseen is not None:
         retro = retro & ~unseen[owners]
-    has_retro = np.zeros(len(scene.all_names), np.bool_)  # by objects
+    has_retro = np.zeros(len(scene.all_names), np.bool_)  # one for each object
     has_retro[owners[retro]] = True
 
     def clusters_of(

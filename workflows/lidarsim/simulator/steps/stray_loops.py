@@ -18,9 +18,9 @@ from ...sensor.optics import LIGHT_M_NS
 from ..casting.surface_loops import at_right_angles
 
 CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
-MAX_STRAY = math.radians(30.0)  # largest angle to a ray from which stray light comes
-# Share of the way from an edge to the middle of a triangle, by which rays to the edge are moved
-# inwards, to hit the triangle.
+MAX_STRAY = math.radians(30.0)  # largest angle between a ray and stray light
+# Rays to an edge of a triangle are moved by this share of the way to its middle, to hit the
+# triangle.
 INWARDS = 0.02
 
 
@@ -39,7 +39,7 @@ class RetroTriangles(NamedTuple):
     corners: Floats  # (t, 3, 3)
     middles: Floats  # (t, 3)
     centre: Floats  # (3,): of a ball around the triangles
-    radius: float  # of the ball, metres
+    radius: float  # radius of the ball, metres
     # (t,): energy that a beam head-on at 10 m returns, relative to a white surface.
     back: Floats
 
@@ -54,7 +54,7 @@ class StrayLimits(NamedTuple):
 
 
 class StrayLight(NamedTuple):
-    """Strongest stray light of rays, to which loops write."""
+    """Strongest stray light of rays, written by loops."""
 
     energy: Floats  # (n,)
     # (n, 3), metres: from the ray's origin to where the light comes from, in the axes of the rays
@@ -90,15 +90,15 @@ class LitSpots(NamedTuple):
 class ReceptionLimits(NamedTuple):
     """Limits of the pulses that a receiver gets."""
 
-    cosine: float  # of the largest angle between a ray and a spot
-    min_range_m: float  # of the distance at which the spot seems to be
+    cosine: float  # cosine of the largest angle between a ray and a spot
+    min_range_m: float  # least distance that the spot may seem to have
     max_range_m: float
 
 
 class ReceivedSpots(NamedTuple):
-    """Arrays to which loops write rays that receive the light of spots: (k,) each."""
+    """Arrays for loops to write rays to that receive the light of spots: (k,) each."""
 
-    row: Ints  # of the ray, in `ReceivingRays`
+    row: Ints  # row of the ray, in `ReceivingRays`
     spot: Ints  # row of `LitSpots`
     distance: Floats  # at which the spot seems to be, metres
     range_m: Floats  # at which the spot is, metres
@@ -112,14 +112,14 @@ class ReceivedSpots(NamedTuple):
 
 @inlined
 def _angle(cosine):
-    """Return the angle of a cosine, radians; the cosine may be rounded beyond 1."""
+    """Return the angle of a cosine, radians, for a cosine that may be rounded beyond 1."""
     cosine = min(max(cosine, -1.0), 1.0)
     return arctan2(math.sqrt((1 - cosine) * (1 + cosine)), cosine)
 
 
 @compiled()
 def bound_cells(origins, directions, cones):
-    """Write cones (c, 5) around cells of rays (3, n), see `RayCells`."""
+    """Write cones (c, 5) around cells of rays (3, n), for `RayCells`."""
     count = origins.shape[1]
     for c in range(len(cones)):
         first = c * CELL_RAYS
@@ -225,7 +225,7 @@ def _reach_of_cell(rays, c, triangles, limits):
 
 @inlined
 def _choose_triangles(middles, ray, chosen):
-    """Write the triangles whose middles are nearest to a ray by angle; return their number.
+    """Write the triangles whose middles are nearest to a ray by angle, and return their number.
 
     `middles` are (t, 3); `chosen` has room for as many triangles as are compared.
     """
