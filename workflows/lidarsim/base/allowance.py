@@ -10,11 +10,11 @@ import psutil
 
 from .errors import LidarError
 
-UNPACKED_TIMES = 100  # of the file's bytes
-MIN_LIMIT_BYTES = 256 * 2**20  # for small files
-CONTROL_GROUPS = Path("/sys/fs/cgroup")  # folder in which Linux states limits of memory
+UNPACKED_TIMES = 100  # multiple of the file's bytes
+MIN_LIMIT_BYTES = 256 * 2**20  # limit for small files
+CONTROL_GROUPS = Path("/sys/fs/cgroup")  # Linux states limits of memory in this folder
 _PREFIXES = {"Pi": 2**50, "Ti": 2**40, "Gi": 2**30, "Mi": 2**20, "ki": 2**10}
-_SHARE = 4  # of the memory: a scene is copied while its objects are placed and joined
+_SHARE = 4  # a fraction of the memory: a scene is copied while its objects are placed and joined
 
 
 class Allowance:
@@ -68,12 +68,18 @@ class Allowance:
         return self.used_bytes + count <= self.limit
 
     def take(self, count: int) -> None:
-        """Take a number of bytes, before they are allocated; LidarError above the limit."""
+        """Take a number of bytes, before they are allocated.
+
+        Raises LidarError above the limit.
+        """
         self.check(count)
         self.used_bytes += count
 
     def check(self, count: int) -> None:
-        """Check that a number of bytes fits that is freed again; LidarError above the limit."""
+        """Check that a number of bytes fits that is freed again.
+
+        Raises LidarError above the limit.
+        """
         if not self.fits(count):
             raise LidarError(
                 f"it has {bytes_of(self._size)} and would unpack to "
@@ -122,7 +128,7 @@ def _control_group_limits() -> list[int]:
 
 
 def _resident_limit() -> list[int]:
-    """Return the limit of resident memory (`ulimit -m`), bytes; empty without a limit."""
+    """Return the limit of resident memory (`ulimit -m`), bytes, or [] without a limit."""
     try:
         import resource
     except ImportError:  # Windows has no such limits

@@ -75,7 +75,9 @@ def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, An
 
 
 def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
-    """Return the content of a file in an archive; ValueError for a damaged file.
+    """Return the content of a file in an archive.
+
+    Raises ValueError for a damaged file.
 
     zipfile takes far longer to find the file than to unpack it.
     """
@@ -97,7 +99,9 @@ def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
 
 
 def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
-    """Read an array of numbers or text from a file of NumPy; ValueError for a damaged file.
+    """Read an array of numbers or text from a file of NumPy.
+
+    Raises ValueError for a damaged file.
 
     Archives are read by several threads. NumPy's reader parses headers with `ast`, which failed now
     and then in threads of Python 3.11: "AST constructor recursion depth mismatch".

@@ -66,7 +66,7 @@ FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
 
 
 def about(description: str, *examples: Any, **limits: Any) -> Any:
-    """Describe a field; a field with a computed default has examples."""
+    """Describe a field, with examples if its default is computed."""
     return Field(description=description, examples=[*examples] or None, **limits)
 
 
@@ -81,7 +81,7 @@ def written_as(kind: Any) -> GetPydanticSchema:
 
 
 def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: Any) -> Any:
-    """Expand the short form of a value in scenarios; `allowed` is its type, for the schema."""
+    """Expand the short form of a value in scenarios, of type `allowed` in the schema."""
     return BeforeValidator(
         lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
     )
@@ -121,7 +121,10 @@ def allowed(words: str) -> WrapValidator:
 
 
 def must_be(words: str) -> PydanticCustomError:
-    """Return a validator's error on the allowed values; messages name the value before."""
+    """Return a validator's error on the allowed values.
+
+    Messages name the value before.
+    """
     return PydanticCustomError("allowed", "Input should be {words}", {"words": words})
 
 

@@ -83,12 +83,18 @@ def expm1(x: ArrayLike) -> Floats:
 
 
 def power(x: ArrayLike, exponent: float) -> Floats:
-    """Return powers of numbers from 0 up; powers of a large exponent are less exact."""
+    """Return powers of numbers from 0 up.
+
+    Powers of a large exponent are less exact.
+    """
     return exp(exponent * log(x))
 
 
 def cbrt(x: ArrayLike) -> Floats:
-    """Return cube roots of numbers except 0; roots of cubes are exact."""
+    """Return cube roots of numbers except 0.
+
+    Roots of cubes are exact.
+    """
     size = np.abs(x)
     root = power(size, 1 / 3)
     root = root - (root * root * root - size) / (3 * root * root)  # Newton's method
@@ -103,7 +109,7 @@ def geomspace(start: float, stop: float, count: int) -> Floats:
 
 
 def interp(x: ArrayLike, knots: Floats, values: Floats) -> Floats:
-    """Interpolate values (k,) at ascending knots (k,); the first or last value beyond the knots."""
+    """Interpolate values (k,) at ascending knots (k,), constant beyond the first and last knot."""
     x = np.asarray(x, np.float64)
     row = np.clip(np.searchsorted(knots, x, "right") - 1, 0, max(len(knots) - 2, 0))
     with np.errstate(divide="ignore", invalid="ignore"):  # slopes between equal knots are not used
@@ -120,7 +126,7 @@ def decade(x: float) -> int:
 def _apply(
     name: str, function: Callable[..., Any], results: int, *arguments: ArrayLike
 ) -> tuple[Floats, ...]:
-    """Apply a function to each number; results have the shape of the first argument."""
+    """Apply a function to each number, with results in the shape of the first argument."""
     arrays = [np.asarray(array, np.float64) for array in arguments]
     shape = arrays[0].shape
     output = np.empty((results, arrays[0].size))

@@ -70,7 +70,7 @@ def exp_of(x: float) -> float:
     """Return the exponential of a number."""
     # Without branches, so that loops become vector instructions.
     bounded = x if x < 710.0 else 710.0
-    bounded = bounded if bounded > -746.0 else -746.0  # also for NaN
+    bounded = bounded if bounded > -746.0 else -746.0  # true for NaN, too
     k = math.floor(bounded * 1.4426950408889634 + 0.5)
     reduced = bounded - k * 6.93147180369123816490e-01
     correction = k * 1.90821492927058770002e-10
@@ -107,7 +107,7 @@ def log_of(x: float) -> float:
 
 
 def arctan2_of(y: float, x: float) -> float:
-    """Return the angle of a vector (x, y), radians; for (±0, ±0) by the signs."""
+    """Return the angle of a vector (x, y), radians, decided by the signs for (±0, ±0)."""
     if x != x or y != y:
         return math.nan
     larger = max(abs(x), abs(y))

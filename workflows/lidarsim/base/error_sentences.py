@@ -48,7 +48,7 @@ _ALLOWED = {
     "Mapping": "a dict",
     "PathLike": "a path",
 }
-_ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
+_ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # items of lists
 _LIMIT_WORDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 _UNKNOWN_FIELD = ("extra_forbidden", "invalid_key", "unexpected_keyword_argument")
 
@@ -80,7 +80,7 @@ def _alike(error: ValidationError) -> Iterable[Sequence[ErrorDetails]]:
     details_by_path = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     groups: dict[Any, list[ErrorDetails]] = {}  # {field and kind of error: errors}
     for path, detail in details_by_path.items():
-        # pydantic reports a list in which all entries are wrong as empty, too.
+        # pydantic reports a list whose entries are all wrong as empty, too.
         deeper = (other_path[: len(path)] == path != other_path for other_path in details_by_path)
         if detail["type"] == "too_short" and any(deeper):
             continue
@@ -163,7 +163,10 @@ def _sentence(
 
 
 def _requirement(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
-    """Return the requirement on a value: «be 1 to 10»; examples only `in_python`."""
+    """Return the requirement on a value: «be 1 to 10».
+
+    Examples are only given `in_python`.
+    """
     kind = detail["type"]
     context = detail.get("ctx", {})
     if kind == "is_instance_of":

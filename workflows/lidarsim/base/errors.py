@@ -12,12 +12,12 @@ from .words import printable
 MAX_MISTAKES = 20
 _UNFORESEEN = (IndexError, TypeError, AttributeError, ArithmeticError, AssertionError)
 _MAX_REASON = 400  # letters: libraries may quote a whole file
-_MAX_LETTERS = 2000  # of a line of a message, of which the start names the file
-_END_LETTERS = 500  # of a line that is cut in its middle: what was expected, and advice
+_MAX_LETTERS = 2000  # letters of a line of a message, whose start names the file
+_END_LETTERS = 500  # a line that is cut in its middle keeps so many: what was expected, and advice
 
 
 _LONG_LIST = re.compile(r"(?:[^\s,]+(?: \([^)]*\))?, ){15,}\S+")
-_MIN_LIST_LETTERS = 300  # of a list with lines of its own
+_MIN_LIST_LETTERS = 300  # letters of a list that is put on separate lines
 _WIDTH = 100  # letters of these lines, as of --help
 _INDENT = "  "
 
@@ -27,7 +27,7 @@ class LidarError(Exception):
 
     The message says in one or two lines what was given, what was expected and what to do. The
     command prints the message without a traceback and exits with code 2. A line is cut in its
-    middle if it quotes a file at length. A long list of names has lines of its own.
+    middle if it quotes a file at length. A long list of names has separate lines.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -42,7 +42,7 @@ def _cut(line: str) -> str:
 
 
 def _wrap_list(line: str) -> str:
-    """Return a line with a long list, such as all columns, on indented lines of its own."""
+    """Return a line with a long list, such as all columns, on separate indented lines."""
     names = _LONG_LIST.search(line)
     if names is None or len(names[0]) < _MIN_LIST_LETTERS or line.startswith(_INDENT):
         return line

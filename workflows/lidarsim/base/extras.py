@@ -27,7 +27,9 @@ def install_command(*requirements: str) -> str:
 
 
 def need(package: str, extra: str, purpose: str) -> None:
-    """Check that the package of an extra is installed; LidarError if not.
+    """Check that the package of an extra is installed.
+
+    Raises LidarError if not.
 
     `purpose` starts the error: «clouds are read».
     """

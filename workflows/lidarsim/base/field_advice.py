@@ -30,7 +30,7 @@ _SUGGESTION = re.compile(r"Did you mean '([^']*)'\?")
 class Owner(NamedTuple):
     """A section that has a field."""
 
-    names: tuple[str, ...]  # of the fields that lead to the section
+    names: tuple[str, ...]  # names of the fields that lead to the section
     forms: tuple[str, ...]  # how each of these fields is written: "%s", or "[%s]" for a list
     field: FieldInfo | None  # the last of these fields; None for the file itself
     kind: Any  # class of the section
@@ -65,7 +65,7 @@ def _inner_sections(outer: Owner) -> Iterator[Owner]:
 
 
 def _forms_of(annotation: Any, key: str, form: str = "%s") -> Iterator[tuple[str, Any]]:
-    """Yield the sections in an annotation, each with its form; `key` is an example of a name."""
+    """Yield the sections in an annotation, each with its form. `key` is an example of a name."""
     if isinstance(annotation, type) and is_section(annotation):
         yield form, annotation
     if (origin := get_origin(annotation)) in (list, tuple, Sequence):
@@ -107,7 +107,7 @@ def place_advice(
         for owner in owners:
             right = _right_value(owner.kind, name, value)
             changed = None
-            if owner.is_direct:  # of the file itself, other faults are no matter
+            if owner.is_direct:  # other faults of the file itself do not matter
                 kind = owner.kind if owner.names else None
                 changed = _with_field(content, owner.names, kind, {name: right})
             if right is None or (changed is not None and contradictory(changed)):
@@ -125,7 +125,7 @@ def place_advice(
 def _in_words(
     path: FieldPath, suggestion: str, direct: Sequence[str], examples: Sequence[str]
 ) -> str:
-    """Return the advice on a field, which is valid in `direct` sections; "" is the file itself."""
+    """Return the advice on a field, which is valid in `direct` sections, "" for the file itself."""
     sections = [section for section in direct if section]
     listed = joined(sections)
     if suggestion and listed:
@@ -163,7 +163,7 @@ def _right_value(kind: Any, name: str, value: Any) -> Any:
 
 def _with_field(content: Any, names: Sequence[str], kind: Any, field: Mapping[str, Any]) -> Any:
     """Return a content with a field in a section, or None if the section is not valid then."""
-    if not isinstance(content, Mapping):  # in its short form
+    if not isinstance(content, Mapping):  # its short form
         return None
     if not names:
         section = {**content, **field}

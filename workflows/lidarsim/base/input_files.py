@@ -17,7 +17,7 @@ from .allowance import bytes_of, memory
 from .errors import LidarError
 from .words import did_you_mean
 
-# Opening a pipe waits for a writer, and opening a terminal may make it that of the process. Both
+# Opening a pipe waits for a writer, and opening a terminal may make it the process's terminal. Both
 # flags only matter if the path changes its kind between the check and the opening.
 _FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
 _KINDS = {  # {file type in the mode: name}
@@ -27,7 +27,7 @@ _KINDS = {  # {file type in the mode: name}
     stat.S_IFBLK: "a device",
 }
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/"
-_LFS_MAX_BYTES = 1024  # of a pointer, by the specification of Git LFS
+_LFS_MAX_BYTES = 1024  # size of a pointer, by the specification of Git LFS
 
 
 class InputFileError(OSError):
@@ -87,7 +87,10 @@ def not_found(path: str | Path, endings: Collection[str] = ()) -> str:
 
 
 def _check_kind(path: str | Path, mode: int) -> None:
-    """Check that a path leads to a plain file, by its mode; OSError if not."""
+    """Check that a path leads to a plain file, by its mode.
+
+    Raises OSError if not.
+    """
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
@@ -96,7 +99,10 @@ def _check_kind(path: str | Path, mode: int) -> None:
 
 
 def input_size(path: str | Path) -> int:
-    """Return the size of a plain file in bytes; OSError if the file cannot be opened."""
+    """Return the size of a plain file in bytes.
+
+    Raises OSError if the file cannot be opened.
+    """
     with open_input(path) as file:
         return os.fstat(file.fileno()).st_size
 
@@ -136,7 +142,7 @@ def read_input(path: str | Path, max_bytes: int | None = None) -> bytes:
 
 
 def read_input_text(path: str | Path, errors: str = "strict") -> str:
-    """Read a text file in UTF-8 without its byte order mark; lines end with a newline alone.
+    """Read a text file in UTF-8 without its byte order mark, with a newline alone at line ends.
 
     `errors` is passed to `bytes.decode`.
 

@@ -62,7 +62,7 @@ def end_on_signals() -> None:
 
 
 def interrupt_on_signals() -> None:
-    """Turn the first signal into KeyboardInterrupt; a second signal ends the process at once."""
+    """Turn the first signal into KeyboardInterrupt, and end the process at once at the second."""
     _on_signals(_Interrupt())
 
 
@@ -118,8 +118,8 @@ def children_spared() -> Iterator[None]:
 
     A terminal sends SIGINT and SIGQUIT to the whole process group, and SIGHUP when it is closed.
     Workers would die with a traceback each before they can be stopped cleanly, and so would their
-    nannies. A blocked signal stays blocked in later threads and processes, also in a worker that a
-    nanny restarts.
+    nannies. A blocked signal stays blocked in later threads and processes, including a worker that
+    a nanny restarts.
     """
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
     try:

@@ -1,4 +1,4 @@
-"""Names of sensor models, of the package and of plug-ins; quick to import.
+"""Names of sensor models, of the package and of plug-ins, quick to import.
 
 Completion of the command lists them without their data, which NumPy and pydantic describe.
 """

@@ -44,7 +44,7 @@ def table_of(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def picture_of(instance: object) -> str:
-    """Return the picture of an instance as HTML; empty if no package draws its class."""
+    """Return the picture of an instance as HTML, or "" if no package draws its class."""
     from importlib import import_module
 
     from .errors import LidarError

@@ -27,7 +27,7 @@ _BROWSER = "mozilla/"  # first letters of the User-Agent of every browser
 
 
 def names_of_machine(listens_at: str) -> frozenset[str]:
-    """Return the names by which clients may ask a service that listens at an address.
+    """Return the names that clients may use for a service that listens at an address.
 
     The domain of the machine, whose look-up may take seconds, counts where the service listens on
     a network.
@@ -47,15 +47,16 @@ def refusal(
     changes_state: bool = False,
     is_page: bool = False,
 ) -> str:
-    """Return why a request is of another site, for the client; "" if the request is answered.
+    """Return why a request comes from another site, for the client, or "" if it is answered.
 
     Parameters
     ----------
     headers
         {name in lower case: value}; values of a repeated header are joined by commas.
     names
-        Names of the service in lower case; None where a proxy of an unknown name is in use. An
-        address as numbers is no name: a browser that asks for an address has connected to it.
+        Names of the service in lower case, or None where a proxy of an unknown name is in use. A
+        numeric address does not count as a name: a browser that asks for an address has connected
+        to it.
     url_authority
         HOST[:PORT] of a URL in absolute form, as clients of a proxy send it.
     changes_state
@@ -63,7 +64,7 @@ def refusal(
         over TLS and to the loopback interface, and no `Origin` for an image. So a browser that
         sends neither needs a `Referer` of the service.
     is_page
-        Whether the answer is a document that changes nothing, to which links may lead.
+        Whether the answer is a document that changes nothing and may be the target of links.
     """
     authorities = [text for text in (headers.get("host"), url_authority) if text]
     for authority in authorities:
@@ -85,7 +86,7 @@ def refusal(
 
 
 def _host_of(authority: str) -> str | None:
-    """Return the host of HOST[:PORT] in lower case; None for other text."""
+    """Return the host of HOST[:PORT] in lower case, or None for other text."""
     match = _AUTHORITY.fullmatch(authority)
     return match[1].lower().removesuffix(".") if match else None
 

@@ -21,7 +21,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Plugin:
-    """An entry point of a distribution; `value` is «module» or «module:attribute»."""
+    """An entry point of a distribution, with a `value` «module» or «module:attribute»."""
 
     group: str
     name: str
@@ -71,7 +71,10 @@ class Plugin:
 
 @cache
 def _imported(plugin: Plugin) -> Any:
-    """Return the value of a plug-in; LidarError if the import fails."""
+    """Return the value of a plug-in.
+
+    Raises LidarError if the import fails.
+    """
     from importlib.metadata import EntryPoint
 
     try:
@@ -81,7 +84,10 @@ def _imported(plugin: Plugin) -> Any:
 
 
 def plugins_of(group: str) -> Mapping[str, tuple[Plugin, ...]]:
-    """Return the plug-ins of a group by name, sorted; several plug-ins may share a name."""
+    """Return the plug-ins of a group by name, sorted.
+
+    Several plug-ins may share a name.
+    """
     from importlib.metadata import entry_points
 
     plugins: dict[str, tuple[Plugin, ...]] = {}
@@ -111,7 +117,7 @@ def find_plugin(group: str, name: str) -> Plugin | None:
 
 
 class PluginTable(Generic[T]):
-    """A table by names, to which plug-ins of a group add.
+    """A table by names that plug-ins of a group add to.
 
     Parameters
     ----------
@@ -135,7 +141,7 @@ class PluginTable(Generic[T]):
 
     @property
     def names(self) -> list[str]:
-        """Names of the table, then those of plug-ins."""
+        """Names of the table, then names of plug-ins."""
         return [*self._built_in, *plugins_of(self.group)]
 
     def __getitem__(self, name: str) -> T:
@@ -144,7 +150,7 @@ class PluginTable(Generic[T]):
         Raises
         ------
         LidarError
-            If there is no entry of that name, or its plug-in cannot be used.
+            If no entry has that name, or its plug-in cannot be used.
         """
         if name in self._built_in:
             return self._built_in[name]

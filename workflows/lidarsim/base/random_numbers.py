@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from .arrays import Floats
 
 _GAMMA = 0x9E3779B97F4A7C15
-_NUMBERS = 256  # of one ray
+_NUMBERS = 256  # random numbers of one ray
 
 
 class Purpose:
@@ -67,7 +67,7 @@ def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def named_seed(seed: int, name: str) -> int:
-    """Return a seed for a name, the same on every machine; without a name, `seed`."""
+    """Return a seed for a name, the same on every machine, or `seed` without a name."""
     if not name:
         return seed
     return int.from_bytes(sha256(f"{seed}\n{name}".encode()).digest()[:8], "little") >> 1
@@ -89,7 +89,7 @@ def raw(
     within its scan, below 2**32, and `number` is below 256.
     """
     start = starts(seed, purpose)
-    # A stream of SplitMix64 for each scan, of which a ray has 256 numbers.
+    # A stream of SplitMix64 for each scan. A ray has 256 numbers of the stream.
     streams = _mixed(start + np.asarray(scan).astype(np.uint64) * np.uint64(_GAMMA))
     steps = np.asarray(ray).astype(np.uint64) * np.uint64(_NUMBERS)
     steps = steps + np.asarray(number).astype(np.uint64) + np.uint64(1)
@@ -126,5 +126,5 @@ def quantiles() -> Floats:
     shares = (np.arange(2**15) + 0.5) / 2**16
     lower_half = np.array([NormalDist().inv_cdf(share) for share in shares])
     table = np.concatenate([lower_half, -lower_half[::-1]])
-    # Rounded to single precision, in which C libraries agree about logarithms.
+    # Rounded to single precision, where C libraries agree about logarithms.
     return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

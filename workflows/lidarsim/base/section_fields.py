@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 Fields = Mapping[str, FieldInfo]
 FieldPath = tuple[int | str, ...]
 
-LIMITS = ("ge", "gt", "le", "lt")  # of numbers, named as in pydantic's `Field`
+LIMITS = ("ge", "gt", "le", "lt")  # limits of numbers, named as in pydantic's `Field`
 
 
 def fields_by_name(hint: Any) -> Fields:

@@ -31,12 +31,12 @@ class _Text(str):
 class _Annotation(str):
     """An annotation as it is written, which `inspect` shows as the types that it stands for."""
 
-    names: Mapping[str, Any]  # of the modules of the annotation, which may still be imported
+    names: Mapping[str, Any]  # names in the modules of the annotation, which may still be imported
     is_optional: bool  # whether None is the default
 
     @classmethod
     def of(cls, annotation: Any, names: Mapping[str, Any], is_optional: bool = False) -> Any:
-        """Return an annotation of source code; an annotation that is no text stays."""
+        """Return an annotation of source code, or an annotation that is not a text unchanged."""
         if not isinstance(annotation, str):
             return annotation
         written = cls(annotation)
@@ -54,7 +54,7 @@ class _Annotation(str):
 
 
 class _Names(dict[str, Any]):
-    """Names of modules; a name that is imported for type checkers only is an empty class."""
+    """Names of modules, with empty classes for names imported for type checkers only."""
 
     def __missing__(self, name: str) -> Any:
         return getattr(builtins, name, None) or type(name, (), {})
@@ -118,7 +118,7 @@ def _array(args: tuple[Any, ...]) -> str:
 def readable(signature: inspect.Signature, names: Mapping[str, Any]) -> inspect.Signature:
     """Return a signature whose annotations are types alone, and whose defaults can be read.
 
-    `names` are those of the module of the annotations.
+    `names` are the names in the module of the annotations.
 
     Examples
     --------
@@ -178,7 +178,7 @@ def _shown(default: Any) -> Any:
         return _Text(default.__name__)
     if isinstance(default, MappingProxyType):
         return dict(default)
-    if type(default).__name__ == "_HAS_DEFAULT_FACTORY_CLASS":  # of a dataclass
+    if type(default).__name__ == "_HAS_DEFAULT_FACTORY_CLASS":  # the mark of a dataclass
         return _Text(_COMPUTED)
     return default
 

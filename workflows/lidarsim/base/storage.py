@@ -43,7 +43,7 @@ def is_url(location: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class Storage:
-    """A folder of files, by path or URL; small when pickled.
+    """A folder of files, by path or URL, small when pickled.
 
     Files are not opened, written or removed through a link below the folder that the user named.
     Writing or removing a file that is a link replaces or removes the link, not its target.
@@ -70,7 +70,7 @@ class Storage:
 
     @classmethod
     def at(cls, location: str | Path | Storage, *, durable: bool = True) -> Storage:
-        """Return the storage at a path that the user named, or at a URL; a storage is returned.
+        """Return the storage at a path that the user named, or at a URL, or a given storage.
 
         LidarError if the URL has a password, which would get into databases and reports, or only
         a scheme.
@@ -127,7 +127,7 @@ class Storage:
 
     @contextmanager
     def _remote(self) -> Iterator[tuple[Any, str]]:
-        """Return file system and folder of a URL; errors of its library become OSError."""
+        """Return file system and folder of a URL, and turn errors of its library into OSError."""
         try:
             if self._opened[0] != os.getpid():  # a fork cannot use its parent's connections
                 self.__dict__.pop("_opened", None)

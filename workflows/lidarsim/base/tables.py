@@ -119,7 +119,7 @@ class ColumnName(NamedTuple):
 
     stem: str  # without the unit: Yaw
     words: str  # the same without case and separators: yaw
-    unit: str | None  # in small letters; None if the header states none
+    unit: str | None  # unit in small letters; None if the header states none
 
 
 def column_name(cell: str) -> ColumnName:
@@ -210,14 +210,17 @@ def _is_finite(cell: str) -> bool:
 
 
 def _separator_of(line: str) -> str | None:
-    """Return the most frequent of comma, semicolon and tab outside brackets; None for spaces."""
+    """Return the most frequent of comma, semicolon and tab outside brackets, or None for spaces."""
     outside = _IN_BRACKETS.sub("", line)
     separator = max(_SEPARATORS, key=outside.count)
     return separator if separator in outside else None
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    """Return the cells of a line without quotes; ValueError for a cell that is too long."""
+    """Return the cells of a line without quotes.
+
+    Raises ValueError for a cell that is too long.
+    """
     if separator is None:
         return [word.strip('"') for word in _WORD.findall(line)]
     try:
@@ -243,7 +246,7 @@ def read_table(
     bare: Mapping[str, str] | None = None,
     time_unit: TimeUnit | None = None,
 ) -> dict[str, Floats]:
-    """Read a table of numbers; refuse each column that is not understood.
+    """Read a table of numbers, and refuse each column that is not understood.
 
     Parameters
     ----------
@@ -278,7 +281,7 @@ def read_table(
     Raises
     ------
     ValueError
-        If there is no header, a column is not known, missing or not unique, a unit is missing or
+        If the header is missing, a column is not known, missing or not unique, a unit is missing or
         not known, a cell holds no finite number, or times have another unit than the header states.
     """
     lines = text.splitlines()
@@ -340,7 +343,7 @@ class _ColumnReader:
         return None if quantity is None else (quantity, name.unit)
 
     def choose(self, columns: Mapping[str, str] | None) -> None:
-        """Assign the columns that the user names; None if users cannot name columns."""
+        """Assign the columns that the user names, or nothing if users cannot name columns."""
         self.can_choose = columns is not None
         faults: list[str] = []
         for name, file_name in (columns or {}).items():
@@ -478,7 +481,10 @@ class _ColumnReader:
         return None
 
     def _add(self, quantity: Quantity, index: int, unit: str | None) -> None:
-        """Assign a column to a quantity; ValueError if the quantity has a column."""
+        """Assign a column to a quantity.
+
+        Raises ValueError if the quantity has a column.
+        """
         if (earlier := self.assigned.get(quantity.name)) is not None:
             earlier_cell = self.cells[earlier[0]]
             cell = self.cells[index]
@@ -546,7 +552,10 @@ def _ignoring(cells: Sequence[str]) -> str:
 def _numbers(
     lines: Sequence[str], header: Header, names: Mapping[str, int], required_names: Sequence[str]
 ) -> Floats:
-    """Return the numbers of the named columns, (rows, columns); ValueError names a bad cell."""
+    """Return the numbers of the named columns, (rows, columns).
+
+    Raises ValueError, with the cell's name, for a bad cell.
+    """
     body = lines[header.body :]
     rows = [line for line in body if not _is_remark(line)]
     if not rows:
@@ -588,7 +597,10 @@ def _rows_of(lines: Sequence[str], header: Header) -> Iterator[tuple[int, list[s
 
 
 def _check_widths(lines: Sequence[str], header: Header) -> None:
-    """Check that each row has as many cells as the header; a row may end with an empty cell."""
+    """Check that each row has as many cells as the header.
+
+    A row may end with an empty cell.
+    """
     width = len(header.cells)
     for number, line in enumerate(islice(lines, header.body, None), header.body + 1):
         if _is_remark(line):
@@ -606,7 +618,10 @@ def _check_widths(lines: Sequence[str], header: Header) -> None:
 
 
 def _check_unnamed(rows: Sequence[str], header: Header) -> None:
-    """Check that columns without a name are empty or number the rows from 0; ValueError if not."""
+    """Check that columns without a name are empty or number the rows from 0.
+
+    Raises ValueError if not.
+    """
     for index, cell in enumerate(header.cells):
         if cell and not re.fullmatch(r"unnamed: \d+", cell.lower()):
             continue

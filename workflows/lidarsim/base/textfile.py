@@ -7,7 +7,7 @@ from pathlib import Path
 from .input_files import open_input, read_input
 
 _START_BYTES = 4096  # bytes that tell text from other content
-# {first bytes of a file that is no text: format and advice}
+# {first bytes of a file that is not a text: format and advice}
 _KINDS = {
     b"\x89MCAP0\r\n": "a bag (MCAP): give it the ending .mcap",
     b"SQLite format 3": "a database (SQLite), as bags of ROS 2 are: give it the ending .db3, or "
@@ -32,7 +32,7 @@ def read_text(path: Path) -> str:
     Raises
     ------
     ValueError
-        If the file is empty, or is no text; the message names the format.
+        If the file is empty, or is not a text; the message names the format.
     LidarError
         If the file is larger than the memory.
     OSError

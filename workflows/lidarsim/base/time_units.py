@@ -17,7 +17,7 @@ _MAX_TIME_S = 1e11
 _YEAR_S = 366 * 86400.0
 # Seconds since 1970 of files that programs of today write: 1990 to 2100.
 _EPOCH_S = (6.3e8, 4.1e9)
-_MAX_STEP_S = 3600.0  # from one pose to the next of a recording
+_MAX_STEP_S = 3600.0  # limit from one pose to the next of a recording
 _USUAL_STEP_S = 0.05  # geometric mean of the steps of lidars, cameras and simulations
 
 
@@ -40,7 +40,7 @@ def seconds_of(
     Raises
     ------
     ValueError
-        If there is no `time_unit`, and a time is 1e11 s or more, or the times span more than a
+        If `time_unit` is missing, and a time is 1e11 s or more, or the times span more than a
         year. The message names the unit that the times probably have.
     """
     if time_unit is not None:
@@ -71,7 +71,7 @@ def are_plausible(first_s: float, last_s: float) -> bool:
 
 
 def _probable_unit(times: Floats, stated: TimeUnit) -> TimeUnit:
-    """Return the unit that finite times (k,) probably have; `stated` if no unit explains them."""
+    """Return the unit that finite times (k,) probably have, or `stated` if no unit fits."""
     steps = np.diff(np.unique(times))
     step = float(np.median(steps)) if len(steps) else 0.0
     largest = float(np.abs(times).max())

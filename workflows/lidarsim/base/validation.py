@@ -61,7 +61,7 @@ _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a function refuse arguments that do not fit their annotations; values are not changed.
+    """Let a function refuse arguments that do not fit their annotations, without changing values.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def checked_fields(cls: C) -> C:
-    """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
+    """Let a dataclass refuse values that do not fit their annotations, in subclasses too.
 
     In a section of a file the dataclass is a section itself, of the same fields. Its `repr` is one
     line, and its signature has types without limits.
@@ -117,7 +117,7 @@ def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema
     def converted(value: Any, validate: Callable[[Any], Any]) -> Any:
         try:
             return validate(value)
-        except LidarError as error:  # from `__post_init__`
+        except LidarError as error:  # raised in `__post_init__`
             raise ValueError(str(error)) from error
 
     return core_schema.no_info_wrap_validator_function(converted, schema)
@@ -207,7 +207,10 @@ def _schema(hint: Any, limits: Mapping[str, Any] = MappingProxyType({})) -> Any:
 
 
 def _list_schema(types: tuple[Any, ...], limits: Mapping[str, Any], is_tuple: bool) -> Any:
-    """Return pydantic's schema of a list, or of a tuple; an iterator is not checked."""
+    """Return pydantic's schema of a list, or of a tuple.
+
+    An iterator is not checked.
+    """
     items = [_schema(kind) for kind in types if kind is not ...]
     if core_schema.any_schema() in items:
         return items[0]
@@ -236,7 +239,10 @@ def _attribute_check(protocol: type) -> Callable[[Any], Any]:
 
 
 def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> AnyArray:
-    """Return values as an array of numbers; LidarError for values that are not numbers."""
+    """Return values as an array of numbers.
+
+    Raises LidarError for values that are not numbers.
+    """
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:

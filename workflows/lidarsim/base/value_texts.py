@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
-_MAX_LETTERS = 160  # of a value in a message
+_MAX_LETTERS = 160  # letters of a value in a message
 _MAX_LINE = 119  # letters of a `repr`
 _MAX_VALUE = 64  # letters of the value of a field
 

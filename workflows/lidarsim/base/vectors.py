@@ -18,7 +18,7 @@ _FLAT = 16 * 2.0**-52
 
 
 def turned(vectors: Floats, rotation: Floats | None) -> Floats:
-    """Rotate vectors (n, 3) by a matrix (k, 3) to (n, k); None returns the same vectors."""
+    """Rotate vectors (n, 3) by a matrix (k, 3) to (n, k), or return the same vectors for None."""
     if rotation is None:
         return vectors
     x, y, z = vectors.T

@@ -1,4 +1,4 @@
-"""Names and figures shared by scenario files, commands and functions; quick to import.
+"""Names and figures shared by scenario files, commands and functions, quick to import.
 
 Help and completion of the command import no other module.
 """
@@ -58,11 +58,11 @@ UNITS_M = {
 }
 
 WAIT_S = 10.0  # wait for partitions that are empty at the start of a run
-QUEUE_S = 3600.0  # for both waits, if workers are jobs in a queue
+QUEUE_S = 3600.0  # limit for both waits, if workers are jobs in a queue
 PATIENCE_S = 60.0  # wait for partitions that become empty; a nanny needs a few seconds
 
 # EPSG codes of systems for maps of the whole Earth, whose metres are true along a line at most:
-# Mercator and cylindrical projections, of which EPSG:3857 is Web Mercator.
+# Mercator and cylindrical projections, such as Web Mercator, EPSG:3857.
 WORLD_EPSG = frozenset({3395, 3410, 3785, 3832, 3857, 3975, 4087, 4088, 6933, 32662, 54004})
 OF_THE_WORLD = (
     "for maps of the world, whose metres are not true: choose a UTM zone or a national grid"

@@ -39,14 +39,16 @@ def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
 
 
 def _most_similar(word: str, candidates: Iterable[str]) -> str | None:
-    """Return the most similar candidate; None if there is no similar candidate."""
+    """Return the most similar candidate, or None if none is similar."""
     lower = {name.lower(): name for name in candidates}
     matches = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
     return lower[matches[0]] if matches else None
 
 
 def name_hint(pattern: str, names: Sequence[str]) -> str:
-    """Return the most similar name; without one, or for a pattern with * or ?, the first names.
+    """Return the most similar name.
+
+    Without one, or for a pattern with * or ?, returns the first names.
 
     Names that differ in their last number are listed as a pattern, with their number.
 
@@ -86,7 +88,7 @@ def as_python(note: str) -> str:
 
 
 def as_scenario(note: str) -> str:
-    """Return a note with its settings as in a scenario: {file: …, up_axis: z}, also of an actor."""
+    """Return a note with its settings as in a scenario or an actor: {file: …, up_axis: z}."""
     form = {"file": "{{file: …, {}: {}}}"}
     return _SETTING.sub(lambda m: form.get(m[1], f"{{}}: {{}} in {m[1]}").format(m[2], m[4]), note)
 
@@ -102,7 +104,7 @@ def scans_in_words(scans: int, sweeps: int) -> str:
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """Return a sort key by which GPU-2 comes before GPU-10."""
+    """Return a sort key that puts GPU-2 before GPU-10."""
     pieces = re.split(r"(\d+)", name)
     return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]
 
@@ -122,7 +124,7 @@ def printable(text: str, max_letters: int = 200) -> str:
 
 
 def fits(name: str, pattern: str) -> bool:
-    """Return whether a name is a pattern, or fits its * and ?; brackets are letters as others.
+    """Return whether a name is a pattern, or fits its * and ?, while brackets are plain letters.
 
     Examples
     --------
@@ -175,7 +177,7 @@ def distinct(names: Iterable[str]) -> list[str]:
 
 
 def shortened(name: str, max_letters: int = 18) -> str:
-    """Shorten a name in its middle to `max_letters`; show control characters."""
+    """Shorten a name in its middle to `max_letters`, and show control characters."""
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
     tail = (max_letters - 1) // 2
     return name if len(name) <= max_letters else f"{name[: max_letters - 1 - tail]}…{name[-tail:]}"

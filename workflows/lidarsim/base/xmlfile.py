@@ -12,9 +12,9 @@ from xml.parsers import expat
 from .allowance import bytes_of
 from .errors import CutShortError
 
-PIECE_BYTES = 2**20  # of files that are parsed piece by piece
+PIECE_BYTES = 2**20  # size of a piece of files that are parsed piece by piece
 # Length of a tag or remark in files that are parsed piece by piece. Expat keeps what is unfinished,
-# and before version 2.6 begins again with each piece. Text of any length is no problem.
+# and before version 2.6 begins again with each piece. Text of any length does no harm.
 MAX_TAG_BYTES = 16 * 2**20
 # Codes of the errors of a text that ends too early.
 AT_END = tuple(
@@ -37,7 +37,7 @@ def xml_root(data: bytes) -> Element:
     Raises
     ------
     ValueError
-        If the file declares entities, or a tag up to that of the root is longer than
+        If the file declares entities, or a tag up to the root's is longer than
         `MAX_TAG_BYTES`. Tags after the root take a time that is proportional to their length.
     CutShortError
         If the file ends before its root element does.

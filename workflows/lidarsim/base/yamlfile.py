@@ -29,7 +29,7 @@ class _Loader(yaml.SafeLoader):
         self._node_bytes: dict[yaml.Node, int] = {}
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose a node; each use of an alias counts towards the memory."""
+        """Compose a node, and count each use of an alias towards the memory."""
         event: Any = self.peek_event()
         used_bytes = self._allowance.used_bytes
         self._allowance.take(_NODE_BYTES)
@@ -45,7 +45,10 @@ class _Loader(yaml.SafeLoader):
         return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Build a mapping; ConstructorError, with the line, for a duplicate key."""
+        """Build a mapping.
+
+        Raises ConstructorError, with the line, for a duplicate key.
+        """
         keys: set[str] = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
@@ -88,7 +91,7 @@ def load_yaml(text: str) -> Any:
 def read_yaml(
     path: Path, form: str = "a scenario has sections (scene:, sensor:, poses:, …)"
 ) -> dict[str, Any]:
-    """Read a YAML file of a mapping; `form` describes the expected mapping in errors.
+    """Read a YAML file of a mapping, for errors that describe the expected mapping by `form`.
 
     Raises
     ------

@@ -36,7 +36,7 @@ LIVOX_POINT = np.dtype(
         "itemsize": 20,
     }
 )
-LIVOX_PADDING = 1  # bytes between points, of which the last point of a message has none
+LIVOX_PADDING = 1  # bytes between points; the last point of a message has none
 # {type of a field of a point: number of the type in PointField}
 POINT_FIELDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 
@@ -57,7 +57,10 @@ def is_bag(path: Path) -> bool:
 
 
 def open_bag(path: Path, name: str) -> Reader:
-    """Open a bag; LidarError, which begins with `name`, if that is impossible."""
+    """Open a bag.
+
+    Raises LidarError, which begins with `name`, if that is impossible.
+    """
     need("rosbags", "ros", f"{name} is read")
     from rosbags.rosbag2 import Reader, ReaderError
 
@@ -84,7 +87,7 @@ def open_bag(path: Path, name: str) -> Reader:
 
 @contextmanager
 def opened_bag(path: Path, name: str) -> Iterator[Reader]:
-    """Open a bag until the context exits; errors of reading the bag become a LidarError."""
+    """Open a bag until the context exits, and turn errors of reading the bag into a LidarError."""
     with closing(open_bag(path, name)) as bag, reading(name):
         yield bag
 
@@ -107,7 +110,9 @@ def message_types() -> Typestore:
 
 
 def point_columns(data: bytes) -> dict[str, AnyArray]:
-    """Return the fields of a PointCloud2, {name: (n,)}; ValueError if its lengths disagree.
+    """Return the fields of a PointCloud2, {name: (n,)}.
+
+    Raises ValueError if its lengths disagree.
 
     A field of several numbers is the columns `name_0`, `name_1`, …; the second field of a name is
     `name_2`.

@@ -56,7 +56,7 @@ class CloudDisplay:
         return f"<{type(self).__name__} of {len(self):,} points: {shown_names}>"
 
     def _repr_html_(self: CloudLike) -> str:
-        """Return an HTML table of the columns, their types, and the first points; a picture."""
+        """Return an HTML table of the columns, their types, and the first points, and a picture."""
         first = next(self.chunks(SHOWN_POINTS), None)
         values = {} if first is None else first.by_name
         kinds = [array.dtype for array in values.values()]
@@ -196,7 +196,7 @@ class Cloud(CloudDisplay):
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), metres; zeros for an empty cloud."""
+        """Lowest and highest coordinates, (2, 3), metres, or zeros for an empty cloud."""
         if not len(self):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
@@ -228,7 +228,7 @@ class Cloud(CloudDisplay):
 
     @classmethod
     def joined(cls, parts: list[Cloud]) -> Cloud:
-        """Concatenate a list of clouds with the same columns; the list is not empty."""
+        """Concatenate one or more clouds with the same columns."""
         first = parts[0]
         if len(parts) == 1:
             return first
@@ -250,7 +250,10 @@ def need_packages(*packages: str) -> None:
 
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:
-    """Convert `values` to the column's type; LidarError if a cast would wrap around."""
+    """Convert `values` to the column's type.
+
+    Raises LidarError if a cast would wrap around.
+    """
     array = np.asarray(values)
     dtype = np.dtype(column.dtype)
     converted = array.astype(dtype, copy=False)

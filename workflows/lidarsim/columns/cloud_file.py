@@ -38,7 +38,10 @@ class CloudFile:
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), metres; all points are read."""
+        """Lowest and highest coordinates, (2, 3), metres.
+
+        All points are read.
+        """
         chunk_bounds = [chunk.bounds for chunk in self.chunks()] or [np.zeros((2, 3))]
         lows, highs = zip(*chunk_bounds, strict=True)
         return np.stack([np.min(lows, axis=0), np.max(highs, axis=0)])
@@ -59,14 +62,17 @@ class CloudFile:
         return bisect_left(self._rows["scan"], scan)
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """Return the rows of scans, start and stop; all rows if not in the order of scans."""
+        """Return the rows of scans, start and stop, or all rows if not in the order of scans."""
         if self.scans[0] >= self.scans[1] or scans == self.scans:
             return 0, len(self)
         scan_column = self._rows["scan"]
         return bisect_left(scan_column, scans[0]), bisect_right(scan_column, scans[1])
 
     def values(self, name: str, rows: Ints | slice) -> AnyArray:
-        """Return values of a column, or of x, y or z; values of a slice stay on the disk."""
+        """Return values of a column, or of x, y or z.
+
+        Values of a slice stay on the disk.
+        """
         files = {column.name: column.in_files for column in self.table}
         return np.asarray(self._rows[files.get(name, name)][rows])
 

@@ -19,7 +19,7 @@ _MAGIC_BYTES = 8
 _CHUNK = 0x06
 _CHUNK_INDEX = 0x08
 _RECORD = Struct("<BQ")  # kind, and length of the content
-_LENGTH_BYTES = 8  # of the length of the packed messages
+_LENGTH_BYTES = 8  # bytes of the length of the packed messages
 _CHUNK_HEAD = Struct("<QQQII")  # first and last time, unpacked size, checksum, length of a name
 # First and last time, start and length of the chunk, length of offsets of messages.
 _INDEX_HEAD = Struct("<QQQQI")
@@ -31,7 +31,7 @@ _ADVICE = "record it with smaller chunks, or without compression"
 _FRAME = 0xFD2FB528
 _SKIPPABLE_FRAMES = range(0x184D2A50, 0x184D2A60)
 _BLOCK_HEADER_BYTES = 3
-_BLOCK_BYTES = 128 << 10  # of a compressed block, unpacked, at most
+_BLOCK_BYTES = 128 << 10  # size of a compressed block, unpacked, at most
 _RAW = 0
 _REPEATED = 1
 
@@ -39,7 +39,7 @@ _REPEATED = 1
 def check_chunks(path: Path) -> None:
     """Check that the chunks of an MCAP file unpack to no more than its size allows.
 
-    Chunks that are cut short, and what is no MCAP, are left to the library that reads the file.
+    Chunks that are cut short, and files other than MCAP, are left to the library that reads them.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def check_packed(path: Path) -> None:
 
 
 def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
-    """Yield the kind of each record of a chunk, and the bytes to which the chunk may unpack.
+    """Yield the kind of each record of a chunk, and the bytes that the chunk may unpack to.
 
     Libraries find chunks by their records, or by the records of an index, which may differ.
     """
@@ -96,7 +96,7 @@ def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
 
 
 def _chunk_bytes(data: mmap, start: int, stop: int) -> int:
-    """Return the number of bytes to which the chunk of a record may unpack."""
+    """Return the number of bytes that the chunk of a record may unpack to."""
     *_, stated_bytes, _, name_length = _CHUNK_HEAD.unpack_from(data, start)
     name_start = start + _CHUNK_HEAD.size
     packed_start = name_start + name_length + _LENGTH_BYTES
@@ -106,7 +106,7 @@ def _chunk_bytes(data: mmap, start: int, stop: int) -> int:
 
 
 def _indexed_bytes(data: mmap, start: int) -> int:
-    """Return the number of bytes to which the chunk of a record of the index may unpack."""
+    """Return the number of bytes that the chunk of a record of the index may unpack to."""
     *_, chunk_start, _, offsets_length = _INDEX_HEAD.unpack_from(data, start)
     name_start = start + _INDEX_HEAD.size + offsets_length + _LENGTH_BYTES
     (name_length,) = _NAME_LENGTH.unpack_from(data, name_start)
@@ -120,7 +120,7 @@ def _indexed_bytes(data: mmap, start: int) -> int:
 
 
 def max_unpacked_bytes(data: bytes | mmap, start: int, stop: int) -> int:
-    """Return the maximum number of bytes to which frames of Zstandard unpack.
+    """Return the maximum number of bytes that frames of Zstandard unpack to.
 
     The frames are the bytes of `data` from `start` to `stop`.
     """

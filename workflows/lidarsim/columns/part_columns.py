@@ -45,7 +45,7 @@ class PartColumns:
 
     @property
     def cells(self) -> Ints | None:
-        """Lowest and highest cells, (2, 3); None without rows."""
+        """Lowest and highest cells, (2, 3), or None without rows."""
         if not len(self):
             return None
         axes = [self.columns[axis.name] for axis in AXES]

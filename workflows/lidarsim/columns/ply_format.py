@@ -50,7 +50,10 @@ def file_type(column: Column) -> np.dtype[Any]:
 
 
 def as_file_type(column: Column, values: AnyArray) -> AnyArray:
-    """Convert values of a column to the type in a file; LidarError if a value would be inexact."""
+    """Convert values of a column to the type in a file.
+
+    Raises LidarError if a value would be inexact.
+    """
     dtype = file_type(column)
     if dtype == np.float64 and values.dtype.kind in "iu" and len(values):
         largest = max(abs(int(values.min())), abs(int(values.max())))
@@ -65,7 +68,7 @@ def as_file_type(column: Column, values: AnyArray) -> AnyArray:
 def row_type(position_type: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[np.void]:
     """Return the type of a row of a file, with columns in the order of the table.
 
-    A row of Open3D has the same size and a different order, that of a hash table.
+    A row of Open3D has the same size and a different order, the order of a hash table.
     """
     kind = "<f8" if position_type == np.float64 else "<f4"
     return np.dtype([(axis, kind) for axis in AXES] + [(c.in_files, file_type(c)) for c in table])
@@ -120,7 +123,10 @@ def mapped_rows(path: Path) -> Records:
 
 
 def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
-    """Return number and type of the rows of a header; ValueError for files not of lidarpool."""
+    """Return number and type of the rows of a header.
+
+    Raises ValueError for files not of lidarpool.
+    """
     elements = [line.split() for line in text.splitlines() if line.startswith("element")]
     properties = [line.split() for line in text.splitlines() if line.startswith("property")]
     if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][-1].isdigit():

@@ -66,7 +66,7 @@ class Column:
     Raises
     ------
     LidarError
-        If the name is no identifier or NumPy has no such type.
+        If the name is not an identifier or NumPy has no such type.
     """
 
     name: str
@@ -247,7 +247,7 @@ TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name:
 
 
 def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
-    """Return the columns in addition to `ALWAYS`, without repetitions; names are of `TABLE`.
+    """Return the columns in addition to `ALWAYS`, without repetitions, named as in `TABLE`.
 
     LidarError if a name is unknown, two columns have the same name, a vector lacks an axis, or a
     name cannot be written.
@@ -298,7 +298,7 @@ def check_names(columns: Iterable[Column]) -> None:
 
 
 def value_names(names: Mapping[int, str]) -> list[str]:
-    """Return the names of the values 0, 1, 2, … of a column; empty for values not in `names`."""
+    """Return the names of the values 0, 1, 2, … of a column, empty for values not in `names`."""
     return [names.get(value, "") for value in range(max(names, default=-1) + 1)]
 
 

@@ -87,7 +87,9 @@ def reflectances() -> dict[str, Measured]:
 @dataclass(frozen=True)
 @checked_fields
 class Material:
-    """Optical properties and class of surfaces; of several entries for a face, the first counts.
+    """Optical properties and class of surfaces.
+
+    Of several entries for a face, the first counts.
 
     An entry applies to objects by their names, to faces by the names of their materials in the
     scene's files, or to faces by both.
@@ -198,7 +200,10 @@ class Material:
         self._check_medium()
 
     def _set_names(self, field_name: str) -> None:
-        """Replace a name by a tuple of names; LidarError for no or empty names."""
+        """Replace a name by a tuple of names.
+
+        Raises LidarError for no or empty names.
+        """
         value = getattr(self, field_name)
         if value is None:
             return
@@ -283,7 +288,7 @@ class Material:
             )
 
     def share(self, wavelength_nm: float) -> float:
-        """Return the share of light that is scattered; with a texture, where there is no colour."""
+        """Return the share of light that is scattered, for a texture where it lacks a colour."""
         if self.spectrum is not None:
             at_905_nm, at_1550_nm = reflectances()[self.spectrum].shares
             # The nearer measurement: between both wavelengths, leaves absorb more than at either.
@@ -298,7 +303,7 @@ class Material:
 
     @property
     def specular(self) -> float:
-        """Share of the light not scattered that is mirrored at right angles; 1 for "fresnel"."""
+        """Share of the light not scattered that is mirrored at right angles, 1 for "fresnel"."""
         return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
     def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
@@ -312,7 +317,10 @@ class Material:
 
 
 def _fits(name: str, patterns: str | Sequence[str] | None) -> bool:
-    """Return whether a name fits a pattern; None fits all names."""
+    """Return whether a name fits a pattern.
+
+    None fits all names.
+    """
     return patterns is None or any(
         name == pattern or fnmatchcase(name, pattern) for pattern in patterns
     )
@@ -550,7 +558,7 @@ class MaterialTable:
     """Materials of kinds of surfaces: arrays with a value for each kind."""
 
     reflectance: Floats
-    scale: Floats  # of the luminance of colours; 0 where the reflectance is a number
+    scale: Floats  # factor of the luminance of colours; 0 where the reflectance is a number
     roughness: Floats  # 0 for no gloss
     metalness: Floats
     retro: Bools
@@ -590,7 +598,7 @@ class MaterialTable:
                 f"materials: no entry names the object {kinds.describe(unmatched[0])}{uncovered}: "
                 'end with one for all the others, such as {objects: "*"}.'
             )
-        entries = [*materials, Material("*")]  # the last is of all, if there are no materials
+        entries = [*materials, Material("*")]  # so that each surface has an entry
         textured = [m.scale * (m.reflectance == "texture") for m in entries]
         angles = tuple(dict.fromkeys(m.leaf_angle for m in entries))
         leaf_area = np.array([m.leaf_area_density or 0.0 for m in entries])[first]

@@ -22,12 +22,12 @@ from ..base.vectors import hypot
 from .materials import REFERENCE_M, WATER_INDEX, extinction
 
 RAIN_LARGEST_MM = 6.0  # larger drops break up (Pruppacher and Klett 1997)
-SNOW_DENSITY = 0.1  # of water's: dry snow, between 0.01 and 0.2 (Hahner et al. 2022)
+SNOW_DENSITY = 0.1  # relative to water: dry snow, between 0.01 and 0.2 (Hahner et al. 2022)
 SNOW_LARGEST_MM = 20.0  # Hahner et al. 2022
-SNOW_LIDAR_RATIO_SR = 25.0  # of ice clouds (Young and Vaughan 2009)
+SNOW_LIDAR_RATIO_SR = 25.0  # value of ice clouds (Young and Vaughan 2009)
 DUST_M2_G = 0.6  # mass extinction of mineral dust (Ansmann et al. 2019: 0.57 to 0.63)
 DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 46 to 50 at 532 nm, 57 to 69 at 1064 nm
-DROPS_LIDAR_RATIO_SR = 18.8  # of clean droplets (O'Connor et al. 2004)
+DROPS_LIDAR_RATIO_SR = 18.8  # value of clean droplets (O'Connor et al. 2004)
 # diameters; of clumps, the mean
 SPRAY_DROP_MM = 0.2
 CLUMP_MM = 20.0
@@ -41,7 +41,7 @@ FAINTEST = 0.5
 # ranges between which particles are simulated
 NEAREST_M = 0.1
 FARTHEST_M = 1e4
-MIN_TRANSMISSION = 1e-200  # of the light, so that divisions by an energy are finite
+MIN_TRANSMISSION = 1e-200  # limit for the light, so that divisions by an energy are finite
 LARGE = 2.0  # extinction of a large particle, in its cross-sections: half of it by diffraction
 
 
@@ -51,7 +51,7 @@ class Weather:
     """Extinction of the air, and returns from the air.
 
     Rain, snow, dust, and fog with a lidar ratio return light: they need `Noise.detection_range_m`,
-    by which a sensor detects returns.
+    which a sensor detects returns by.
     """
 
     visibility_km: Annotated[
@@ -233,7 +233,7 @@ class Air(NamedTuple):
     extinction: float  # 1/m
     exit_m: float  # diameter of the beam where it leaves the sensor, metres
     divergence: float  # full angle, radians
-    overlap_m: float  # range from which on the receiver sees the beam completely
+    overlap_m: float  # nearest range where the receiver sees the beam completely
 
     def width(self, distance: Floats) -> Floats:
         """Return the diameters of the beam at distances (n,), metres: (n,)."""

@@ -97,7 +97,10 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
 
 
 def _chosen(labels: Sequence[str], topic: str | None) -> str:
-    """Return the only label, or the only frame if the topic is /tf; LidarError if several fit."""
+    """Return the only label, or the only frame if the topic is /tf.
+
+    Raises LidarError if several fit.
+    """
     frames = [label for label in labels if label.startswith("/tf:")]
     if topic == "/tf" and len(frames) == 1:
         return frames[0]
@@ -191,7 +194,7 @@ def _gnss_poses(
 
 
 def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints, Floats] | None:
-    """Return times (k,), ns, and rows (k, 7) with orientations of an IMU; None without any."""
+    """Return times (k,), ns, and rows (k, 7) with orientations of an IMU, or None without any."""
     topics = [topic for topic, kind in kinds.items() if kind == _IMU]
     if imu and imu not in topics:
         raise LidarError(f"it has no Imu {imu!r}.{did_you_mean(imu, topics)}")

@@ -41,15 +41,15 @@ WALK = Purpose(43, "steps of an instrument's random walk")
 SKEW = Purpose(44, "scale factors of an instrument's axes, and angles between axes")
 OUTAGE = Purpose(45, "drift in outages of GNSS")
 BLOCK = 1 << 14  # samples in a block
-RETURNS_IN_S = 1.0  # time after an outage in which its error falls to 37 %
+RETURNS_IN_S = 1.0  # after an outage, its error falls to 37 % in this time
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
 GeodeticPosition = Annotated[
     tuple[Latitude, Longitude, Annotated[float, Field(ge=-1e5, le=1e6)]], Strict(False)
 ]
-TurnNoise = Annotated[float, Field(ge=0, le=100)]  # of a gyroscope
-SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # of an accelerometer
+TurnNoise = Annotated[float, Field(ge=0, le=100)]  # noise of a gyroscope
+SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # noise of an accelerometer
 Deviation = Annotated[float, Field(ge=0, le=1e6)]  # metres
 Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
 Skew = Annotated[float, Field(ge=0, le=10)]  # degrees
@@ -59,7 +59,7 @@ Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 @dataclass(frozen=True)
 @checked_fields
 class Imu:
-    """An inertial measurement unit on the carrier; without arguments, an ideal unit.
+    """An inertial measurement unit on the carrier, ideal without arguments.
 
     `mount` is its pose in the carrier frame. Noise is named and measured as in kalibr's `imu.yaml`.
 
@@ -102,7 +102,7 @@ class Imu:
 @dataclass(frozen=True)
 @checked_fields
 class Gnss:
-    """A GNSS receiver on the carrier; without arguments, an ideal receiver.
+    """A GNSS receiver on the carrier, ideal without arguments.
 
     `mount` is the pose of its antenna in the carrier frame.
 
@@ -416,7 +416,7 @@ class _Errors:
         self._walk = walk * math.sqrt(step_s)
         self._persistence = exp_of(-step_s / bias_time_s)
         self._driven = bias * math.sqrt(1 - self._persistence * self._persistence)
-        self._biases: Floats = np.zeros(3)  # of the last sample
+        self._biases: Floats = np.zeros(3)  # biases of the last sample
         self._walked: Floats = np.zeros(3)
 
     def next_errors(self, samples: Ints) -> Floats:
@@ -501,7 +501,7 @@ def _geocentric(
 
 
 def local_positions(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
-    """Return positions east, north and up of an origin (k, 3), metres; inverse of `geodetic`.
+    """Return positions east, north and up of an origin (k, 3), metres, the inverse of `geodetic`.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from ..base.words import natural
 from .rotations import quaternions_of, rotations_of
 
 WIDTH = 30  # numbers of a row
-_RADIUS_M = 6378137.0  # of KITTI's Mercator projection
+_RADIUS_M = 6378137.0  # radius of KITTI's Mercator projection
 OXTS_TIMES = "timestamps.txt"
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d(\.\d*)?")
 
@@ -73,7 +73,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
 
 
 def dates_of(text: str) -> Floats | None:
-    """Return the seconds since 1970 (k,) of the dates in a text, one a line; None for others."""
+    """Return the seconds since 1970 (k,) of the dates in a text, one a line, or None for others."""
     lines = [line.strip() for line in text.split("\n") if line.strip()]
     if not all(_DATE.fullmatch(line) for line in lines):
         return None

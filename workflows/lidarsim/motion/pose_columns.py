@@ -92,6 +92,6 @@ def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
 
 
 def angles_of(columns: Mapping[str, Floats], count: int) -> Floats:
-    """Return yaw, pitch and roll in degrees (count, 3); angles that a table lacks are zero."""
+    """Return yaw, pitch and roll in degrees (count, 3), zero where a table lacks them."""
     zero = np.zeros(count)
     return np.stack([columns.get(quantity.name, zero) for quantity in (YAW, PITCH, ROLL)], axis=1)

@@ -15,7 +15,7 @@ from ..base.vectors import (
     products,
 )
 
-_ROUNDS = 8  # of the power iteration: rotations are rounded by 2e-3 at most
+_ROUNDS = 8  # rounds of the power iteration: rotations are rounded by 2e-3 at most
 
 
 def rotations_of(angles_deg: Floats) -> Floats:

@@ -66,14 +66,14 @@ class Pose:
 
     @property
     def rotation(self) -> Floats | None:
-        """Rotation from the sensor frame to the scene frame, (3, 3); None without rotation."""
+        """Rotation from the sensor frame to the scene frame, (3, 3), or None without rotation."""
         if not (self.yaw_deg or self.pitch_deg or self.roll_deg):
             return None
         return rotations_of(np.array([self.yaw_deg, self.pitch_deg, self.roll_deg]))
 
     @property
     def rotation_matrix(self) -> Floats:
-        """Rotation from the sensor frame to the scene frame, (3, 3); identity without rotation."""
+        """Rotation from the sensor frame to the scene frame, (3, 3), identity without rotation."""
         return np.eye(3) if self.rotation is None else self.rotation
 
     def compose(self, mount: Pose) -> Pose:
@@ -161,7 +161,7 @@ class Trajectory(Protocol):
 
     @property
     def duration_ns(self) -> float:
-        """Longest duration of a station, nanoseconds; may be infinite."""
+        """Longest duration of a station, nanoseconds, possibly infinite."""
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """Return the pose at a time since the start of a station, nanoseconds."""
@@ -344,7 +344,7 @@ class Track:
     ) -> Sequence[Track]:
         """Return the straight tracks of k bodies, whose poses are computed all at once.
 
-        Time 0 of the tracks is 0 by the clock of `times_s`, also if that is outside the times.
+        Time 0 of the tracks is 0 by the clock of `times_s`, even if that is outside the times.
 
         Parameters
         ----------
@@ -368,7 +368,7 @@ class Track:
         return [_BatchTrack.of_batch(batch, number) for number in range(len(matrices))]
 
     def _set_poses(self) -> None:
-        """Check and freeze the times, positions and quaternions; compute missing quaternions."""
+        """Check and freeze times, positions and quaternions, and compute missing quaternions."""
         times = as_array("times_s", self.times_s).copy()
         positions = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or positions.shape != (len(times), 3):
@@ -628,7 +628,7 @@ class _BatchTrack(Track):
     """
 
     batch: TrackBatch
-    number: int  # of the track in the batch
+    number: int  # number of the track in the batch
 
     @classmethod
     def of_batch(cls, batch: TrackBatch, number: int) -> _BatchTrack:
@@ -654,7 +654,7 @@ class _BatchTrack(Track):
 
 
 def batch_of(trajectory: Trajectory) -> TrackBatch | None:
-    """Return the batch of a track; None for other trajectories.
+    """Return the batch of a track, or None for other trajectories.
 
     Actors on tracks of batches are always in the scene.
     """
@@ -685,7 +685,10 @@ def _travel_quaternions(slopes: Floats) -> Floats:
 
 
 def _check_times(times_s: Floats) -> None:
-    """Check that times (k,) are finite and ascend; LidarError if not."""
+    """Check that times (k,) are finite and ascend.
+
+    Raises LidarError if not.
+    """
     _check_poses(~np.isfinite(times_s), "the time of pose {} is not finite")
     _check_poses(
         np.append(False, np.diff(times_s) <= 0),

@@ -260,7 +260,7 @@ def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
         times = dates if has_dates else _numbers(text, 1)[:, 0]
     except ValueError as error:
         raise ValueError(f"{path} has no times: {message_of(error)}") from error
-    assert times is not None  # of dates, or of numbers
+    assert times is not None  # they are times of dates, or numbers
     try:
         return _seconds_of_dates(times, unit) if has_dates else seconds_of(times, unit)
     except ValueError as error:
@@ -268,7 +268,10 @@ def _seconds_in_file(path: Path, unit: TimeUnit | None) -> Floats:
 
 
 def _seconds_of_dates(seconds: Floats, unit: TimeUnit | None) -> Floats:
-    """Return the seconds (k,) of dates; ValueError if the user states their unit."""
+    """Return the seconds (k,) of dates.
+
+    Raises ValueError if the user states their unit.
+    """
     if unit is not None:
         raise ValueError("its times are dates: leave out time_unit")
     return seconds_of(seconds, None, advice="correct them")
@@ -284,7 +287,7 @@ def _is_pose_column(cell: str) -> bool:
 
 
 def _numbers(text: str, columns: int | None = None) -> Floats:
-    """Return the rows of numbers in a text, (k, columns); lines that begin with # are comments."""
+    """Return the rows of numbers in a text, (k, columns), without comments (#)."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise ValueError("it has no rows of numbers")
@@ -309,7 +312,7 @@ def _table(
     bare: Mapping[str, str],
     time_unit: TimeUnit | None,
 ) -> PoseTable:
-    """Return the poses of a table with a header; `bare` are units of columns without a unit."""
+    """Return the poses of a table with a header, with units `bare` of columns without a unit."""
     quaternion = [quantity.name for quantity in QUATERNION]
 
     def required_columns(columns: Mapping[str, Floats]) -> tuple[str, ...]:
@@ -352,7 +355,7 @@ def _table(
 
 def _from_camera(track: Track) -> Track:
     """Convert poses of a camera frame (z ahead, y down) to a carrier frame (x ahead, z up)."""
-    assert track.quaternions is not None  # of every track
+    assert track.quaternions is not None  # every track has quaternions
     x, y, z, w = track.quaternions.T
     quaternions = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
     positions = turned(track.positions, _CAMERA)

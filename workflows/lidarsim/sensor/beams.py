@@ -18,7 +18,7 @@ from ..base.errors import LidarError
 from ..base.signatures import ReadableSignature
 from ..base.validation import as_array, checked, checked_fields
 
-MAX_CHANNELS = 65_535  # of the type of the column
+MAX_CHANNELS = 65_535  # limit of the type of the column
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Beams:
     Raises
     ------
     LidarError
-        If the lengths differ, a value is not finite, or there are no beams or too many.
+        If the lengths differ, a value is not finite, or beams are missing or too many.
     """
 
     __signature__ = ReadableSignature()
@@ -104,10 +104,10 @@ class Head(Protocol):
 
     @property
     def period(self) -> int | None:
-        """Number of firings after which azimuths repeat exactly; None if they never do."""
+        """Number of firings after which azimuths repeat exactly, or None if they never do."""
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firings of a time step; steps have no gaps."""
+        """Return the half-open range of the firings of a time step, without gaps between steps."""
 
     def times_ns(self, firings: Ints) -> Floats:
         """Return the starts of firings (k,), nanoseconds since the head started: (k,)."""
@@ -181,12 +181,12 @@ class Spin:
 
     @property
     def period(self) -> int | None:
-        """Number of firings in a revolution; None without a whole number."""
+        """Number of firings in a revolution, or None without a whole number."""
         count = int(self.firings_per_turn)
         return count if count == self.firings_per_turn else None
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firings of a time step; numbers go on after 360°."""
+        """Return the half-open range of the firings of a time step, counted on after 360°."""
         # Rounded up, in whole numbers: fractions would take as long as a small scan.
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
@@ -246,7 +246,7 @@ class Mirror(Spin):
 
 
 def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Return values as a read-only float64 array of a shape; zeros for an empty array."""
+    """Return values as a read-only float64 array of a shape, or zeros for an empty array."""
     array = as_array(f"Beams.{name}", values).copy()
     if not array.size:
         array = np.zeros(shape)

@@ -37,11 +37,11 @@ class Calibration:
     """Content of a calibration file."""
 
     file: str  # its name
-    maker: str | None  # of the format; None for a plain table of beams
-    beams: Beams | None = None  # in the maker's order, with the times in the file, if any
+    maker: str | None  # maker of the format; None for a plain table of beams
+    beams: Beams | None = None  # beams in the maker's order, with the times in the file, if any
     rays: Floats | None = None  # instead of beams, unit directions (n, 3) in the order of firing
     shot_ns: Floats | None = None  # times (n,) of the rays, if the file has times
-    starts: Floats | None = None  # of the rays (n, 3), metres; None for the sensor's centre
+    starts: Floats | None = None  # starts of the rays (n, 3), metres; None for the sensor's centre
     cycle_ns: float | None = None  # duration of the list of rays, if the file states it
     range_m: tuple[float, float] | None = None  # shortest and longest, if the file states ranges
     sensor: str = ""  # name of the sensor, if the file states it
@@ -83,7 +83,10 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def _velodyne(name: str, data: Any) -> Calibration:
-    """Return the beams of Velodyne's YAML; geometry as in ros-drivers/velodyne, rawdata.cc."""
+    """Return the beams of Velodyne's YAML.
+
+    The geometry is as in ros-drivers/velodyne, rawdata.cc.
+    """
     if not isinstance(data, dict) or not isinstance(data.get("lasers"), list):
         raise ValueError("it has no list of lasers, as Velodyne's calibrations have")
     lasers = sorted(data["lasers"], key=lambda laser: laser["laser_id"])
@@ -118,7 +121,7 @@ _OUSTER_FIRST_MM = 12.163
 
 
 def _ouster(name: str, data: Any) -> Calibration:
-    """Return the beams of Ouster's metadata, old and new; geometry as in Ouster's sensor manual.
+    """Return the beams of Ouster's metadata, old and new, by the geometry of its sensor manual.
 
     Ranges are measured from the beam's start, as of all sensors; Ouster's ranges from the axis.
     """
@@ -158,7 +161,7 @@ def _ouster(name: str, data: Any) -> Calibration:
 
 
 def _ouster_section(data: dict[str, Any], name: str, default: Any = None) -> dict[str, Any]:
-    """Return a section of Ouster's metadata; `default` for metadata in the layout without sections.
+    """Return a section of Ouster's metadata, or `default` for a layout without sections.
 
     Firmware before 1.14 writes an error in place of a section: then it is empty.
     """
@@ -190,7 +193,7 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
 def _calibration_of(name: str, rays: FiredRays) -> Calibration:
     """Return the rays of a file of a sensor as a calibration, with their times."""
     rays = rays.timed()
-    assert rays.times_ns is not None  # of timed rays
+    assert rays.times_ns is not None  # timed rays have times
     shot_ns = rays.times_ns.astype(np.float64)
     interval_ns = float(shot_ns[-1]) / max(len(rays) - 1, 1) or 1e9 / rays.rate_hz / len(rays)
     cycle_ns = rays.cycle_ns or float(shot_ns[-1]) + interval_ns

@@ -17,7 +17,7 @@ from .optics import Optics
 from .ray_sensors import PrismSensor
 from .sensor import Sensor
 
-MAX_RAYS = 20_000_000  # of a file; the arrays of as many rays take 4 GB
+MAX_RAYS = 20_000_000  # limit for a file; the arrays of as many rays take 4 GB
 _SLACK_NS = 1e-3  # roundings of times of firings
 
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
@@ -78,7 +78,7 @@ def export_sensor(
     Raises
     ------
     LidarError
-        If there is no such format, the format cannot hold the sensor, the rays are too many, a
+        If the format is unknown, the format cannot hold the sensor, the rays are too many, a
         package is missing, or the file cannot be written.
 
     Examples

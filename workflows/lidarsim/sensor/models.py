@@ -74,7 +74,7 @@ class BeamTable(_ModelSection):
     crossing_m: Annotated[float, Field(ge=0, le=1)] = 0.0  # see `origins`
 
     def beams(self) -> Beams:
-        """Return the beams; a single beam straight ahead if the table has no elevations."""
+        """Return the beams, or a single beam straight ahead if the table has no elevations."""
         count = len(self.elevation_deg)
         if not count:
             return Beams(np.zeros(1))
@@ -140,7 +140,7 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """Figures of a data sheet on a sensor's noise and returns; see `SensorModel.datasheet`.
+    """Figures of a data sheet on a sensor's noise and returns, for `SensorModel.datasheet`.
 
     The precision of ranges is given either by the fields of `Noise`, with the same names, or for
     two surfaces, from which its dependence on energy follows.
@@ -153,7 +153,7 @@ class Performance(_ModelSection):
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
     false_alarms: Annotated[float, Field(ge=0, lt=0.5)] | None = None  # share of pulses
-    dropout: UnitShare = 0.0  # of returns, whatever their energy
+    dropout: UnitShare = 0.0  # share of returns, whatever their energy
     mode: Mode = "strongest"
 
     @model_validator(mode="after")
@@ -198,7 +198,7 @@ class Performance(_ModelSection):
 
 
 class PacketPart(_ModelSection):
-    """Packets of the maker, as in `PacketSettings`; identifiers are defined by the format."""
+    """Packets of the maker, as in `PacketSettings`, with identifiers that the format defines."""
 
     format: str
     ports: dict[str, Annotated[int, Field(ge=1, le=65_535)]] = {}
@@ -256,7 +256,10 @@ class SensorModel(_ModelSection):
         return not (self.beams.elevation_deg or self.mirror or self.prisms)
 
     def datasheet(self) -> Datasheet:
-        """Return noise and returns by the data sheet; LidarError if the file has no performance."""
+        """Return noise and returns by the data sheet.
+
+        Raises LidarError if the file has no performance.
+        """
         performance = self.performance
         if performance is None:
             raise LidarError(
@@ -311,7 +314,7 @@ def plugin_of_model(name: str | None) -> Plugin | None:
 
 
 def plugin_model_file(name: str | None) -> Path | None:
-    """Return the data file of a plug-in's model; None for a model of the package or of a file.
+    """Return the data file of a plug-in's model, or None for a model of the package or of a file.
 
     Raises
     ------
@@ -368,7 +371,10 @@ def _built_in(name: str) -> SensorModel:
 
 
 def _read(path: Path | Traversable) -> SensorModel:
-    """Read the data file of a model; LidarError if the file cannot be used."""
+    """Read the data file of a model.
+
+    Raises LidarError if the file cannot be used.
+    """
     try:
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)

@@ -29,7 +29,7 @@ AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise of ranges and angles, lost returns and false alarms; no noise without arguments.
+    """Noise of ranges and angles, lost returns and false alarms, by default without noise.
 
     The standard deviation of a range of r metres is ``range_m + range_per_m * r``, and
     `range_at_threshold_m` times the threshold of detection over the return's energy is added in

@@ -18,7 +18,7 @@ from ..base.vectors import hypot
 from .disc import SUBRAYS, Beam, Profile
 from .reflectivity import SCALES
 
-LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
+LIGHT_M_NS = 0.299792458  # speed in vacuum; in air it is slower by 0.03 %
 FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
 WINDOW_SIGMAS = 10  # width of a return in a waveform, standard deviations of the system waveform
 CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, a return is 0 (4e-6)
@@ -139,7 +139,7 @@ class Returns:
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
     def divergence(self, optics: Optics) -> float:
-        """Return the full angle of the beam, radians; of an oval beam, of a circle of equal area.
+        """Return the full angle of the beam, radians, for an oval beam of a circle of equal area.
 
         Raises
         ------
@@ -166,7 +166,7 @@ class Returns:
         return Beam.from_divergences(self.subrays, divergences, profile, self.exit_m(optics))
 
     def exit_m(self, optics: Optics) -> float:
-        """Return the width of the beam at the sensor, metres; 0 if the width is unknown."""
+        """Return the width of the beam at the sensor, metres, or 0 if the width is unknown."""
         return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
     def _divergences(self, optics: Optics) -> tuple[float, float]:

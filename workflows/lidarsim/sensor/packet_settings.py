@@ -15,7 +15,7 @@ Identifier = int | float | str
 
 @dataclass(frozen=True, eq=False)
 class PacketSettings:
-    """Packets in which a sensor of a maker sends its returns.
+    """Packets that a sensor of a maker sends its returns in.
 
     Parameters
     ----------

@@ -45,7 +45,10 @@ def to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
 
 
 def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
-    """Return a value as data for JSON; TypeError for a class that is not of this package."""
+    """Return a value as data for JSON.
+
+    Raises TypeError for a class that is not of this package.
+    """
     if isinstance(value, np.ndarray):
         name = f"rays{len(arrays)}"
         arrays[name] = value

@@ -125,7 +125,7 @@ _KEPT_DIRECTIONS: WeakKeyDictionary[PrismSensor, dict[tuple[int, int], Floats]] 
     WeakKeyDictionary()
 )
 _KEPT_SWEEPS = 16
-_MAX_KEPT_RAYS = 1 << 16  # of a sweep that is kept: 1.5 MB
+_MAX_KEPT_RAYS = 1 << 16  # rays of a sweep that is kept: 1.5 MB
 
 
 def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:

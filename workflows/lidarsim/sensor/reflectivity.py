@@ -18,11 +18,11 @@ class ByteScale(NamedTuple):
     """Codes of reflectances: linear up to `code`, then logarithmic."""
 
     code: int
-    reflectance: float  # of `code`
-    max_reflectance: float  # of the code 255
+    reflectance: float  # reflectance of `code`
+    max_reflectance: float  # reflectance of the code 255
 
     def codes(self, reflectance: Floats) -> Bytes:
-        """Return the codes (n,) of reflectances (n,); 255 for reflectances beyond the scale."""
+        """Return the codes (n,) of reflectances (n,), 255 for reflectances beyond the scale."""
         share = reflectance / self.reflectance
         code = self.code * np.minimum(share, 1) + log(np.maximum(share, 1)) / self._step
         return np.rint(np.minimum(code, 255)).astype(np.uint8)

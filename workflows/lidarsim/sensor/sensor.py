@@ -33,7 +33,7 @@ Sector = Annotated[
     float,
     about("for a grid: degrees that a revolution sweeps, half of it left of +x", gt=0, le=360),
 ]
-SAMPLED_FIRINGS = 2000  # from which the field of view is taken
+SAMPLED_FIRINGS = 2000  # firings that give the field of view
 MAX_GAP_DEG = 5.0  # between neighbouring azimuths of a sensor that looks all around
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
@@ -233,12 +233,12 @@ class Sensor:
 
     @property
     def ring_step(self) -> int | None:
-        """Rays between successive firings of a channel, for `raybeam.Pattern`; None if unknown."""
+        """Rays between successive firings of a channel, for `raybeam.Pattern`. None if unknown."""
         return self.channels
 
     @property
     def period(self) -> int | None:
-        """Number of firings after which directions and origins repeat; None without repetition."""
+        """Number of firings after which directions and origins repeat, or None if they do not."""
         return self.head.period
 
     def firings(self, step: int) -> tuple[int, int]:
@@ -249,7 +249,7 @@ class Sensor:
         return self.head.firings(step)
 
     def revolutions(self, steps: ArrayLike) -> Ints:
-        """Return the numbers of the revolutions, or frames, in which time steps (k,) start: (k,).
+        """Return the numbers of the revolutions, or frames, that time steps (k,) start in: (k,).
 
         A head without `rate_hz`, such as a user's, makes a revolution in each step.
         """
@@ -285,10 +285,10 @@ class Sensor:
         return self._first_step(1, 1)
 
     def _first_step(self, number: int, steps_per_revolution: int) -> int:
-        """Return the first time step of a revolution; `steps_per_revolution` is a guess."""
+        """Return the first time step of a revolution, with `steps_per_revolution` as a guess."""
 
         def revolution_of(step: int) -> int:
-            """Return the number of the revolution in which a time step starts."""
+            """Return the number of the revolution that a time step starts in."""
             return int(self.revolutions([step])[0])
 
         lower = upper = number * steps_per_revolution
@@ -324,7 +324,7 @@ class Sensor:
 
     @cached_property
     def centre(self) -> Floats | None:
-        """Common start of all beams in the head frame, (3,), metres; None if starts differ."""
+        """Common start of all beams in the head frame, (3,), metres, or None if starts differ."""
         origin = self.beams.origin
         return origin[0] if (origin == origin[0]).all() else None
 
@@ -341,7 +341,7 @@ class Sensor:
 
     @property
     def axes(self) -> Floats | None:
-        """Rotation (3, 3) from the head frame to the sensor frame; None for the identity."""
+        """Rotation (3, 3) from the head frame to the sensor frame, or None for the identity."""
         return None
 
     def _rotated(self, firings: Ints, vectors: Floats) -> Floats:

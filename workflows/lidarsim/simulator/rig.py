@@ -308,7 +308,7 @@ class Rig:
 
         `specs` are consecutive scans of one station; for random numbers, the scans of the next pose
         have the next numbers. The poses are positions (k, 3), metres, and rotations (k, 3, 3) from
-        the carrier frame to the scene frame; they are not checked here. Ranges are those of the
+        the carrier frame to the scene frame; they are not checked here. Ranges belong to the
         nearest reported returns, metres: float32 (k, firings, channels); inf without a return.
         """
         number = specs[0].sensor

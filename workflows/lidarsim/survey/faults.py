@@ -38,7 +38,9 @@ _KIND_FIELDS: dict[str, tuple[str, ...]] = {
 @dataclass(frozen=True)
 @checked_fields
 class Fault:
-    """A fault of a sensor, for a time; labels keep the truth, and list the faults.
+    """A fault of a sensor, for a time.
+
+    Labels keep the truth, and list the faults.
 
     Raises
     ------
@@ -94,7 +96,7 @@ class Fault:
     def drops(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
         """Return whether firings (n,) are in dropped packets, at any time.
 
-        `number` is the number of this fault in its survey, `seed` that of the sensor's noise.
+        `number` is the number of this fault in its survey, `seed` the seed of the sensor's noise.
         """
         packets = firings // (self.packet or 1)
         return np.asarray(uniform(seed, PACKET, station, packets, number) < (self.share or 0.0))

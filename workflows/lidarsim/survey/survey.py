@@ -45,14 +45,14 @@ STEPS = 36  # default at each pose: one revolution of most sensors
 MAX_STEPS = 10_000_000  # along a trajectory
 StepCount = Annotated[int, Field(ge=1, le=MAX_STEPS)]
 OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
-MAX_SENSORS = 255  # of the type of the column
-MAX_PARTICLES = 100  # that a pulse may return from
-MAX_RAYS = 1 << 32  # of a scan, which is cast in one call
-PRECISION_M = 0.01  # of points, if a sensor states no resolution
+MAX_SENSORS = 255  # limit of the type of the column
+MAX_PARTICLES = 100  # particles that a pulse may return from
+MAX_RAYS = 1 << 32  # rays of a scan, which is cast in one call
+PRECISION_M = 0.01  # precision of points, if a sensor states no resolution
 START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
 # EPSG code of the world's coordinate system.
 EpsgCode = Annotated[int, Field(ge=1024, le=32767)]
-MAX_DURATION_NS = 2.0**63  # of the type of the column time: 292 years
+MAX_DURATION_NS = 2.0**63  # limit of the type of the column time: 292 years
 
 
 def nanoseconds(moment: datetime) -> int:
@@ -344,7 +344,10 @@ class Survey(CloudOptions, Weather):
             object.__setattr__(self, name, value)
 
     def _trajectory(self) -> Trajectory:
-        """Return the trajectory, or the poses as stations; LidarError for both or neither."""
+        """Return the trajectory, or the poses as stations.
+
+        Raises LidarError for both or neither.
+        """
         if self.trajectory is None:
             if not self.poses:
                 raise LidarError("A survey needs at least one pose to scan from.")
@@ -473,12 +476,12 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def path(self) -> Trajectory:
         """The trajectory, or the poses as stations."""
-        assert self.trajectory is not None  # of the poses by default
+        assert self.trajectory is not None  # the poses have a trajectory by default
         return self.trajectory
 
     @cached_property
     def carried(self) -> tuple[Mounted, ...]:
-        """The sensors with their mounts, also of a survey with `sensor`."""
+        """The sensors with their mounts, for a survey with `sensor` too."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @property
@@ -630,7 +633,7 @@ class Survey(CloudOptions, Weather):
         return (self.path.stations - 1) * self.station_ns + last
 
     def scan(self, index: int) -> ScanSpec:
-        """Return scan `index`; scans are in the order of sensors, stations and steps."""
+        """Return scan `index`, counted in the order of sensors, stations and steps."""
         sensor = bisect_right(self._firsts, index) - 1
         station, step = divmod(index - self._firsts[sensor], self.steps_each[sensor])
         lidar = self.carried[sensor].sensor
@@ -719,7 +722,10 @@ def _last_firing_ns(sensor: Sensor, steps: int) -> float:
 
 
 def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
-    """Return poses, of which each may be x, y and z; LidarError if they are not a list of poses."""
+    """Return poses, where each may be x, y and z.
+
+    Raises LidarError if they are not a list of poses.
+    """
     if isinstance(poses, str) or not isinstance(poses, Iterable):
         raise LidarError(f"poses is {shown(poses)}; it must be a list of poses: [(0, 0, 1)].")
     return tuple(pose_of("poses", pose) for pose in poses)

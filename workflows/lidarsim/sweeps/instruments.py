@@ -22,7 +22,7 @@ INSTRUMENT_FILES = (IMU_FILE, GNSS_FILE)
 class Instrument:
     """Mount and noise of an instrument, which bags state beside its samples."""
 
-    position: list[float]  # on the carrier, metres
+    position: list[float]  # place on the carrier, metres
     quaternion: list[float]  # x, y, z, w
     # Variances of white noise: of angular velocities and specific forces; or of positions to the
     # east, the north and up, including drift.
@@ -39,7 +39,7 @@ class Instruments:
 
     @classmethod
     def from_survey(cls, survey: Survey) -> Instruments | None:
-        """Return the instruments of a survey; None if the survey has none."""
+        """Return the instruments of a survey, or None if the survey has none."""
         navigation = survey.navigation
         if navigation is None or (navigation.imu is None and navigation.gnss is None):
             return None
@@ -84,7 +84,7 @@ class Instruments:
         return cls(imu, gnss)
 
     def rows(self, name: str) -> Iterator[list[str]]:
-        """Yield the rows of a file, without its header; no rows if the file is not written."""
+        """Yield the rows of a file, without its header, or no rows if the file is not written."""
         if self.folder is None or name not in self.files:
             return
         with TextIOWrapper(open_input(self.folder / name), encoding="ascii") as file:

@@ -46,12 +46,12 @@ class LidarTraits:
     """Properties of a sensor that fields of files depend on."""
 
     channels: int
-    mode: str  # of its returns, see `Returns`
+    mode: str  # mode of its returns (`Returns`)
     zero_deg: float = 0.0  # azimuth at which its head starts: counter-clockwise from x
     firing_ns: float = 0.0  # time from the first beam of a firing to the last
     # Difference between the manufacturer's ranges and distances from the beam's origin, metres.
     range_offset_m: float = 0.0
-    lines: MirrorLines | None = None  # of sensors that sweep across the direction of flight
+    lines: MirrorLines | None = None  # lines of sensors that sweep across the direction of flight
     # The maker's number of the laser of each channel, from 0; empty if unknown.
     lasers: tuple[int, ...] = ()
 

@@ -115,7 +115,10 @@ class Image:
 
 
 def fired_of(sweeps: Sweeps) -> FiredRays:
-    """Return the description of all rays of a survey; LidarError without a description."""
+    """Return the description of all rays of a survey.
+
+    Raises LidarError without a description.
+    """
     if sweeps.fired is None:
         raise LidarError(
             "Range images and organized clouds need every return of a survey: run it with "

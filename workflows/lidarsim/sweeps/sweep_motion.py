@@ -14,7 +14,7 @@ from ..survey.survey import Survey
 from .lidar_traits import LidarTraits
 
 KNOT_NS = 2e6  # between stored poses: at 10 m/s², 5 µm from a straight line
-_MAX_KNOTS = 1000  # of a sweep
+_MAX_KNOTS = 1000  # limit for a sweep
 _POSES = 100_000  # poses that are computed at a time
 STILL = np.zeros((0, 0, 7), np.float32)  # knots of sensors that are static while they sweep
 
@@ -145,7 +145,7 @@ def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
 def _relative_poses(
     path: Trajectory, station: int, times_ns: Floats, mount: Pose, sent_rotations: Floats
 ) -> Floats:
-    """Return the knots (k, m, 7) of sweeps at times (k, m), see `knots_of`.
+    """Return the knots (k, m, 7) of sweeps at times (k, m), for `knots_of`.
 
     `sent_rotations` (k, 3, 3) are from the sensor frame at the starts of the sent sweeps to the
     world frame; they differ from the cast sweeps if the sensor is frozen.

@@ -90,7 +90,7 @@ class FiredRays:
     sensors: tuple[Sensor, ...]
     returns: tuple[int, ...]  # reported returns of a pulse of each sensor at most; 1 if unknown
     steps: Ints  # (n,): first time step of each sweep, counted from the start of its station
-    seeds: tuple[int, ...]  # of each sensor's noise, on which dropped packets depend
+    seeds: tuple[int, ...]  # seeds of each sensor's noise, which dropped packets depend on
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,31 +101,31 @@ class Sweeps:
     begins_ns: Floats  # (n,): start of each sweep, nanoseconds since the survey's start
     ends_ns: Floats  # (n,): start of the last firing of each sweep
     sensor: Bytes  # (n,): number of the sensor
-    pose: SweepPoses  # of the sensors
-    mounts: SweepPoses  # of each sensor in the carrier frame
+    pose: SweepPoses  # poses of the sensors
+    mounts: SweepPoses  # mounts of each sensor in the carrier frame
     sensors: tuple[str, ...]  # names
     objects: tuple[str, ...]  # names
     actors: tuple[str, ...]  # names; actors follow the objects in the column `object`
-    actor_poses: SweepPoses  # of the actors (a, n)
+    actor_poses: SweepPoses  # poses of the actors (a, n)
     actor_velocities: Floats  # (a, n, 3): of the middles of the actors' boxes, m/s, world
     # (a, 2, 3): corners of each actor's box in the actor's frame, metres; of all poses if its mesh
     # deforms.
     actor_bounds: Floats
     actor_there: Bools  # (a, n): whether each actor is in the scene when each sweep begins
     actor_comes: Bools  # (a, n): whether each actor appears during each sweep
-    coordinates: str  # of the cloud's points, "world" or "sensor"
-    precision_m: float  # step to which positions were rounded
+    coordinates: str  # frame of the cloud's points, "world" or "sensor"
+    precision_m: float  # positions were rounded to multiples of this step
     epsg: int | None = None  # code of the coordinate system of the world
-    start_ns: int | None = None  # from 1970-01-01 UTC to the survey's start
-    instruments: Instruments | None = None  # of the carrier
+    start_ns: int | None = None  # nanoseconds from 1970-01-01 UTC to the survey's start
+    instruments: Instruments | None = None  # instruments of the carrier
     fired: FiredRays | None = None  # all rays, if the survey keeps every return with its ray
     classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # {number: name}
-    faults: tuple[Fault, ...] = ()  # of all sensors
+    faults: tuple[Fault, ...] = ()  # faults of all sensors
     materials: tuple[str, ...] = ()  # names that the column `material` counts
     lidars: tuple[LidarTraits, ...] = ()  # traits of each sensor; empty if unknown
     knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7): see `knots_of`
-    stations: int = 1  # of the survey, each with as many sweeps of a sensor
-    station_ns: int = 0  # from the start of a station to the start of the next
+    stations: int = 1  # number in the survey, each with as many sweeps of a sensor
+    station_ns: int = 0  # time between the starts of two stations
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -337,7 +337,7 @@ class Sweeps:
         return round(begin) + sum(int(fault.jumps_ns(begin)) for fault in self.faults_in(sweep))
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
-        """Yield the points of each sweep from `first` to `stop` in order, also of empty sweeps.
+        """Yield the points of each sweep from `first` to `stop` in order, empty sweeps included.
 
         Raises
         ------
@@ -368,7 +368,10 @@ class Sweeps:
             current = current + 1
 
     def save(self, path: Path) -> None:
-        """Write the sweeps as a NumPy archive; OSError if the file cannot be written."""
+        """Write the sweeps as a NumPy archive.
+
+        Raises OSError if the file cannot be written.
+        """
         path.write_bytes(self.packed())
 
     def packed(self) -> bytes:
@@ -394,7 +397,7 @@ class Sweeps:
 
     @classmethod
     def load(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> Sweeps:
-        """Read sweeps that `save` has written; no code in the file is run.
+        """Read sweeps that `save` has written, without running any code in the file.
 
         `read` returns the bytes of the file, by default those at `path`.
 
@@ -474,7 +477,7 @@ class _SensorSweeps(NamedTuple):
 
 
 class _ActorSweeps(NamedTuple):
-    """Actors during n sweeps; see the fields of `Sweeps`."""
+    """Actors during n sweeps, in fields of `Sweeps`."""
 
     poses: SweepPoses  # (a, n)
     velocities: Floats  # (a, n, 3)
@@ -546,7 +549,7 @@ def _times_of_presence(times_ns: Floats, appears_ns: float, leaves_ns: float) ->
 
 
 def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:
-    """Return all rays of a survey; None unless the survey keeps every return with its ray."""
+    """Return all rays of a survey, or None unless it keeps every return with its ray."""
     if survey.keep_every != 1 or all(c.name != "ray" for c in survey.stored_columns):
         return None
     max_returns = tuple(2 if returns.mode in TWO_RETURNS else 1 for returns in survey.returns_each)

@@ -1,4 +1,4 @@
-"""Lidars in worlds that other programs move, such as MuJoCo, of which nothing is imported."""
+"""Lidars in worlds that other programs move, such as MuJoCo, without importing these programs."""
 
 from .mujoco_scanner import MujocoScanner
 

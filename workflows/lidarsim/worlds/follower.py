@@ -24,7 +24,7 @@ from ..sensor import Sensor
 from ..simulator.scanner import Scanner
 from ..survey.survey import Mounted
 
-_SLACK_S = 1e-9  # by which the time of a step may be before the last beam of a sweep
+_SLACK_S = 1e-9  # the time of a step may be before a sweep's last beam by so much
 
 
 class _Step(NamedTuple):
@@ -58,7 +58,7 @@ class Follower:
     Raises
     ------
     LidarError
-        If there are no meshes, or `Scanner` refuses an option.
+        If meshes are missing, or `Scanner` refuses an option.
 
     Examples
     --------
@@ -104,7 +104,7 @@ class Follower:
         self._matrices = np.tile(np.eye(4), (len(bodies), 1, 1))
         self._steps: deque[_Step] = deque()
         self._start_s: float | None = None  # time of the first step
-        self._number = 0  # of the sweep under way
+        self._number = 0  # number of the sweep under way
         # Times of the first and last beam of the sweep under way, seconds since the first step.
         self._span_s: tuple[float, float] | None = None
 
@@ -187,7 +187,7 @@ class Follower:
         return self._frozen.ranges(_local(sensor_poses, self._frozen.origin), number=number)
 
     def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
-        """Take note of a step of the world; return the sweeps that have ended since the last step.
+        """Take note of a step of the world, and return the sweeps that ended since the last step.
 
         The first sweep begins at the first step, and sweeps follow each other. A time before that
         of the last step, as of a world that was reset, begins anew.
@@ -278,7 +278,9 @@ def _local(matrices: Floats, origin: Floats) -> Floats:
 
 
 def _matrices(values: ArrayLike, count: int | None) -> Floats:
-    """Return matrices as an array (k, 4, 4); LidarError if they are not `count` such matrices.
+    """Return matrices as an array (k, 4, 4).
+
+    Raises LidarError if they are not `count` such matrices.
 
     The scanner checks that matrices are rigid.
     """

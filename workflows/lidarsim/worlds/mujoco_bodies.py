@@ -27,13 +27,13 @@ class ModelBody(NamedTuple):
     """A body, or a geom of a body, that a lidar may see."""
 
     body: int  # number of the body
-    mesh: SceneMesh  # in the frame of the body; equal bodies share its arrays
+    mesh: SceneMesh  # mesh in the frame of the body; equal bodies share its arrays
 
 
 class ModelBodies(NamedTuple):
     """Bodies of a model."""
 
-    static: list[SceneMesh]  # in world coordinates
+    static: list[SceneMesh]  # meshes in world coordinates
     moving: list[ModelBody]
 
 
@@ -49,7 +49,7 @@ class Choice(NamedTuple):
 
 
 def number_of(model: Any, kind: str, name: str | int) -> int:
-    """Return the number of a body, geom or site by its name or number; -1 if there is none."""
+    """Return the number of a body, geom or site by its name or number, or -1 if none exists."""
     names = names_of(model, kind)
     if isinstance(name, str):
         return names.index(name) if name in names else -1
@@ -57,7 +57,10 @@ def number_of(model: Any, kind: str, name: str | int) -> int:
 
 
 def names_of(model: Any, kind: str) -> list[str]:
-    """Return the names of all bodies, geoms or sites; those without a name are numbered."""
+    """Return the names of all bodies, geoms or sites.
+
+    Nameless ones are numbered.
+    """
     addresses = np.asarray(getattr(model, f"name_{kind}adr"))
     table = bytes(model.names)
     names = [table[start : table.index(b"\0", start)].decode() for start in addresses.tolist()]
@@ -65,7 +68,10 @@ def names_of(model: Any, kind: str) -> list[str]:
 
 
 def required_number(model: Any, kind: str, name: str | int) -> int:
-    """Return the number of a body or site, by its name or number; LidarError if there is none."""
+    """Return the number of a body or site, by its name or number.
+
+    Raises LidarError if none exists.
+    """
     number = number_of(model, kind, name)
     if number < 0:
         raise LidarError(_unknown(name, kind, names_of(model, kind)))
@@ -73,7 +79,7 @@ def required_number(model: Any, kind: str, name: str | int) -> int:
 
 
 def excluded(model: Any, names: Iterable[str | int]) -> tuple[list[int], list[int]]:
-    """Return the numbers of excluded bodies and geoms; numbers in `names` are of bodies.
+    """Return the numbers of excluded bodies and geoms, where numbers in `names` are of bodies.
 
     LidarError if there is neither a body nor a geom with a name.
     """
@@ -111,7 +117,7 @@ def bodies_of(model: Any, choice: Choice) -> ModelBodies:
     is_static = _static_bodies(model)
     names = names_of(model, choice.objects)
     colours = _colours(model)
-    meshes: dict[Hashable, SceneMesh] = {}  # of equal bodies, the mesh of the first
+    meshes: dict[Hashable, SceneMesh] = {}  # equal bodies have the mesh of the first
     static = []
     moving = []
     for group in groups:
@@ -174,7 +180,7 @@ def _srgb_of(model: Any, geom: int, colour: Floats) -> Bytes:
 def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, choice: Choice) -> SceneMesh:
     """Return the mesh of geoms of a body, in the frame of the body, without a name.
 
-    `colours` (geoms, 4) are those of all geoms of the model.
+    `colours` (geoms, 4) are the colours of all geoms of the model.
     """
     shapes = [_placed_geom(model, geom, choice) for geom in geoms]
     counts = [len(shape.faces) for shape in shapes]
@@ -197,7 +203,7 @@ def _placed_geom(model: Any, geom: int, choice: Choice) -> GeomMesh:
 
 
 def _materials_of(model: Any, geoms: list[int], counts: list[int]) -> FaceMaterials | None:
-    """Return the materials of the faces of geoms, `counts` of each; None without materials."""
+    """Return the materials of the faces of geoms, `counts` of each, or None without materials."""
     materials = np.asarray(model.geom_matid)[geoms]
     if (materials < 0).all():
         return None
@@ -233,7 +239,7 @@ def _rest_pose(model: Any, body: int) -> tuple[Floats, Floats]:
 
 
 def soft_bodies(model: Any) -> str:
-    """Return the numbers of flexes and skins, which a lidar does not see; empty without any."""
+    """Return the numbers of flexes and skins, which a lidar does not see, or "" without any."""
     counts = {
         "flex": (int(getattr(model, "nflex", 0)), "flexes"),
         "skin": (int(getattr(model, "nskin", 0)), "skins"),

@@ -136,7 +136,7 @@ def _cells(grid: Ints) -> Ints:
 
 
 def _walls(rim: Ints, first_lower: int) -> Ints:
-    """Return the triangles below a closed line of vertices; the lower vertices are numbered on."""
+    """Return the triangles below a closed line of vertices, with the lower vertices numbered on."""
     lower = first_lower + np.arange(len(rim))
     next_rim = np.roll(rim, -1)
     next_lower = np.roll(lower, -1)
@@ -149,7 +149,7 @@ def _walls(rim: Ints, first_lower: int) -> Ints:
 
 
 def _plane(size: Floats, plane_m: float) -> GeomMesh:
-    """Return the triangles of a plane; without a size along an axis, of `plane_m`."""
+    """Return the triangles of a plane, of `plane_m` along an axis without a size."""
     x, y = np.where(size[:2] > 0, size[:2], plane_m).tolist()
     corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
     return GeomMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))

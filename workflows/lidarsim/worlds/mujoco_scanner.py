@@ -149,7 +149,7 @@ class MujocoScanner:
         return images[0] if self._is_single else images
 
     def step(self, data: Any) -> list[Cloud]:
-        """Take note of a step of the simulation; return the sweeps that have ended since the last.
+        """Take note of a step of the simulation, and return the sweeps that ended since the last.
 
         Call `step` after each `mj_step`: each beam leaves from the pose of the lidar, and meets
         bodies at their poses, at the time of the beam. A time before the last begins anew.
@@ -162,7 +162,10 @@ class MujocoScanner:
         return self.follower.step(float(data.time), self._pose(data), self._matrices(data))
 
     def _pose(self, data: Any) -> Floats:
-        """Return the matrix (4, 4) of the only lidar; LidarError if there are several."""
+        """Return the matrix (4, 4) of the only lidar.
+
+        Raises LidarError if there are several.
+        """
         if len(self._frames) != 1:
             raise LidarError(
                 f"There are {len(self._frames)} lidars: `sweep` and `step` are for a single body "

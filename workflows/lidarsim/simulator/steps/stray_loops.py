@@ -196,7 +196,7 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
 def _reach_of_cell(rays, c, triangles, limits):
     """Return whether cell `c` of rays may receive light of triangles, and a cosine.
 
-    The cosine is that of the largest angle between a ray of the cell and the centre of the
+    The cosine belongs to the largest angle between a ray of the cell and the centre of the
     triangles at which the ray may receive light: beyond, the light of the nearest triangle is too
     faint. All triangles are taken to return as much light as the first.
     """
@@ -308,7 +308,7 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
 
 @compiled()
 def receive(pairs, rays, spots, limits, output):
-    """Write rays that receive the light of spots to `output`, `ReceivedSpots`; return their number.
+    """Write rays that receive the light of spots to `output`, `ReceivedSpots`, and their number.
 
     `pairs` are `SpotPairs`, `rays` `ReceivingRays`, `spots` `LitSpots`, and `limits`
     `ReceptionLimits`. The distance of a spot is that of a pulse which the ray would have sent.

@@ -36,8 +36,8 @@ STEPS = 30  # largest number of steps of Levenberg and Marquardt
 GAIN = 1e-3  # share of the sum of squares that a step has to gain for the fit to go on
 ENOUGH = 1e-9  # sum of squares at which a fit stops
 HIGHEST = 1.2  # largest height of a Gaussian, as a share of the highest sample
-_AREA = math.sqrt(2 * math.pi)  # of a Gaussian of height and standard deviation 1
-_KEY_STEPS = 1024  # steps of a sample in which times of hits and peaks are compared
+_AREA = math.sqrt(2 * math.pi)  # area of a Gaussian of height and standard deviation 1
+_KEY_STEPS = 1024  # steps of a sample for comparing times of hits and peaks
 
 
 class WaveMarks(NamedTuple):
@@ -78,23 +78,23 @@ class WaveSampling(NamedTuple):
 
 
 class WavePeaks(NamedTuple):
-    """Peak to which each hit belongs, in the waveforms that `search_waveforms` searches."""
+    """Peak that each hit belongs to, in the waveforms that `search_waveforms` searches."""
 
     number: Ints  # (n,): number of the peak, counted over all waveforms; -1 without a peak
-    # (3, n): time of the peak, samples from range 0, energy, and width as a multiple of that of the
-    # system waveform.
+    # (3, n): time of the peak, samples from range 0, energy, and width as a multiple of the system
+    # waveform's width.
     shapes: Floats
 
 
 class WaveReturnArrays(NamedTuple):
-    """Arrays to which returns are written: (k,) each."""
+    """Arrays that returns are written to: (k,) each."""
 
     beam: Ints  # number of the beam in the batch
-    row: Ints  # of the strongest hit, in the table of hits before sorting
+    row: Ints  # row of the strongest hit, in the table of hits before sorting
     distance: Floats  # metres
     energy: Floats
     velocity: Floats  # radial, m/s
-    width: Floats  # as a multiple of the width of the system waveform
+    width: Floats  # multiple of the width of the system waveform
 
     def first(self, count: int) -> WaveReturnArrays:
         """Return copies of the first `count` returns, which a loop has written."""
@@ -133,9 +133,9 @@ class GaussianScratch(NamedTuple):
     minima: Ints  # samples where the curvature has a minimum
     x: Floats  # samples of a piece, in standard deviations of the system waveform
     y: Floats  # samples of a piece, as shares of the highest sample
-    time: Floats  # of the Gaussians, samples from range 0
-    height: Floats  # in units of the samples
-    width: Floats  # in standard deviations of the system waveform
+    time: Floats  # times of the Gaussians, samples from range 0
+    height: Floats  # heights in units of the samples
+    width: Floats  # widths in standard deviations of the system waveform
     fit: FitScratch
 
 
@@ -160,7 +160,7 @@ class SampledWaveform(NamedTuple):
 
 @stage
 def _sample(light, begin, stop, first, length, sigma, samples):
-    """Write the sum of the pulses of hits `begin` to `stop`; return the highest sample.
+    """Write the sum of the pulses of hits `begin` to `stop`, and return the highest sample.
 
     `samples` are numbered from `first` on; `length` samples are written.
     """
@@ -203,7 +203,7 @@ def _vertex(samples, peak):
 
 @stage
 def _peaks(wave, stops, peaks):
-    """Write the local maxima of a waveform to `stops` and `peaks`; return their number.
+    """Write the local maxima of a waveform to `stops` and `peaks`, and return their number.
 
     See `SearchScratch`. Times and heights come from the Gaussian through three samples, energies
     are the areas between the lowest samples to both sides.
@@ -221,7 +221,7 @@ def _peaks(wave, stops, peaks):
         peak = s
         last = s
         s += 1
-        while s < length:  # to the next peak, or the end
+        while s < length:  # go to the next peak, or the end
             if samples[s] < samples[last]:
                 last = s
             if s < length - 1 and _is_peak(samples, s, top):
@@ -243,7 +243,7 @@ def _peaks(wave, stops, peaks):
 
 @stage
 def _residual(x, y, sample_count, gaussians, count, residual, slopes):
-    """Write the residual of a sum of `count` Gaussians, and slopes; return the sum of squares.
+    """Write residual and slopes of a sum of `count` Gaussians, and return the sum of squares.
 
     `x` and `y` are `GaussianScratch.x` and `.y`; `gaussians`, `residual` and `slopes` are arrays of
     a `FitScratch`.
@@ -270,7 +270,7 @@ def _residual(x, y, sample_count, gaussians, count, residual, slopes):
 
 @stage
 def _solve(lower, size, step):
-    """Solve equations by their Cholesky factor; `step` holds the right side, then the result."""
+    """Solve equations by their Cholesky factor, and replace the right side `step` by the result."""
     for row in range(size):
         for k in range(row):
             step[row] -= lower[row, k] * step[k]
@@ -354,7 +354,7 @@ def _fit(x, y, sample_count, count, scratch):
 
 @stage
 def _find_minima(wave, scratch):
-    """Write the samples at which the second derivative is minimal; return their number.
+    """Write the samples with minimal second derivative, and return their number.
 
     Each minimum is the first guess of a Gaussian. `scratch` is a `GaussianScratch`, whose `minima`
     receive indices of samples.
@@ -412,7 +412,7 @@ def _fit_piece(wave, begin, stop, first, end, scratch):
 
 @stage
 def _sort_gaussians(scratch, count, faintest):
-    """Sort Gaussians by time, without those lower than `faintest`; return their number.
+    """Sort Gaussians by time, without any lower than `faintest`, and return their number.
 
     A fit may move a Gaussian beyond its piece.
     """
@@ -479,7 +479,7 @@ def _join_gaussians(wave, scratch, count, stops, peaks):
 
 @stage
 def _gaussians(wave, scratch, stops, peaks):
-    """Decompose a waveform into Gaussians; write and return the same as `_peaks`.
+    """Decompose a waveform into Gaussians, and write and return the same as `_peaks`.
 
     Each minimum of the second derivative is a Gaussian (after Hofton et al. 2000, who take the
     points of inflection around the minima), none narrower than the system waveform.
@@ -553,7 +553,7 @@ def _has_several_surfaces(starts_surface, first, end):
 
 @compiled()
 def divide_into_waveforms(hits, sigma_m, neighbours, parts):
-    """Mark where waveforms start, and write the waveforms to search; return their number.
+    """Mark where waveforms start, write the waveforms to search, and return their number.
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
     that of the hit before. A waveform is searched if its hits are farther apart than `NARROW`, and
@@ -631,7 +631,7 @@ def scratch_for(length: int) -> SearchScratch:
 
 @inlined
 def _peak_of_hit(time, wave, stops, count):
-    """Return the number of the peak, among `count`, to which a hit at a time belongs."""
+    """Return the number of the peak, among `count`, that a hit at a time belongs to."""
     key = np.int64(np.rint(time * _KEY_STEPS)) - _KEY_STEPS * wave.first
     number = 0
     while number < count - 1 and stops[number] < key:
@@ -641,9 +641,9 @@ def _peak_of_hit(time, wave, stops, count):
 
 @compiled()
 def search_waveforms(light, parts, sampling, starts, peaks, scratch):
-    """Sample waveforms, and write the peak to which each of their hits belongs.
+    """Sample waveforms, and write the peak that each of their hits belongs to.
 
-    Waveform k is that of the hits `parts[k, 0]` to `parts[k, 1]` of `light`, a `WaveLight`.
+    Waveform k has the hits `parts[k, 0]` to `parts[k, 1]` of `light`, a `WaveLight`.
     `sampling` is a `WaveSampling`, and `scratch` a `SearchScratch`. Writes `peaks`, `WavePeaks`,
     and marks in `starts` (n,) the first hits of peaks.
     """
@@ -675,7 +675,7 @@ def search_waveforms(light, parts, sampling, starts, peaks, scratch):
 
 @compiled()
 def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
-    """Write the returns of the waveforms of beams to `output`, see `waveform.returns_in`.
+    """Write the returns of the waveforms of beams to `output`, for `waveform.returns_in`.
 
     `hits` are `WaveHits`, `peaks` `WavePeaks`, `neighbours` `pulse_loops.Neighbours`, and `output`
     is a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in range. A

@@ -38,7 +38,7 @@ class WaveformStep(PulseStep):
         return setup.in_waveforms
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the returns in the waveforms of the hits of a batch; their `ray` is the beam."""
+        """Return the returns in the waveforms of the hits of a batch, with the beam as `ray`."""
         digitizer = Digitizer.for_sensor(self.setup)
         in_waveforms = returns_in(returns, digitizer, batch.subrays_per_beam, batch.planes)
         return in_waveforms._replace(ray=batch.start + in_waveforms.ray)
@@ -83,7 +83,7 @@ class Digitizer:
         """Return heights of returns (n,) by energy and full width at half maximum, ns.
 
         A return as wide as the system waveform is as high as its energy. A width of 0 is unknown,
-        and taken as that of the system waveform.
+        and taken as the width of the system waveform.
         """
         system_ns = FWHM * self.sigma_ns
         return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
@@ -184,7 +184,7 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
 
 
 def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, parts: Ints) -> WavePeaks:
-    """Return the peaks of hits in waveforms that are searched; mark where peaks start.
+    """Return the peaks of hits in waveforms that are searched, and mark where peaks start.
 
     `parts` (k, 2) are the first hit, and the hit after the last, of each waveform. Writes
     `hits.marks.starts`.

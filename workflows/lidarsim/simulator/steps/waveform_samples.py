@@ -82,7 +82,7 @@ class RecordingStep(PulseStep):
         return returns._replace(waveform=records)
 
     def _received(self, samples: Floats, windows: Windows, batch: PulseBatch) -> Floats:
-        """Add the receiver's noise to samples (windows, count) in place; return clipped samples."""
+        """Add the receiver's noise to samples (windows, count) in place. Return clipped samples."""
         noise = self.setup.noise
         if noise.threshold:
             keys = Keys(batch.keys.scan, batch.keys.scan_starts - batch.start)
