@@ -61,7 +61,10 @@ class PacketSource:
 
     @property
     def settings(self) -> PacketSettings:
-        """Packets of the sensor; LidarError without packets."""
+        """Packets of the sensor.
+
+        Raises LidarError without packets.
+        """
         return settings_of(self.sensor)
 
     @classmethod
@@ -158,7 +161,10 @@ class PacketEncoder(ABC):
         return LidarError(f"The packets of {self.source.sensor.model} {reason}.")
 
     def number(self, name: str) -> int:
-        """Return an identifier that is a whole number; LidarError for other values."""
+        """Return an identifier that is a whole number.
+
+        Raises LidarError for other values.
+        """
         value: Identifier = self.source.settings.identifiers[name]
         if not isinstance(value, int):
             raise self.unusable(f"state {name} {value!r}: give a whole number")
@@ -169,7 +175,10 @@ class PacketEncoder(ABC):
         return str(self.source.settings.identifiers[name])
 
     def decimal(self, name: str) -> float:
-        """Return an identifier that is a number; LidarError for other values."""
+        """Return an identifier that is a number.
+
+        Raises LidarError for other values.
+        """
         value: Identifier = self.source.settings.identifiers[name]
         if isinstance(value, str):
             raise self.unusable(f"state {name} {value!r}: give a number")
@@ -263,7 +272,10 @@ def _imported(value: str) -> Any:
 
 
 def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
-    """Return the encoder of a plug-in; LidarError for another class."""
+    """Return the encoder of a plug-in.
+
+    Raises LidarError for another class.
+    """
     encoder = plugin.load(type)
     if not issubclass(encoder, PacketEncoder):
         raise plugin.lacks("a subclass of lidarsim.packets.encoders.PacketEncoder")

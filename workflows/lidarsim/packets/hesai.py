@@ -110,7 +110,10 @@ class HesaiEncoder(PacketEncoder):
         return round(self.source.sensor.head.rate_hz * 60)  # type: ignore[attr-defined]
 
     def _layout_of_model(self) -> Layout:
-        """Return the layout of the model; LidarError for an unknown model."""
+        """Return the layout of the model.
+
+        Raises LidarError for an unknown model.
+        """
         model = self.text("model")
         if model not in LAYOUTS:
             names = ", ".join(LAYOUTS)
@@ -135,7 +138,10 @@ class HesaiEncoder(PacketEncoder):
             )
 
     def _is_ptp(self) -> bool:
-        """Return whether times are those of a PTP clock; LidarError for an unknown clock."""
+        """Return whether times come from a PTP clock.
+
+        Raises LidarError for an unknown clock.
+        """
         clock = self.source.settings.identifiers.get("clock", "gps")
         clocks = _CLOCKS if self._layout.has_epoch_seconds else _CLOCKS[:1]
         if clock not in clocks:

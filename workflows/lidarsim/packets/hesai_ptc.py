@@ -158,7 +158,10 @@ class PtcService(TcpService):
     async def _answered(
         self, start: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> bytes:
-        """Read the rest of a request, and return the answer; ValueError for other bytes."""
+        """Read the rest of a request, and return the answer.
+
+        Raises ValueError for other bytes.
+        """
         header = start + await reader.readexactly(_HEADER.size - 1)
         mark, command, _, size = _HEADER.unpack(header)
         if mark != _MARK or size > _MAX_REQUEST_BYTES:
@@ -172,7 +175,10 @@ class PtcService(TcpService):
         return _HEADER.pack(_MARK, command, _OK, len(content)) + content
 
     def _content(self, command: int, parameter: bytes, own_host: str) -> bytes:
-        """Return the content of the answer to a command; _RefusedError for what cannot be done."""
+        """Return the content of the answer to a command.
+
+        Raises _RefusedError for what cannot be done.
+        """
         device = self._device
         answers: dict[int, Callable[[], bytes]] = {
             _GET_CALIBRATION: lambda: device.calibration,
@@ -202,7 +208,10 @@ class PtcService(TcpService):
 
 
 def _unchanged(parameter: bytes, current: bytes) -> bytes:
-    """Accept the current value of a setting, which cannot be changed; _RefusedError for others."""
+    """Accept the current value of a setting, which cannot be changed.
+
+    Raises _RefusedError for others.
+    """
     if parameter != current:
         raise _RefusedError(_INVALID_PARAMETER)
     return b""

@@ -86,7 +86,10 @@ class HttpService(TcpService):
 
     @abstractmethod
     def answer(self, request: Request) -> Answer:
-        """Return the answer to a request; RefusedError for what is not understood."""
+        """Return the answer to a request.
+
+        Raises RefusedError for what is not understood.
+        """
 
     def changes_state(self, method: str, path: str) -> bool:
         """Return True if a request may change what the sensor does."""
@@ -154,7 +157,9 @@ class HttpService(TcpService):
 
 
 def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
-    """Return method, URL and headers of a request; RefusedError for other bytes.
+    """Return method, URL and headers of a request.
+
+    Raises RefusedError for other bytes.
 
     The URL may be in absolute form, as for a proxy.
     """
@@ -178,7 +183,10 @@ def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
 
 
 def _body_size(headers: Headers) -> int:
-    """Return the size of the body that headers announce; RefusedError for other encodings."""
+    """Return the size of the body that headers announce.
+
+    Raises RefusedError for other encodings.
+    """
     if "transfer-encoding" in headers:
         raise RefusedError("give a Content-Length", HTTPStatus.LENGTH_REQUIRED)
     size = headers.get("content-length", "0")
@@ -190,7 +198,10 @@ def _body_size(headers: Headers) -> int:
 
 
 def receiver_of(name: str, value: Any) -> str:
-    """Return the IPv4 address of one receiver; RefusedError for others, `name` is the parameter."""
+    """Return the IPv4 address of one receiver.
+
+    Raises RefusedError for others, with the parameter's `name`.
+    """
     try:
         address = IPv4Address(str(value))
     except AddressValueError as error:
@@ -201,7 +212,10 @@ def receiver_of(name: str, value: Any) -> str:
 
 
 def receiver_port(name: str, value: Any) -> int:
-    """Return a port, or 0 for packets that are not sent; RefusedError for other values."""
+    """Return a port, or 0 for packets that are not sent.
+
+    Raises RefusedError for other values.
+    """
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 16:
         raise RefusedError(f"{name} is no port")
     return value

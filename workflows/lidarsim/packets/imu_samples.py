@@ -32,17 +32,17 @@ class ImuSamples:
         self._jumps_ns: Ints = np.zeros(1, np.int64)  # of the clock, at the last shots
 
     def during(self, shots: Shots) -> ImuBatch | None:
-        """Return the samples until the last of the shots; None if there are no samples."""
+        """Return the samples until the last of the shots, or None without samples."""
         self._starts_ns = shots.starts_ns
         self._jumps_ns = shots.stamps_ns - shots.starts_ns
         return self._until(int(shots.starts_ns[-1]))
 
     def remaining(self) -> ImuBatch | None:
-        """Return the samples after the last shots; None if there are no samples."""
+        """Return the samples after the last shots, or None without samples."""
         return self._until(None)
 
     def _until(self, until_ns: int | None) -> ImuBatch | None:
-        """Return the samples up to a time, or all for None; None if there are no samples."""
+        """Return the samples up to a time, or all for None. Without samples return None."""
         rows = []
         while self._next_row is not None:
             if until_ns is not None and int(self._next_row[0]) > until_ns:

@@ -99,7 +99,7 @@ class RefusedError(Exception):
 
 
 def parse_request(content: bytes) -> Frame | None:
-    """Return the request in a datagram; None without a request with right checksums."""
+    """Return the request in a datagram, or None without a request with right checksums."""
     if len(content) < _HEAD_BYTES:
         return None
     start, version, length, number, command, kind, _, _ = _HEAD.unpack_from(content)
@@ -135,7 +135,10 @@ def _checksum(data: bytes) -> int:
 
 
 def parse_values(data: bytes) -> dict[int, bytes]:
-    """Return the parameters of a request to set; RefusedError if parameters are cut off."""
+    """Return the parameters of a request to set.
+
+    Raises RefusedError if parameters are cut off.
+    """
     values = {}
     offset = _COUNT.size
     for _ in range(_key_count(data)):
@@ -150,7 +153,10 @@ def parse_values(data: bytes) -> dict[int, bytes]:
 
 
 def parse_keys(data: bytes) -> Sequence[int]:
-    """Return the keys of a request to get; RefusedError if keys are cut off."""
+    """Return the keys of a request to get.
+
+    Raises RefusedError if keys are cut off.
+    """
     count = _key_count(data)
     if _COUNT.size + count * _KEY.size > len(data):
         raise RefusedError(Code.WRONG_KEY_NUMBER)

@@ -143,7 +143,10 @@ class LivoxService(Service):
         self._stack.close()
 
     def _bound(self, port: int) -> socket.socket:
-        """Return a socket at a port of the sensor; LidarError if the port cannot be had."""
+        """Return a socket at a port of the sensor.
+
+        Raises LidarError if the port cannot be had.
+        """
         if ":" in self.host:
             raise LidarError(
                 f"--api {self.host}: Livox's ports are fixed, give an address without a port, such "

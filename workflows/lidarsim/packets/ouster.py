@@ -270,7 +270,10 @@ class OusterEncoder(PacketEncoder):
         self._samples = ImuSamples(source)
 
     def _profile_of_mode(self) -> Profile:
-        """Return the profile that the identifiers or the mode state; LidarError if both differ."""
+        """Return the profile that the identifiers or the mode state.
+
+        Raises LidarError if both differ.
+        """
         mode = self.source.mode
         if mode not in _RETURN_ORDERS:
             modes = ", ".join(_RETURN_ORDERS)

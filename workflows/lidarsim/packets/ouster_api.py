@@ -60,7 +60,10 @@ class OusterApi(HttpService):
         self._user_data = ""
 
     def answer(self, request: Request) -> Answer:
-        """Return the answer to a request; RefusedError for what the sensor does not have."""
+        """Return the answer to a request.
+
+        Raises RefusedError for what the sensor does not have.
+        """
         path = request.path.rstrip("/")
         if not path.startswith(_ROOT):
             raise RefusedError("the interface is at /api/v1", HTTPStatus.NOT_FOUND)
@@ -159,7 +162,10 @@ class OusterApi(HttpService):
         return Answer({})
 
     def _stage(self, values: Any, peer: str) -> None:
-        """Change the staged configuration; RefusedError for what cannot be set."""
+        """Change the staged configuration.
+
+        Raises RefusedError for what cannot be set.
+        """
         if not isinstance(values, dict):
             raise RefusedError("give an object of parameters")
         staged = dict(self._staged)
@@ -190,7 +196,10 @@ class OusterApi(HttpService):
 
 
 def _json(body: bytes) -> Any:
-    """Return the data of JSON; RefusedError for other bytes."""
+    """Return the data of JSON.
+
+    Raises RefusedError for other bytes.
+    """
     try:
         return json.loads(body)
     except (ValueError, RecursionError) as error:

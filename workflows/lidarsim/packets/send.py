@@ -157,7 +157,10 @@ class Sender:
         return self._lateness
 
     def _write(self, content: bytes | memoryview) -> None:
-        """Write to the process; LidarError if it has ended."""
+        """Write to the process.
+
+        Raises LidarError if it has ended.
+        """
         assert self._process is not None
         file = self._process.stdin
         assert file is not None
@@ -255,7 +258,10 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Return the address of one receiver of IPv4; LidarError for other text and addresses."""
+        """Return the address of one receiver of IPv4.
+
+        Raises LidarError for other text and addresses.
+        """
         host, separator, number = text.rpartition(":")
         if not separator:
             host, number = text, ""
@@ -298,7 +304,10 @@ def _is_ipv6(text: str) -> bool:
 
 
 def _resolved(host: str, text: str) -> IPv4Address:
-    """Return the IPv4 address of a name; LidarError if the name has none."""
+    """Return the IPv4 address of a name.
+
+    Raises LidarError if the name has none.
+    """
     try:
         entries = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:

@@ -128,7 +128,7 @@ class Outbox:
         self._rest = content[start:]
 
     def next_ns(self) -> int | None:
-        """Return when the next datagram is sent; None if none waits."""
+        """Return when the next datagram is sent, or None if none waits."""
         if not self.waiting:
             return None
         due_ns, _, sensor, *_ = self.waiting[0]

@@ -67,7 +67,10 @@ class Service(ABC):
 
     @abstractmethod
     def __enter__(self) -> Self:
-        """Listen; LidarError if the address cannot be used."""
+        """Listen.
+
+        Raises LidarError if the address cannot be used.
+        """
 
     @abstractmethod
     def __exit__(self, *error: object) -> None:

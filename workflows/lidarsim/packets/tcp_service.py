@@ -96,7 +96,10 @@ class TcpService(Service):
         self._loop.close()
 
     def _listening_socket(self) -> socket.socket:
-        """Return a socket at the address; LidarError if the address cannot be used."""
+        """Return a socket at the address.
+
+        Raises LidarError if the address cannot be used.
+        """
         ports = [self.usual_port, 0] if self.port is None else [self.port]
         for port in ports:
             listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)

@@ -63,7 +63,10 @@ class VelodyneApi(HttpService):
         self._laser = "On"
 
     def answer(self, request: Request) -> Answer:
-        """Return the answer to a request; RefusedError for what the sensor does not have."""
+        """Return the answer to a request.
+
+        Raises RefusedError for what the sensor does not have.
+        """
         documents: dict[str, Callable[[], Mapping[str, Any]]] = {
             "/cgi/info.json": self._info,
             "/cgi/status.json": self._status,
@@ -125,7 +128,10 @@ class VelodyneApi(HttpService):
         self._apply()
 
     def _set(self, values: Mapping[str, str]) -> None:
-        """Switch the laser; RefusedError for what cannot be set."""
+        """Switch the laser.
+
+        Raises RefusedError for what cannot be set.
+        """
         current = {"returns": self._state.returns, "rpm": str(self._state.rpm)}
         laser = self._laser
         for name, value in values.items():

@@ -92,7 +92,7 @@ class _Fixes(NamedTuple):
 
     @classmethod
     def of_source(cls, source: PacketSource) -> _Fixes | None:
-        """Return the fixes of the carrier; None if it has none with latitudes."""
+        """Return the fixes of the carrier, or None if it has none with latitudes."""
         instruments = source.instruments
         rows = [] if instruments is None else list(instruments.rows(GNSS_FILE))
         if not rows or len(rows[0]) < 6:

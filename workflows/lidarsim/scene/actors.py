@@ -191,7 +191,10 @@ class Actor:
         return ActorSamples(times_ns, positions, quaternions_of(rotations))
 
     def check(self, start_ns: float, stop_ns: float) -> None:
-        """Check that the trajectory covers times from start to stop, ns; LidarError if not."""
+        """Check that the trajectory covers times from start to stop, ns.
+
+        Raises LidarError if not.
+        """
         try:
             self.trajectory.poses(0, np.array([start_ns, stop_ns], np.float64))
         except LidarError as error:
@@ -203,7 +206,10 @@ class Actor:
 
 
 def check_spray(actors: Iterable[Actor]) -> None:
-    """Check that actors that raise spray have a size; LidarError if not."""
+    """Check that actors that raise spray have a size.
+
+    Raises LidarError if not.
+    """
     for actor in actors:
         if actor.spray and not (np.ptp(actor.mesh.vertices, axis=0) > 0).all():
             raise LidarError(

@@ -105,7 +105,10 @@ class Colours:
         return replace(self, uv=uv, corners=corners)
 
     def check(self, name: str, faces: int) -> None:
-        """Check that the shapes fit a number of faces of an object; LidarError if not."""
+        """Check that the shapes fit a number of faces of an object.
+
+        Raises LidarError if not.
+        """
         shapes = [(self.image, (faces,)), (self.uv, (faces, 3, 2)), (self.corners, (faces, 3, 3))]
         valid = all(array is None or array.shape == shape for array, shape in shapes)
         for image in self.images:

@@ -29,7 +29,7 @@ class FaceMaterials:
 
     @classmethod
     def named(cls, name: str) -> FaceMaterials | None:
-        """Return the same material for all faces; None without a name."""
+        """Return the same material for all faces, or None without a name."""
         return cls((name,)) if name else None
 
     def take(self, rows: Integers | slice) -> FaceMaterials:
@@ -37,7 +37,10 @@ class FaceMaterials:
         return self if self.index is None else FaceMaterials(self.names, self.index[rows])
 
     def check(self, name: str, faces: int) -> None:
-        """Check that names are distinct, and rows fit a number of faces; LidarError if not."""
+        """Check that names are distinct, and rows fit a number of faces.
+
+        Raises LidarError if not.
+        """
         index = self.index
         fits = len(self.names) > 0 and len(set(self.names)) == len(self.names)
         if index is not None:
@@ -73,7 +76,7 @@ class ObjectMaterials:
         meshes: Sequence[FaceMaterials | None],
         sizes: Sequence[int],
     ) -> ObjectMaterials | None:
-        """Return the materials of a scene; None if no object has materials.
+        """Return the materials of a scene, or None if no object has materials.
 
         Parameters
         ----------

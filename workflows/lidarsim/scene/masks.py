@@ -110,7 +110,10 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
 
 @contextmanager
 def _opened(image: Path | bytes) -> Iterator[Image.Image]:
-    """Open an image for the body; MaskError for all errors, also in the body."""
+    """Open an image for the body.
+
+    Raises MaskError for all errors, those in the body included.
+    """
     name = image.name if isinstance(image, Path) else "its image"
     try:
         # Pillow warns of images that it reads all the same, and of images that are too large.
@@ -258,7 +261,10 @@ class Texture:
 
 
 def _take(allowance: Allowance, count: int) -> None:
-    """Take bytes of an image from the allowance; MaskError if the image is too large."""
+    """Take bytes of an image from the allowance.
+
+    Raises MaskError if the image is too large.
+    """
     if not allowance.fits(count):
         raise MaskError("its image would be too large")
     allowance.take(count)

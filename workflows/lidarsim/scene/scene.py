@@ -408,7 +408,7 @@ class Scene:
 
     @property
     def coloured(self) -> list[Colours]:
-        """Colours of the faces, of parts of instances and of actors' meshes; empty if all are grey.
+        """Colours of the faces, of parts of instances and of actors' meshes, empty if all are grey.
 
         Only colours that exist are listed, in this order.
         """
@@ -597,7 +597,10 @@ class Scene:
 
 
 def _world_position(value: ArrayLike) -> Floats:
-    """Return a position (3,) as read-only float64; LidarError if it is none."""
+    """Return a position (3,) as read-only float64.
+
+    Raises LidarError if it is none.
+    """
     position = np.array(as_array("world_origin", value))
     if position.shape != (3,) or not np.isfinite(position).all():
         raise LidarError(f"world_origin is {shown(value)}; it must be x, y and z in metres.")
@@ -657,7 +660,10 @@ class _SplitObjects:
 
 
 def _check_objects(objects: Sequence[object]) -> None:
-    """Check that there are objects, each a mesh or an instance; LidarError if not."""
+    """Check that there are objects, each a mesh or an instance.
+
+    Raises LidarError if not.
+    """
     for item in objects:
         if not isinstance(item, (SceneMesh, SceneInstance)):
             raise LidarError(
@@ -713,7 +719,10 @@ def _mesh_of_part(name: str, part: MeshPart) -> SceneMesh:
 
 
 def _check_counts(split: _SplitObjects) -> None:
-    """Check that 32 bits can number the vertices and triangles of objects; LidarError if not."""
+    """Check that 32 bits can number the vertices and triangles of objects.
+
+    Raises LidarError if not.
+    """
     vertices = sum(len(mesh.vertices) for mesh in split.meshes)
     triangles = sum(len(mesh.faces) for mesh in split.meshes)
     triangles += sum(len(split.parts[placed.part].faces) for placed in split.placed_parts)

@@ -100,7 +100,10 @@ class SceneInstance:
 
 
 def check_coordinate(position: Floats) -> None:
-    """Check that a position (3,) is within `MAX_COORDINATE_M` of zero; LidarError if not."""
+    """Check that a position (3,) is within `MAX_COORDINATE_M` of zero.
+
+    Raises LidarError if not.
+    """
     if not (np.abs(position) <= MAX_COORDINATE_M).all():
         raise LidarError(
             f"An instance cannot be at {np.asarray(position).tolist()}: give metres within "

@@ -169,7 +169,10 @@ class SceneMesh:
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:
-    """Check shapes, types and values of the voxels of a mesh; LidarError if they are wrong."""
+    """Check shapes, types and values of the voxels of a mesh.
+
+    Raises LidarError if they are wrong.
+    """
     density = voxels.density
     matrix = voxels.matrix
     valid = density.dtype == np.float32 and density.ndim == 3 and density.size > 0
@@ -186,7 +189,10 @@ def _check_voxels(name: str, voxels: Voxels) -> None:
 
 
 def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
-    """Check shapes, types and values of the cutouts of a mesh; LidarError if they are wrong."""
+    """Check shapes, types and values of the cutouts of a mesh.
+
+    Raises LidarError if they are wrong.
+    """
     for cut in cutouts:
         valid = cut.mask.dtype == np.bool_ and cut.mask.ndim == 2 and cut.mask.size > 0
         valid = valid and cut.uv.shape[1:] == (3, 2) and len(cut.uv) > 0

@@ -70,7 +70,10 @@ def rolling(
 
 
 def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
-    """Check that each pattern of `wheels` matches a name of an object; LidarError if not."""
+    """Check that each pattern of `wheels` matches a name of an object.
+
+    Raises LidarError if not.
+    """
     for wheel in wheels:
         if not any(name == wheel or fnmatchcase(name, wheel) for name in names):
             raise LidarError(

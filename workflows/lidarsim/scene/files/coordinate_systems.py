@@ -78,7 +78,10 @@ def has_registry() -> bool:
 
 
 def need_registry(purpose: str) -> None:
-    """Check that rasterio is installed; LidarError if not. `purpose` starts the error."""
+    """Check that rasterio is installed.
+
+    Raises LidarError if not. `purpose` starts the error.
+    """
     if not has_registry():
         raise LidarError(f"{purpose} by rasterio: {install_command('lidarpool[geo]')}.")
 
@@ -104,7 +107,7 @@ def _crs_of_json(text: str) -> Any:
 
 
 def crs_of_code(epsg: int) -> Any:
-    """Return the `rasterio.crs.CRS` of an EPSG code; None if the code is unknown."""
+    """Return the `rasterio.crs.CRS` of an EPSG code, or None if the code is unknown."""
     return crs_of_text(f"EPSG:{epsg}")
 
 
@@ -174,13 +177,13 @@ def transformed(source: Any, target: Any, points: Floats) -> Floats:
 
 
 def longitude_latitude(crs: Any, x: float, y: float) -> tuple[float, float] | None:
-    """Return longitude and latitude (WGS 84) of a place, degrees; None outside of the system."""
+    """Return longitude and latitude (WGS 84) of a place, degrees, or None outside of the system."""
     places = _transformed_places(crs, crs_of_code(4326), np.array([[x, y]]))
     return None if places is None else (float(places[0, 0]), float(places[0, 1]))
 
 
 def _transformed_places(source: Any, target: Any, places: Floats) -> Floats | None:
-    """Return places (n, 2) in another system; None if one of them has no coordinates there."""
+    """Return places (n, 2) in another system, or None if one of them has no coordinates there."""
     try:
         moved = transformed(source, target, places)
     except Exception:  # errors of GDAL have classes that rasterio keeps private
@@ -269,13 +272,13 @@ def zone_in_metres(longitude: float, latitude: float) -> int:
 
 
 def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
-    """Return the EPSG code of a system in true metres at a place; None if it is not on Earth."""
+    """Return the EPSG code of a system in true metres at a place, or None if it is not on Earth."""
     place = longitude_latitude(horizontal_part(crs)[0], x, y)
     return None if place is None else zone_in_metres(*place)
 
 
 def projection_kind(name: str) -> bool | None:
-    """Return whether a projection is made for true lengths, by its name; None if unknown.
+    """Return whether a projection is made for true lengths, by its name, or None if unknown.
 
     For where PROJ cannot tell the scale: False for Mercator's.
     """
@@ -303,7 +306,7 @@ def _middle(item: SceneMesh | SceneInstance) -> Floats:
 
 
 def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) -> str:
-    """Return why lengths are not true at a place of a system, as a clause; empty if they are.
+    """Return why lengths are not true at a place of a system, as a clause, empty if they are.
 
     For systems of meshes, in metres. The clause follows the name of the system, such as «whose
     metre is 0.68 m long on the ground here».

@@ -170,7 +170,10 @@ class _NodeReader:
         return Node(name, self._local(index), meshes, children, copies, skinned)
 
     def _is_hidden(self, index: int, data: dict[str, Any]) -> bool:
-        """Return True for a node that is hidden; ValueError if the file does not say it clearly."""
+        """Return True for a node that is hidden.
+
+        Raises ValueError if the file does not say it clearly.
+        """
         visible = extension(data, VISIBILITY).get("visible", True)
         if not isinstance(visible, bool):
             raise ValueError(f"node {index} has {visible!r} as {VISIBILITY}.visible")

@@ -21,7 +21,9 @@ AnimatedNodes = dict[tuple[int, str], Floats]  # {(node, path): values at each t
 
 
 def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any]:
-    """Return the animation of a name, or of a number for a nameless animation; "" for the first.
+    """Return the animation of a name, or of a number for a nameless animation.
+
+    The name "" stands for the first animation.
 
     Raises
     ------

@@ -64,7 +64,10 @@ def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def check_readable(header: dict[str, Any]) -> None:
-    """Check that a file is glTF 2.0 and requires no unknown extension; MeshFileError if not."""
+    """Check that a file is glTF 2.0 and requires no unknown extension.
+
+    Raises MeshFileError if not.
+    """
     # Version 1.0 names parts, instead of numbering them.
     if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
         header.get("nodes"), dict
@@ -112,7 +115,10 @@ class GltfFile:
         self._buffer = cache(self._read_buffer)
 
     def part(self, kind: str, index: Any) -> dict[str, Any]:
-        """Return a part of the file by its index; ValueError without such a part."""
+        """Return a part of the file by its index.
+
+        Raises ValueError without such a part.
+        """
         parts: list[dict[str, Any]] = self.header.get(kind, [])
         number = natural(index)
         if number >= len(parts):
@@ -227,7 +233,10 @@ def extension(part: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def natural(number: Any) -> int:
-    """Return a count or an index; ValueError for a negative number or no integer."""
+    """Return a count or an index.
+
+    Raises ValueError for a negative number or no integer.
+    """
     if type(number) is not int or number < 0:
         raise ValueError(f"{number!r} is given as an index or a count")
     return number

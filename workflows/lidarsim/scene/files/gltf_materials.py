@@ -134,7 +134,7 @@ class GltfMaterials:
         return name[:80] or f"material {str(number)[:20]}"
 
     def _read_texture(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
-        """Return the mask of a material and its texture info; None for a solid material."""
+        """Return the mask of a material and its texture info, or None for a solid material."""
         material = self._file.part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
         if mode not in _CUT:
@@ -164,7 +164,7 @@ class GltfMaterials:
         return Texture(opacity >= min_alpha, (wrap_u, wrap_v), self._allowance)
 
     def _read_opacity(self, index: int) -> Bytes | None:
-        """Return the opacity of an image; None for an opaque image."""
+        """Return the opacity of an image, or None for an opaque image."""
         return self._file.image(index, read_opacity)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:

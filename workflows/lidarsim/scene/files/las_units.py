@@ -103,7 +103,7 @@ class CoordinateUnits:
         return self.factors == (1.0, 1.0, 1.0)
 
     def note(self) -> str:
-        """Return a clause on the conversion to metres; empty for metres."""
+        """Return a clause on the conversion to metres, empty for metres."""
         if self.metric:
             return ""
         if not self.vertical_stated:
@@ -187,7 +187,7 @@ def wkt_units(text: str) -> CoordinateUnits:
 
 
 def wkt_method(text: str) -> str:
-    """Return the name of the projection's method in WKT; empty without a projection."""
+    """Return the name of the projection's method in WKT, empty without a projection."""
     _, parts = _systems(text)
     for part in parts:
         if part.keyword in _HORIZONTAL:
@@ -275,7 +275,10 @@ def _third_unit(system: _Node) -> CoordinateUnit | None:
 
 
 def _unit_of(node: _Node) -> CoordinateUnit:
-    """Return the unit of length of a node; LidarError without a length in metres."""
+    """Return the unit of length of a node.
+
+    Raises LidarError without a length in metres.
+    """
     name, *factors = node.values
     metres = float(factors[0]) if factors else 0.0
     if not 1e-6 <= metres <= 1e6:
@@ -345,7 +348,7 @@ def height_unit_of_keys(keys: Mapping[int, float]) -> CoordinateUnit | None:
 
 
 def method_of_keys(keys: Mapping[int, float]) -> str:
-    """Return the name of the projection's method by GeoTIFF keys; empty if it is unknown."""
+    """Return the name of the projection's method by GeoTIFF keys, empty if it is unknown."""
     return _METHODS.get(int(keys.get(_PROJECTION, 0)), "")
 
 

@@ -111,7 +111,7 @@ class MeshFormat:
 
 
 def _flaw(options: type) -> str:
-    """Return why a class cannot be the options of a format, as a clause; empty if it can."""
+    """Return why a class cannot be the options of a format, as a clause, empty if it can."""
     if not (is_dataclass(options) and is_section(options)):
         return "are no dataclass with checked_fields"
     for entry in fields(options):
@@ -242,7 +242,10 @@ def _installed_plugin(ending: str, folders: tuple[str, ...]) -> Plugin | None:
 
 
 def _row_of_plugin(plugin: Plugin) -> MeshFormat:
-    """Return the format of a plug-in; LidarError for a plug-in that cannot be used."""
+    """Return the format of a plug-in.
+
+    Raises LidarError for a plug-in that cannot be used.
+    """
     row = plugin.load(MeshFormat)
     if row.read is None:
         raise plugin.lacks("read")
@@ -292,7 +295,7 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
 
 
 def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
-    """Return a clause on options that a file does not have by its format; empty if it has all.
+    """Return a clause on options that a file does not have by its format, empty if it has all.
 
     The clause follows the name of the file, and names the formats that have the options.
     """
@@ -342,7 +345,7 @@ def formats_with_plugins() -> Iterator[MeshFormat]:
 
 
 def advice_on(path: str | Path) -> str:
-    """Return the advice on a file of a format that is not read; empty for formats that are."""
+    """Return the advice on a file of a format that is not read, empty for formats that are."""
     row = format_of(path)
     return "" if row is None else row.advice
 

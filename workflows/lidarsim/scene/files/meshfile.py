@@ -306,7 +306,10 @@ def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance])
 
 
 def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Content:
-    """Read a file of a format with at least one object; LidarError for all errors."""
+    """Read a file of a format with at least one object.
+
+    Raises LidarError for all errors.
+    """
     try:
         with prefixed(path):
             return _checked_content(row, path, data, options)
@@ -346,7 +349,10 @@ def _advice(error: Exception) -> str:
 
 
 def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOptions) -> Content:
-    """Read the content of a file; MeshFileError for a foreign file, or without objects."""
+    """Read the content of a file.
+
+    Raises MeshFileError for a foreign file, or without objects.
+    """
     for beginning, problem in _FOREIGN.items():
         if re.match(beginning, data):
             raise MeshFileError(problem)
@@ -364,7 +370,10 @@ def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOpti
 
 
 def _format_to_read(path: Path) -> MeshFormat:
-    """Return the format of a file; LidarError if no format that is read has its ending."""
+    """Return the format of a file.
+
+    Raises LidarError if no format that is read has its ending.
+    """
     row = format_of(path)
     if row is not None and not row.advice:
         return row

@@ -162,7 +162,10 @@ class MtlMaterials:
                         self.notes.missing_files.append(name)
 
     def _content(self, path: Path | None) -> bytes:
-        """Return the content of a file of materials; OSError for a missing or large file."""
+        """Return the content of a file of materials.
+
+        Raises OSError for a missing or large file.
+        """
         if path is None or path.stat().st_size > _MAX_BYTES:
             raise FileNotFoundError
         return read_input(path)

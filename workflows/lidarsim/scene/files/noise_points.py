@@ -29,7 +29,7 @@ class LeftOut(NamedTuple):
     noise: int = 0
 
     def note(self) -> str:
-        """Return a sentence with the numbers; empty if no points are left out."""
+        """Return a sentence with the numbers, empty if no points are left out."""
         kinds = []
         if self.withheld:
             kinds.append(f"{plural(self.withheld, 'withheld point')}")

@@ -50,7 +50,10 @@ def read_npy_cloud(path: Path) -> list[CloudScan]:
 
 
 def _fields(records: AnyArray) -> dict[str, AnyArray]:
-    """Return the fields of records (n,) by their usual names; ValueError without x, y and z."""
+    """Return the fields of records (n,) by their usual names.
+
+    Raises ValueError without x, y and z.
+    """
     columns: dict[str, AnyArray] = {}
     for name in records.dtype.names or ():
         values = records[name]
@@ -66,7 +69,10 @@ def _fields(records: AnyArray) -> dict[str, AnyArray]:
 
 
 def _read_array(file: BinaryIO, size: int) -> AnyArray:
-    """Return the array of numbers in a file of a size in bytes; ValueError for other files."""
+    """Return the array of numbers in a file of a size in bytes.
+
+    Raises ValueError for other files.
+    """
     shape, is_fortran, kind = _read_header(file)
     if not _holds_numbers(kind):
         raise ValueError(f"its array has the type {printable(str(kind))[:80]!r}: {_EXPECTED}")
@@ -81,7 +87,10 @@ def _read_array(file: BinaryIO, size: int) -> AnyArray:
 
 
 def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return the shape, the order and the type of the array in a file; ValueError if broken."""
+    """Return the shape, the order and the type of the array in a file.
+
+    Raises ValueError if broken.
+    """
     layout: Any = np.lib.format
     readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
     start = file.read(len(layout.MAGIC_PREFIX))

@@ -190,7 +190,10 @@ _Entries = Mapping[str, tuple[int, list[str]]]
 
 
 def _fields(entries: _Entries) -> list[_Field]:
-    """Return the fields of a header; ValueError if they are broken."""
+    """Return the fields of a header.
+
+    Raises ValueError if they are broken.
+    """
     if not entries.get("FIELDS", (0, []))[1]:
         raise ValueError("its header has no FIELDS")
     names = entries["FIELDS"][1]
@@ -222,7 +225,10 @@ def _fields(entries: _Entries) -> list[_Field]:
 
 
 def _count_of_points(entries: _Entries) -> int:
-    """Return POINTS, or WIDTH x HEIGHT without it; ValueError if they contradict each other."""
+    """Return POINTS, or WIDTH x HEIGHT without it.
+
+    Raises ValueError if they contradict each other.
+    """
     (points,) = _whole_numbers(entries, "POINTS", [-1], 1)
     (width,) = _whole_numbers(entries, "WIDTH", [-1], 1)
     (height,) = _whole_numbers(entries, "HEIGHT", [1], 1)
@@ -238,7 +244,10 @@ def _count_of_points(entries: _Entries) -> int:
 def _whole_numbers(
     entries: _Entries, keyword: str, default: list[int], count: int | None = None
 ) -> list[int]:
-    """Return the whole numbers of a line of a header; ValueError if there are others."""
+    """Return the whole numbers of a line of a header.
+
+    Raises ValueError if there are others.
+    """
     if keyword not in entries:
         return default
     number, words = entries[keyword]
@@ -307,7 +316,10 @@ def _row_type(fields: Sequence[_Field], row_size: int) -> np.dtype[Any]:
 
 
 def _check_length(header: _Header, row_size: int, size: int) -> None:
-    """Check that all announced points are in a file; ValueError if not."""
+    """Check that all announced points are in a file.
+
+    Raises ValueError if not.
+    """
     if header.points * row_size > size:
         raise CutShortError(
             f"{header.points:,} points of {row_size} bytes announced, and "
@@ -355,7 +367,10 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
 
 
 def _unpacked(packed: memoryview, size: int) -> Bytes:
-    """Return bytes that LZF packed; ValueError if they are damaged."""
+    """Return bytes that LZF packed.
+
+    Raises ValueError if they are damaged.
+    """
     from .lzf_loops import unpack_lzf  # numba takes a while to load
 
     content = np.zeros(size, np.uint8)
@@ -403,7 +418,9 @@ def _exact_integers(field: _Field, body: memoryview, cells: Sequence[int]) -> An
 
 
 def _as_type(values: Floats, field: _Field) -> AnyArray:
-    """Return real numbers as the whole numbers of a field; ValueError if they are others.
+    """Return real numbers as the whole numbers of a field.
+
+    Raises ValueError if they are others.
 
     NaN becomes 0, as in PCL.
     """

@@ -100,7 +100,7 @@ class _ObjContent:
 
     @cached_property
     def vertex_colours(self) -> Bytes | None:
-        """Colours of the vertices, (v, 3); None unless all vertices have a colour."""
+        """Colours of the vertices, (v, 3), or None unless all vertices have a colour."""
         if not self.tints or len(self.tints) != len(self.positions):
             return None
         return as_bytes(_colour_shares(np.frombuffer(self.tints).reshape(-1, 3)))
@@ -322,7 +322,9 @@ _NumberedLine = tuple[int, list[bytes]]  # number of the line, and its words
 
 
 def _off_lines(text: bytes, first_line: int) -> tuple[list[_NumberedLine], list[_NumberedLine]]:
-    """Return the lines of vertices and of faces after the counts; ValueError for other counts.
+    """Return the lines of vertices and of faces after the counts.
+
+    Raises ValueError for other counts.
 
     `first_line` is the number of the first line in the file.
     """
@@ -530,7 +532,10 @@ def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
-    """Return the triangles (t, 3) of all faces; ValueError if there are no indices."""
+    """Return the triangles (t, 3) of all faces.
+
+    Raises ValueError if there are no indices.
+    """
     name = next((name for name in _PLY_LISTS if name in rows["face"]), None)
     if name is None:
         raise ValueError(f"its faces have no {_PLY_LISTS[0]}")
@@ -569,14 +574,20 @@ def ply_comments(data: bytes) -> list[str]:
 
 
 def _ply_vertices(rows: _PlyRows) -> Floats:
-    """Return the positions of vertices, (v, 3); ValueError if an axis is missing."""
+    """Return the positions of vertices, (v, 3).
+
+    Raises ValueError if an axis is missing.
+    """
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     return np.stack([rows["vertex"][axis].numbers for axis in "xyz"], axis=1).astype(np.float64)
 
 
 def _ply_header(data: bytes) -> _PlyHeader:
-    """Parse the header of a .ply file; ValueError if the header is broken."""
+    """Parse the header of a .ply file.
+
+    Raises ValueError if the header is broken.
+    """
     header_match = re.match(rb"ply[ \t]*\r?\n(.*?\n)??end_header[ \t]*\r?\n", data, re.DOTALL)
     header_match = header_match or re.match(rb"ply\r(.*?\r)??end_header\r", data, re.DOTALL)
     if not header_match:

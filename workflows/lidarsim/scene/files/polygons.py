@@ -173,7 +173,10 @@ def _newell(points: Floats) -> Floats:
 
 
 def check_corners(corners: Ints, vertex_count: int) -> None:
-    """Check that corners refer to existing vertices, numbered from 0; ValueError if not."""
+    """Check that corners refer to existing vertices, numbered from 0.
+
+    Raises ValueError if not.
+    """
     if len(corners) and not 0 <= corners.min() <= corners.max() < vertex_count:
         raise ValueError(
             f"faces refer to vertices {corners.min()} to {corners.max()}, counted from 0, of "

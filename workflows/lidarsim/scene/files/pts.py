@@ -64,7 +64,7 @@ def read_pts(path: Path) -> list[CloudScan]:
 
 
 def next_line(lines: Iterator[tuple[int, str]]) -> tuple[int, str] | None:
-    """Return the next line that is not blank, with its number; None at the end."""
+    """Return the next line that is not blank, with its number, or None at the end."""
     return next(((number, line) for number, line in lines if not line.isspace()), None)
 
 
@@ -88,7 +88,10 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
 
 
 def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
-    """Return the names of the cells of a line, by their number; ValueError for another number."""
+    """Return the names of the cells of a line, by their number.
+
+    Raises ValueError for another number.
+    """
     number, line = entry
     count = len(line.split())
     if count not in names:

@@ -119,7 +119,10 @@ def _begun(first: str, lines: Iterator[str]) -> Iterator[str]:
 
 
 def _header_numbers(entry: tuple[int, str], width: int, meaning: str) -> list[float]:
-    """Return the numbers of a line of the header; ValueError if they are others."""
+    """Return the numbers of a line of the header.
+
+    Raises ValueError if they are others.
+    """
     number, line = entry
     try:
         values = list(map(float, line.split()))

@@ -94,7 +94,7 @@ class StatedSystem:
 
     @classmethod
     def of_records(cls, records: Mapping[int, bytes], prefer_wkt: bool) -> StatedSystem | None:
-        """Return the system of the records of LASF_Projection in a LAS file; None without one.
+        """Return the system of the records of LASF_Projection in a LAS file, or None without one.
 
         `prefer_wkt` says whether WKT counts where a file also has GeoTIFF keys. ValueError if a
         record is broken.
@@ -141,7 +141,7 @@ class StatedSystem:
         return self._code
 
     def units(self) -> CoordinateUnits | None:
-        """Return the units of the coordinates; None if the file says nothing of a projection.
+        """Return the units of the coordinates, or None if the file says nothing of a projection.
 
         Raises
         ------

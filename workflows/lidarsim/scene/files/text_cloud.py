@@ -117,7 +117,10 @@ def _begins_as_raster(start: bytes) -> bool:
 
 
 def _check_text(start: bytes) -> None:
-    """Check that a file begins as text in UTF-8, and is no raster; ValueError if not."""
+    """Check that a file begins as text in UTF-8, and is not a raster.
+
+    Raises ValueError if not.
+    """
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise ValueError("it is text in UTF-16: save it as UTF-8")
     if b"\0" in start:
@@ -130,7 +133,10 @@ def _check_text(start: bytes) -> None:
 
 
 def _read_head(lines: Iterator[str]) -> _Head:
-    """Read up to the first line of points; ValueError if there is none."""
+    """Read up to the first line of points.
+
+    Raises ValueError if there is none.
+    """
     names: list[str] | None = None
     names_line = 0
     is_remark = False
@@ -176,7 +182,7 @@ def _begins_with_numbers(text: str) -> bool:
 
 
 def _separator(line: str) -> str | None:
-    """Return what separates the cells of a line of numbers; None for spaces and tabs."""
+    """Return what separates the cells of a line of numbers, or None for spaces and tabs."""
     if ";" in line:
         return ";"
     words = line.split()
@@ -202,7 +208,10 @@ def _is_number(cell: str, separator: str | None) -> bool:
 
 
 def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> list[str]:
-    """Return the names of all cells of a line; ValueError if the header has other cells."""
+    """Return the names of all cells of a line.
+
+    Raises ValueError if the header has other cells.
+    """
     names = head.names or []
     count = len(first_cells)
     if count < len("xyz"):
@@ -264,7 +273,10 @@ def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, fl
 def _numeric_cells(
     head: _Head, first_cells: Sequence[str], separator: str | None, axes: Sequence[int]
 ) -> list[int]:
-    """Return the indices of the cells that are numbers; ValueError if x, y or z is none."""
+    """Return the indices of the cells that are numbers.
+
+    Raises ValueError if x, y or z is none.
+    """
     numeric = [
         index
         for index, cell in enumerate(first_cells)
@@ -290,7 +302,10 @@ def _column(values: Floats, first_cell: str) -> AnyArray:
 
 
 def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
-    """Check the number of points, and that headless rows are points; ValueError if not."""
+    """Check the number of points, and that headless rows are points.
+
+    Raises ValueError if not.
+    """
     if head.announced is not None and len(values) != head.announced:
         failure = CutShortError if len(values) < head.announced else ValueError
         raise failure(

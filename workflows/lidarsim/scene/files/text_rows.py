@@ -111,7 +111,10 @@ class RowReader:
         return np.frombuffer(numbers, np.float64).reshape(-1, width)
 
     def _number(self, cell: str, index: int, line_number: int) -> float:
-        """Return the number in a cell; ValueError if there is none."""
+        """Return the number in a cell.
+
+        Raises ValueError if there is none.
+        """
         text = cell
         if "." in cell and not self.point_line:
             self.point_line = line_number
