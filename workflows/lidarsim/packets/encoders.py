@@ -35,7 +35,7 @@ class Datagrams:
     payloads: Bytes  # (n, size)
     due_ns: Ints  # (n,): when the sensor sends them, nanoseconds since the survey's start
     port: int
-    source_port: int = 0  # of the sensor; 0 for any: in files the same port
+    source_port: int = 0  # port of the sensor; 0 for any: in files the same port
 
     def __len__(self) -> int:
         return len(self.payloads)
@@ -52,11 +52,11 @@ class PacketSource:
     """What packets depend on beside the shots: a sensor of a survey, and its times."""
 
     sensor: Sensor
-    mode: str  # of its returns, see `Returns`
-    name: str = ""  # of the sensor in its survey
-    start_ns: int = START_NS  # of the survey, since 1970-01-01 UTC
+    mode: str  # mode of its returns (`Returns`)
+    name: str = ""  # name of the sensor in its survey
+    start_ns: int = START_NS  # start of the survey, since 1970-01-01 UTC
     dated: bool = False  # whether the survey has a start, as of a clock that a receiver sets
-    instruments: Instruments | None = None  # of the carrier
+    instruments: Instruments | None = None  # instruments of the carrier
     mount: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4): pose on the carrier
 
     @property
@@ -98,10 +98,10 @@ class PacketEncoder(ABC):
     that fill no packet for the next sweep (`CarryOver`).
     """
 
-    columns: tuple[str, ...] = ("reflectivity",)  # of the cloud, beside ray and range
-    identifiers: ClassVar[tuple[str, ...]] = ()  # that the data file must state
-    optional_identifiers: ClassVar[tuple[str, ...]] = ()  # that it may state
-    address: ClassVar[str] = "192.168.1.201"  # of the sensor, as it leaves the factory
+    columns: tuple[str, ...] = ("reflectivity",)  # columns of the cloud, beside ray and range
+    identifiers: ClassVar[tuple[str, ...]] = ()  # the data file must state them
+    optional_identifiers: ClassVar[tuple[str, ...]] = ()  # the data file may state them
+    address: ClassVar[str] = "192.168.1.201"  # address of the sensor, as it leaves the factory
     destination: ClassVar[str] = "255.255.255.255"
     default_ports: ClassVar[Mapping[str, int]] = {}  # {kind of packets: port}, returns first
     # Whether receivers tell sensors of one port apart, by addresses or serial numbers.
@@ -251,7 +251,7 @@ _DECODERS = (
 
 
 def decoder_of(path: Path, name: str, frame: bytes) -> PacketDecoder:
-    """Return the decoder of a file by its first frame; `name` is the file's in messages.
+    """Return the decoder of a file by its first frame, for the file's `name` in messages.
 
     Raises
     ------

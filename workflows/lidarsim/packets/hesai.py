@@ -23,7 +23,7 @@ from .service import Destination
 from .shots import CarryOver, Shots, last_and_strongest
 
 DATA_PORT = 2368
-_AZIMUTHS = 36_000  # in a revolution
+_AZIMUTHS = 36_000  # azimuths in a revolution
 _MAX_UNITS = 65_535
 _FACTORY = 0x42
 _SECOND_NS = 1_000_000_000

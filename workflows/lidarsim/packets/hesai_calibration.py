@@ -48,7 +48,7 @@ class LaserTable(NamedTuple):
         return "\n".join(["Channel,Elevation,Azimuth", *lines, ""])
 
     def firetimes_file(self) -> str:
-        """Return the file of firing times; in all states and distances they are the same."""
+        """Return the file of firing times, the same in all states and distances."""
         states = self.layout.listed_states
         times_us = [_decimal(time) for time in self.time_us]
         if not states:

@@ -41,16 +41,16 @@ class Layout:
     firing_us: float
     packet: np.dtype[np.void]
     modes: Mapping[str, int]  # {mode of returns: number in the packet}
-    first_laser_us: float  # from the reference of a block to the laser that fires first
-    reference_us: float  # from the stamp of a packet to the reference of the stamped block
+    first_laser_us: float  # time between the reference of a block and the laser that fires first
+    reference_us: float  # time between the stamp of a packet and the reference of the stamped block
     epoch: int  # year 0 of dates
-    model_code: int  # of the device information, see hesai_ptc.py
+    model_code: int  # code of the device information (hesai_ptc.py)
     header: tuple[int, ...] = ()  # bytes, of which `dual_header` replaces some
     dual_header: Mapping[int, int] | None = None  # {position: byte in the mode dual}
     block_start: int | None = None  # first bytes of each block
     return_byte: int = 0  # fourth byte of a return
     stamps_first_block: bool = False  # else the stamp is of the last block
-    has_checksums: bool = False  # of body, state and tail
+    has_checksums: bool = False  # whether body, state and tail have checksums
     has_epoch_seconds: bool = True  # whether the date may be seconds since 1970, of a PTP clock
     listed_states: tuple[int, ...] = ()  # operational state of each column of firing times
     lists_distances: bool = False  # whether each state has columns for far and for near targets

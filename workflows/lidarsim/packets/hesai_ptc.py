@@ -23,7 +23,7 @@ PTC_PORT = 9347
 _MARK = b"\x47\x74"  # first bytes of requests and answers
 _HEADER = Struct(">2sBBI")  # mark, command, code of the answer, bytes that follow
 _MAX_REQUEST_BYTES = 1024
-_WITHIN_S = 5.0  # from the start of a request to its end, and for its answer
+_WITHIN_S = 5.0  # limit for a request from start to end, and for its answer
 
 _GET_CALIBRATION = 0x05
 _GET_INVENTORY = 0x07
@@ -44,7 +44,7 @@ _STATUS = Struct(">IH8iBBiiB5x")
 _DESTINATION = Struct(">4sHH")
 # {mode of returns: number of the command}
 _RETURN_MODES = {"last": 0, "strongest": 1, "dual": 2, "first": 3}
-_GPS_PORT = 10_110  # of packets with the receiver's sentences, which are not sent
+_GPS_PORT = 10_110  # port of packets with the receiver's sentences, which are not sent
 
 # What ends a connection: the peer, bytes that are no command, or this side.
 _ENDS = (OSError, TimeoutError, asyncio.IncompleteReadError, ValueError, asyncio.CancelledError)
@@ -54,12 +54,12 @@ _ENDS = (OSError, TimeoutError, asyncio.IncompleteReadError, ValueError, asyncio
 class PtcDevice:
     """Facts of a sensor that its commands report."""
 
-    name: str  # of the sensor in its survey
+    name: str  # name of the sensor in its survey
     model_code: int
     lasers: int
     rate_rpm: int
-    mode: str  # of returns
-    port: int  # of the data
+    mode: str  # mode of returns
+    port: int  # port of the data
     dated: bool  # whether a receiver sets the clock
     ptp: bool  # whether the clock is a PTP clock
     calibration: bytes  # file of angles
@@ -86,16 +86,16 @@ class PtcDevice:
             *(0, 0),  # no phase lock
             *(0, 3600),  # field of view, 0.1 degrees
             self.ptp,
-            1,  # with sequence numbers
+            1,  # packets have sequence numbers
             0,  # fires by time
             _RETURN_MODES[self.mode],
-            *(0, 0),  # in operation
+            *(0, 0),  # state: in operation
             *(0, 0),  # no VLAN
             *(0, 0, 0),  # format of dates, noise filter, linear reflectivity
         )
 
     def status(self, uptime_s: float) -> bytes:
-        """Return the time of operation and the rate; temperatures are 0."""
+        """Return the time of operation and the rate, with temperatures 0."""
         ptp_state = 2 if self.ptp else 0  # locked, or free run
         return _STATUS.pack(
             int(uptime_s), self.rate_rpm, *[0] * 8, *[self.dated] * 2, 1, 0, ptp_state
@@ -111,7 +111,7 @@ class _RefusedError(Exception):
 
 
 class PtcService(TcpService):
-    """Answers commands; a connection may send any number of commands.
+    """Answers commands, any number of commands on a connection.
 
     Parameters
     ----------

@@ -23,9 +23,9 @@ from .service import is_single_receiver
 from .tcp_service import TcpService
 
 HTTP_PORT = 80
-_MAX_HEAD_BYTES = 16 << 10  # of the request line and headers
+_MAX_HEAD_BYTES = 16 << 10  # limit for the request line and headers
 _MAX_BODY_BYTES = 64 << 10
-_WITHIN_S = 5.0  # from the connection to the answer
+_WITHIN_S = 5.0  # limit between the connection and the answer
 _METHODS = ("GET", "POST", "PUT", "DELETE", "HEAD")
 _READING = ("GET", "HEAD")
 
@@ -49,7 +49,7 @@ class Answer:
 
     content: Any = None  # plain data for JSON; None for no content
     status: int = HTTPStatus.OK
-    text: str | None = None  # in place of JSON
+    text: str | None = None  # replaces JSON
 
     def encode(self) -> bytes:
         """Return the answer as bytes of HTTP."""
@@ -77,7 +77,7 @@ class RefusedError(Exception):
 
 
 class HttpService(TcpService):
-    """Answers requests of HTTP; parameters are those of `TcpService`."""
+    """Answers requests of HTTP, with the parameters of `TcpService`."""
 
     usual_port = HTTP_PORT
     example_port = 8080

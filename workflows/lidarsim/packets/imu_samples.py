@@ -22,14 +22,14 @@ class ImuBatch(NamedTuple):
 
 
 class ImuSamples:
-    """Samples of the carrier's IMU in the order of their times; none without an IMU."""
+    """Samples of the carrier's IMU in the order of their times, or none without an IMU."""
 
     def __init__(self, source: PacketSource) -> None:
         instruments = source.instruments
         self._rows = iter(()) if instruments is None else instruments.rows(IMU_FILE)
         self._next_row: list[str] | None = next(self._rows, None)
-        self._starts_ns: Ints = np.zeros(1, np.int64)  # of the last shots
-        self._jumps_ns: Ints = np.zeros(1, np.int64)  # of the clock, at the last shots
+        self._starts_ns: Ints = np.zeros(1, np.int64)  # starts of the last shots
+        self._jumps_ns: Ints = np.zeros(1, np.int64)  # jumps of the clock, at the last shots
 
     def during(self, shots: Shots) -> ImuBatch | None:
         """Return the samples until the last of the shots, or None without samples."""

@@ -21,7 +21,7 @@ from .imu_samples import ImuBatch, ImuSamples
 from .service import Destination, Service
 from .shots import CarryOver, Shots
 
-DOTS = 96  # of a packet
+DOTS = 96  # dots per packet
 IMU_DATA = 0  # type of data
 _CHECKED_FROM = 28  # byte of a packet from which its checksum counts
 _MODES = ("strongest", "first", "last")
@@ -39,7 +39,7 @@ class Ports:
     host_points: int
     host_imu: int
     command: int
-    state: int  # of state messages; 0: none are sent
+    state: int  # port of state messages; 0: none are sent
     host_state: int
 
 
@@ -81,9 +81,9 @@ def packet_type(data: np.dtype[np.void], count: int) -> np.dtype[np.void]:
         [
             ("version", "u1"),
             ("length", "<u2"),
-            ("interval", "<u2"),  # from the first to the last point, 0.1 µs
+            ("interval", "<u2"),  # time between the first and the last point, 0.1 µs
             ("count", "<u2"),
-            ("number", "<u2"),  # of the packet in its frame
+            ("number", "<u2"),  # number of the packet in its frame
             ("frame", "u1"),
             ("data_type", "u1"),
             ("time_type", "u1"),
@@ -152,7 +152,7 @@ class LivoxEncoder(PacketEncoder):
         return [self._points(filling).without(np.asarray(dropped)), *imu]
 
     def finish(self) -> list[Datagrams]:
-        """Return the last samples of the IMU; points that fill no packet are not sent."""
+        """Return the last samples of the IMU, while points that fill no packet are not sent."""
         return self._imu(self._samples.remaining())
 
     @property
@@ -205,7 +205,7 @@ class LivoxEncoder(PacketEncoder):
         return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
     def _positions_m(self, shots: Shots) -> Floats:
-        """Return positions in the sensor frame, metres: (n, c, 3); NaN without a return."""
+        """Return positions in the sensor frame, metres: (n, c, 3), or NaN without a return."""
         sensor = self.source.sensor
         channels = self.source.settings.channels
         positions = sensor.directions(shots.firings)[:, channels]
@@ -246,7 +246,7 @@ class LivoxEncoder(PacketEncoder):
         return numbers, frames % 256
 
     def _imu(self, batch: ImuBatch | None) -> list[Datagrams]:
-        """Return a packet for each sample of the IMU; none for None."""
+        """Return a packet for each sample of the IMU, or none for None."""
         if batch is None:
             return []
         packets = np.zeros(len(batch.times_ns), packet_type(_IMU_SAMPLE, 1))
@@ -262,7 +262,7 @@ class LivoxEncoder(PacketEncoder):
         return [Datagrams(payloads, batch.times_ns, self.ports["imu"], source_port)]
 
     def _write_header(self, packets: Records, stamps_ns: Ints) -> None:
-        """Write the common fields of packets (n,); `stamps_ns` (n,) are since the survey's start.
+        """Write the common fields of packets (n,), sent `stamps_ns` (n,) after the survey's start.
 
         A sensor that no clock has told the time counts from its start.
         """

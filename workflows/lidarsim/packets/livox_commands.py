@@ -16,7 +16,7 @@ from zlib import crc32
 
 MAX_FRAME_BYTES = 1400
 _HEAD = Struct("<BBHIHBB6s")  # start, version, length, number, command, is it an answer, sender
-_CHECKSUMS = Struct("<HI")  # of the head, of the data
+_CHECKSUMS = Struct("<HI")  # checksums of the head, of the data
 _HEAD_BYTES = _HEAD.size + _CHECKSUMS.size
 _START = 0xAA
 _VERSION = 0
@@ -24,7 +24,7 @@ _REQUEST = 0  # types of frames
 _ANSWER = 1
 _HOST = 0  # senders
 _LIDAR = 1
-_COUNT = Struct("<HH")  # of keys, reserved
+_COUNT = Struct("<HH")  # number of keys, reserved
 _KEY = Struct("<H")
 _ENTRY = Struct("<HH")  # key, length
 
@@ -35,7 +35,7 @@ class Command(IntEnum):
     SEARCH = 0x0000
     SET = 0x0100
     GET = 0x0101
-    PUSH = 0x0102  # from the sensor to the host
+    PUSH = 0x0102  # sent by the sensor to the host
     REBOOT = 0x0200
     RESET = 0x0201
     SET_GPS_TIME = 0x0202

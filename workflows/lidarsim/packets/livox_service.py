@@ -1,8 +1,8 @@
 """The command interface of a live Livox: search, parameters, and state messages.
 
 Livox-SDK2 searches by broadcasts to port 56000, which do not reach a sensor on the same machine,
-and ignores datagrams from its own address. So the sensor has an address of its own, such as
-127.0.0.2, and tells the host each second that it is there, as if the host had searched.
+and ignores datagrams from its own address. So the sensor has a separate address, such as 127.0.0.2,
+and tells the host each second that it is there, as if the host had searched.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from .livox_commands import (
 from .service import Destination, Service, is_single_receiver
 
 SEARCH_PORT = 56_000
-_ANNOUNCE_S = 1.0  # as often as the SDK searches
-_LOOKS_S = 0.1  # for the end of the service
-_MAX_REQUESTS = 200  # in a second: others are dropped, so that a flood takes little time
+_ANNOUNCE_S = 1.0  # the SDK searches as often
+_LOOKS_S = 0.1  # pause between looks for the end of the service
+_MAX_REQUESTS = 200  # limit per second: others are dropped, so that a flood takes little time
 _SEARCH_ANSWER = Struct("<BB16s4sH")
 _SET_ANSWER = Struct("<BH")
 _GET_ANSWER = Struct("<BH")
@@ -80,8 +80,8 @@ class LivoxState:
     product: str
     serial: str
     command_port: int
-    state_ports: tuple[int, int]  # of the sensor, and by default of the host; 0: no state messages
-    points_ports: tuple[int, int]  # of the sensor, and of its datagrams
+    state_ports: tuple[int, int]  # ports of the sensor, and by default of the host; 0: none
+    points_ports: tuple[int, int]  # ports of the sensor, and of its datagrams
     imu_ports: tuple[int, int]
     data_type: int
     data_types: tuple[int, ...]
@@ -89,7 +89,7 @@ class LivoxState:
 
 
 class LivoxService(Service):
-    """Answers commands of Livox-SDK2 on a thread of its own, and tells the host of the sensor.
+    """Answers commands of Livox-SDK2 on a separate thread, and tells the host of the sensor.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class LivoxService(Service):
                     self._serve(key.fileobj)
 
     def _serve(self, opened: socket.socket) -> None:
-        """Answer the next request of a socket; datagrams that are no requests are ignored."""
+        """Answer the next request of a socket, and ignore other datagrams."""
         with suppress(OSError):  # such as of a host that has gone
             content, peer = opened.recvfrom(MAX_FRAME_BYTES + 1)
             request = parse_request(content)
@@ -243,7 +243,7 @@ class LivoxService(Service):
         return _GET_ANSWER.pack(Code.SUCCESS, len(values)) + packed_values(values)
 
     def _set(self, data: bytes) -> bytes:
-        """Set all parameters of a request, or none if a value is wrong; return the answer."""
+        """Set all parameters of a request, or none if a value is wrong, and return the answer."""
         try:
             values = parse_values(data)
             for key, value in values.items():

@@ -37,8 +37,8 @@ from .shots import Shots
 LIDAR_PORT = 7502
 IMU_PORT = 7503
 COLUMNS_PER_PACKET = 16
-_COLUMNS = (512, 1024, 2048, 4096)  # of a revolution
-_ENCODER_TICKS = 90_112  # of a revolution
+_COLUMNS = (512, 1024, 2048, 4096)  # columns per revolution
+_ENCODER_TICKS = 90_112  # ticks per revolution
 _LIDAR_PACKET = 1  # type of packet
 _INITIALIZATION_ID = 1  # number of the sensor's start; the same in packets and metadata
 _STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
@@ -76,8 +76,8 @@ class Profile:
     """A layout of lidar packets, by its name in the metadata (`udp_profile_lidar`)."""
 
     name: str
-    layout: int  # of pixels, see `ouster_loops`
-    pixel_words: int  # of 32 bits
+    layout: int  # layout of pixels (`ouster_loops`)
+    pixel_words: int  # words of 32 bits
     range_bits: int
     unit_mm: int = 1
 
@@ -109,7 +109,7 @@ class RangeUnits(NamedTuple):
 class ReturnImages(NamedTuple):
     """Returns of n columns of c beams: arrays (r, n, c) of up to r returns, the nearest first."""
 
-    range_m: AnyFloats  # from the beam's start; 0 or NaN without a return
+    range_m: AnyFloats  # range from the beam's start; 0 or NaN without a return
     reflectivity: Bytes
     signal: NDArray[np.uint16]
 
@@ -150,8 +150,8 @@ def lidar_packet(profile: Profile, beams: int) -> np.dtype[np.void]:
             ("serial_number", "u1", (5,)),
             ("alert_flags", "u1"),  # 0: no alert
             ("reserved", "u1", (3,)),
-            ("countdowns", "u1", (2,)),  # to thermal shutdown and shot limiting, s; 0: none
-            ("states", "u1", (2,)),  # of thermal shutdown and shot limiting; 0: normal
+            ("countdowns", "u1", (2,)),  # until thermal shutdown and shot limiting, s; 0: none
+            ("states", "u1", (2,)),  # states of thermal shutdown and shot limiting; 0: normal
             ("reserved_of_header", "u1", (12,)),
             ("columns", column, (COLUMNS_PER_PACKET,)),
             ("reserved_of_footer", "u1", (24,)),
@@ -209,7 +209,7 @@ _IMU_PACKET = np.dtype(
         ("system_ns", "<u8"),
         ("accelerometer_ns", "<u8"),
         ("gyroscope_ns", "<u8"),
-        ("acceleration", "<f4", (3,)),  # in units of standard gravity
+        ("acceleration", "<f4", (3,)),  # multiple of standard gravity
         ("angular_velocity", "<f4", (3,)),  # degrees a second
     ]
 )
@@ -351,7 +351,7 @@ class OusterEncoder(PacketEncoder):
         return [] if rest is None else self._lidar(rest)
 
     def _lidar(self, shots: Shots) -> list[Datagrams]:
-        """Return the lidar packets of shots; the first and the last packet may lack columns."""
+        """Return lidar packets of shots, where the first and the last packet may lack columns."""
         if not len(shots):
             return []
         blocks = self._blocks(shots)
@@ -389,7 +389,7 @@ class OusterEncoder(PacketEncoder):
         )
 
     def _imu(self, batch: ImuBatch | None) -> list[Datagrams]:
-        """Return a packet for each sample of the IMU; none for None."""
+        """Return a packet for each sample of the IMU, or none for None."""
         if batch is None:
             return []
         payloads = imu_packets(batch.stamps_ns + self.source.start_ns, batch.rates, batch.forces)
@@ -459,7 +459,7 @@ class OusterEncoder(PacketEncoder):
         return pose
 
     def _imu_pose(self) -> Floats:
-        """Return the pose (4, 4) of the IMU in the sensor frame, mm; the identity without IMU."""
+        """Return the pose (4, 4) of the IMU in the sensor frame, mm, the identity without IMU."""
         instruments = self.source.instruments
         if instruments is None or instruments.imu is None:
             return np.eye(4)
@@ -478,7 +478,7 @@ def _rounded(values: Floats) -> list[float]:
 
 
 class OusterDecoder(PacketDecoder):
-    """Reads the scans of ouster-sdk; a .json beside a .pcap has the metadata."""
+    """Reads the scans of ouster-sdk, with metadata from a .json beside a .pcap."""
 
     intensity = "reflectivity"
 

@@ -18,7 +18,7 @@ from .http_service import Answer, HttpService, RefusedError, Request, receiver_o
 from .service import Destination
 
 _ROOT = "/api/v1/"
-_AUTO = "@auto"  # in the place of an address: that of the client
+_AUTO = "@auto"  # stands for the address of the client
 _PORTS = ("udp_port_lidar", "udp_port_imu")
 _MODES = ("NORMAL", "STANDBY")
 

@@ -19,7 +19,7 @@ SINGLE, DUAL, LOW_RATE = range(3)
 #           | signal [16], signal of the second return [16] | near infrared [16]
 # LOW_RATE  range [15], reflectivity [8 from 16], near infrared [8]
 
-_POLYNOMIAL = np.uint64(0xC96C5795D7870F42)  # of ECMA-182, the lowest bit first
+_POLYNOMIAL = np.uint64(0xC96C5795D7870F42)  # polynomial of ECMA-182, the lowest bit first
 _ALL_BITS = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
 _BYTE = np.uint64(255)
 

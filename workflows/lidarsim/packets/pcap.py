@@ -45,7 +45,10 @@ class PcapWriter:
         file.write(_FILE_HEADER)
 
     def write(self, groups: Sequence[Datagrams]) -> None:
-        """Write the datagrams of all groups in the order of their times; OSError on failure."""
+        """Write the datagrams of all groups in the order of their times.
+
+        Raises OSError on failure.
+        """
         groups = [group for group in groups if len(group)]
         if not groups:
             return

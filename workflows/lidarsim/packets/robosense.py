@@ -23,10 +23,10 @@ from .shots import CarryOver, Shots
 MSOP_PORT = 6699
 DIFOP_PORT = 7788
 DIFOP_INTERVAL_NS = 100_000_000
-_BLOCKS = 12  # of a packet
+_BLOCKS = 12  # blocks per packet
 _BLOCK_LASERS = 32
 _BLOCK_FLAG = 0xFFEE
-_AZIMUTHS = 36_000  # in a revolution
+_AZIMUTHS = 36_000  # azimuths in a revolution
 _MAX_UNITS = 65_535
 _MSOP_TAIL = 0x00FF
 _DIFOP_TAIL = 0x0FF0
@@ -38,7 +38,7 @@ _TEMPERATURE = (40 * 16 % 32 << 3, 40 * 16 // 32)
 _MAC = bytes.fromhex("020000000001")
 _PTP = 2  # source of the time
 _SYNCHRONIZED = 1
-_FIRST_YEAR = 2000  # of dates
+_FIRST_YEAR = 2000  # year 0 of dates
 _LAST_YEAR = 2255
 
 _RETURN = [("distance", ">u2"), ("reflectivity", "u1")]
@@ -53,7 +53,7 @@ _SIGNED_ANGLE = [("negative", "u1"), ("centidegrees", ">u2")]
 
 
 def _placed(size: int, fields: Mapping[str, tuple[int, DTypeLike]]) -> np.dtype[np.void]:
-    """Return a type of `size` bytes with fields {name: (offset, type)}; further bytes are 0."""
+    """Return a type of `size` bytes with fields {name: (offset, type)}, otherwise 0."""
     offsets, formats = zip(*fields.values(), strict=True)
     return np.dtype(
         {"names": list(fields), "offsets": offsets, "formats": formats, "itemsize": size}
@@ -94,7 +94,7 @@ class Model:
 
     lasers: int
     unit_m: float
-    type_code: int  # in the header
+    type_code: int  # code in the header
     header: bytes  # identification of a packet of measurements
     modes: Mapping[str, int]  # {mode of returns: its code in device data}
     msop: np.dtype[np.void]
@@ -239,7 +239,7 @@ class RobosenseEncoder(PacketEncoder):
         return np.concatenate([first, shots.returned[1:2] ^ first])
 
     def _difop(self, shots: Shots, until_ns: int) -> Datagrams:
-        """Return device data that are due up to a time; the first when the shots start."""
+        """Return device data that are due up to a time, beginning when the shots start."""
         if self._next_difop_ns is None:
             self._next_difop_ns = int(shots.starts_ns[0])
         due_ns = np.arange(self._next_difop_ns, until_ns + 1, DIFOP_INTERVAL_NS)

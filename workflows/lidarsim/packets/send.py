@@ -1,4 +1,4 @@
-"""Sends datagrams at their times from a process of its own, and checks where they may go."""
+"""Sends datagrams at their times from a separate process, and checks where they may go."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .sender_process import DATAGRAM, END, HEADER, ROUTE
 from .service import Destination, is_single_receiver
 
 LOOPBACK = "127.0.0.1"
-_SHOWN_LETTERS = 60  # of an address that is refused
+_SHOWN_LETTERS = 60  # letters of an address that is refused
 _RECORD = np.dtype(
     [
         ("kind", "<u2"),
@@ -37,7 +37,7 @@ _RECORD = np.dtype(
         ("due_ns", "<i8"),
     ]
 )
-_ENDS_WITHIN_S = 2.0  # of the process after SIGTERM
+_ENDS_WITHIN_S = 2.0  # limit for the process after SIGTERM
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Lateness:
 
     sent: int = 0
     limits_ms: tuple[float, ...] = ()  # upper limits of the bins
-    counts: tuple[int, ...] = ()  # of datagrams in each bin, and of later datagrams
+    counts: tuple[int, ...] = ()  # number of datagrams in each bin, and of later datagrams
     latest_ms: float = 0.0
     failures: Mapping[str, int] = field(default_factory=dict)  # {error: datagrams not sent}
 
@@ -94,8 +94,8 @@ class Sender:
     def __init__(self, note: Callable[[str], None] = lambda words: None) -> None:
         self._note = note
         self._process: subprocess.Popen[bytes] | None = None
-        self._lock = threading.Lock()  # services redirect from threads of their own
-        self._reported = b""  # of a line that has not fully arrived
+        self._lock = threading.Lock()  # services redirect from separate threads
+        self._reported = b""  # start of a line that has not fully arrived
         self._lateness = Lateness()
 
     def __enter__(self) -> Self:
@@ -107,7 +107,7 @@ class Sender:
             start_new_session=True,  # Ctrl-C in a terminal must not end it before this process
         )
         assert self._process.stdout is not None
-        os.read(self._process.stdout.fileno(), 1 << 16)  # that it is ready: starting takes 0.1 s
+        os.read(self._process.stdout.fileno(), 1 << 16)  # it is ready: starting takes 0.1 s
         os.set_blocking(self._process.stdout.fileno(), False)
         return self
 
@@ -146,7 +146,7 @@ class Sender:
             self._write(_in_order(records, np.concatenate(dues_ns)).data)
 
     def finish(self) -> Lateness:
-        """Wait until all datagrams are sent; return how late they were."""
+        """Wait until all datagrams are sent, and return how late they were."""
         self._write(HEADER.pack(END, 0, 0, 0, 0, 0))
         self._wait(None)
         return self._lateness
@@ -252,7 +252,7 @@ def _in_order(records: Sequence[Bytes], due_ns: Ints) -> Bytes:
 class Address:
     """An address that a user gives: HOST or HOST:PORT, of IPv4."""
 
-    host: str  # as numbers
+    host: str  # numeric address
     port: int | None = None
     name: str = field(default="", compare=False)  # the host as the user gives it, unless numbers
 

@@ -64,7 +64,7 @@ class Route:
             self._source = values["source"]
 
     def open_from(self, port: int) -> socket.socket:
-        """Return the socket that sends from a port, 0 for any; open it before its first use."""
+        """Return the socket that sends from a port, 0 for any, opened before its first use."""
         if port not in self._sockets:
             self._sockets[port] = _open_socket(self._source, port)
         return self._sockets[port]
@@ -74,7 +74,7 @@ class Route:
         return max(due_ns, self._sent_ns + (due_ns - self._due_ns) // _CATCH_UP)
 
     def mark_sent(self, due_ns: int) -> int:
-        """Take note that a datagram is sent now; return by how much it is late, nanoseconds."""
+        """Take note that a datagram is sent now, and return by how much it is late, nanoseconds."""
         self._due_ns = due_ns
         self._sent_ns = time.monotonic_ns()
         return self._sent_ns - due_ns
@@ -98,12 +98,12 @@ class Outbox:
         self.waiting_bytes = 0
         self.routes: dict[int, Route] = {}
         self.ended = False
-        self._count = 0  # of datagrams so far
+        self._count = 0  # number of datagrams so far
         self._late = [0] * (len(BINS_MS) + 1)
         self._max_late_ns = 0
         self._sent = 0
         self._failures: dict[str, int] = {}  # {error: datagrams that were not sent}
-        self._rest = b""  # of a record that has not fully arrived
+        self._rest = b""  # start of a record that has not fully arrived
 
     def take(self, content: bytes) -> None:
         """Take the records of further bytes of stdin."""
@@ -203,7 +203,7 @@ def serve(outbox: Outbox) -> None:
 
 
 def main() -> None:
-    """Send until END, SIGTERM, or the end of stdin; report at the start and at the end."""
+    """Send until END, SIGTERM, or the end of stdin, and report at the start and at the end."""
 
     def stop(number: int, frame: object) -> NoReturn:
         raise Stop

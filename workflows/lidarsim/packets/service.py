@@ -41,7 +41,7 @@ def is_single_receiver(address: IPv4Address) -> bool:
 
 
 class Service(ABC):
-    """Answers a maker's software, on threads of its own: a context manager.
+    """Answers a maker's software, on separate threads: a context manager.
 
     Software that never ends a request, or sends what is not understood, must not stop the sensor:
     a service bounds its threads, and the sizes and times of requests.

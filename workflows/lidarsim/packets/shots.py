@@ -47,7 +47,7 @@ class Shots:
 
     @classmethod
     def joined(cls, parts: list[Shots]) -> Shots:
-        """Concatenate firings; the list is not empty, and all parts have the same columns."""
+        """Concatenate one or more parts with firings, which have the same columns."""
         if len(parts) == 1:
             return parts[0]
         columns = {
@@ -64,7 +64,7 @@ class Shots:
     def from_points(
         cls, sweeps: Sweeps, sweep: int, points: Cloud, columns: Iterable[str] = ()
     ) -> Shots:
-        """Return the shots of a sweep; `points` are all returns of the sweep, in order.
+        """Return the shots of a sweep, from all returns of the sweep in order, `points`.
 
         `columns` are names of columns that the shots have beside the range.
 
@@ -155,7 +155,10 @@ def check_columns(cloud_columns: Collection[str], names: Iterable[str]) -> None:
 
 
 def settings_of(sensor: Sensor) -> PacketSettings:
-    """Return the packets of a sensor; LidarError, with models that have some, without packets."""
+    """Return the packets of a sensor.
+
+    Raises LidarError, with models that have some, without packets.
+    """
     if sensor.packets is None:
         names = ", ".join(name.rpartition("/")[2] for name in with_packets())
         raise LidarError(f"{sensor.model} has no packets: use a model with packets, {names}.")
@@ -182,7 +185,7 @@ class CarryOver:
         self._rest: Shots | None = None
 
     def whole_packets(self, shots: Shots) -> Shots:
-        """Add firings; return all firings that fill packets, perhaps none, and keep the rest.
+        """Add firings, return all firings that fill packets, perhaps none, and keep the rest.
 
         At a new station the sensor starts anew: the rest of the last station is never sent.
         """
@@ -194,7 +197,7 @@ class CarryOver:
         return joined[:count]
 
     def rest(self) -> Shots | None:
-        """Return the firings that fill no packet, and forget them; None before the first sweep."""
+        """Return firings that fill no packet, and forget them, or None before the first sweep."""
         rest = self._rest
         self._rest = None
         return rest

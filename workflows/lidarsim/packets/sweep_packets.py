@@ -82,7 +82,7 @@ class Packets:
 
     @classmethod
     def of_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
-        """Return the packets of a scanner's sensor; `start` as above."""
+        """Return the packets of a scanner's sensor, with `start` as above."""
         carried = scanner.survey.carried[0]
         return cls(carried, returns=scanner.survey.returns_each[0], start=start)
 

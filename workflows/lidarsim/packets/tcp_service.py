@@ -19,7 +19,7 @@ _BACKLOG = 128  # connections that wait to be accepted
 
 
 class TcpService(Service):
-    """Serves connections on a thread; an end of the context drops all that are open.
+    """Serves connections on a thread, and drops all open connections at the end of the context.
 
     Beyond `max_connections`, the oldest connection gives way to the newest: clients that open
     connections and do not end their requests keep nobody else from being answered.
@@ -35,9 +35,9 @@ class TcpService(Service):
 
     name: ClassVar[str]  # what is served, for messages
     usual_port: ClassVar[int]
-    example_port: ClassVar[int]  # for advice
+    example_port: ClassVar[int]  # port in advice
     max_connections: ClassVar[int]
-    buffer_bytes: ClassVar[int] = 1 << 16  # of a connection
+    buffer_bytes: ClassVar[int] = 1 << 16  # buffer of a connection
 
     def __init__(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]

@@ -24,16 +24,16 @@ from .shots import CarryOver, Shots, last_and_strongest
 from .velodyne_position import POSITION_PORT, PositionPackets
 
 DATA_PORT = 2368
-_BLOCKS = 12  # of a packet
+_BLOCKS = 12  # blocks per packet
 _BLOCK_LASERS = 32
 _CHANNELS = (16, 32, 128)
-_FLAGS = np.array([0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF], "<u2")  # of lasers 0, 32, 64 and 96 onwards
+_FLAGS = np.array([0xEEFF, 0xDDFF, 0xCCFF, 0xBBFF], "<u2")  # flags from laser 0, 32, 64, 96 on
 _UNUSED = 0xFFFF  # flag of blocks without lasers
 _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
-_AZIMUTHS = 36_000  # in a revolution
+_AZIMUTHS = 36_000  # azimuths in a revolution
 _MAX_UNITS = 65_535
 _HOUR_US = 3_600_000_000
-_FRAME_BYTES = (1248, 554)  # of Ethernet frames with points, and with a position
+_FRAME_BYTES = (1248, 554)  # bytes of Ethernet frames with points, and with a position
 # Laser of the VLS-128 whose time is the packet's: the first of the fourth group of eight.
 _STAMPED_LASER_OF_128 = 24
 

@@ -17,7 +17,7 @@ from ..base.ports import port_number
 from .http_service import Answer, HttpService, RefusedError, Request, receiver_of, receiver_port
 from .service import Destination
 
-_PORTS = ("dport", "tport")  # of data and position packets
+_PORTS = ("dport", "tport")  # ports of data and position packets
 
 
 @dataclass(frozen=True)

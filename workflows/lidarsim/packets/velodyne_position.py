@@ -18,7 +18,7 @@ from ..sweeps.instruments import GNSS_FILE
 from .encoders import Datagrams, PacketSource
 
 POSITION_PORT = 8308
-_DATA_PACKETS = 14  # for each position packet
+_DATA_PACKETS = 14  # data packets for each position packet
 _HOUR_US = 3_600_000_000
 _SECOND_NS = 1_000_000_000
 _SENTENCE_BYTES = 306
@@ -29,7 +29,7 @@ _POSITION = np.dtype({
     "itemsize": 512,
 })  # fmt: skip
 _LOCKED = 2  # state of the pulse per second
-_DEGREE_M = 111_195.0  # of a great circle
+_DEGREE_M = 111_195.0  # a degree of a great circle
 _KNOT_M_S = 1852 / 3600
 
 
@@ -102,7 +102,7 @@ class _Fixes(NamedTuple):
         return cls(times_ns, latitudes, longitudes)
 
     def at(self, time_ns: int) -> Fix | None:
-        """Return the last fix at or before a time; None before the first fix."""
+        """Return the last fix at or before a time, or None before the first fix."""
         row = int(np.searchsorted(self.times_ns, time_ns, "right")) - 1
         if row < 0:
             return None

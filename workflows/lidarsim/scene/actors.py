@@ -114,11 +114,11 @@ class Actor:
 
     @property
     def bounds(self) -> Floats:
-        """Corners of the actor's box in its frame, (2, 3), metres; of all poses if it deforms."""
+        """Corners of the actor's box in its frame, (2, 3), metres, in all poses if it deforms."""
         return (self.mesh.animation or self.mesh).bounds
 
     def placed(self, time_ns: float) -> SceneMesh:
-        """Return the mesh at a time, in the scene's local coordinates; a point while absent."""
+        """Return the mesh at a time, in the scene's local coordinates, or a point while absent."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices
         if (animation := self.mesh.animation) is not None:
@@ -248,7 +248,7 @@ def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
 
 
 def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:
-    """Join objects to a mesh in world coordinates; masks are kept, unless a mesh is animated.
+    """Join objects to a mesh in world coordinates, with masks unless a mesh is animated.
 
     Raises
     ------

@@ -12,7 +12,7 @@ from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
 from ..base.vectors import turned
 
-RATE_HZ = 60.0  # of baked poses, at least
+RATE_HZ = 60.0  # least rate of baked poses
 # Vertices in all poses of a mesh in pictures; the vertices of a walk compress to 1.4 bytes each.
 MAX_PICTURED_VERTICES = 500_000
 

@@ -35,7 +35,7 @@ def as_srgb(linear: ArrayLike) -> Bytes:
 
 
 def as_bytes(shares: ArrayLike) -> Bytes:
-    """Return the bytes of sRGB values, 0 to 1, of any shape; NaN gives 0."""
+    """Return the bytes of sRGB values, 0 to 1, of any shape, and 0 for NaN."""
     finite_shares = np.nan_to_num(np.asarray(shares, np.float64))
     return np.rint(255 * np.clip(finite_shares, 0, 1)).astype(np.uint8)
 
@@ -145,7 +145,7 @@ class Colours:
         return mean_colours
 
 
-MAX_DENSE_FACES = 20_000  # of meshes whose colours are averaged from 100 points a face
+MAX_DENSE_FACES = 20_000  # limit for meshes whose colours are averaged from 100 points a face
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
@@ -194,7 +194,7 @@ class Lookup:
         self._light = _Planes.joined(tinted, lights)
 
     def colours_at(self, rows: Integers, points: Floats) -> UInts32:
-        """Return the packed colours (n,) of points (n, 3) on faces (n,); of images, the texel."""
+        """Return the packed colours (n,) of points (n, 3) on faces (n,), the texel of an image."""
         image = self._image.take(rows)
         texel = self._first.take(image)
         positions = np.ascontiguousarray(points.T)
@@ -221,7 +221,7 @@ class _Planes(NamedTuple):
 
     @classmethod
     def joined(cls, has_values: Bools, blocks: list[Floats]) -> _Planes | None:
-        """Join blocks of slopes (k, 4 w) of the faces that have values; None if no face has."""
+        """Join blocks of slopes (k, 4 w) of the faces that have values, None without any."""
         if not has_values.any():
             return None
         slope_rows = np.where(has_values, np.cumsum(has_values) - 1, -1).astype(np.int32)
@@ -302,7 +302,7 @@ _SHARES = WEIGHTS[:, None] * LINEAR
 
 
 def join_colours(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
-    """Join the colours of meshes in order; None if no mesh has colours.
+    """Join the colours of meshes in order, or return None if no mesh has colours.
 
     `sizes` are the numbers of faces of the meshes; a mesh without colours becomes grey.
     """

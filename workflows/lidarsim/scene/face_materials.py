@@ -33,7 +33,7 @@ class FaceMaterials:
         return cls((name,)) if name else None
 
     def take(self, rows: Integers | slice) -> FaceMaterials:
-        """Return the materials of selected faces; the names stay."""
+        """Return the materials of selected faces, with the same names."""
         return self if self.index is None else FaceMaterials(self.names, self.index[rows])
 
     def check(self, name: str, faces: int) -> None:
@@ -113,7 +113,7 @@ class ObjectMaterials:
 def join_materials(
     parts: Sequence[FaceMaterials | None], sizes: Iterable[int]
 ) -> FaceMaterials | None:
-    """Join the materials of meshes in order; None if no mesh has materials.
+    """Join the materials of meshes in order, or return None if no mesh has materials.
 
     `sizes` are the numbers of faces of the meshes; faces without a material get the name "".
     """

@@ -160,7 +160,7 @@ def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
 
 
 def _of_bytes(image: Image.Image) -> Image.Image:
-    """Return an image of 8 bits; Pillow would clip an image of 16 bits."""
+    """Return an image of 8 bits, while Pillow would clip an image of 16 bits."""
     if not image.mode.startswith("I;16"):
         return image
     return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
@@ -281,11 +281,11 @@ class MaskNotes:
         self.missing_files: list[str] = []  # files of materials that cannot be read
 
     def without_mask(self, material: str) -> AbstractContextManager[None]:
-        """Note MaskErrors of the body; the triangles are solid then."""
+        """Note MaskErrors of the body, and leave the triangles solid then."""
         return _noted(self.mask_errors, material)
 
     def without_colour(self, material: str) -> AbstractContextManager[None]:
-        """Note errors of the body; the triangles have no colour then."""
+        """Note errors of the body, and leave the triangles without colour then."""
         return _noted(self.colour_errors, material)
 
     def lines(self) -> list[str]:

@@ -246,7 +246,7 @@ class Scene:
     @classmethod
     @checked
     def from_meshes(cls, meshes: Iterable[SceneMesh | SceneInstance]) -> Scene:
-        """Make a scene of meshes; each mesh becomes an object.
+        """Make a scene of meshes, with an object for each mesh.
 
         Parameters
         ----------
@@ -344,7 +344,7 @@ class Scene:
 
     @property
     def all_names(self) -> tuple[str, ...]:
-        """Names of all objects; actors follow the static objects."""
+        """Names of all objects, first the static objects, then the actors."""
         if not self.actors:
             return self.names
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
@@ -384,7 +384,7 @@ class Scene:
 
     @property
     def face_materials(self) -> Ints32 | None:
-        """Indices of `faces` into `material_names`, (f,), -1 for none; None without any name."""
+        """Indices of `faces` into `material_names`, (f,), -1 for none, or None without any name."""
         if self.materials is None or not self.material_names:
             return None
         kinds = self.surface_kinds
@@ -708,7 +708,7 @@ def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObject
 
 
 def _mesh_of_part(name: str, part: MeshPart) -> SceneMesh:
-    """Return a part without mask and voxels as a mesh; frame and triangles stay."""
+    """Return a part without mask and voxels as a mesh, with the same frame and triangles."""
     return SceneMesh(
         name,
         part.vertices,

@@ -24,14 +24,14 @@ from .transform import Transform, affine
 
 # No point on Earth is farther from the origin of its map; see also `sections.Coordinate`.
 MAX_COORDINATE_M = 1e8
-_MAX_ITERATIONS = 64  # of Newton's method at most
+_MAX_ITERATIONS = 64  # limit of Newton's method
 BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
 
 
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class SceneInstance:
-    """A mesh placed in the world; any number of instances share a mesh.
+    """A mesh placed in the world, where any number of instances share a mesh.
 
     Parameters
     ----------
@@ -120,11 +120,11 @@ class MeshPart(NamedTuple):
     uv: Floats32 | None = None  # (f, 3, 2)
     colours: Colours | None = None
     voxels: Voxels | None = None  # leaves within the surface
-    materials: FaceMaterials | None = None  # with all names of the mesh
+    materials: FaceMaterials | None = None  # they include all names of the mesh
 
 
 def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
-    """Yield the parts of a mesh, divided by its masks; the triangles stay in order."""
+    """Yield the parts of a mesh, divided by its masks, with the triangles in order."""
     start = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
 
     def part(first: int, stop: int, cut: Cutout | None = None) -> MeshPart:

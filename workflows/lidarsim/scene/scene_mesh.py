@@ -42,7 +42,7 @@ class Cutout:
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Leaf densities in a grid within a closed surface; there are no leaves outside the surface.
+    """Leaf densities in a grid within a closed surface, without leaves outside the surface.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class Voxels:
     matrix: Floats
 
     def moved(self, linear: Floats, offset: Floats) -> Voxels:
-        """Return the voxels at p -> linear @ p + offset; densities are shared, and stay per m³."""
+        """Return the voxels at p -> linear @ p + offset, with the same densities per m³."""
         shift = np.pad(offset[:, None], ((0, 0), (3, 0)))
         return Voxels(self.density, matmul(linear, self.matrix) + shift)
 

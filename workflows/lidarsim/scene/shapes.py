@@ -110,7 +110,7 @@ def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMes
 
 
 def _revolved_faces(rings: int, segments: int) -> Ints:
-    """Return faces over `rings` circles of `segments` vertices; the last two vertices are poles."""
+    """Return faces over `rings` circles of `segments` vertices, with two poles as last vertices."""
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)
     lower = grid[:-1]
@@ -129,7 +129,7 @@ def _revolved_faces(rings: int, segments: int) -> Ints:
 
 
 def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
-    """Round off a polygon (n, 2) by cutting its corners (Chaikin 1974); both ends stay.
+    """Round off a polygon (n, 2) by cutting its corners (Chaikin 1974), but keep both ends.
 
     The limit is a quadratic B-spline, which never leaves the convex hull of three neighbouring
     control points, so radii stay positive.

@@ -15,11 +15,11 @@ from .scene import Scene
 from .scene_instances import Instances, MeshPart
 from .scene_mesh import stacked, triangle_areas
 
-DRAWN_TRIANGLES = 2_000_000  # of all instances; parts of more triangles are simplified
-MIN_PART_TRIANGLES = 32  # of a simplified part
+DRAWN_TRIANGLES = 2_000_000  # limit for all instances; parts of more triangles are simplified
+MIN_PART_TRIANGLES = 32  # least number for a simplified part
 CUT_TRIANGLES = 50_000  # pieces of a part with a mask
 CUT_STEPS = 128  # pieces along the edge of a triangle
-_MAX_POSITIONS = 200  # to which distances are measured
+_MAX_POSITIONS = 200  # distances are measured to so many positions
 
 
 @dataclass(frozen=True, eq=False)

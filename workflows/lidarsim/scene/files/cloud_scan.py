@@ -31,7 +31,7 @@ class CloudScan(NamedTuple):
     columns: dict[str, AnyArray]  # {name: (n,)}: further numbers of the points
     pose: Floats | None = None  # (4, 4): from the frame of the points to the frame of the file
     scanner: Floats | None = None  # (3,): position in the frame of the file; None if unknown
-    units_m: tuple[float, float, float] | None = None  # of x, y and z, if the file states them
+    units_m: tuple[float, float, float] | None = None  # one for each axis, if the file states them
     unread: tuple[str, ...] = ()  # columns without numbers or names
 
 

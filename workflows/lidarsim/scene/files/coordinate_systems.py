@@ -25,12 +25,12 @@ from ...base.vocabulary import OF_THE_WORLD, WORLD_EPSG
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
 
-MAX_SCALE_ERROR = 0.01  # of lengths that count as true
+MAX_SCALE_ERROR = 0.01  # error of lengths that count as true
 UTM_EPSG = (range(32601, 32661), range(32701, 32761), range(25828, 25839), range(26901, 26924))
 _UTM_MIDDLE_M = 500_000.0  # easting of the meridian in the middle of a zone
-_UTM_HALF_WIDTH_M = 900_000.0  # from the middle to where lengths are wrong by 0.96 %
-_GROUND_STEP_M = 10.0  # of the differences by which a scale is computed
-_BLOCK_POINTS = 100_000  # that are reprojected at a time, through lists of Python
+_UTM_HALF_WIDTH_M = 900_000.0  # at this distance from the middle lengths are wrong by 0.96 %
+_GROUND_STEP_M = 10.0  # step of the differences that a scale is computed by
+_BLOCK_POINTS = 100_000  # reprojected at a time, through lists of Python
 UNNAMED = ("unnamed", "unknown", "")  # names by GDAL and PROJ of systems without a name
 POLAR_EPSG = (5041, 5042)  # universal polar stereographic, of the north and of the south
 _POLAR_DEG = 84.0  # latitude from which the polar stereographic projection stands for UTM
@@ -250,7 +250,7 @@ def _ground_metres_of_degrees(base: dict[str, Any], latitude_deg: float) -> tupl
         axis = float(radius)
         inverse = float(ellipsoid.get("inverse_flattening", np.inf))
     flattening = 1 / inverse
-    square = flattening * (2 - flattening)  # of the eccentricity
+    square = flattening * (2 - flattening)  # square of the eccentricity
     sine, cosine = sin_cos(np.radians(np.array([latitude_deg])))
     level = 1 - square * float(sine[0]) ** 2
     meridian = axis * (1 - square) / (level * np.sqrt(level))
@@ -289,7 +289,7 @@ def projection_kind(name: str) -> bool | None:
 
 
 def middle_of(objects: Sequence[SceneMesh | SceneInstance]) -> Floats:
-    """Return x and y in the middle of the middles of objects, (2,); zero without any."""
+    """Return x and y in the middle of the middles of objects, (2,), zero without any."""
     if not objects:
         return np.zeros(2)
     middles = np.array([_middle(item)[:2] for item in objects])

@@ -54,6 +54,6 @@ def read_float_rows(path: Path) -> list[CloudScan]:
     Errors as of `read_float_columns`.
     """
     columns = read_float_columns(path, columns_by_name(path))
-    with np.errstate(invalid="ignore"):  # of NaN of any kind
+    with np.errstate(invalid="ignore"):  # NaN of any kind may be invalid
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return [CloudScan(positions, columns)]

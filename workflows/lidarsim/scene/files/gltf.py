@@ -82,7 +82,7 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _NodeReader:
-    """Reader of nodes, meshes and skins by their indices; each is read once."""
+    """Reader of nodes, meshes and skins by their indices, each of them once."""
 
     def __init__(self, file: GltfFile, materials: GltfMaterials) -> None:
         self._file = file
@@ -112,7 +112,7 @@ class _NodeReader:
         return bake_animation(self._poses(animation, times_s), times_s.tolist(), self._allowance)
 
     def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
-        """Yield the content at each time of an animation; only the first has colours."""
+        """Yield the content at each time of an animation, with colours in the first only."""
         self._channels = sample_channels(animation, times_s, self._file.accessor)
         if not self._channels:
             raise MeshFileError("has an animation that moves no node: choose another")
@@ -141,7 +141,7 @@ class _NodeReader:
         return _matrix({**node, **animated})
 
     def node(self, index: int) -> Node:
-        """Return a node; a node without a name gets the name of its mesh.
+        """Return a node, with the name of its mesh if the node has no name.
 
         A hidden node has neither meshes nor children.
         """
@@ -255,7 +255,7 @@ class _NodeReader:
     def _read_posed(
         self, index: int, weights: tuple[float, ...], skin: int | None
     ) -> list[SceneMesh]:
-        """Return a mesh with morph targets applied; with a skin, in the scene's coordinates.
+        """Return a mesh with morph targets applied or, with a skin, in the scene's coordinates.
 
         All primitives, which differ by material only, are joined.
         """
@@ -270,7 +270,7 @@ class _NodeReader:
                 return unposed
             if DRACO in primitive.get("extensions", {}):
                 raise MeshFileError(f"bends what is packed with {DRACO}: export it without")
-            self._allowance.take(600 * len(unposed.vertices))  # of temporary matrices and points
+            self._allowance.take(600 * len(unposed.vertices))  # temporary matrices and points
             vertices = unposed.vertices.astype(np.float64)
             for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
                 if weight and "POSITION" in target:
@@ -282,7 +282,7 @@ class _NodeReader:
         return join_pieces(name, map(piece, surfaces), self._allowance)
 
     def _read_joints(self, skin: int) -> Floats:
-        """Return matrices (j, 4, 4) of a skin's joints, from mesh to scene; glTF 2.0, 3.7.3."""
+        """Return matrices (j, 4, 4) of a skin's joints, from mesh to scene, by glTF 2.0, 3.7.3."""
         skin_data = self._file.part("skins", skin)
         if not skin_data.get("joints"):
             raise MeshFileError("has a skin without joints: export it again, or without the skin")

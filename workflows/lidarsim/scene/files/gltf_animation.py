@@ -40,7 +40,7 @@ def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any
 
 
 def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tuple[float, float]:
-    """Return the first and last time of all keys; `read` returns the numbers of an accessor.
+    """Return the first and last time of all keys, where `read` returns an accessor's numbers.
 
     Raises
     ------
@@ -56,7 +56,7 @@ def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tu
 def sample_channels(
     animation: Mapping[str, Any], at_s: Floats, read: Callable[[Any], AnyArray]
 ) -> AnimatedNodes:
-    """Return the values of animated nodes at times (t,); `read` returns an accessor's numbers.
+    """Return the values of animated nodes at times (t,), where `read` returns accessors' numbers.
 
     Raises
     ------

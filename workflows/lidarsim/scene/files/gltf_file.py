@@ -23,7 +23,7 @@ from .gltf_draco import DRACO
 from .scene_graph import MeshFileError, ReadOptions
 
 INSTANCING = "EXT_mesh_gpu_instancing"
-VISIBILITY = "KHR_node_visibility"  # of nodes, and of all nodes below
+VISIBILITY = "KHR_node_visibility"  # extension for a node, and for all nodes below
 # Extensions that do not change shapes, or that are supported here.
 _READ = re.compile(
     r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization|"
@@ -51,7 +51,7 @@ def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         if len(data) < total:
             raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
         body = data[28 + size : total]
-        data = data[20 : 20 + size].rstrip(b"\0")  # with which some programs pad it
+        data = data[20 : 20 + size].rstrip(b"\0")  # some programs pad it with these
     elif data[:1] not in b"{[ \t\r\n":
         raise MeshFileError("is not glTF")
     try:
@@ -95,7 +95,7 @@ def root_nodes(header: dict[str, Any]) -> list[int]:
 
 
 class GltfFile:
-    """Parts, numbers, buffers and images of a file by their indices; each is read once."""
+    """Parts, numbers, buffers and images of a file by their indices, each of them read once."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class GltfFile:
         return self.normalised(numbers) if accessor.get("normalized") else numbers
 
     def normalised(self, numbers: AnyArray) -> AnyArray:
-        """Return the fractions that integers encode; glTF 2.0, 3.6.2.2."""
+        """Return the fractions that integers encode, by glTF 2.0, 3.6.2.2."""
         if numbers.dtype.kind not in "iu":
             return numbers
         self.allowance.take(8 * numbers.size)

@@ -35,7 +35,7 @@ _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
 class GltfMaterials:
-    """Masks, base colours and names of the materials of a file; each texture is made once."""
+    """Masks, base colours and names of the materials of a file, with each texture made once."""
 
     def __init__(self, file: GltfFile, options: ReadOptions) -> None:
         self._file = file
@@ -54,7 +54,7 @@ class GltfMaterials:
         return any(m.get("alphaMode") in _CUT for m in self._file.header.get("materials", ()))
 
     def with_material(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
-        """Return a piece with mask, colours and material; `mesh` is the mesh unpacked by Draco."""
+        """Return a piece with mask, colours and material, for `mesh`, unpacked by Draco."""
         if self.options.materials and (number := primitive.get("material")) is not None:
             piece = piece._replace(material=self._material_name(number))
         if self.options.colours and len(piece.faces):
@@ -100,7 +100,7 @@ class GltfMaterials:
         return self._tinted((_image_of(texture), light, *self._wraps(texture))), info
 
     def _read_tinted(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
-        """Return the texture of a tinted image; keys are (image, linear tint, wraps)."""
+        """Return the texture of a tinted image, by keys (image, linear tint, wraps)."""
         image, light, wrap_u, wrap_v = key
         colours = self._file.image(image, partial(read_colours, notes=self.notes))
         if light != (1.0, 1.0, 1.0):
@@ -157,7 +157,7 @@ class GltfMaterials:
         return self._mask((image, min_alpha, *self._wraps(texture))), info
 
     def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
-        """Return the mask of an image; keys are (image, least alpha that stops light, wraps)."""
+        """Return the mask of an image, by keys (image, least alpha that stops light, wraps)."""
         image, min_alpha, wrap_u, wrap_v = key
         opacity = self._opacity(image)
         assert opacity is not None

@@ -290,7 +290,7 @@ def _unit_of(node: _Node) -> CoordinateUnit:
 
 
 def geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
-    """Return the numbers of the GeoTIFF keys of a file; keys of texts are left out."""
+    """Return the numbers of the GeoTIFF keys of a file, without keys of texts."""
     data = records.get(GEO_KEYS, b"")
     if len(data) < 8:
         return {}
@@ -353,7 +353,7 @@ def method_of_keys(keys: Mapping[int, float]) -> str:
 
 
 def _unit_of_code(code: float | None) -> CoordinateUnit | None:
-    """Return the unit of an EPSG code; None without a code, or for a user-defined unit."""
+    """Return the unit of an EPSG code, or None without a code, or for a user-defined unit."""
     if code is None or code in (0, USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:

@@ -9,7 +9,7 @@ from raybeam.compiled import compiled
 
 @compiled()
 def unpack_lzf(packed, unpacked):
-    """Unpack bytes into `unpacked`; return the number of bytes written, or -1 if they are damaged.
+    """Unpack bytes into `unpacked`, and return the number of bytes written, -1 if damaged.
 
     A byte below 32 announces as many literal bytes, less one. Another byte begins a copy of earlier
     bytes: its upper three bits are the length, with a further byte if all are set; the lower five

@@ -76,7 +76,7 @@ class MeshFormat:
 
     @property
     def reader(self) -> MeshReader:
-        """Function that reads a file; a reader given by its name is imported.
+        """Function that reads a file, imported if given by its name.
 
         LidarError if the reader of a plug-in cannot be imported.
         """
@@ -88,7 +88,7 @@ class MeshFormat:
 
     @property
     def own_options(self) -> type | None:
-        """Dataclass of the options of the format; a dataclass given by its name is imported.
+        """Dataclass of the options of the format, imported if given by its name.
 
         LidarError if the dataclass of a plug-in cannot be imported or used.
         """
@@ -315,7 +315,7 @@ def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
 
 
 def option_names(row: MeshFormat | None) -> tuple[str, ...]:
-    """Return the names of all options of a format, shared and own; of None the shared options."""
+    """Return the names of all options of a format, shared and own, or the shared ones for None."""
     if row is None:
         return _SHARED
     shared = _SHARED if row.animated else tuple(name for name in _SHARED if name != "animation")
@@ -353,7 +353,7 @@ def advice_on(path: str | Path) -> str:
 def endings(
     condition: Callable[[MeshFormat], bool] = lambda row: not row.advice,
 ) -> tuple[str, ...]:
-    """Return the endings of the known formats that fulfil a condition; by default, formats read.
+    """Return the endings of the known formats that fulfil a condition, by default formats read.
 
     Examples
     --------

@@ -35,7 +35,7 @@ Opacity = Annotated[
 @dataclass(frozen=True, kw_only=True)
 @checked_fields
 class MeshOptions:
-    """Options for reading a mesh file of any format; see `lidarsim.scene.scene.Scene.load`."""
+    """Options for reading a mesh file of any format, as `lidarsim.scene.scene.Scene.load` lists."""
 
     unit: LengthUnit = None
     up_axis: UpAxis = None

@@ -224,7 +224,7 @@ def _tell_notes(
 def load_meshes(
     path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
 ) -> tuple[SceneMesh | SceneInstance, ...]:
-    """Read all objects of a mesh file as static objects; see `load_objects` for `options`."""
+    """Read all objects of a mesh file as static objects, with `options` as in `load_objects`."""
     objects = load_objects(path, tell=tell, **options)
     return objects.at_start(lambda line: tell(f"{path} moves {line}"))
 
@@ -331,7 +331,7 @@ def _read(path: Path, row: MeshFormat, data: bytes, options: ReadOptions) -> Con
 
 
 def _end_missing(error: Exception, data: bytes) -> CutShortError | None:
-    """Return an error of a file that ends too early, if a library's error tells that; else None."""
+    """Return an error of a file that ends too early, if a library's error tells that, else None."""
     if isinstance(error, json.JSONDecodeError):
         if error.msg.startswith("Unterminated") or error.pos >= len(error.doc.rstrip()):
             return CutShortError(f"its JSON ends in line {error.lineno}, column {error.colno}")

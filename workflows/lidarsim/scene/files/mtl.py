@@ -28,7 +28,7 @@ _OPTION = re.compile(
     re.IGNORECASE,
 )
 _WITHOUT_ALPHA = (".jpg", ".jpeg")
-_MAX_BYTES = 1 << 26  # of a file of materials
+_MAX_BYTES = 1 << 26  # limit for a file of materials
 
 
 @dataclass
@@ -64,7 +64,7 @@ class _Image:
         return np.column_stack([u, v])
 
     def _numbers(self, option: bytes, default: float) -> list[float]:
-        """Return two numbers of an option; missing numbers have a default."""
+        """Return two numbers of an option, with a default for missing numbers."""
         numbers = [float(word) for word in self.options.get(option, [])]
         return (numbers + [default] * 2)[:2]
 
@@ -206,13 +206,13 @@ class MtlMaterials:
         return Texture(mask, (wrap, wrap), self._allowance)
 
     def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
-        """Return the opacity of an image, or None; keys are (name, whether brightness counts)."""
+        """Return the opacity of an image, or None, by keys (name, whether brightness counts)."""
         name, grey = key
         file = image_file(self._mesh, name, self._options, self._allowance)
         return read_opacity(file, self._allowance, grey=grey)
 
     def _read_image(self, key: tuple[str, Wrap]) -> Texture:
-        """Return the texture of an image of colours; keys are (name, continuation)."""
+        """Return the texture of an image of colours, by keys (name, continuation)."""
         name, wrap = key
         file = image_file(self._mesh, name, self._options, self._allowance)
         image = read_colours(file, self._allowance, self.notes)

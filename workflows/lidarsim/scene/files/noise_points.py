@@ -17,7 +17,7 @@ from ...base.arrays import AnyArray, Bools
 from ...base.words import plural
 
 NOISE_CLASSES = (7, 18)
-LEGACY_NOISE_CLASSES = (7,)  # of point formats 0 to 5
+LEGACY_NOISE_CLASSES = (7,)  # classes of point formats 0 to 5
 _CLASS_COLUMN = "classification"
 _WITHHELD_COLUMNS = ("withheld", "withheldflag", "classifwithheldflag")
 

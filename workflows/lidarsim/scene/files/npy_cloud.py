@@ -44,7 +44,7 @@ def read_npy_cloud(path: Path) -> list[CloudScan]:
         columns = dict(zip(names, rows.T, strict=True))
     else:
         raise ValueError(f"its array has the shape {array.shape}: {_EXPECTED}")
-    with np.errstate(invalid="ignore", over="ignore"):  # of NaN of any kind, and of long doubles
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN of any kind, and long doubles
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return [CloudScan(positions, columns)]
 

@@ -32,7 +32,7 @@ _KEYWORDS = (
     "VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS",
 )  # fmt: skip
 _DATA = re.compile(rb"^DATA[ \t]+([^\r\n]*?)[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
-_STARTS = (b"# .PCD", b"VERSION", b"FIELDS", b"COLUMNS")  # of lines of a header
+_STARTS = (b"# .PCD", b"VERSION", b"FIELDS", b"COLUMNS")  # starts of lines of a header
 _PADDING = "_"  # name of the fields by which PCL fills its rows
 _KINDS = {
     ("F", 4): "<f4", ("F", 8): "<f8",
@@ -41,8 +41,8 @@ _KINDS = {
 }  # fmt: skip
 _LETTERS = {"f": "F", "i": "I", "u": "U"}  # {kind of NumPy: TYPE}
 _HEADER_MAX_BYTES = 1 << 20
-_MAX_NUMBERS = 10_000  # of a point; descriptors of PCL have up to 1,980
-_MAX_QUATERNION_ERROR = 0.01  # of the length of VIEWPOINT's quaternion
+_MAX_NUMBERS = 10_000  # numbers of a point; descriptors of PCL have up to 1,980
+_MAX_QUATERNION_ERROR = 0.01  # error of the length of VIEWPOINT's quaternion
 _SMALLER = "write it uncompressed"
 _COLOURS = ("red", "green", "blue")
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
@@ -53,7 +53,7 @@ class _Field:
     """A field of the header."""
 
     name: str
-    kind: str  # of NumPy: «<f4»
+    kind: str  # type of NumPy: «<f4»
     count: int  # numbers of a point
 
     @property
@@ -110,7 +110,7 @@ def read_pcd(path: Path) -> list[CloudScan]:
             f"its FIELDS are {printable(names)}: x, y and z of a number each are needed, and there "
             f"is no {', '.join(missing)}"
         )
-    with np.errstate(invalid="ignore"):  # of NaN of any kind
+    with np.errstate(invalid="ignore"):  # NaN of any kind may be invalid
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     pose = _pose(header.viewpoint)
     scanner = None if header.viewpoint == _NO_VIEWPOINT else pose[:3, 3]
@@ -160,7 +160,10 @@ def pcd_bytes(
 
 
 def _parse_header(data: bytes, encoding: str) -> _Header:
-    """Return the header in `data`, up to DATA; ValueError names the line that is broken."""
+    """Return the header in `data`, up to DATA.
+
+    Raises ValueError, with the line that is broken.
+    """
     entries: dict[str, tuple[int, list[str]]] = {}  # {keyword: (number of the line, words)}
     lines = data.decode("latin-1").splitlines()
     for number, line in enumerate(lines, 1):
@@ -427,7 +430,7 @@ def _as_type(values: Floats, field: _Field) -> AnyArray:
     numbers = np.nan_to_num(values)
     limits = np.iinfo(field.kind)
     lowest = float(limits.min)
-    stop = float(limits.max) + (field.kind[2] != "8")  # of 64 bits, the float is rounded upwards
+    stop = float(limits.max) + (field.kind[2] != "8")  # limits of 64 bits are rounded up as floats
     if not ((numbers % 1 == 0) & (numbers >= lowest) & (numbers < stop)).all():
         raise ValueError(
             f"its field {printable(field.name)[:40]!r} has other numbers than whole ones from "

@@ -131,7 +131,10 @@ def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 def _parse_obj(text: bytes, stem: str, with_colours: bool, with_materials: bool) -> _ObjContent:
-    """Parse the lines of a file; without a name, polygons belong to the object `stem`."""
+    """Parse the lines of a file.
+
+    Without a name, polygons belong to the object `stem`.
+    """
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
     polygons = _ObjPolygons()
     content = _ObjContent({(stem, 0): polygons})
@@ -197,7 +200,7 @@ def _obj_names(key: bytes, text: bytes) -> list[bytes]:
 
 
 def _obj_coordinates(value: bytes) -> list[float]:
-    """Return two texture coordinates; NaN if a word is no number."""
+    """Return two texture coordinates, or NaN if a word is not a number."""
     try:
         u, v = [*map(float, value.partition(b"#")[0].split()[:2]), 0.0][:2]
     except ValueError:
@@ -219,7 +222,7 @@ def _obj_coordinate_rows(value: bytes, count: int) -> list[int]:
 
 
 def _obj_corners(value: bytes, count: int) -> list[int]:
-    """Return the rows of vertices of a face; `count` vertices have been read so far.
+    """Return the rows of vertices of a face, after `count` vertices that have been read.
 
     ValueError if a number is none of a vertex before the face.
     """
@@ -392,7 +395,10 @@ def _off_mistake(number: int, words: Sequence[bytes], expected: str) -> str:
 
 
 def _colour_shares(colours: Floats) -> Floats:
-    """Return colours as 0 to 1; if a number is above 1.5, all are written as 0 to 255."""
+    """Return colours as 0 to 1.
+
+    If a number is above 1.5, all are written as 0 to 255.
+    """
     return colours / (255 if (colours > 1.5).any() else 1)
 
 
@@ -456,7 +462,7 @@ def _stl_mistake(text: bytes) -> str | None:
 
 
 def _stl_mesh(name: str, corners: Floats) -> list[SceneMesh]:
-    """Return a mesh of triangles that share no vertices, in a list; [] without triangles."""
+    """Return a mesh of triangles that share no vertices, in a list, or [] without triangles."""
     faces = np.arange(len(corners)).reshape(-1, 3)
     return [SceneMesh(name, corners, faces)] if len(faces) else []
 
@@ -503,7 +509,7 @@ class _PlyHeader(NamedTuple):
     elements: list[_Element]
     order: str  # byte order, '' of text
     body: bytes
-    lines: int  # of the header
+    lines: int  # lines of the header
     comments: list[str]  # texts of comment and obj_info
 
 

@@ -65,7 +65,7 @@ def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
 
 
 def _clipped_polygon(vertices: Floats, corners: Ints) -> Ints:
-    """Return the triangles (t, 3) of a polygon with reflex corners; none without an area."""
+    """Return the triangles (t, 3) of a polygon with reflex corners, or none without an area."""
     clipped = with_holes(vertices, [corners])
     if len(clipped) < len(corners) - 2 and _leaves_gaps(vertices[corners], vertices[clipped]):
         return np.asarray(corners[_all_triangles(vertices[corners])])

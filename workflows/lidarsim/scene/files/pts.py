@@ -27,7 +27,7 @@ _NAMES = {  # {cells of a line: names}
     6: ("x", "y", "z", *COLOURS),
     7: ("x", "y", "z", "intensity", *COLOURS),
 }
-_LOWEST_INTENSITY = -2048  # of Leica's scale, which is 4096 wide
+_LOWEST_INTENSITY = -2048  # lowest value of Leica's scale, which is 4096 wide
 
 
 def read_pts(path: Path) -> list[CloudScan]:
@@ -104,7 +104,7 @@ def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) ->
 
 
 def point_columns(values: Floats, names: Sequence[str]) -> dict[str, AnyArray]:
-    """Return the columns of rows (n, k) after x, y and z; colours of 0 to 255 as bytes."""
+    """Return the columns of rows (n, k) after x, y and z, with colours of 0 to 255 as bytes."""
     columns: dict[str, AnyArray] = {}
     for index, name in enumerate(names[3:], 3):
         columns[name] = values[:, index]

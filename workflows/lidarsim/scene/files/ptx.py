@@ -40,7 +40,7 @@ _HEADER_LINES = (  # numbers of each line, and their meaning
     (4, "the third row of the transformation"),
     (4, "the last row of the transformation"),
 )
-_MAX_ROTATION_ERROR = 1e-3  # of the transformation's axes, which are rounded
+_MAX_ROTATION_ERROR = 1e-3  # error of the transformation's axes, which are rounded
 
 _Lines = Iterator[tuple[int, str]]
 

@@ -30,7 +30,7 @@ SHORTER = "shorten its animation or simplify its mesh"
 SHARED_TRIANGLES = 100_000
 MAX_NODES = 200_000  # nodes of a scene, counting every instance
 _MAX_PATH_NAMES = 16  # names of nodes that a placed node remembers
-MAX_TRIANGLES = np.iinfo(np.int32).max  # of all placed meshes
+MAX_TRIANGLES = np.iinfo(np.int32).max  # limit for all placed meshes
 
 
 @dataclass(frozen=True)
@@ -326,5 +326,5 @@ def _compacted_piece(piece: Piece, allowance: Allowance | None) -> Piece:
         allowance.take(faces.nbytes + extra)
     vertices, faces = compacted(vertices, faces)
     if allowance is not None:
-        allowance.take(24 * len(vertices))  # in double precision
+        allowance.take(24 * len(vertices))  # double precision
     return Piece(vertices, faces, cutout, face_colours, material)

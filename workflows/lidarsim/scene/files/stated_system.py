@@ -58,14 +58,14 @@ from .las_units import (
     wkt_units,
 )
 
-WKT_RECORD = 2112  # of LASF_Projection, by ASPRS LAS 1.4
+WKT_RECORD = 2112  # record of LASF_Projection, by ASPRS LAS 1.4
 _CODE = re.compile(r"(?i)(?:urn:ogc:def:crs:)?epsg:(?:[\d.]*:)?(\d{4,6})")
 _COMMENT = re.compile(
     r"(?i)(?:(?:crs|srs|projection|coordinate system|spatial reference)(?: wkt)?\s*[:=]?\s*)?"
     r"(?:epsg\s*[:=]?\s*(?P<code>\d{4,6})|"
     r"(?P<wkt>(?:projcs|projcrs|compd_cs|compoundcrs|geogcs|geogcrs|boundcrs)\s*\[.*))"
 )
-Metres = tuple[float, float, float]  # in the units of x, y and z
+Metres = tuple[float, float, float]  # metres in the units of x, y and z
 
 
 class _TiffTag(NamedTuple):
@@ -158,7 +158,7 @@ class StatedSystem:
 
     @cached_property
     def crs(self) -> Any:
-        """The `rasterio.crs.CRS`; None without rasterio, and for none on Earth that PROJ knows."""
+        """The `rasterio.crs.CRS`, or None without rasterio, or if PROJ knows none on Earth."""
         if not has_registry():
             return None
         crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
@@ -169,7 +169,7 @@ class StatedSystem:
 
     @property
     def horizontal_m(self) -> float | None:
-        """Metres in the unit of x and y; None for angles, and if the unit is not known."""
+        """Metres in the unit of x and y, or None for angles, and if the unit is not known."""
         if self.crs is not None:
             return float(self.crs.linear_units_factor[1]) if self.crs.is_projected else None
         return self._stated_m
@@ -194,7 +194,7 @@ class StatedSystem:
 
     @property
     def is_true_by_name(self) -> bool | None:
-        """Whether the projection is made for true lengths, by its code or name; None if unknown."""
+        """Whether the projection is for true lengths, by its code or name, or None if unknown."""
         if self._code in WORLD_EPSG:
             return False
         if self._code is not None and is_utm(self._code):
@@ -210,7 +210,7 @@ class StatedSystem:
             except ValueError:  # no WKT, which counts as metres where the user gives the unit
                 return None
             has_projection = bool(method)
-        return projection_kind(method) if has_projection else True  # of a local system
+        return projection_kind(method) if has_projection else True  # local systems are true
 
     def is_in_utm_zone(self, positions: Floats) -> bool:
         """Return True for a UTM zone whose metres are true at all positions (n, 3)."""
@@ -296,7 +296,7 @@ def stated_metres(
 
 
 def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[str]:
-    """Check the system of a file whose format has true metres, such as E57; return notes.
+    """Check the system of a file whose format has true metres, such as E57, and return notes.
 
     `positions` (n, 3) are points of the file, or a sample, in metres.
 
@@ -422,7 +422,7 @@ class Reprojection:
                 raise LidarError(f"it cannot be brought to {problem}.")
 
     def apply(self, positions: Floats) -> Floats:
-        """Return positions (n, 3) in metres of the chosen system; NaN for positions not finite.
+        """Return positions (n, 3) in metres of the chosen system, NaN for positions not finite.
 
         LidarError for a position that is outside of one of the systems.
         """
@@ -460,7 +460,7 @@ def _crs_of_keys(records: Mapping[int, bytes]) -> Any:
 
 
 def _tiff(records: Mapping[int, bytes]) -> bytes:
-    """Return a TIFF of one pixel with GeoTIFF keys; TIFF 6.0, little-endian."""
+    """Return a TIFF of one pixel with GeoTIFF keys, little-endian, by TIFF 6.0."""
     tags = [
         _TiffTag(256, 4, 1, struct.pack("<I", 1)),  # width
         _TiffTag(257, 4, 1, struct.pack("<I", 1)),  # length

@@ -33,7 +33,7 @@ _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 # {name without case and separators: axis}; of several, the first in this order counts.
 _AXES = {
     **{axis: axis for axis in "xyz"},
-    **{f"points{index}": axis for index, axis in enumerate("xyz")},  # of ParaView
+    **{f"points{index}": axis for index, axis in enumerate("xyz")},  # names in ParaView
     "easting": "x",
     "northing": "y",
     "east": "x",
@@ -50,13 +50,13 @@ _KITTI_COLUMNS = 12  # three rows of a matrix, in each of them a rotation and an
 _RASTER = b"ncols"  # first word of an Esri ASCII grid
 _MIN_AMBIGUOUS = 6  # cells between commas that may be three numbers with decimal commas
 _MAX_EXACT = 1 << 53  # integers that double precision holds
-_MANY_POINTS = 3  # of a column that counts the points
+_MANY_POINTS = 3  # a column may count the points from so many points on
 
 
 class _Head(NamedTuple):
     """What precedes the points of a file."""
 
-    names: list[str] | None  # of the columns; None without a header
+    names: list[str] | None  # names of the columns; None without a header
     names_line: int  # number of the header's line
     is_remark: bool  # whether the header is a remark
     announced: int | None  # points, in a line of their own

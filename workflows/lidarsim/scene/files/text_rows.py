@@ -144,5 +144,5 @@ class RowReader:
 
 
 def _line_with(mark: str, lines: Sequence[str], number: int) -> int:
-    """Return the number of the first line with a mark; `number` is the number of the first line."""
+    """Return the number of the first line with a mark, counted from `number`, the first line's."""
     return number + next(index for index, line in enumerate(lines) if mark in line)
