@@ -59,7 +59,9 @@ Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 @dataclass(frozen=True)
 @checked_fields
 class Imu:
-    """An inertial measurement unit on the carrier, ideal without arguments.
+    """An inertial measurement unit on the carrier.
+
+    Without arguments, the unit is ideal.
 
     `mount` is its pose in the carrier frame. Noise is named and measured as in kalibr's `imu.yaml`.
 
@@ -102,7 +104,9 @@ class Imu:
 @dataclass(frozen=True)
 @checked_fields
 class Gnss:
-    """A GNSS receiver on the carrier, ideal without arguments.
+    """A GNSS receiver on the carrier.
+
+    Without arguments, the receiver is ideal.
 
     `mount` is the pose of its antenna in the carrier frame.
 

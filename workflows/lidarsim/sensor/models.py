@@ -140,7 +140,9 @@ STATED = {
 
 
 class Performance(_ModelSection):
-    """Figures of a data sheet on a sensor's noise and returns, for `SensorModel.datasheet`.
+    """Figures of a data sheet on a sensor's noise and returns.
+
+    `SensorModel.datasheet` makes settings of them.
 
     The precision of ranges is given either by the fields of `Noise`, with the same names, or for
     two surfaces, from which its dependence on energy follows.
@@ -198,7 +200,10 @@ class Performance(_ModelSection):
 
 
 class PacketPart(_ModelSection):
-    """Packets of the maker, as in `PacketSettings`, with identifiers that the format defines."""
+    """Packets of the maker, as in `PacketSettings`.
+
+    The format defines the identifiers.
+    """
 
     format: str
     ports: dict[str, Annotated[int, Field(ge=1, le=65_535)]] = {}

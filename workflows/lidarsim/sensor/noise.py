@@ -29,7 +29,9 @@ AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise of ranges and angles, lost returns and false alarms, by default without noise.
+    """Noise of ranges and angles, lost returns and false alarms.
+
+    Without arguments, there is none of these.
 
     The standard deviation of a range of r metres is ``range_m + range_per_m * r``, and
     `range_at_threshold_m` times the threshold of detection over the return's energy is added in

@@ -35,7 +35,10 @@ Opacity = Annotated[
 @dataclass(frozen=True, kw_only=True)
 @checked_fields
 class MeshOptions:
-    """Options for reading a mesh file of any format, as `lidarsim.scene.scene.Scene.load` lists."""
+    """Options for reading a mesh file of any format.
+
+    `lidarsim.scene.scene.Scene.load` describes them.
+    """
 
     unit: LengthUnit = None
     up_axis: UpAxis = None
