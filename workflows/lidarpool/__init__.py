@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from .comparing.two_clouds import compare
     from .datasets.loader import sweeps
     from .datasets.sweep_data import Sweep
+    from .places.building import Twin, twin
     from .plan import Plan, Planning
     from .report.merging import merge
     from .run.pipeline.stage_messages import ScanFrame
@@ -91,6 +92,7 @@ __all__ = [
     "Survey",
     "Sweep",
     "Track",
+    "Twin",
     "__version__",
     "compare",
     "fit",
@@ -107,6 +109,7 @@ __all__ = [
     "sweeps",
     "to_dask",
     "to_open3d",
+    "twin",
 ]
 
 # Modules of the names above, except names of lidarsim. A module is imported when one of its names
@@ -129,6 +132,7 @@ _MODULES = {
     ".comparing.comparison": ("Comparison",),
     ".comparing.two_clouds": ("compare",),
     ".comparing.fit": ("Fit", "fit"),
+    ".places.building": ("Twin", "twin"),
     ".run.run_result": ("CampaignRun",),
     ".run.store.run_store": ("remove_run",),
     ".scenario.build": ("Job",),

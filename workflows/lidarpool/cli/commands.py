@@ -39,6 +39,7 @@ from .play_command import play
 from .result_commands import compare, export, fit, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors
 from .stations_command import stations
+from .twin_command import twin
 
 if TYPE_CHECKING:
     from ..base.tls_files import TlsFiles
@@ -201,7 +202,7 @@ class _Commands(click.Group):
     cls=_Commands,
     commands=[
         *(init, import_, check, schema, scene, sensors, stations),
-        *(view, play, plot, export, compare, fit),
+        *(view, play, plot, export, compare, fit, twin),
     ],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )

@@ -111,9 +111,10 @@ _mesh_reading_options = combine(
     _mesh_option("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
 )
 _mesh_options = combine(
-    _mesh_option(
-        "sensor",
-        "sensor, one of lidarpool sensors or a file",
+    click.option(
+        "--sensor",
+        help="Of a mesh, or a scenario with one sensor: sensor, one of lidarpool sensors or a "
+        "file.",
         metavar="MODEL|FILE.yaml",
         shell_complete=completion.sensors,
     ),

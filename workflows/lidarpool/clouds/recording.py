@@ -203,9 +203,8 @@ class Recording:
                     "compare it with a recording of sweeps."
                 )
             positions = positions @ pose[:3, :3].T + pose[:3, 3] * self.metres
-        names = _INTENSITY_COLUMNS if self.intensity_column is None else (self.intensity_column,)
         rings = rings_of(columns)
-        intensities = _first_column(columns, names)
+        intensities = intensities_of(self, columns)
         return RecordedPoints(
             positions,
             None if rings is None else rings[valid].astype(np.int64),
@@ -305,6 +304,12 @@ class RecordingSource:
 def rings_of(columns: Columns) -> AnyArray | None:
     """Return the rings (n,) of points, or None without a column of rings."""
     return _first_column(columns, _RING_COLUMNS)
+
+
+def intensities_of(recording: Recording, columns: Columns) -> AnyArray | None:
+    """Return the intensities (n,) of points, or None without a column of intensities."""
+    chosen = recording.intensity_column
+    return _first_column(columns, _INTENSITY_COLUMNS if chosen is None else (chosen,))
 
 
 def _first_column(columns: Columns, names: Iterable[str]) -> AnyArray | None:

@@ -27,7 +27,7 @@ from ..clouds.format_table import point_suffixes, points_reader
 
 _SAMPLE = 1000  # points that tell whether another system has true metres there
 # Names of columns in files of various programs; the first name that a file has is read.
-_CLASSES = (
+CLASSES = (
     "class", "classification", "scalar_Classification", "scalar_classification", "label",
     "scalar_Label", "scalar_label",
 )  # fmt: skip
@@ -214,7 +214,7 @@ def _scanned_points(content: FilePoints, to_metres: Callable[[Floats], Floats]) 
         except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
             outward = None
             content.ignored.append("positions of scanners without a place in that system")
-    classes = _first(columns, _CLASSES)
+    classes = _first(columns, CLASSES)
     intensities = _first(columns, _INTENSITIES)
     points = ScannedPoints(
         positions,
@@ -272,7 +272,7 @@ def _left_out(content: FilePoints) -> list[str]:
     """Return the names of the columns that surfels do not keep and that are not zero."""
     columns = content.columns
     used: set[str] = set()
-    for names in (_CLASSES, _INTENSITIES):
+    for names in (CLASSES, _INTENSITIES):
         used.update([name for name in names if name in columns][:1])
     for axes in (*_COLOURS, *NORMALS, *ORIGINS):
         used.update(axes)

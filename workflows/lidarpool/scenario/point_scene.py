@@ -144,7 +144,7 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
     voxel_m = voxel_m or _spacing_m(o3d, positions)
     if not voxel_m:
         raise LidarError(f"{path} has most of its points in the same places: give voxel_m.")
-    voxels = _Voxels.of_points(path, positions, voxel_m)
+    voxels = Voxels.of_points(path, positions, voxel_m)
     count = len(voxels.counts)
     if count * POINT_BYTES > memory() // 2:
         raise LidarError(
@@ -163,18 +163,23 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
     corners = _surfel_corners(
         np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size, outward
     )
-    faces = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
     return SceneMesh(
         path.stem,
         corners.reshape(-1, 3) + origin,
-        faces.reshape(-1, 3),
+        surfel_faces(count),
         colours=_surfel_colours(points, voxels),
-        materials=_surfel_materials(points, voxels),
+        materials=surfel_materials(points, voxels),
     )
 
 
+def surfel_faces(count: int) -> Ints:
+    """Return the triangles (2 · count, 3) of surfels with four vertices each, in order."""
+    faces: Ints = 4 * np.arange(count)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
+    return faces.reshape(-1, 3)
+
+
 @dataclass(frozen=True, eq=False)
-class _Voxels:
+class Voxels:
     """Points sorted by the voxels that contain them; only voxels with points are counted."""
 
     order: Ints  # (n,): indices of the points, voxel by voxel
@@ -182,7 +187,7 @@ class _Voxels:
     counts: Ints  # (v,): number of points in each voxel
 
     @classmethod
-    def of_points(cls, path: Path, positions: Floats, voxel_m: float) -> _Voxels:
+    def of_points(cls, path: Path, positions: Floats, voxel_m: float) -> Voxels:
         """Sort the points (n, 3) of a file into voxels; LidarError if there are too many voxels."""
         lower = positions.min(axis=0)
         spans = (positions.max(axis=0) - lower) / voxel_m + 1
@@ -225,7 +230,7 @@ def _directions(vectors: Floats) -> Floats:
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
 
-def _surfel_colours(points: ScannedPoints, voxels: _Voxels) -> Colours | None:
+def _surfel_colours(points: ScannedPoints, voxels: Voxels) -> Colours | None:
     """Return the mean colours of surfels in linear light, or greys of their mean intensities."""
     light: Floats
     if points.colours is not None:
@@ -240,7 +245,7 @@ def _surfel_colours(points: ScannedPoints, voxels: _Voxels) -> Colours | None:
     return Colours.of_faces(colours.repeat(2, axis=0))
 
 
-def _surfel_materials(points: ScannedPoints, voxels: _Voxels) -> FaceMaterials | None:
+def surfel_materials(points: ScannedPoints, voxels: Voxels) -> FaceMaterials | None:
     """Return the most frequent classes of surfels as names of materials, such as «class 2»."""
     if points.classes is None:
         return None

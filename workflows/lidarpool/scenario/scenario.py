@@ -84,6 +84,22 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
     return {name: value for name, value in data.items() if value is not None}
 
 
+def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
+    """Return the data of a scenario file with another sensor; LidarError for other options."""
+    is_campaign = isinstance(data, dict) and "base" in data
+    if is_campaign or {*options} != {"sensor"}:
+        name = next((name for name in options if name != "sensor"), "sensor")
+        raise LidarError(
+            f"--{name.replace('_', '-')} is for a mesh file: in {path}"
+            f"{', or rather its base' * is_campaign}, change {MESH_OPTIONS[name]}."
+        )
+    if not isinstance(data, dict):
+        return data  # `from_data` says what is wrong
+    if "sensors" in data:
+        raise LidarError(f"--sensor is for one sensor: in {path}, change sensors.")
+    return data | {"sensor": mesh_data([], path.parent, options)["sensor"]}
+
+
 def survey_of(mesh_file: Path) -> str:
     """Return the name of the survey of a mesh file without a scenario, for messages."""
     return f"survey of {mesh_file}"
@@ -221,6 +237,8 @@ class Scenario(Section):
     def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
         """Read a scenario file (YAML), or make the scenario of a mesh file by `mesh_data`.
 
+        Of the options, a scenario file with one sensor takes another `sensor`.
+
         Raises
         ------
         LidarError
@@ -230,11 +248,7 @@ class Scenario(Section):
         mesh = path.suffix.lower() not in ("", ".yaml", ".yml")
         data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
         if options and not mesh:
-            name = next(iter(options))
-            raise LidarError(
-                f"--{name.replace('_', '-')} is for a mesh file: in {path}"
-                f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
-            )
+            data = _with_sensor(path, data, options)
         return cls.from_data(
             data, source=survey_of(path) if mesh else str(path), folder=path.parent
         )

@@ -1,0 +1,65 @@
+"""The command `twin`: a place from a recording."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidarsim.base.errors import LidarError
+
+from . import completion
+from . import shared_options as options
+from .shared_options import overwrite
+
+
+@click.command()
+@click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
+@options.path("--out", "-o", metavar="DIR", required=True, help="Folder for the twin.")
+@click.option(
+    "--model",
+    metavar="MODEL|FILE",
+    shell_complete=completion.sensors,
+    help="The sensor; needed if it has no rings.",
+)
+@options.path("--trajectory", help="Poses of the sensor.  [default: the recording's, or KISS-ICP]")
+@click.option(
+    "--voxel-m", type=float, default=0.1, show_default=True, help="Distance of the surfels, metres."
+)
+@click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
+@click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
+@overwrite
+@options.as_json
+def twin(recording: Path, out: Path, *, overwrite: bool, as_json: bool, **settings: Any) -> None:
+    """Rebuild the place of a drive from its recording, without what moved.
+
+    Writes the scene (place.glb), the drive (trajectory.csv), the sensor (sensor.yaml), a scenario
+    with these, and report.html. The report compares held-out sweeps with a scan of the place.
+    RECORDING is one that `lidarpool compare` reads, with sweeps.
+
+    \b
+    Examples:
+      lidarpool twin drive.mcap --out twin
+      lidarpool twin sweeps --trajectory poses.txt --out twin
+      lidarpool twin mid360.mcap --model livox/mid360 --out twin
+      lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
+    """  # noqa: D301 - click wants the character, not its name
+    from ..base.fork_server import keep_freed_memory
+    from ..places.building import SCENARIO_FILE
+    from ..places.building import twin as build
+
+    if (out / SCENARIO_FILE).exists() and not overwrite:
+        raise LidarError(f"{out} holds {SCENARIO_FILE}: give another folder, or --overwrite.")
+    keep_freed_memory()
+
+    def tell(line: str) -> None:
+        if not as_json:
+            click.echo(f"{line} …", err=True)
+
+    built = build(recording, tell=tell, **settings)
+    files = [click.format_filename(path) for path in built.save(out)]
+    scenario = shlex.quote(str(out / SCENARIO_FILE))
+    following = f"next: lidarpool run {scenario} [--sensor MODEL]"
+    options.show(built.figures, [repr(built), *files, following], as_json)

@@ -1,0 +1,1 @@
+"""Places that are rebuilt from recordings, to be scanned again: twins."""

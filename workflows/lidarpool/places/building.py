@@ -1,0 +1,326 @@
+"""Rebuilds a place from a recording: the scene, the drive, the sensor, and how near they come."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import yaml
+from pydantic import Field
+
+from lidarscenes.writers.scene_file import write_scene
+from lidarsim._version import __version__
+from lidarsim.base.arrays import Bools, Floats
+from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.even_samples import even_indices
+from lidarsim.base.extras import need
+from lidarsim.base.signatures import ReadableSignature
+from lidarsim.base.validation import checked
+from lidarsim.base.words import plural
+from lidarsim.columns.cloud import Cloud
+from lidarsim.motion.rotations import quaternions_of
+from lidarsim.scene.colours import Colours, as_srgb
+from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.sensor.models import SensorModel, read_model
+from lidarview.render.picture_page import Page
+
+from ..clouds.folder import result_folder, staging
+from ..clouds.recording import Read, Recording
+from ..columns.parts import StoredCloud
+from ..comparing.fit import fit
+from ..recordings.opening import open_recording
+from ..report.page.rendering import rendered
+from .alignment import AlignedSweeps, align
+from .charts import draw_above, draw_errors, draw_sweep
+from .free_space import standing_points
+from .held_out import HeldOut, hold_out
+from .odometry import find_poses
+from .place import Place, build_place
+from .recorded_sweeps import RecordedSweeps
+from .reflectances import Reflectances, fit_reflectances
+
+MIN_SWEEPS = 4
+SCENE_FILE = "place.glb"
+TRAJECTORY_FILE = "trajectory.csv"
+SENSOR_FILE = "sensor.yaml"
+SCENARIO_FILE = "scenario.yaml"
+FIGURES_FILE = "twin.json"
+PAGE_FILE = "report.html"
+DEFAULT_VOXEL_M = 0.1
+_FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
+_COMPARED_SWEEPS = 12  # of the held-out sweeps
+_POSE_DECIMALS = 6
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Twin:
+    """A place that was rebuilt from a recording, the drive through it, and the sensor.
+
+    Attributes
+    ----------
+    scene
+        The place: surfels with reflectances as colours, and classes as materials.
+    poses
+        float64 (s, 4, 4): from the sensor frame of each sweep to the scene frame.
+    times_s
+        float64 (s,): times of the sweeps, seconds from the first.
+    model
+        The sensor of the recording, with the noise that was fitted.
+    figures
+        Numbers and texts of the report; lengths in metres.
+    """
+
+    __signature__ = ReadableSignature()
+
+    scene: Scene
+    poses: Floats
+    times_s: Floats
+    model: SensorModel
+    figures: dict[str, Any]
+    pictures: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return rendered("twin.txt", report=self.figures).rstrip("\n")
+
+    @checked
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write the scene, the drive, the sensor, a scenario of the three, and a report.
+
+        LidarError if the folder, which is created, cannot be written to.
+        """
+        path = Path(folder)
+        with (
+            result_folder(path),
+            explained(f"The twin cannot be written to {path}", "make room"),
+            staging(path) as staged,
+        ):
+            write_scene(staged / SCENE_FILE, self.scene)
+            pictures = {name: page.svg() for name, page in self.pictures.items()}
+            page = rendered("twin.html", report=self.figures, pictures=pictures)
+            model = self.model.model_dump(mode="json", exclude_defaults=True)
+            texts = {
+                TRAJECTORY_FILE: self._trajectory(),
+                SENSOR_FILE: yaml.safe_dump(model, sort_keys=False, default_flow_style=None),
+                SCENARIO_FILE: self._scenario(),
+                FIGURES_FILE: json.dumps(self.figures, indent=1, allow_nan=False) + "\n",
+                PAGE_FILE: page,
+            }
+            for name, text in texts.items():
+                (staged / name).write_text(text, encoding="utf-8", newline="\n")
+            return [(staged / name).replace(path / name) for name in (SCENE_FILE, *texts)]
+
+    def _trajectory(self) -> str:
+        """Return the table of the poses."""
+        quaternions = quaternions_of(self.poses[:, :3, :3])
+        rows = np.column_stack([self.times_s, self.poses[:, :3, 3], quaternions])
+        lines = ["time_s,x,y,z,qx,qy,qz,qw"]
+        lines += [",".join(f"{value:.{_POSE_DECIMALS}f}" for value in row) for row in rows]
+        return "\n".join(lines) + "\n"
+
+    def _scenario(self) -> str:
+        """Return a scenario of the recording's sensor on its drive through the place."""
+        scenario: dict[str, Any] = {
+            "scene": SCENE_FILE,
+            "sensor": SENSOR_FILE,
+            "trajectory": TRAJECTORY_FILE,
+        }
+        if self.scene.has_colours.any():
+            scenario["materials"] = [{"objects": "*", "reflectance": "texture"}]
+        scenario["cloud"] = {"keep_every": 1, "columns": ["time", "intensity"]}
+        scenario["planning"] = {"enabled": False}
+        head = (
+            f"# The place of {self.figures['name']}, rebuilt by lidarpool {__version__}.\n"
+            "# Another sensor on the same drive: lidarpool run scenario.yaml --sensor MODEL\n"
+        )
+        return head + yaml.safe_dump(scenario, sort_keys=False, default_flow_style=None)
+
+
+@checked
+def twin(
+    recording: str | Path | Cloud | StoredCloud | Recording,
+    *,
+    model: str | Path | None = None,
+    trajectory: str | Path | None = None,
+    voxel_m: Annotated[float, Field(gt=0, le=10)] = DEFAULT_VOXEL_M,
+    sensor: str | None = None,
+    intensity: str | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Twin:
+    """Rebuild the place of a recording without what moved, to scan it again.
+
+    Every second sweep is held out first, and its rays are compared with the place that the other
+    sweeps make: these are the figures. The place is then made of all sweeps.
+
+    Parameters
+    ----------
+    recording
+        Sweeps in any format of `compare`, or a cloud in memory that has sweeps.
+    model
+        The sensor, by name or file, for its optics and data sheet; needed for a sensor without
+        rings. By default a sensor with the recorded rings.
+    trajectory
+        File of the poses of the sensor. By default the poses are the recording's, and without these
+        KISS-ICP finds them.
+    voxel_m
+        Edge of the cubes in each of which all points become their mean.
+    sensor, intensity
+        Name of the sensor, or topic of a bag, if the recording has several; column with the
+        intensities, if not ``intensity``.
+    tell
+        Called with a line on each step.
+
+    Raises
+    ------
+    LidarError
+        If the recording cannot be read, has less than four sweeps, no planes or no rings and no
+        `model`; or an extra is missing.
+    """
+    need("scipy", "twin", "Places are rebuilt")
+    if not isinstance(recording, Recording):
+        recording = open_recording(recording, sensor, intensity, name="the recording")
+    if recording.thinned:
+        raise LidarError(f"{recording.notes[0]}.")
+    sweeps = RecordedSweeps.of_recording(recording)
+    if sweeps.count < MIN_SWEEPS:
+        raise LidarError(
+            f"{recording.name} has {plural(sweeps.count, 'sweep')}, and a twin needs at least "
+            f"{MIN_SWEEPS}: a place shows what stands by sweeps that agree."
+        )
+    base = None if model is None else read_model(model)
+    if base is None and not len(sweeps.elevation_rad):
+        raise LidarError(
+            f"{recording.name} has no rings: name its sensor, for example --model livox/mid360."
+        )
+    return _Building(sweeps, base, voxel_m, tell).twin(
+        None if trajectory is None else Path(trajectory)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Building:
+    """What a twin is built of, and how."""
+
+    recorded: RecordedSweeps
+    base: SensorModel | None
+    voxel_m: float
+    tell: Callable[[str], None]
+
+    def twin(self, trajectory: Path | None) -> Twin:
+        """Build the twin."""
+        recorded = self.recorded
+        self.tell(f"{plural(recorded.count, 'sweep')}: finding poses")
+        poses = find_poses(recorded, trajectory)
+        mapped = list(range(0, recorded.count, 2))
+        self.tell(f"poses {poses.source}; aligning the sweeps")
+        sweeps = AlignedSweeps(recorded, align(recorded, poses.matrices, mapped))
+        self.tell("finding what stands")
+        standing = standing_points(sweeps, range(recorded.count))
+        self.tell(f"building the place of {plural(len(mapped), 'sweep')}, to compare the others")
+        held_out, picture = self._hold_out(sweeps, standing, mapped)
+        self.tell("building the place of all sweeps")
+        place = build_place(sweeps, standing, self.voxel_m)
+        reflectances = self._reflectances(sweeps, place, standing)
+        self.tell("fitting the sensor")
+        model, notes = self._sensor(sweeps, place, reflectances)
+        figures = self._figures(sweeps, standing, place) | {
+            "poses": poses.source,
+            "held_out": held_out.figures(),
+            "response": None if reflectances is None else reflectances.figures(),
+            "model": model.name,
+            "notes": [*recorded.recording.notes, *recorded.notes, *notes],
+        }
+        pictures = {
+            "sweep": picture,
+            "above": draw_above(sweeps, standing),
+            "errors": draw_errors(figures),
+        }
+        mesh = _coloured(place.surfels.mesh, reflectances)
+        scene = Scene.from_meshes([mesh])
+        return Twin(scene, sweeps.alignment.poses, poses.times_s, model, figures, pictures)
+
+    def _hold_out(
+        self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], mapped: list[int]
+    ) -> tuple[HeldOut, Page]:
+        """Compare held-out sweeps with the place of the mapped ones; draw one of these."""
+        by_mapped = standing_points(sweeps, mapped)
+        place = build_place(sweeps, by_mapped, self.voxel_m)
+        reflectances = self._reflectances(sweeps, place, by_mapped)
+        others = np.setdiff1d(np.arange(self.recorded.count), mapped)
+        compared = others[even_indices(len(others), _COMPARED_SWEEPS)].tolist()
+        held_out = hold_out(sweeps, place, reflectances, standing, compared)
+        return held_out, draw_sweep(sweeps, place, reflectances, compared[len(compared) // 2])
+
+    def _reflectances(
+        self, sweeps: AlignedSweeps, place: Place, standing: Mapping[int, Bools]
+    ) -> Reflectances | None:
+        """Fit the reflectances of a place."""
+        seen = place.observations(sweeps, standing)
+        return fit_reflectances(seen, len(place.surfels), self.recorded.ring_count)
+
+    def _sensor(
+        self, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None
+    ) -> tuple[SensorModel, list[str]]:
+        """Return the sensor with the noise of its pulses on the place, and notes."""
+        if not len(self.recorded.elevation_rad):
+            assert self.base is not None
+            return self.base, ["without rings, the noise of the sensor is that of its model"]
+        chosen = even_indices(self.recorded.count, _FIT_SWEEPS).tolist()
+
+        def read(index: int) -> Read:
+            sweep = sweeps.read(chosen[index])
+            columns: dict[str, Any] = {"ring": self.recorded.ring_count - 1 - sweep.ring}
+            if sweep.intensities is not None:
+                columns["intensity"] = sweep.intensities
+            return sweep.points, columns, None
+
+        aligned = Recording(sweeps.name, len(chosen), read)
+        scene = Scene.from_meshes([place.surfels.mesh])
+        white = None if reflectances is None else reflectances.white
+        poses = sweeps.alignment.poses[chosen]
+        fitted = fit(aligned, scene=scene, pose=poses, white=white).model
+        if self.base is None or fitted.performance is None:
+            return self.base or fitted, []
+        source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"
+        changes = {
+            "performance": fitted.performance.model_dump(exclude_defaults=True),
+            "sources": {**self.base.sources, "performance": source},
+        }
+        return SensorModel.model_validate(self.base.model_dump() | changes), []
+
+    def _figures(
+        self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], place: Place
+    ) -> dict[str, Any]:
+        """Return the figures of the place and of the drive."""
+        alignment = sweeps.alignment
+        path = alignment.poses[:, :3, 3]
+        moved = sum(int((~mask).sum()) for mask in standing.values())
+        return {
+            "versions": {"lidarpool": __version__},
+            "name": Path(sweeps.name).name,
+            "sweeps": self.recorded.count,
+            "rings": len(self.recorded.elevation_rad),
+            "points": sum(len(mask) for mask in standing.values()),
+            "moved": moved,
+            "surfels": len(place.surfels),
+            "voxel_m": self.voxel_m,
+            "length_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
+            "turning": alignment.turning,
+            "motion_share": alignment.motion_share,
+            "thickness_m": list(alignment.thickness_m),
+            "plane_distance_m": float(np.nanmedian(alignment.plane_distance_m)),
+            "ring_offset_m": float(np.std(alignment.ring_offsets[:, 0])),
+            "ring_offset_deg": float(np.degrees(np.std(alignment.ring_offsets[:, 1]))),
+        }
+
+
+def _coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
+    """Return the mesh of surfels, whose colours are their reflectances."""
+    if reflectances is None:
+        return mesh
+    light = reflectances.surfels[:, None].repeat(3, axis=1)
+    return replace(mesh, colours=Colours.of_faces(as_srgb(light).repeat(2, axis=0)))

@@ -1,0 +1,132 @@
+"""Poses of the sweeps of a recording: recorded, of a file, or of KISS-ICP."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import need
+from lidarsim.base.words import plural
+from lidarsim.motion.rotations import matrices
+from lidarsim.motion.trajectory_files import load_trajectory
+
+from .recorded_sweeps import RecordedSweeps
+
+_VOXELS_OF_REACH = 100  # voxels of the map of KISS-ICP in the range of the sensor
+_MIN_VOXEL_M = 0.25
+_MAX_VOXEL_M = 1.0
+_MAX_REACH_M = 100.0  # farther points are too far apart to register sweeps by
+_MAX_STEP_M = 5.0  # from sweep to sweep at 10 Hz: 180 km/h
+DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 Hz
+
+
+class RecordedPoses(NamedTuple):
+    """Poses of the sweeps of a recording."""
+
+    matrices: Floats  # (s, 4, 4): from the sensor frame to the world, metres
+    times_s: Floats  # (s,): ascending, from 0
+    source: str  # a clause, such as "of the recording"
+
+
+def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses:
+    """Return the poses of all sweeps.
+
+    Parameters
+    ----------
+    sweeps
+        The sweeps.
+    trajectory
+        A file of poses of the sensor; by default the poses are the recording's, and without these
+        KISS-ICP (Vizzo et al., 2023) registers each sweep to a map of the earlier ones.
+
+    Raises
+    ------
+    LidarError
+        If the recording has no times to look up in a trajectory, KISS-ICP is needed and not
+        installed, or the poses jump.
+    """
+    times_s = _times_s(sweeps)
+    if trajectory is not None:
+        poses = _of_file(sweeps, trajectory, times_s)
+        return RecordedPoses(poses, times_s - times_s[0], f"of {trajectory.name}")
+    recorded = sweeps.recording.poses(range(sweeps.count))
+    # Many files of a sweep each state the pose of none, as VIEWPOINT of PCD does.
+    if recorded is not None and np.ptp(recorded, axis=0).any():
+        poses = recorded
+        source = "of the recording"
+    else:
+        poses = _registered(sweeps)
+        source = "of KISS-ICP"
+        steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        if len(steps_m) and steps_m.max() > _MAX_STEP_M:
+            number = int(steps_m.argmax()) + 1
+            raise LidarError(
+                f"KISS-ICP moves {steps_m.max():.1f} m from sweep {number - 1} to sweep {number} "
+                f"of {sweeps.recording.name}, which is a failure: give --trajectory."
+            )
+    return RecordedPoses(poses, times_s - times_s[0], source)
+
+
+def _times_s(sweeps: RecordedSweeps) -> Floats:
+    """Return the times (s,) of the sweeps, seconds; at 10 Hz from 0 if unknown."""
+    times = sweeps.recording.times
+    if times is None:
+        return DEFAULT_PERIOD_S * np.arange(sweeps.count, dtype=np.float64)
+    seconds = 1e-9 * np.fromiter(times(), np.float64)
+    if len(seconds) != sweeps.count or (np.diff(seconds) <= 0).any():
+        raise LidarError(f"{sweeps.recording.name} has times of sweeps that do not ascend.")
+    return np.asarray(seconds)
+
+
+def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> Floats:
+    """Return the poses of a file at the times of the sweeps, or one for each sweep."""
+    track = load_trajectory(trajectory)
+    if len(track.times_s) != sweeps.count and sweeps.recording.times is None:
+        raise LidarError(
+            f"{trajectory} has {plural(len(track.times_s), 'pose')} for "
+            f"{plural(sweeps.count, 'sweep')} without times: give a pose for each sweep."
+        )
+    first_s, last_s = (float(track.times_s[k]) for k in (0, -1))
+    if len(track.times_s) == sweeps.count:
+        times_s = np.asarray(track.times_s, np.float64)
+    elif times_s[0] < first_s or times_s[-1] > last_s:
+        raise LidarError(
+            f"{trajectory} is from {first_s:.3f} to {last_s:.3f} s, and "
+            f"{sweeps.recording.name} from {times_s[0]:.3f} to {times_s[-1]:.3f} s: give the "
+            "trajectory of the same drive, in the same time."
+        )
+    positions, quaternions = track.poses(0, 1e9 * (times_s - first_s))
+    poses = np.tile(np.eye(4), (sweeps.count, 1, 1))
+    poses[:, :3, :3] = matrices(quaternions)
+    poses[:, :3, 3] = positions
+    return np.asarray(poses)
+
+
+def _registered(sweeps: RecordedSweeps) -> Floats:
+    """Register sweeps by KISS-ICP in one thread, since its results depend on the threads."""
+    need("kiss_icp", "twin", "Sweeps without poses are registered")
+    from kiss_icp.config.parser import load_config
+    from kiss_icp.kiss_icp import KissICP
+
+    first = sweeps.read(0)
+    reach_m = float(np.quantile(np.linalg.norm(first.points, axis=1), 0.98)) if len(first) else 0.0
+    reach_m = min(max(reach_m, 1.0), _MAX_REACH_M)
+    config = load_config(None)
+    config.data.deskew = False
+    config.data.max_range = reach_m
+    config.data.min_range = 0.0
+    config.mapping.voxel_size = float(
+        np.clip(reach_m / _VOXELS_OF_REACH, _MIN_VOXEL_M, _MAX_VOXEL_M)
+    )
+    config.registration.max_num_threads = 1
+    odometry = KissICP(config)
+    poses = []
+    for number in range(sweeps.count):
+        sweep = sweeps.read(number)
+        odometry.register_frame(np.ascontiguousarray(sweep.points), np.empty(0))
+        poses.append(np.array(odometry.last_pose))
+    return np.array(poses)

@@ -1,0 +1,176 @@
+"""The place of a recording: surfels of all that stands, and what the sensor saw of each.
+
+Surfels reach beyond edges, and single points of things that moved are left. The caster decides:
+rays of the recording that pass a surfel, although it should have stopped them, count against the
+surfel, and rays that end on it count for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.even_samples import even_indices
+from raybeam import RayCaster
+
+from ..scenario.point_files import ScannedPoints
+from .alignment import AlignedSweep, AlignedSweeps
+from .surfels import Surfels
+from .voxel_planes import voxel_order
+
+_ROUNDS = 2  # of casting and leaving surfels out
+_VOTING_SWEEPS = 48  # at most, evenly chosen
+_ON_SURFEL_M = 0.06  # distance to the plane of a surfel within which a point is on it
+_VIEW_CELL_M = 0.5  # edge of the cells in which ranges of points are compared
+_MAX_VIEW_FACTOR = 1.5  # of the shortest range in a cell, beyond which points are left out
+_ON_RAY_M = 0.15  # difference of ranges within which a ray ends on a surfel
+
+
+class Observations(NamedTuple):
+    """Rays of the recording that end on surfels."""
+
+    surfel: Ints  # (k,)
+    ring: Ints  # (k,)
+    range_m: Floats  # (k,)
+    cosine: Floats  # (k,): of the incidence
+    intensity: Floats  # (k,): NaN where the recording has none
+
+
+class Seen(NamedTuple):
+    """What the rays of a sweep meet in a place; arrays of the k rays that meet a surfel."""
+
+    rays: Ints  # (k,): indices of the points of the sweep
+    surfel: Ints
+    distance_m: Floats  # to the surfel, along the ray
+    range_m: Floats  # as recorded
+    off_plane_m: Floats  # distance of the recorded point from the plane of the surfel
+    cosine: Floats  # of the incidence
+
+    @property
+    def ends(self) -> Bools:
+        """Mask (k,) of the rays that end on their surfels."""
+        near = np.abs(self.distance_m - self.range_m) < _ON_RAY_M
+        return np.asarray(near | (self.off_plane_m < _ON_SURFEL_M))
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Surfels, and the caster of rays at these."""
+
+    surfels: Surfels
+    caster: RayCaster
+
+    @classmethod
+    def of_surfels(cls, surfels: Surfels) -> Place:
+        """Make the caster of some surfels."""
+        return cls(surfels, RayCaster(surfels.mesh.vertices, surfels.mesh.faces))
+
+    def see(self, sweep: AlignedSweep, chosen: Bools | None = None) -> Seen:
+        """Cast the rays of a sweep; `chosen` (n,) are some of its points."""
+        rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
+        directions = sweep.world[rows] - sweep.origin
+        hits = self.caster.cast(sweep.origin, directions)
+        met = np.flatnonzero(hits.hit)
+        surfel = hits.triangle[met].astype(np.int64) // 2
+        range_m = np.linalg.norm(directions[met], axis=1)
+        normals = self.surfels.normals[surfel]
+        offsets = sweep.world[rows[met]] - self.surfels.centres[surfel]
+        off_plane_m = np.abs(np.einsum("ij,ij->i", offsets, normals))
+        cosine = np.abs(np.einsum("ij,ij->i", directions[met], normals)) / range_m
+        return Seen(rows[met], surfel, hits.distance[met], range_m, off_plane_m, cosine)
+
+    def votes(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Ints, Ints]:
+        """Return how many rays pass each surfel, and how many end on each: (m,)."""
+        count = len(self.surfels)
+        passed = np.zeros(count, np.int64)
+        met = np.zeros(count, np.int64)
+        for number in _some(standing):
+            seen = self.see(sweeps.read(number), standing[number])
+            passes = ~seen.ends & (seen.distance_m < seen.range_m - _ON_RAY_M)
+            passed += np.bincount(seen.surfel[passes], minlength=count)
+            met += np.bincount(seen.surfel[seen.ends], minlength=count)
+        return passed, met
+
+    def observations(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Observations:
+        """Return the rays that end on surfels."""
+        parts: list[Observations] = []
+        for number in _some(standing):
+            sweep = sweeps.read(number)
+            seen = self.see(sweep, standing[number])
+            ends = seen.ends
+            rays = seen.rays[ends]
+            parts.append(
+                Observations(
+                    seen.surfel[ends],
+                    sweep.ring[rays],
+                    seen.range_m[ends],
+                    seen.cosine[ends],
+                    np.full(len(rays), np.nan)
+                    if sweep.intensities is None
+                    else sweep.intensities[rays],
+                )
+            )
+        return Observations(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float) -> Place:
+    """Build the place of the points of sweeps that stand; LidarError if too few stand."""
+    points = _standing(sweeps, standing)
+    if not len(points):
+        raise LidarError(f"{sweeps.name} has no points that stand: nothing is left.")
+    name = Path(sweeps.name).name
+    surfels = Surfels.of_points(name, points, voxel_m, sweeps.recorded.gap_rad)
+    place = Place.of_surfels(surfels)
+    for _ in range(_ROUNDS):
+        passed, met = place.votes(sweeps, standing)
+        surfels = surfels.part(passed <= met)
+        if not len(surfels):
+            raise LidarError(f"{sweeps.name}: its sweeps contradict each other.")
+        place = Place.of_surfels(surfels)
+    return place
+
+
+def _some(standing: Mapping[int, Bools]) -> list[int]:
+    """Return the numbers of some sweeps, evenly chosen."""
+    numbers = np.fromiter(standing, np.int64)
+    chosen: list[int] = numbers[even_indices(len(numbers), _VOTING_SWEEPS)].tolist()
+    return chosen
+
+
+def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPoints:
+    """Return the points that stand in the world, with the directions to the sensor."""
+    positions = []
+    outward = []
+    classes = []
+    for number, mask in standing.items():
+        sweep = sweeps.read(number)
+        positions.append(sweep.world[mask])
+        outward.append(sweep.origin - sweep.world[mask])
+        if sweep.classes is not None:
+            classes.append(sweep.classes[mask])
+    points = ScannedPoints(
+        np.concatenate(positions),
+        np.concatenate(outward),
+        np.concatenate(classes) if len(classes) == len(positions) else None,
+    )
+    return points.take(_nearest_views(points))
+
+
+def _nearest_views(points: ScannedPoints) -> Ints:
+    """Return the indices of points that were not seen from much closer elsewhere.
+
+    Rays that come from far away are far apart, and their errors of direction are large.
+    """
+    assert points.outward is not None
+    range_m = np.linalg.norm(points.outward, axis=1)
+    order, starts = voxel_order(points.positions, _VIEW_CELL_M)
+    closest_m = np.minimum.reduceat(range_m[order], starts)
+    lengths = np.diff(starts, append=len(order))
+    kept = range_m[order] <= _MAX_VIEW_FACTOR * closest_m.repeat(lengths)
+    return np.sort(order[kept])

@@ -1,0 +1,196 @@
+"""Sweeps of a recording as a twin needs them: points in the sensor frame, rings, and intensities.
+
+A KITTI `.bin` and many PCD files have no column of rings. Where points are stored ring by ring, a
+ring begins where the azimuth falls back to 0°, and the points show their rings by their order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.base.even_samples import even_indices
+from lidarsim.base.extras import reading
+
+from ..clouds.recording import Columns, Recording, intensities_of, rings_of
+from ..scenario.point_files import CLASSES
+
+MIN_RINGS = 4  # a sensor with fewer rings is treated as a sensor without rings
+_MAX_RINGS = 512
+_GAP_RAD = np.radians(0.5)  # between the rays of a sensor without rings, in many sweeps
+_REFERENCE_SWEEPS = 5  # sweeps that tell the elevations of the rings
+_WRAP_DEG = 300.0  # a fall of the azimuth that begins a ring
+_SHORT_RING = 0.02  # a run of points shorter than this share of the median is no ring
+_MIN_IN_ORDER = 0.95  # share of runs whose elevations go on in one direction
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSweep:
+    """Returns of a sweep, in the sensor frame."""
+
+    points: Floats  # (n, 3): metres
+    ring: Ints  # (n,): row in `RecordedSweeps.elevation_rad`; 0 for a sensor without rings
+    intensities: Floats | None  # (n,): in the scale of the recording
+    classes: Ints | None  # (n,)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def part(self, rows: Bools | Ints) -> RecordedSweep:
+        """Return selected points."""
+        return RecordedSweep(
+            self.points[rows],
+            self.ring[rows],
+            None if self.intensities is None else self.intensities[rows],
+            None if self.classes is None else self.classes[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedSweeps:
+    """The sweeps of a recording, which are read one by one.
+
+    Attributes
+    ----------
+    elevation_rad
+        float64 (r,): median elevations of the rings, the highest first; empty for a sensor without
+        rings.
+    ring_numbers
+        int64 (r,): numbers of the rings in the recording; None if the order of points shows the
+        rings.
+    notes
+        Sentences on what the recording lacks.
+    """
+
+    recording: Recording
+    elevation_rad: Floats
+    ring_numbers: Ints | None
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of_recording(cls, recording: Recording) -> RecordedSweeps:
+        """Find the rings of a recording; LidarError if it cannot be read or has no sweeps."""
+        if recording.is_cloud or not recording.count:
+            raise LidarError(f"{recording.name} has no sweeps: give a recording of sweeps.")
+        references = []
+        for number in even_indices(recording.count, _REFERENCE_SWEEPS).tolist():
+            points, columns = _returns(recording, number)
+            references.append((points, columns))
+        if not any(len(points) for points, _ in references):
+            raise LidarError(f"{recording.name} has no points: there is no place to rebuild.")
+        if all(rings_of(columns) is not None for _, columns in references):
+            rings = np.concatenate([np.asarray(rings_of(columns)) for _, columns in references])
+            elevation = np.concatenate([elevations(points) for points, _ in references])
+            numbers, index = np.unique(rings.astype(np.int64), return_inverse=True)
+            medians = np.array([np.median(elevation[index == k]) for k in range(len(numbers))])
+            order = np.argsort(-medians, kind="stable")
+            if len(order) >= MIN_RINGS:
+                return cls(recording, medians[order], numbers[order], ())
+            return cls(recording, np.empty(0), None, ())
+        found = [_runs_in_order(points) for points, _ in references]
+        runs = [run for run in found if run is not None]
+        if not runs:
+            note = (
+                f"{recording.name} has no rings, and the order of its points shows none: the rays "
+                "of the sensor are not calibrated."
+            )
+            return cls(recording, np.empty(0), None, (note,))
+        medians = max(runs, key=len)
+        note = (
+            f"{recording.name} has no column of rings: the order of its points shows "
+            f"{len(medians)} rings."
+        )
+        return cls(recording, np.sort(medians)[::-1], None, (note,))
+
+    @property
+    def count(self) -> int:
+        """Number of sweeps."""
+        return self.recording.count
+
+    @property
+    def ring_count(self) -> int:
+        """Number of rings; 1 for a sensor without rings."""
+        return max(len(self.elevation_rad), 1)
+
+    @property
+    def gap_rad(self) -> float:
+        """Typical angle between the rays of neighbouring rings, radians."""
+        if len(self.elevation_rad) < MIN_RINGS:
+            return _GAP_RAD
+        return float(np.median(-np.diff(self.elevation_rad)))
+
+    def read(self, number: int) -> RecordedSweep:
+        """Read a sweep; LidarError if the recording cannot be read."""
+        points, columns = _returns(self.recording, number)
+        ring, known = self._rings(points, columns)
+        intensities = intensities_of(self.recording, columns)
+        classes = next((columns[name] for name in CLASSES if name in columns), None)
+        sweep = RecordedSweep(
+            points,
+            ring,
+            None if intensities is None else np.asarray(intensities, np.float64),
+            None if classes is None else np.asarray(classes).astype(np.int64),
+        )
+        return sweep if known.all() else sweep.part(known)
+
+    def _rings(self, points: Floats, columns: Columns) -> tuple[Ints, Bools]:
+        """Return the rows of the rings of points (n,), and which rings are known."""
+        count = len(points)
+        if not len(self.elevation_rad):
+            return np.zeros(count, np.int64), np.ones(count, bool)
+        if self.ring_numbers is not None:
+            numbers = np.asarray(rings_of(columns)).astype(np.int64)
+            order = np.argsort(self.ring_numbers)
+            place = np.searchsorted(self.ring_numbers, numbers, sorter=order)
+            ring = order[np.minimum(place, len(order) - 1)]
+            return ring, self.ring_numbers[ring] == numbers
+        starts, is_ring = _runs(points)
+        lengths = np.diff(np.append(starts, count))
+        medians = _medians(elevations(points), starts)
+        nearest = np.abs(medians[:, None] - self.elevation_rad).argmin(axis=1)
+        return nearest.repeat(lengths), is_ring.repeat(lengths)
+
+
+def elevations(points: Floats) -> Floats:
+    """Return the elevations (n,) of points (n, 3) in the sensor frame, radians."""
+    return np.asarray(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+
+
+def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyArray]]:
+    """Return the points (n, 3) of a sweep in the sensor frame, metres, and their columns."""
+    with reading(recording.name):
+        points, columns, _ = recording.read(number)
+    positions = np.asarray(points, np.float64)
+    # Drivers write NaN or zeros for pulses without a return.
+    returned = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
+    kept = {name: np.asarray(values)[returned] for name, values in columns.items()}
+    return positions[returned] * recording.metres, kept
+
+
+def _runs(points: Floats) -> tuple[Ints, Bools]:
+    """Return where runs of rising or falling azimuths start (k,), and which runs are rings."""
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    falls = np.abs(np.diff(azimuth)) > _WRAP_DEG
+    starts = np.append(0, np.flatnonzero(falls) + 1)
+    lengths = np.diff(np.append(starts, len(points)))
+    return starts, lengths > _SHORT_RING * np.median(lengths)
+
+
+def _medians(values: Floats, starts: Ints) -> Floats:
+    """Return the medians (k,) of runs of values (n,)."""
+    return np.array([np.median(run) for run in np.split(values, starts[1:])])
+
+
+def _runs_in_order(points: Floats) -> Floats | None:
+    """Return the median elevations (k,) of runs, radians; None if the runs are not rings."""
+    if len(points) < _MAX_RINGS:
+        return None
+    starts, is_ring = _runs(points)
+    if not MIN_RINGS <= is_ring.sum() <= _MAX_RINGS:
+        return None
+    medians = _medians(elevations(points), starts)[is_ring]
+    steps = np.sign(np.diff(medians))
+    return medians if abs(steps.mean()) > 2 * _MIN_IN_ORDER - 1 else None

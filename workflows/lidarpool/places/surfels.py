@@ -1,0 +1,186 @@
+"""Surfels of the points of many sweeps, as large as the gaps between the rays of the sensor.
+
+A lidar sees a surface in lines: points of a ring are close to each other, and rings are far apart.
+The twelve nearest points of a point are often on one line, which has no plane. Then more points are
+asked, until lines of other rings and sweeps are among these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.allowance import bytes_of, memory
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.scene.scene_mesh import SceneMesh
+
+from ..clouds.file_points import POINT_BYTES
+from ..scenario.point_files import ScannedPoints
+from ..scenario.point_scene import Voxels, surfel_faces, surfel_materials
+
+_NEIGHBOURS = (12, 32, 80)  # of which the first number that is no line counts
+_MIN_WIDTH = 0.1  # smaller over larger variance within a plane: less is a line
+_EXTENT = 0.85  # half of a side over the standard deviation of the neighbours
+_MAX_HALF_VOXELS = 3  # that half a side is long, beside the gaps between rays
+_MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
+_PLANE_GAPS = 0.55  # half a side, across the rings, over the gap between rays on a plane
+_MAX_RADII = 2.0  # the same over the distance of the farthest neighbour, at most
+_MAX_GAPS = 1.0  # half a side over the gap between rays elsewhere, at most
+_MIN_COSINE = 0.1  # of the incidence, by which gaps grow
+_BLOCK = 1 << 16  # surfels at a time
+
+
+@dataclass(frozen=True, eq=False)
+class Surfels:
+    """Surfels, each two triangles in turn."""
+
+    mesh: SceneMesh
+
+    def __len__(self) -> int:
+        return len(self.mesh.faces) // 2
+
+    @cached_property
+    def centres(self) -> Floats:
+        """Middles of the surfels, (m, 3), metres."""
+        return np.asarray(self.mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
+
+    @cached_property
+    def normals(self) -> Floats:
+        """Unit normals of the surfels, (m, 3)."""
+        corners = self.mesh.vertices.reshape(-1, 4, 3)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        return np.asarray(normals / np.maximum(lengths, 1e-12))
+
+    def part(self, rows: Bools) -> Surfels:
+        """Return selected surfels."""
+        mesh = self.mesh
+        vertices = mesh.vertices.reshape(-1, 4, 3)[rows].reshape(-1, 3)
+        faces = surfel_faces(int(rows.sum()))
+        both = np.flatnonzero(rows.repeat(2))
+        materials = None if mesh.materials is None else mesh.materials.take(both)
+        return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials))
+
+    @classmethod
+    def of_points(cls, name: str, points: ScannedPoints, voxel_m: float, gap_rad: float) -> Surfels:
+        """Make surfels of the means of points in voxels.
+
+        Parameters
+        ----------
+        name
+            Of the mesh, and in messages.
+        points
+            Points with the directions to the sensor, whose lengths are the ranges.
+        voxel_m
+            Edge of the voxels.
+        gap_rad
+            Angle between the rays of neighbouring rings.
+
+        Raises
+        ------
+        LidarError
+            If there are too few points, or too many for the memory.
+        """
+        from scipy.spatial import cKDTree
+
+        assert points.outward is not None
+        voxels = Voxels.of_points(Path(name), points.positions, voxel_m)
+        count = len(voxels.counts)
+        if count * POINT_BYTES > memory() // 2:
+            raise LidarError(
+                f"{name} makes {count:,} surfels, which take {bytes_of(count * POINT_BYTES)} of "
+                f"memory, of at most {bytes_of(memory() // 2)}: give a larger voxel_m than "
+                f"{voxel_m:.3g}."
+            )
+        if count < _NEIGHBOURS[-1]:
+            raise LidarError(
+                f"{name} has {count} points that stand in different voxels of {voxel_m:.3g} m, and "
+                f"at least {_NEIGHBOURS[-1]} are needed."
+            )
+        means = voxels.means(points.positions)
+        outward = voxels.means(points.outward)
+        tree = cKDTree(means)
+        corners = np.empty((count, 4, 3))
+        for start in range(0, count, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            planes = _Planes.around(means[block], tree, means)
+            corners[block] = planes.corners(means[block], outward[block], voxel_m, gap_rad)
+        mesh = SceneMesh(
+            name,
+            corners.reshape(-1, 3),
+            surfel_faces(count),
+            materials=surfel_materials(points, voxels),
+        )
+        return cls(mesh)
+
+
+class _Planes(NamedTuple):
+    """Planes of the neighbours of m points."""
+
+    axes: Floats  # (m, 3, 3): unit vectors: normal, across the lines, along the lines
+    halves: Floats  # (m, 2): half the sides of surfels across and along, metres
+    radius_m: Floats  # (m,): distance of the farthest neighbour; 0 if these are in no plane
+
+    @classmethod
+    def around(cls, centres: Floats, tree: object, means: Floats) -> _Planes:
+        """Find the planes of the neighbours of some of the means (v, 3), which are in a tree."""
+        count = len(centres)
+        axes = np.empty((count, 3, 3))
+        halves = np.empty((count, 2))
+        radius_m = np.empty(count)
+        left = np.arange(count)
+        for neighbours in _NEIGHBOURS:
+            around = means[_nearest(tree, centres[left], neighbours)]
+            variances, found = _principal(around)
+            axes[left] = found
+            flat = variances[:, 0] < _MAX_FLAT * variances[:, 1]
+            farthest_m = np.linalg.norm(around[:, -1] - centres[left], axis=1)
+            radius_m[left] = np.where(flat, farthest_m, 0.0)
+            near = around[:, : _NEIGHBOURS[0]] - centres[left, None]
+            close = np.square(np.einsum("mki,mji->mkj", near, found[:, 1:])).mean(axis=1)
+            is_line = close[:, 0] < _MIN_WIDTH * close[:, 1]
+            close[is_line, 0] = variances[is_line, 1]
+            halves[left] = _EXTENT * np.sqrt(np.maximum(close, 0))
+            left = left[variances[:, 1] < _MIN_WIDTH * variances[:, 2]]
+            if not len(left):
+                break
+        return cls(axes, halves, radius_m)
+
+    def corners(self, centres: Floats, outward: Floats, voxel_m: float, gap_rad: float) -> Floats:
+        """Return the corners (m, 4, 3) of surfels, counter-clockwise seen from the sensor."""
+        range_m = np.linalg.norm(outward, axis=1)
+        facing = np.einsum("mi,mi->m", self.axes[:, 0], outward)
+        cosine = np.abs(facing) / np.maximum(range_m, 1e-9)
+        gap_m = gap_rad * range_m / np.maximum(cosine, _MIN_COSINE)
+        longest_m = np.maximum(_MAX_HALF_VOXELS * voxel_m, _MAX_GAPS * gap_m)
+        halves = np.minimum(self.halves, longest_m[:, None])
+        # Between two rings of a sweep a plane goes on, wherever the rings of others are.
+        to_next_m = np.minimum(_PLANE_GAPS * gap_m, _MAX_RADII * self.radius_m)
+        halves[:, 0] = np.maximum(halves[:, 0], to_next_m)
+        across = self.axes[:, 1] * halves[:, :1]
+        along = self.axes[:, 2] * halves[:, 1:]
+        inverted = np.einsum("mi,mi->m", np.cross(along, across), outward) < 0
+        across = np.where(inverted[:, None], -across, across)
+        corners = np.empty((len(centres), 4, 3))
+        for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
+            corners[:, corner] = centres + a * along + b * across
+        return corners
+
+
+def _nearest(tree: object, centres: Floats, count: int) -> Ints:
+    """Return the indices (m, count) of the nearest points in a tree, the nearest first."""
+    _, rows = tree.query(centres, count)  # type: ignore[attr-defined]
+    return np.asarray(rows)
+
+
+def _principal(around: Floats) -> tuple[Floats, Floats]:
+    """Return the variances (m, 3), ascending, and axes (m, 3, 3) of points (m, k, 3)."""
+    offsets = around - around.mean(axis=1, keepdims=True)
+    covariances = np.einsum("mki,mkj->mij", offsets, offsets) / around.shape[1]
+    variances, axes = np.linalg.eigh(covariances)
+    return variances, np.swapaxes(axes, 1, 2)

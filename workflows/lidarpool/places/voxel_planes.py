@@ -1,0 +1,82 @@
+"""Planes of a place: means of points in voxels, and the normals of their neighbourhoods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
+
+_NEIGHBOURS = 12
+_MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
+_MIN_WIDTH = 0.05  # smaller over larger variance within a plane: less is a line
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelPlanes:
+    """Means of the points in voxels whose neighbours lie in a plane."""
+
+    centres: Floats  # (p, 3): metres
+    normals: Floats  # (p, 3): unit vectors, of either side
+    tree: Any  # scipy.spatial.cKDTree of the centres
+    thickness_m: float  # median standard deviation of the neighbours along the normals
+
+    @classmethod
+    def of_points(cls, points: Floats, voxel_m: float) -> VoxelPlanes | None:
+        """Find planes among points (n, 3); None without any."""
+        from scipy.spatial import cKDTree
+
+        means = voxel_means(points, voxel_m)
+        if len(means) < _NEIGHBOURS:
+            return None
+        _, neighbours = cKDTree(means).query(means, _NEIGHBOURS)
+        around = means[neighbours]
+        middles = around.mean(axis=1)
+        around -= middles[:, None]
+        covariances = np.einsum("nki,nkj->nij", around, around) / _NEIGHBOURS
+        variances, axes = np.linalg.eigh(covariances)
+        flat = _is_plane(variances)
+        if not flat.any():
+            return None
+        normals = axes[flat, :, 0]
+        middles = middles[flat]
+        thickness_m = float(np.sqrt(np.median(np.maximum(variances[flat, 0], 0))))
+        return cls(middles, normals, cKDTree(middles), thickness_m)
+
+    def distances(self, points: Floats, max_m: float) -> tuple[Floats, Ints, Bools]:
+        """Return signed distances (k,) of points (n, 3) to their planes, the planes, and a mask.
+
+        The mask (n,) marks the points that are within `max_m` of the centre of a plane.
+        """
+        distance, plane = self.tree.query(points, distance_upper_bound=max_m)
+        near = np.isfinite(distance)
+        plane = plane[near]
+        offsets = points[near] - self.centres[plane]
+        return np.einsum("ij,ij->i", offsets, self.normals[plane]), plane, near
+
+
+def _is_plane(variances: Floats) -> Bools:
+    """Mark neighbourhoods that are planes by their variances (n, 3), ascending."""
+    smallest, middle, largest = variances.T
+    return np.asarray((smallest < _MAX_FLAT * middle) & (middle > _MIN_WIDTH * largest))
+
+
+def voxel_means(points: Floats, voxel_m: float) -> Floats:
+    """Return the means (v, 3) of points (n, 3) in the same voxels, in order of the voxels."""
+    order, starts = voxel_order(points, voxel_m)
+    counts = np.diff(starts, append=len(order))
+    return np.asarray(np.add.reduceat(points[order], starts, axis=0) / counts[:, None])
+
+
+def voxel_order(points: Floats, voxel_m: float) -> tuple[Ints, Ints]:
+    """Return indices that sort points (n, 3) by voxel, and where each voxel starts in these."""
+    cells = np.floor(points / voxel_m).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, ny, nz = (int(size) + 1 for size in cells.max(axis=0))
+    keys: AnyArray = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
+    return order, starts
