@@ -1,4 +1,4 @@
-"""What plug-ins of mesh files and packets import; docs/how-to/plugins.md has examples."""
+"""The imports of plug-ins of mesh files and packets, with examples in docs/how-to/plugins.md."""
 
 from .base.declared import about
 from .base.validation import checked_fields

@@ -178,7 +178,10 @@ class Storage:
                 system.makedirs(f"{folder}/{name}".rstrip("/"), exist_ok=True)
 
     def claim(self) -> None:
-        """Make the folder; LidarError if files cannot be written and removed."""
+        """Make the folder.
+
+        Raises LidarError if files cannot be written and removed.
+        """
         name = f"{TEMPORARY}{secrets.token_hex(4)}"
         try:
             self.prepare()
@@ -195,7 +198,7 @@ class Storage:
             ) from error
 
     def write(self, name: str, content: Any) -> None:
-        """Write bytes, or a list of bytes, completely or not at all; flush if durable."""
+        """Write bytes, or a list of bytes, completely or not at all, and flush if durable."""
         pieces = content if isinstance(content, list) else [content]
         if self.is_local:
             with self._replacing(self._target(name)) as file:
@@ -306,7 +309,7 @@ class Storage:
             return False
 
     def sizes(self) -> dict[str, int]:
-        """Return all plain files and their sizes, bytes; {} if the folder is missing."""
+        """Return all plain files and their sizes, bytes, or {} if the folder is missing."""
         return {name: size for name, size in self.entries().items() if size is not None}
 
     def entries(self) -> dict[str, int | None]:
@@ -329,7 +332,7 @@ class Storage:
         return sizes
 
     def remove(self, names: Iterable[str], *, folder: bool = False) -> None:
-        """Remove files, of which any may be missing; with `folder`, remove the empty folder too."""
+        """Remove files, some of them missing perhaps, and with `folder` the empty folder."""
         for name in names:
             if self.is_local:
                 self._target(name).unlink(missing_ok=True)
@@ -341,7 +344,10 @@ class Storage:
                 self.local().rmdir()
 
     def tree(self, name: str = "") -> list[str]:
-        """Return the names of all files in a folder and below; LidarError for a link."""
+        """Return the names of all files in a folder and below.
+
+        Raises LidarError for a link.
+        """
         if self.is_local:
             paths_below: list[Path] = []
             for folder, folders, files in os.walk(self.local(name)):

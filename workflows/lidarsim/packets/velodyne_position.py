@@ -119,7 +119,9 @@ class _Fixes(NamedTuple):
 
 
 def gprmc(second: int, fix: Fix | None) -> bytes:
-    r"""Return the GPRMC sentence of a second since 1970, UTC; without a fix its status is V.
+    r"""Return the GPRMC sentence of a second since 1970, UTC.
+
+    Without a fix its status is V.
 
     Examples
     --------

@@ -143,7 +143,10 @@ def fired_rays(
 
 
 def _duration_ns(sensor: Sensor, seconds: float | None, revolutions: int | None) -> float:
-    """Return the duration of a pattern, nanoseconds; LidarError if both figures are given."""
+    """Return the duration of a pattern, nanoseconds.
+
+    Raises LidarError if both figures are given.
+    """
     if seconds is not None and revolutions is not None:
         raise LidarError("seconds and revolutions both say how long the pattern is: give one.")
     if seconds is not None:

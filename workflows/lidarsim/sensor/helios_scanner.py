@@ -176,7 +176,10 @@ def _attributes(numbers: dict[str, float]) -> str:
 
 
 def _number(value: float) -> str:
-    """Return the shortest text of a number; HELIOS++ refuses whole numbers that end in .0."""
+    """Return the shortest text of a number.
+
+    HELIOS++ refuses whole numbers that end in .0.
+    """
     return str(int(value)) if value == int(value) else repr(float(value))
 
 
@@ -209,7 +212,10 @@ def _lost_rate(scanner: _Scanner) -> Iterable[str]:
 
 
 def _scanner_of(sensor: Sensor, duration_s: float) -> _Scanner:
-    """Return the optics for a sensor; LidarError if HELIOS++ has none."""
+    """Return the optics for a sensor.
+
+    Raises LidarError if HELIOS++ has none.
+    """
     if isinstance(sensor, PrismSensor):
         return _prisms(sensor, duration_s)
     kind = type(sensor)
@@ -233,7 +239,10 @@ def _refusal(sensor: Sensor, reason: str) -> LidarError:
 
 
 def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
-    """Return a whole number of pulses a second; LidarError for less than one."""
+    """Return a whole number of pulses a second.
+
+    Raises LidarError for less than one.
+    """
     if exact_hz < 0.5:
         raise _refusal(sensor, f"it fires {exact_hz:.3g} times a second, and pulseFreq_hz is whole")
     return round(exact_hz)
@@ -304,7 +313,7 @@ class _EvenLine(NamedTuple):
 
 
 def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
-    """Return the line of beams; None for beams that make no even line from the centre.
+    """Return the line of beams, or None for beams that make no even line from the centre.
 
     `radians_per_ns` is the speed of the head, which turns while the beams fire.
     """
@@ -331,7 +340,10 @@ def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
 
 
 def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | None:
-    """Return a mirror that draws a line in each firing; None for beams that make no even line."""
+    """Return a mirror that draws a line in each firing.
+
+    Returns None for beams that make no even line.
+    """
     line = _even_line(sensor.beams, head.radians_per_ns)
     if line is None:
         return None
@@ -354,7 +366,7 @@ def _line_of_beams(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner | 
 def _set_line(
     scanner: _Scanner, step_deg: float, count: int, pulses_per_line: int, pulse_hz: int
 ) -> float:
-    """Give a scanner a mirror that draws lines; return the angle of their middle, degrees.
+    """Give a scanner a mirror that draws lines, and return the angle of their middle, degrees.
 
     The mirror turns from -scanAngleMax_deg on, by a step from pulse to pulse; pulses between
     verticalAngleMin_deg and verticalAngleMax_deg leave the device.
@@ -380,7 +392,10 @@ def _set_line(
 
 
 def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
-    """Return a mirror that draws lines with a single beam; LidarError for other mirrors."""
+    """Return a mirror that draws lines with a single beam.
+
+    Raises LidarError for other mirrors.
+    """
     beams = sensor.beams
     if len(beams) > 1 or abs(beams.elevation[0]) > 1e-9 or beams.origin.any():
         raise _refusal(
@@ -423,7 +438,10 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
 
 
 def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
-    """Return Risley prisms; LidarError for what HELIOS++ does not have of prisms."""
+    """Return Risley prisms.
+
+    Raises LidarError for prisms that HELIOS++ does not have.
+    """
     if sensor.mirror is not None:
         raise _refusal(sensor, "a mirror turns behind its prisms, and HELIOS++ has prisms alone")
     if len(sensor.prisms) > MAX_PRISMS:

@@ -13,7 +13,10 @@ from ..base.storage import Storage
 
 @contextmanager
 def write_bytes_of(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file that appears after the body; LidarError if the file cannot be written."""
+    """Open a file that appears after the body.
+
+    Raises LidarError if the file cannot be written.
+    """
     with (
         explained(f"{path} cannot be written"),
         Storage.at(path.parent, durable=False).writing(path.name) as file,
@@ -22,7 +25,10 @@ def write_bytes_of(path: Path) -> Iterator[IO[bytes]]:
 
 
 def write_text_of(path: Path, text: str) -> None:
-    """Write a text in UTF-8; LidarError if the file cannot be written."""
+    """Write a text in UTF-8.
+
+    Raises LidarError if the file cannot be written.
+    """
     with write_bytes_of(path) as file:
         file.write(text.encode())
 

@@ -87,7 +87,7 @@ class FiredRays:
 
     @property
     def origins_or_centre(self) -> Floats:
-        """Starts of the rays (n, 3), metres; zeros if all start at the sensor's centre."""
+        """Starts of the rays (n, 3), metres, or zeros if all start at the sensor's centre."""
         return np.zeros((len(self), 3)) if self.origins is None else self.origins
 
     def timed(self) -> FiredRays:

@@ -74,7 +74,10 @@ class SensorFormat:
     extra: str = ""
 
     def function(self, name: str) -> Any:
-        """Import the module and return its function of a name; LidarError without its package."""
+        """Import the module and return its function of a name.
+
+        Raises LidarError without its package.
+        """
         for package in self.packages:
             need(package, self.extra, f"Sensors as {self.name} are written and read")
         return getattr(import_module(self.module), name)
@@ -202,7 +205,7 @@ def _choices(ending: str) -> str:
 
 
 def read_rays(path: Path) -> FiredRays | None:
-    """Return the rays of a file by its ending; None for an ending of no format that is read.
+    """Return the rays of a file by its ending, or None for the ending of an unread format.
 
     Raises
     ------

@@ -22,7 +22,10 @@ _SECOND_NS = 1_000_000_000
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write rays in the order of firing; the format has no remarks."""
+    """Write rays in the order of firing.
+
+    The format has no remarks.
+    """
     times_ns = rays.timed().times_ns
     assert times_ns is not None  # of timed rays
     azimuths = np.round(rays.azimuths_deg, _DECIMALS) + 0.0  # no -0.0
@@ -43,7 +46,7 @@ def is_livox(text: str) -> bool:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of a list; None for a file of another format."""
+    """Return the rays of a list, or None for a file of another format."""
     text = read_text(path)
     return rays_of_text(text) if is_livox(text) else None
 

@@ -69,7 +69,9 @@ def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of arrays `theta` and `phi`; None for other arrays and for Python files.
+    """Return the rays of arrays `theta` and `phi`.
+
+    Returns None for other arrays and for Python files.
 
     Raises
     ------

@@ -144,7 +144,10 @@ def _state(rays: FiredRays, number: int, frame: Ints) -> Iterator[str]:
 
 
 def _array(number: int, kind: str, name: str, values: AnyArray) -> Iterator[str]:
-    """Yield the lines of an attribute with an array; angles have the digits of float32."""
+    """Yield the lines of an attribute with an array.
+
+    Angles have the digits of float32.
+    """
     yield f"    {kind} {STATE}{_state_name(number)}:{name} = ["
     if kind == "float[]":
         words = [f"{value:.9g}" for value in values.astype(np.float32).tolist()]

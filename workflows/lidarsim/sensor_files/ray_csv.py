@@ -50,7 +50,7 @@ def is_ray_table(text: str) -> bool:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of a table; see `rays_of_text`."""
+    """Return the rays of a table (`rays_of_text`)."""
     return rays_of_text(read_text(path))
 
 
@@ -74,7 +74,10 @@ def rays_of_text(text: str) -> FiredRays:
 
 
 def _header(text: str) -> dict[str, Any]:
-    """Return the header in the remarks at the start of a text; other remarks are left out."""
+    """Return the header in the remarks at the start of a text.
+
+    Other remarks are left out.
+    """
     header = {}
     for line in text.splitlines():
         if not line.startswith("#"):

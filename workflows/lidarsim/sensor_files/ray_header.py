@@ -27,7 +27,9 @@ def header_of(
     azimuth: str = "azimuth_deg",
     elevation: str = "elevation_deg",
 ) -> dict[str, Any]:
-    """Return the header of rays; an infinite range is None.
+    """Return the header of rays.
+
+    An infinite range is None.
 
     `left_out` says what the file does not hold of the sensor; `azimuth` and `elevation` are the
     names of the columns, which have radians unless the names end in _deg.
@@ -117,7 +119,10 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
 
 
 def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
-    """Raise ValueError if a file has arrays or columns that are not known; `kind` says which."""
+    """Raise ValueError if a file has arrays or columns that are not known.
+
+    `kind` says which.
+    """
     if unknown := [name for name in names if name not in known]:
         shown = ", ".join(map(printable, unknown[:5]))
         raise ValueError(f"it has {kind} that are not known: {shown}. Known: {', '.join(known)}")
@@ -138,7 +143,9 @@ def check_times(rays: FiredRays) -> None:
 
 
 def _directions(columns: Mapping[str, Any]) -> Floats:
-    """Return the unit directions of columns, from vectors or else from angles; ValueError if none.
+    """Return the unit directions of columns, from vectors or else from angles.
+
+    Raises ValueError without directions.
 
     Vectors are scaled to length 1 unless they have it to twelve digits.
     """
@@ -159,7 +166,10 @@ def _directions(columns: Mapping[str, Any]) -> Floats:
 
 
 def _positive(header: Mapping[str, Any], name: str, default: float | None = None) -> float:
-    """Return a figure of a header above 0; ValueError for another value."""
+    """Return a figure of a header above 0.
+
+    Raises ValueError for another value.
+    """
     value = header.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < inf:
         raise ValueError(f"{name} of its header is {value!r}; a number above 0 is expected")

@@ -28,7 +28,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of a file of this format; None for arrays of another format.
+    """Return the rays of a file of this format, or None for arrays of another format.
 
     Raises
     ------
@@ -46,7 +46,10 @@ def read(path: Path) -> FiredRays | None:
 
 
 def header_in(arrays: dict[str, Any]) -> dict[str, Any]:
-    """Remove the header from arrays and return it; ValueError if it is not of a file of rays."""
+    """Remove the header from arrays and return it.
+
+    Raises ValueError if the arrays are not of a file of rays.
+    """
     header = json.loads(str(arrays.pop(HEADER, np.array("{}"))))
     if not isinstance(header, dict):
         raise ValueError("its header is not of a file of rays")

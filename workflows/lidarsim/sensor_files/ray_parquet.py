@@ -19,7 +19,10 @@ _HEADER = b"lidarpool"
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
-    """Write rays as a table; the metadata of the schema have the header as JSON."""
+    """Write rays as a table.
+
+    The metadata of the schema have the header as JSON.
+    """
     table = pa.table(columns_of(rays)).replace_schema_metadata(
         {_HEADER: json.dumps(header_of(rays, left_out)).encode()}
     )

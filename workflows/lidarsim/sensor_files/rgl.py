@@ -65,7 +65,7 @@ def _matrices(rays: FiredRays) -> Floats:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of arrays of this format; None for other arrays.
+    """Return the rays of arrays of this format, or None for other arrays.
 
     Raises
     ------

@@ -129,7 +129,10 @@ def _levels(angles_deg: Floats) -> _Levels:
 
 
 def _even(name: str, words: str, angles_deg: Floats) -> _Angles:
-    """Return evenly spaced angles (k,) by their ends; LidarError for others."""
+    """Return evenly spaced angles (k,) by their ends.
+
+    Raises LidarError for other angles.
+    """
     count = len(angles_deg)
     even_deg = np.linspace(angles_deg[0], angles_deg[-1], count)
     if np.abs(even_deg - angles_deg).max() > _SLACK_DEG:

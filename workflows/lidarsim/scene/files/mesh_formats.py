@@ -103,7 +103,7 @@ class MeshFormat:
         return options
 
     def _named(self, name: str, kind: Any) -> Any:
-        """Return an object by its name, "module:object"; of a plug-in, of a kind."""
+        """Return an object by its name, "module:object", for a plug-in of a kind."""
         if self.plugin is not None:
             return replace(self.plugin, value=name).load(kind)
         module, _, attribute = name.partition(":")

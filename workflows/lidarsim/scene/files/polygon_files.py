@@ -691,7 +691,7 @@ class _PlyElementReader:
         return self._unequal_rows(start)
 
     def _equal_rows(self, start: int, sizes: list[int]) -> dict[str, _PlyColumn] | None:
-        """Return columns if all rows have as many numbers as the first, as most files; else None.
+        """Return columns if all rows have as many numbers as the first, as most files, else None.
 
         The rows are read at once as a table.
         """

@@ -1,4 +1,4 @@
-"""Clouds of Leica's .pts: the number of points, and a point in each line; often several of these.
+"""Clouds of Leica's .pts: the number of points, and a point in each line, often several times.
 
 Leica Cyclone writes x, y, z, an intensity from -2048 to 2047, and red, green and blue; other
 programs leave out the intensity, the colours, or the number of points.
