@@ -103,7 +103,10 @@ class Child(NamedTuple):
 
 
 def _next_frame(stream: IO[bytes], take: Callable[[dict[str, Any], int], None]) -> Frame | None:
-    """Read a frame; None at the end, also of a process that has ended within a frame."""
+    """Read a frame, or None at the end.
+
+    A process that has ended within a frame gives None too.
+    """
     line = stream.readline()
     if not line.endswith(b"\n"):
         return None

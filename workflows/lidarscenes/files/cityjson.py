@@ -1,4 +1,4 @@
-"""CityJSON and CityJSONSeq, after the specifications 1.0 to 2.0 (Ledoux et al. 2019; cityjson.org).
+"""CityJSON and CityJSONSeq, after the specifications 1.0 to 2.0 (Ledoux et al. 2019, cityjson.org).
 
 This is not cjio, which triangulates in a loop of Python and keeps no names in its exports.
 """
@@ -88,7 +88,10 @@ _Json = dict[str, Any]
 
 
 class _Polygons(NamedTuple):
-    """Polygons of the objects of a document; an owner is (number of the object, material)."""
+    """Polygons of the objects of a document.
+
+    An owner is (number of the object, material).
+    """
 
     corners: list[Ints]  # vertices of the polygons without holes, an array for each object
     sizes: list[int]  # number of corners of each polygon without holes
@@ -98,7 +101,7 @@ class _Polygons(NamedTuple):
 
 
 def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the highest level of detail of each city object; a .jsonl line by line."""
+    """Read the highest level of detail of each city object, from a .jsonl line by line."""
     allowance = Allowance(len(data), _PARTS)
 
     def lines() -> Iterator[bytes]:
@@ -218,7 +221,7 @@ class _CityFile:
     def _meshes(
         self, points: Floats, objects: list[tuple[str, list[_Json]]], document: _Json
     ) -> list[list[SceneMesh]]:
-        """Return the mesh of each object, in a list; an empty list without triangles.
+        """Return the mesh of each object, in a list, or an empty list without triangles.
 
         `objects` are names and geometries. All polygons of a document are cut at once, which takes
         a tenth of the time.
@@ -240,7 +243,7 @@ class _CityFile:
         ]
 
     def _polygons(self, points: Floats, objects: list[tuple[str, list[_Json]]]) -> _Polygons:
-        """Collect the polygons of objects; polygons with holes as triangles."""
+        """Collect the polygons of objects, and cut polygons with holes into triangles."""
         polygons = _Polygons([np.zeros(0, np.int64)], [], [], [], [])
         for number, (name, geometries) in enumerate(objects):
             corners: list[int] = []
@@ -264,7 +267,7 @@ class _CityFile:
         return polygons
 
     def _triangles(self, points: Floats, polygons: _Polygons) -> tuple[Ints, Ints]:
-        """Cut polygons into triangles (t, 3); return these and their owners (t, 2)."""
+        """Cut polygons into triangles (t, 3), and return these and their owners (t, 2)."""
         corners = np.concatenate(polygons.corners)
         sizes = np.array(polygons.sizes, np.int64)
         self._allowance.take(100 * len(corners))
@@ -281,7 +284,7 @@ class _CityFile:
         return faces, owners
 
     def _piece(self, points: Floats, faces: Ints, material: int, document: _Json) -> Piece:
-        """Return triangles with colour and name of a material; -1 is no material."""
+        """Return triangles with colour and name of a material, where -1 is not a material."""
         colours = None
         name = ""
         if material >= 0:
@@ -414,7 +417,10 @@ def _looks_like_angles(corners: Floats) -> bool:
 
 
 def _points(rows: Any) -> Floats:
-    """Return coordinates (v, 3); ValueError for another shape."""
+    """Return coordinates (v, 3).
+
+    Raises ValueError for another shape.
+    """
     try:
         points = np.array(rows or np.zeros((0, 3)), np.float64)
     except (TypeError, ValueError) as error:
@@ -433,7 +439,10 @@ def _integers(numbers: Sequence[int]) -> Ints:
 
 
 def _item(items: Any, number: Any) -> Any:
-    """Return an item by its number; ValueError if the number is none of theirs."""
+    """Return an item by its number.
+
+    Raises ValueError if no item has the number.
+    """
     if type(number) is not int or not 0 <= number < len(items):
         raise ValueError(f"{str(number)[:20]} is none of {len(items)} templates or vertices")
     return items[number]

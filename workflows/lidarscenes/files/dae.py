@@ -79,7 +79,10 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
 
 
 class _Document:
-    """Elements of a file by their ids; each geometry is read once."""
+    """Elements of a file by their ids.
+
+    Each geometry is read once.
+    """
 
     def __init__(
         self, root: Element, allowance: Allowance, paint: _Effects | None, options: ReadOptions
@@ -98,7 +101,7 @@ class _Document:
         self._floats = cache(_numbers)
 
     def roots(self) -> list[Element]:
-        """Return the visual scene of the file, in a list; by default the first."""
+        """Return the visual scene of the file, in a list, by default the first."""
         shown = self._root.find("scene/instance_visual_scene")
         if shown is not None:
             return [self._target(shown, "visual_scene")]
@@ -221,7 +224,7 @@ class _Document:
     def _colours(
         self, paint: _Effects, primitive: Element, material: Element, corners: Ints, rows: Ints
     ) -> Colours | None:
-        """Return the colours of triangles by a material; None if its effect has no colour.
+        """Return the colours of triangles by a material, or None if its effect has no colour.
 
         `corners` (c, stride) are the numbers in <p>, `rows` (t, 3) the triangles' corners.
         """
@@ -243,7 +246,10 @@ class _Document:
         return np.column_stack([s, 1 - t]), _whole_number(first, "offset")
 
     def _inputs(self, primitive: Element) -> _Inputs:
-        """Return the points of a primitive; ValueError without points."""
+        """Return the points of a primitive.
+
+        Raises ValueError without points.
+        """
         stride = 0
         points = None
         offset = 0
@@ -291,7 +297,10 @@ class _Document:
 
 
 class _Effects:
-    """Diffuse colours of effects; each image is read once."""
+    """Diffuse colours of effects.
+
+    Each image is read once.
+    """
 
     def __init__(self, path: Path, options: ReadOptions, allowance: Allowance) -> None:
         self.notes = MaskNotes()
@@ -301,7 +310,10 @@ class _Effects:
         self._texture = remembered(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
-        """Return the image or colour (1, 1, 3) of an effect; None for an effect without colour."""
+        """Return the image or colour (1, 1, 3) of an effect.
+
+        Returns None for an effect without colour.
+        """
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None
@@ -332,7 +344,10 @@ class _Effects:
         return self._texture((file.strip(), wrap_s, wrap_t))
 
     def _read_texture(self, key: tuple[str, str, str]) -> Texture:
-        """Read the texture of an image; `key` is its name and the wraps along s and t."""
+        """Read the texture of an image.
+
+        `key` is its name and the wraps along s and t.
+        """
         name, *wraps = key
         file = image_file(self._path, name, self._options, self._allowance)
         wrap_s, wrap_t = (_WRAPS.get(wrap, "repeat") for wrap in wraps)
@@ -343,7 +358,10 @@ class _Effects:
 def _triangles(
     primitive: Element, points: Floats, corners: Callable[[Element], Ints]
 ) -> Iterator[Ints]:
-    """Yield the triangles (t, 3) of a primitive; `corners` returns the corners of a <p> or <h>."""
+    """Yield the triangles (t, 3) of a primitive.
+
+    `corners` returns the corners of a <p> or <h>.
+    """
     lists = [corners(p) for p in primitive.findall("p")]
     if primitive.tag == "triangles":
         yield from (row[: len(row) // 3 * 3].reshape(-1, 3) for row in lists)
@@ -380,7 +398,10 @@ def _numbers(element: Element) -> Floats:
 
 
 def _words(element: Element, kind: type, expected: str) -> AnyArray:
-    """Return the numbers of a type in the text of an element; ValueError for other words."""
+    """Return the numbers of a type in the text of an element.
+
+    Raises ValueError for other words.
+    """
     words = (element.text or "").split()
     try:
         return np.array(words, kind)
@@ -401,7 +422,10 @@ def _is_number(word: str, kind: type) -> bool:
 
 
 def _whole_number(element: Element, attribute: str, default: int = 0) -> int:
-    """Return an attribute; ValueError if it is no whole number."""
+    """Return an attribute.
+
+    Raises ValueError if the attribute is not a whole number.
+    """
     text = element.get(attribute, str(default))
     try:
         return int(text)
@@ -418,7 +442,10 @@ def _tag(element: Element) -> str:
 
 
 def _step(element: Element) -> Floats:
-    """Return the matrix (4, 4) of a step of a placement; ValueError for other numbers."""
+    """Return the matrix (4, 4) of a step of a placement.
+
+    Raises ValueError for other numbers.
+    """
     numbers = _numbers(element)
     count, matrix_of = _STEPS[element.tag]
     if len(numbers) != count:
@@ -427,7 +454,7 @@ def _step(element: Element) -> Floats:
 
 
 def _rotate(numbers: Floats) -> Floats:
-    """Return the rotation about an axis, in degrees; without an axis, the identity."""
+    """Return the rotation about an axis, in degrees, or the identity without an axis."""
     *axis, degrees = numbers
     return affine(rotation_about(axis, degrees) if np.any(axis) else np.eye(3), np.zeros(3))
 

@@ -141,7 +141,10 @@ def _check_end(path: Path) -> None:
 
 
 def _check_storeys(wanted: Sequence[str] | None, storeys: list[str]) -> None:
-    """Check that a building has all storeys asked for; MeshFileError with their names if not."""
+    """Check that a building has all storeys asked for.
+
+    Raises MeshFileError with their names if not.
+    """
     missing = [name for name in wanted or () if name not in storeys]
     if missing:
         names = ", ".join(repr(name[:80]) for name in dict.fromkeys(storeys[:50]))
@@ -164,7 +167,7 @@ class _Shapes:
         self._frames.append((frame, arrays))
 
     def meshes(self, number: int, name: str, plain_material: str) -> list[SceneMesh]:
-        """Return the mesh of a shape, in a list; an empty list without triangles.
+        """Return the mesh of a shape, in a list, or an empty list without triangles.
 
         `plain_material` is the name of the material of faces without a style.
         """

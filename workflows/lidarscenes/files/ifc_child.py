@@ -195,7 +195,10 @@ class Building:
         )
 
     def _material(self, style: Any) -> dict[str, Any]:
-        """Return the name, colour and transparency of a style; a colour is None if not stated."""
+        """Return the name, colour and transparency of a style.
+
+        A colour is None if not stated.
+        """
         colour = style.get_color()
         shares = [colour.r(), colour.g(), colour.b()]
         transparency = style.transparency
@@ -249,7 +252,7 @@ class Building:
 
 
 def _open(path: str, max_unpacked: int) -> Any:
-    """Open a file; an .ifczip is unpacked in memory.
+    """Open a file, and unpack an .ifczip in memory.
 
     UnreadSchemaError if the library does not read the schema of the file.
     """
@@ -317,7 +320,7 @@ def _name(element: Any) -> str:
 
 
 def _material_of(element: Any) -> str:
-    """Return the name of the single material of an element; empty for layers and the like."""
+    """Return the name of the single material of an element, or empty for layers and the like."""
     for relation in getattr(element, "HasAssociations", None) or ():
         if relation.is_a("IfcRelAssociatesMaterial"):
             material = relation.RelatingMaterial

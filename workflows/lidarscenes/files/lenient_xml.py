@@ -26,7 +26,9 @@ _CDATA = ("<![CDATA[", "]]>")
 
 
 def lenient_root(data: bytes) -> Element:
-    """Return the root element of a file; prefixes stay in tags, and comments are left out.
+    """Return the root element of a file.
+
+    Prefixes stay in tags, and comments are left out.
 
     Raises
     ------
@@ -64,7 +66,7 @@ class _Parser:
         return self._root
 
     def _after_markup(self, start: int) -> int:
-        """Read the markup at a position; return the position after the markup."""
+        """Read the markup at a position, and return the position after the markup."""
         text = self._text
         for first, last in _SKIPPED.items():
             if text.startswith(first, start):
@@ -95,7 +97,10 @@ class _Parser:
         return stop + len(mark)
 
     def _after_declaration(self, start: int) -> int:
-        """Return the position after a <!DOCTYPE …>; ValueError for declarations."""
+        """Return the position after a <!DOCTYPE …>.
+
+        Raises ValueError for declarations.
+        """
         stop = self._end_of(start, ">")
         declaration = self._text[start:stop]
         if "[" in declaration or not declaration.upper().startswith("<!DOCTYPE"):
@@ -146,7 +151,10 @@ class _Parser:
 
 
 def _character(reference: re.Match[str]) -> str:
-    """Return the character of a reference; ValueError for an entity."""
+    """Return the character of a reference.
+
+    Raises ValueError for an entity.
+    """
     name = reference[1]
     if name in _CHARACTERS:
         return _CHARACTERS[name]

@@ -130,7 +130,10 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
 def _raster_mesh(
     source: _Source, target_crs: Any, path: Path, options: ReadOptions, notes: list[str]
 ) -> tuple[SceneMesh, str]:
-    """Return the mesh of a raster in a coordinate system, and its summary; append notes."""
+    """Return the mesh of a raster in a coordinate system, and its summary.
+
+    Appends notes.
+    """
     request: RasterOptions = options.own
     window = request.window
     chosen = request.step_m is not None or window is not None
@@ -274,7 +277,7 @@ def _failure(reason: str, driver: str) -> ValueError:
 
 
 def _read_beside(path: Path, suffix: str) -> bytes:
-    """Return the content of a small file beside a raster; empty without such a file."""
+    """Return the content of a small file beside a raster, or no text without such a file."""
     for ending in (suffix, suffix.upper()):
         if (file := path.with_suffix(ending)).is_file():
             return read_input(file, _MAX_BESIDE_BYTES)
@@ -337,7 +340,10 @@ def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
 
 
 def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
-    """Return the system of a chosen code; MeshFileError if it is not in true metres."""
+    """Return the system of a chosen code.
+
+    Raises MeshFileError if the system is not in true metres.
+    """
     target = crs_of_code(epsg)
     place = middle
     if target is not None and crs is not None:
@@ -349,7 +355,10 @@ def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
 
 
 def _zone_crs(source: _Source, middle: Floats) -> Any:
-    """Return the UTM zone of a place in a raster's system; MeshFileError if it is too wide."""
+    """Return the UTM zone of a place in a raster's system.
+
+    Raises MeshFileError if the raster is too wide.
+    """
     place = longitude_latitude(source.crs, *middle.tolist())
     if place is None:
         raise MeshFileError(
@@ -367,7 +376,7 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
 
 
 def _width_deg(source: _Source) -> float:
-    """Return the width of a raster on Earth in degrees of longitude; infinite if it has none."""
+    """Return the width of a raster on Earth in degrees of longitude, or infinite if it has none."""
     corners = _corners(source.file, source.affine)
     if source.crs.is_geographic:
         return float(np.ptp(corners[:, 0]))
@@ -380,7 +389,7 @@ def _width_deg(source: _Source) -> float:
 
 
 def _scale_error_at_edges(source: _Source, target: Any) -> float:
-    """Return the largest error of lengths at the corners of a raster; 0 below the limit."""
+    """Return the largest error of lengths at the corners of a raster, or 0 below the limit."""
     corners = _corners(source.file, source.affine)
     if source.crs is not None and source.crs != target:
         try:
@@ -394,7 +403,7 @@ def _scale_error_at_edges(source: _Source, target: Any) -> float:
 
 
 def _affine(file: Any, path: Path) -> Any:
-    """Return the affine from columns and rows to x and y; by default for pixels of 1 m."""
+    """Return the affine from columns and rows to x and y, by default for pixels of 1 m."""
     from rasterio.transform import Affine
 
     affine = file.transform
@@ -409,7 +418,7 @@ def _affine(file: Any, path: Path) -> Any:
 
 
 def _apply(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """Return x and y by an affine; its own operators differ from version to version."""
+    """Return x and y by an affine, whose operators differ from version to version."""
     a, b, c, d, e, f = [*affine][:6]
     return a * x + b * y + c, d * x + e * y + f
 

@@ -75,7 +75,7 @@ class _MeshObject:
 
     @cached_property
     def meshes(self) -> list[SceneMesh]:
-        """The mesh of the object, in a list; an empty list without triangles."""
+        """The mesh of the object, in a list, or an empty list without triangles."""
         if not self.faces:
             return []
         vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
@@ -162,7 +162,10 @@ class _Package:
         return self.models[name]
 
     def _pieces(self, name: str) -> Iterator[bytes]:
-        """Yield the content of an inner file; the content is never longer than announced."""
+        """Yield the content of an inner file.
+
+        The content is never longer than announced.
+        """
         if name not in self._archive.namelist():
             raise ValueError(f"its archive has no file {name[:80]!r}")
         entry = self._archive.getinfo(name)
@@ -174,7 +177,10 @@ class _Package:
                 yield piece
 
     def object(self, key: _Key) -> _MeshObject:
-        """Return an object; ValueError if the object is missing."""
+        """Return an object.
+
+        Raises ValueError if the object is missing.
+        """
         objects = self.model(key[0]).objects
         if key[1] not in objects:
             raise ValueError(f"object {key[1][:20]!r} is placed, but missing")
@@ -267,7 +273,10 @@ class _Model:
         self.objects[attributes["id"]] = self._object
 
     def _begin_model(self, attributes: dict[str, str]) -> None:
-        """Read the unit of the model; MeshFileError if an extension is not supported."""
+        """Read the unit of the model.
+
+        Raises MeshFileError if an extension is not supported.
+        """
         self.unit = attributes.get("unit", self.unit)
         for prefix in attributes.get("requiredextensions", "").split():
             extension = attributes.get(f"xmlns:{prefix}", prefix)
@@ -282,7 +291,7 @@ class _Model:
         return names[index] if 0 <= index < len(names) else ""
 
     def _shade(self, attributes: dict[str, str]) -> None:
-        """Add the colours of a triangle's corners; grey for a triangle without colours."""
+        """Add the colours of a triangle's corners, or grey for a triangle without colours."""
         group, number = self._object.default_property
         group = attributes.get("pid", group)
         first = attributes.get("p1", number)

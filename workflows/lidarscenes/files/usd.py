@@ -110,7 +110,10 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
     """Read a file in a process of its own, and yield the frames of its standard output."""
 
     def take(frame: dict[str, Any], size: int) -> None:
-        """Take the bytes of an array of a frame; images let the content take more."""
+        """Take the bytes of an array of a frame.
+
+        Images let the content take more.
+        """
         if frame["what"] == "image":
             allowance.grow(size)
         allowance.take(size)
@@ -141,7 +144,7 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
 def _polygon_mesh(
     frame: dict[str, Any], arrays: list[AnyArray], allowance: Allowance, materials: UsdMaterials
 ) -> list[SceneMesh]:
-    """Return the mesh of polygons, in a list; an empty list without triangles."""
+    """Return the mesh of polygons, in a list, or an empty list without triangles."""
     name = frame["name"]
     allowance.take(24 * len(arrays[2]) + 4 * 8 * len(arrays[1]))
     sizes, corners, points, holes = arrays[:4]
@@ -183,7 +186,7 @@ def _shape_mesh(
 
 
 def _plain_shape(frame: dict[str, Any]) -> SceneMesh | None:
-    """Return the triangles of a shape, without materials; None if a size is 0."""
+    """Return the triangles of a shape, without materials, or None if a size is 0."""
     name = frame["name"]
     kind = frame["kind"]
     size = frame["sizes"]

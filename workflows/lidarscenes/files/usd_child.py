@@ -50,7 +50,10 @@ class TooManyError(Exception):
 
 
 class _Inherited(NamedTuple):
-    """Properties of a node that the prims above set; with its path, the key of the node."""
+    """Properties of a node that the prims above set.
+
+    With its path, they are the key of the node.
+    """
 
     excluded: bool  # its purpose is left out
     still: bool  # its animation is ignored, as for prims that an instancer copies
@@ -107,7 +110,10 @@ class StageNodes:
         return self._numbers[key]
 
     def _count(self, count: int, kind: str = "prims and copies") -> None:
-        """Count towards the limit of a kind; TooManyError beyond the limit."""
+        """Count towards the limit of a kind.
+
+        Raises TooManyError beyond the limit.
+        """
         self._remaining[kind] -= count
         if self._remaining[kind] < 0:
             raise TooManyError(kind)
@@ -162,7 +168,10 @@ class StageNodes:
             node[2].append(number)
 
     def _any_below(self, prim: Any, test: Callable[[Any], bool]) -> bool:
-        """Return whether a prim, or a prim below, passes a test; prototypes are tested once."""
+        """Return whether a prim, or a prim below, passes a test.
+
+        Prototypes are tested once.
+        """
         for inner in Usd.PrimRange(_shared(prim)):
             if test(inner):
                 return True
@@ -333,7 +342,7 @@ def _poses_up_to(
 
 
 class Looks:
-    """Images and materials, written when they are first used; and colours of meshes."""
+    """Images and materials, written when they are first used, and colours of meshes."""
 
     def __init__(self, request: dict[str, Any], write: Any) -> None:
         self.time = Usd.TimeCode.Default()
@@ -347,7 +356,10 @@ class Looks:
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
     def inherited(self, instance: Any) -> Any:
-        """Return the material and colour that prims in an instance inherit; None without both."""
+        """Return the material and colour that prims in an instance inherit.
+
+        Returns None without both.
+        """
         if not (self._masks or self._colours or self._names_materials):
             return None
         colour = self._values(instance, "displayColor") if self._colours else None
@@ -355,7 +367,9 @@ class Looks:
         return None if look == (None, None) else look
 
     def mesh_fields(self, prim: Any, arrays: list[Any]) -> dict[str, Any]:
-        """Return fields of a frame: materials of polygons, and values; append to its arrays.
+        """Return fields of a frame: materials of polygons, and values.
+
+        The values are appended to the arrays of the frame.
 
         Values are at corners, vertices, polygons or constant, by OpenUSD's interpolation.
         """
@@ -381,7 +395,10 @@ class Looks:
         return {"materials": materials, "values": values} if materials or values else {}
 
     def _values(self, prim: Any, name: str) -> tuple[str, NDArray[np.float32]] | None:
-        """Return interpolation and values (k, w) of a primvar; None if the primvar is not set."""
+        """Return interpolation and values (k, w) of a primvar.
+
+        Returns None if the primvar is not set.
+        """
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
         values = np.array(primvar.ComputeFlattened(self.time) if primvar else None)
         if values.dtype.kind != "f" or values.ndim != 2:
@@ -389,7 +406,7 @@ class Looks:
         return str(primvar.GetInterpolation()), values.astype(np.float32)
 
     def _bound(self, prim: Any) -> tuple[int | None, list[str]]:
-        """Return the material of a prim as `_material` does; (None, []) without a material."""
+        """Return the material of a prim as `_material` does, or (None, []) without a material."""
         binding = UsdShade.MaterialBindingAPI(prim)
         material = binding.ComputeBoundMaterial(UsdShade.Tokens.preview)[0]
         if not material:
@@ -400,7 +417,7 @@ class Looks:
         return self._materials[path]
 
     def _material(self, material: Any) -> tuple[int | None, list[str]]:
-        """Write a new material; return its number and the names of the values read.
+        """Write a new material, and return its number and the names of the values read.
 
         The number is None for a material without properties that are asked for.
         """
@@ -451,7 +468,7 @@ class Looks:
         return {"value": [a * b for a, b in zip(plain or (0.2, 0.2, 0.2), tint, strict=True)]}
 
     def _source(self, surface_input: Any) -> dict[str, Any] | None:
-        """Return the source of the value of a surface's input; None if the input is not set."""
+        """Return the source of the value of a surface's input, or None if the input is not set."""
         attributes = (
             UsdShade.Utils.GetValueProducingAttributes(surface_input) if surface_input else ()
         )
@@ -512,7 +529,7 @@ class Looks:
         return {"unread": "its texture coordinates are computed in a way that is not read"}
 
     def _image(self, asset: Any) -> int:
-        """Write a new image; return its number."""
+        """Write a new image, and return its number."""
         path = getattr(asset, "resolvedPath", "") or getattr(asset, "path", "")
         number = self._images.setdefault(path, len(self._images))
         if number < len(self._images) - 1:
@@ -533,7 +550,10 @@ class Looks:
 
 
 def _surface_shader(material: Any) -> tuple[Any, str]:
-    """Return the shader of a material's surface and its kind; preferably a kind that is read."""
+    """Return the shader of a material's surface and its kind.
+
+    A kind that is read is preferred.
+    """
     shader = None
     kind = ""
     for context in ("", "mdl", "mtlx"):
@@ -546,7 +566,7 @@ def _surface_shader(material: Any) -> tuple[Any, str]:
 
 
 def _constant(shader_input: Any) -> Any:
-    """Return the value of an input that no shader computes; None for an unset input."""
+    """Return the value of an input that no shader computes, or None for an unset input."""
     attributes = UsdShade.Utils.GetValueProducingAttributes(shader_input) if shader_input else ()
     return attributes[0].Get() if attributes else None
 
@@ -626,7 +646,10 @@ def _select_animation(stage: Any, request: dict[str, Any]) -> _Animation:
 
 
 def _stage_files(stage: Any) -> list[str]:
-    """Return the files that a stage was read from; files in a .usdz count as the .usdz."""
+    """Return the files that a stage was read from.
+
+    Files in a .usdz count as the .usdz.
+    """
     layers = [layer.realPath for layer in stage.GetUsedLayers() if not layer.anonymous]
     return sorted({str(Ar.SplitPackageRelativePathOuter(path)[0]) for path in layers} - {""})
 

@@ -85,7 +85,7 @@ class MeshLook:
         return np.stack([u, 1 - v], axis=1), corners
 
     def painted(self, name: str, rows: Ints) -> Colours | None:
-        """Return colours of triangles by values, linear light; None without values."""
+        """Return colours of triangles by values, linear light, or None without values."""
         if name not in self._values:
             return None
         values, corners = self._corner_values(name, rows, 3)
@@ -111,7 +111,7 @@ class MeshLook:
 
 
 class UsdMaterials:
-    """Images and materials of a scene by their numbers; colours and masks of triangles."""
+    """Images and materials of a scene by their numbers, with colours and masks of triangles."""
 
     def __init__(self, allowance: Allowance, options: ReadOptions) -> None:
         self._allowance = allowance
@@ -162,7 +162,7 @@ class UsdMaterials:
         return None
 
     def cutout(self, number: int | None, look: MeshLook, rows: Ints) -> Cutout | None:
-        """Return the mask that a material gives triangles; None for solid triangles."""
+        """Return the mask that a material gives triangles, or None for solid triangles."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
         with self.notes.without_mask(material["name"]):
@@ -180,7 +180,10 @@ class UsdMaterials:
         return None
 
     def _image(self, number: int) -> bytes:
-        """Return the content of an image; MaskError if the image cannot be read."""
+        """Return the content of an image.
+
+        Raises MaskError if the image cannot be read.
+        """
         reason, content = self._images[number]
         if reason:
             raise MaskError(reason)
@@ -195,7 +198,10 @@ class UsdMaterials:
         return Texture(np.stack(shades, axis=-1), use.wraps, self._allowance)
 
     def _read_mask(self, key: tuple[_Use, float]) -> Texture | Literal["glass"] | None:
-        """Read the mask of an image; «glass» if nowhere opaque, None if everywhere opaque."""
+        """Read the mask of an image.
+
+        Returns «glass» if the image is nowhere opaque, and None if it is opaque everywhere.
+        """
         use, threshold = key
         channel = use.channels[0]
         content = self._image(use.image)

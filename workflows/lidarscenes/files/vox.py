@@ -76,7 +76,10 @@ class _Table(NamedTuple):
 
 
 def _read_table(data: bytes) -> _Table:
-    """Read header and rows of a voxel file; MeshFileError if they are not valid."""
+    """Read header and rows of a voxel file.
+
+    Raises MeshFileError if they are not valid.
+    """
     heading = re.search(rb"^[ \t]*i[ \t]+j[ \t]+k[ \t].*$", data, re.MULTILINE)
     if heading is None:
         raise MeshFileError("has no row of names that begins with i j k")
@@ -96,7 +99,10 @@ def _read_table(data: bytes) -> _Table:
 
 
 def _numbers(rows: bytes, columns: list[str], used: tuple[int, ...], first_line: int) -> Floats:
-    """Return the numbers (n, k) of the used columns; ValueError names a line that is wrong."""
+    """Return the numbers (n, k) of the used columns.
+
+    Raises ValueError that names a wrong line.
+    """
     try:
         return np.asarray(np.loadtxt(io.BytesIO(rows), usecols=used, ndmin=2), np.float64)
     except ValueError:  # read cell by cell, which names the line
@@ -115,7 +121,10 @@ def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Flo
 
 
 def _grid(header: dict[str, str]) -> _Grid:
-    """Read the grid of a header; MeshFileError if numbers are missing or wrong."""
+    """Read the grid of a header.
+
+    Raises MeshFileError if numbers are missing or wrong.
+    """
 
     def three(name: str, times: int = 1) -> Floats:
         """Return three numbers of the header, or raise MeshFileError."""

@@ -59,7 +59,10 @@ class Appearance(NamedTuple):
 
 
 def appearance_of(shape: Element, retro: float) -> Appearance:
-    """Return the appearance of a visual or collision; `retro` is its <laser_retro>, 0 for none."""
+    """Return the appearance of a visual or collision.
+
+    `retro` is its <laser_retro>, 0 for none.
+    """
     material = shape.find("material")
     hidden = numbers_of(shape, "transparency", 1, "0").item() >= 1
     name = "" if material is None else printable(material.findtext("script/name") or "")

@@ -57,7 +57,9 @@ class Instance(NamedTuple):
 
 @dataclass(eq=False)
 class Body:
-    """A model, or a world, without its pose; equal includes share a body.
+    """A model, or a world, without its pose.
+
+    Equal includes share a body.
 
     Attributes
     ----------
@@ -87,7 +89,10 @@ class _Included(NamedTuple):
 
 
 class BodyReader:
-    """Reader of the bodies of a world; each file and each model is read once."""
+    """Reader of the bodies of a world.
+
+    Each file and each model is read once.
+    """
 
     def __init__(self, resources: Resources, notes: Notes, allowance: Allowance) -> None:
         self.resources = resources
@@ -163,7 +168,7 @@ class BodyReader:
     def _define(
         self, body: Body, name: str, nested: Body, posed: Element, placing: Element
     ) -> tuple[str, Body, RelativePose]:
-        """Define the frame of a nested model; return name, body and pose of the model."""
+        """Define the frame of a nested model, and return name, body and pose of the model."""
         placement = _placement_frame(placing, posed)
         pose = pose_of(posed)
         pose = pose._replace(matrix=placed_by(pose.matrix, nested.frames, placement))
@@ -185,7 +190,10 @@ class BodyReader:
         ]
 
     def model(self, element: Element, source: Source) -> Body:
-        """Return the body of a <model>; LidarError if includes go in a circle."""
+        """Return the body of a <model>.
+
+        Raises LidarError if includes go in a circle.
+        """
         key = id(element)
         if key in self._open_elements:
             raise LidarError("it includes itself, by its own files: remove an <include>.")
@@ -202,7 +210,7 @@ class BodyReader:
         return self._bodies[key]
 
     def _included(self, uri: str, source: Source) -> _Included | None:
-        """Return the model of a URI; None for a light, or for a model that is missing."""
+        """Return the model of a URI, or None for a light, or for a model that is missing."""
         if not uri:
             self.notes.missing_models["an <include> without <uri>"] += 1
             return None
@@ -224,7 +232,7 @@ class BodyReader:
         return self._ground
 
     def _read(self, source: Source) -> _Included | None:
-        """Return the model of a file; None without a model, or for an unreadable file."""
+        """Return the model of a file, or None without a model, or for an unreadable file."""
         path = source.path.resolve()
         if path not in self._files:
             self._files[path] = None
@@ -245,7 +253,7 @@ class BodyReader:
 
 
 def _placement_frame(placing: Element, posed: Element) -> str:
-    """Return the frame of a model that its pose is for; empty for the model's own."""
+    """Return the frame of a model that its pose is for, or no text for the model's own frame."""
     text = placing.findtext("placement_frame") or posed.get("placement_frame") or ""
     return printable(text)
 

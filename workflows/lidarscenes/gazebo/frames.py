@@ -49,7 +49,9 @@ def numbers_in(
     at_least: float | None = None,
     of_any_size: bool = False,
 ) -> Floats:
-    """Return the numbers of a text; LidarError, which names `subject`, as `numbers_of`.
+    """Return the numbers of a text.
+
+    Raises LidarError, which names `subject`, as `numbers_of` does.
 
     With `of_any_size`, numbers may also be infinite, NaN or very large.
     """
@@ -67,7 +69,7 @@ def numbers_in(
 
 
 def pose_of(element: Element) -> RelativePose:
-    """Return the pose of an element; identity without <pose>."""
+    """Return the pose of an element, or identity without <pose>."""
     pose = element.find("pose")
     if pose is None:
         return RelativePose(np.eye(4), "")
@@ -104,7 +106,10 @@ def matrix_of(pose: Element) -> Floats:
 
 
 class Frames:
-    """Frames of a world or model, by name; `root` is the name of its own frame."""
+    """Frames of a world or model, by name.
+
+    `root` is the name of its own frame.
+    """
 
     def __init__(self, root: str) -> None:
         self.root = root
@@ -113,7 +118,9 @@ class Frames:
         self._poses: dict[str, RelativePose] = {}
 
     def define(self, name: str, pose: RelativePose, default: str) -> str:
-        """Define a frame by its pose; `default` is the frame of poses that name none.
+        """Define a frame by its pose.
+
+        `default` is the frame of poses that name none.
 
         Returns the name, with a number if the name is in use.
         """

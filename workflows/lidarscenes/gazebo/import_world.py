@@ -117,7 +117,10 @@ def _folders(world: Path, assets: Sequence[Path]) -> tuple[Path, ...]:
 
 
 def _loaded(world: Path, assets: Sequence[Path]) -> World:
-    """Return a world; LidarError if the file cannot be read."""
+    """Return a world.
+
+    Raises LidarError if the file cannot be read.
+    """
     with explained("it cannot be read"):
         data = read_input(world)
     try:

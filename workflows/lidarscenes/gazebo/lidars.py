@@ -53,7 +53,10 @@ class GazeboLidar(NamedTuple):
 
 
 def lidars_of(world: World) -> Iterator[GazeboLidar]:
-    """Yield the lidars of a world; LidarError if figures of a lidar are impossible."""
+    """Yield the lidars of a world.
+
+    Raises LidarError if figures of a lidar are impossible.
+    """
     for link in world.links:
         for element in lidar_elements(link.link.element):
             name = printable(element.get("name", "")) or "lidar"
@@ -132,12 +135,15 @@ class _Scan(NamedTuple):
 
     @property
     def step_deg(self) -> float:
-        """Angle between two samples; 0 of a single sample."""
+        """Angle between two samples, or 0 for a single sample."""
         return (self.last_deg - self.first_deg) / (self.samples - 1) if self.samples > 1 else 0.0
 
 
 def _scan(figures: Element, name: str, samples: str) -> _Scan:
-    """Return the samples of <horizontal> or <vertical>; `samples` is the default number."""
+    """Return the samples of <horizontal> or <vertical>.
+
+    `samples` is the default number.
+    """
     scan = figures.find(f"scan/{name}")
     scan = Element(name) if scan is None else scan
     stated = numbers_of(scan, "samples", 1, samples, at_least=1).item()
@@ -184,7 +190,10 @@ def _range_m(ranges: Element | None) -> tuple[float, float]:
 
 
 def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str, Any]:
-    """Return the fields of a data file for noise; differences to Gazebo go to `left_out`."""
+    """Return the fields of a data file for noise.
+
+    Differences to Gazebo go to `left_out`.
+    """
     noise = figures.find("noise")
     noise = element.find("noise") if noise is None else noise
     if noise is None:

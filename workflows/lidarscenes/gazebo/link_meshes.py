@@ -47,7 +47,9 @@ class LinkMesh(NamedTuple):
 
 @dataclass(eq=False)
 class LinkMeshes:
-    """Reader of the visuals, or the collision shapes, of links; each file is read once.
+    """Reader of the visuals, or the collision shapes, of links.
+
+    Each file is read once.
 
     `masks` are the <visibility_mask>s of the world's lidars.
     """
@@ -69,7 +71,9 @@ class LinkMeshes:
     def meshes_of(
         self, body: Body, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
-        """Return the mesh of a link, which instances of the model share; empty without shapes.
+        """Return the mesh of a link, which instances of the model share.
+
+        Returns an empty list without shapes.
 
         A link has several meshes if a lidar of the world sees some of its visuals and not others.
         `name` is that of the link in the world, for notes; `scale` are three factors for all
@@ -103,7 +107,7 @@ class LinkMeshes:
         ]
 
     def _flags_of(self, shape: Element, name: str) -> int:
-        """Return the flags of a visual; a visual that nothing sees is noted."""
+        """Return the flags of a visual, and note a visual that nothing sees."""
         with prefixed(f"visual {printable(shape.get('name', ''))!r}"):
             flags = flags_of(shape)
         if not flags:
@@ -158,7 +162,7 @@ class LinkMeshes:
         return mesh
 
     def geometry(self, geometry: Element, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a <geometry>; empty for a shape without a size or file."""
+        """Return the meshes of a <geometry>, or [] for a shape without a size or file."""
         shapes = [child for child in geometry if ":" not in child.tag]
         if not shapes:
             return []
@@ -209,7 +213,7 @@ class LinkMeshes:
         return chosen
 
     def _height_map(self, shape: Element, source: Source) -> list[SceneMesh]:
-        """Return the surface of a height map; none if its image is missing or cannot be read."""
+        """Return the surface of a height map, or none if its image is missing or cannot be read."""
         uri = (shape.findtext("uri") or "").strip()
         file = self._file(uri, source)
         if file is None:
@@ -225,17 +229,26 @@ class LinkMeshes:
             return []
 
     def file_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the meshes of a file in its axes; empty, with a note, for an unusable file."""
+        """Return the meshes of a file in its axes.
+
+        The list is empty, and a note says so, for an unusable file.
+        """
         return self._read_once(uri, source, self._load)
 
     def skin_meshes(self, uri: str, source: Source) -> list[SceneMesh]:
-        """Return the skin of an actor at rest; empty, with a note, for an unusable file."""
+        """Return the skin of an actor at rest.
+
+        The list is empty, and a note says so, for an unusable file.
+        """
         return self._read_once(uri, source, self._load_skin)
 
     def _read_once(
         self, uri: str, source: Source, load: Callable[[Source], list[SceneMesh]]
     ) -> list[SceneMesh]:
-        """Return the meshes of a file, from the cache or by `load`; empty for an unusable file."""
+        """Return the meshes of a file, from the cache or by `load`.
+
+        The list is empty for an unusable file.
+        """
         file = self._file(uri, source)
         if file is None:
             return []
@@ -250,7 +263,10 @@ class LinkMeshes:
         return self._files[key]
 
     def _load(self, file: Source) -> list[SceneMesh]:
-        """Return the meshes of a file; LidarError for an unusable file."""
+        """Return the meshes of a file.
+
+        Raises LidarError for an unusable file.
+        """
         if file.path.suffix.lower() not in MESHES:
             raise LidarError(f"Gazebo reads meshes of {' '.join(MESHES)}.")
         # Gazebo ignores up-axes, of Collada and glTF, but not the unit of Collada.
@@ -291,7 +307,7 @@ class LinkMeshes:
         return [*existing, file.root, *self.resources.trusted]
 
     def _file(self, uri: str, source: Source) -> Source | None:
-        """Return the file of a URI; None, with a note, for a missing file."""
+        """Return the file of a URI, or None, with a note, for a missing file."""
         try:
             return self.resources.file(uri, source)
         except MissingFileError as error:
@@ -300,7 +316,7 @@ class LinkMeshes:
 
 
 def _retro(link: Element, shape: Element) -> float:
-    """Return the <laser_retro> of a shape, or of the first collision shape that has any; else 0."""
+    """Return the <laser_retro> of a shape, or of the first collision shape that has any, else 0."""
     for candidate in (shape, *link.findall("collision")):
         value = float(numbers_of(candidate, "laser_retro", 1, "0").item())
         if value > 0:

@@ -62,7 +62,7 @@ def unknown_children(element: Element) -> list[str]:
 
 
 class Notes:
-    """Notes of a world; each thing is told once."""
+    """Notes of a world, each told once."""
 
     def __init__(self) -> None:
         self.missing_models: Counter[str] = Counter()  # {name: number of uses}
@@ -78,7 +78,10 @@ class Notes:
         self.of_meshes: dict[str, None] = {}  # lines on mesh files
 
     def check_children(self, element: Element) -> None:
-        """Note the children of an element that SDFormat does not define; prefixes are free."""
+        """Note the children of an element that SDFormat does not define.
+
+        Prefixes are free.
+        """
         self.unknown |= dict.fromkeys(unknown_children(element))
 
     def remote_lines(self) -> Iterator[str]:

@@ -36,7 +36,10 @@ _SDF_VERSION = (1, 12)  # the newest that is known
 
 
 class MissingFileError(Exception):
-    """A file or model that no folder has; its text is the name to report."""
+    """A file or model that no folder has.
+
+    The text of the error is the name to report.
+    """
 
 
 class Candidate(NamedTuple):
@@ -124,14 +127,20 @@ class Resources:
         raise MissingFileError(short_name(uri))
 
     def file(self, uri: str, source: Source) -> Source:
-        """Return a file of a mesh or an image; MissingFileError and LidarError as `model`."""
+        """Return a file of a mesh or an image.
+
+        Raises MissingFileError and LidarError as `model` does.
+        """
         for target in self._targets(uri, source):
             if target.path.is_file():
                 return target
         raise MissingFileError(printable(uri))
 
     def _targets(self, uri: str, source: Source) -> Iterator[Source]:
-        """Yield the existing paths that a URI may name; LidarError if a path must not be read."""
+        """Yield the existing paths that a URI may name.
+
+        Raises LidarError if a path must not be read.
+        """
         refused: Path | None = None
         for path, root, is_allowed in self._candidates(uri, source):
             try:
@@ -280,6 +289,6 @@ def _configured_files(path: Path) -> dict[tuple[int, ...], str]:
 
 
 def _version(entry: Element) -> tuple[int, ...]:
-    """Return the version of an <sdf>: (1, 6); (0,) without a version."""
+    """Return the version of an <sdf>, such as (1, 6), or (0,) without a version."""
     parts = entry.get("version", "").split(".")
     return tuple(map(int, parts)) if all(part.isdecimal() for part in parts) else (0,)

@@ -26,7 +26,7 @@ _PARALLEL = 1e-12  # of unit vectors: 1 minus the cosine between them
 
 
 def shape_mesh(shape: Element) -> SceneMesh | None:
-    """Return the mesh of a shape without a file, in its frame; None for a shape of size zero.
+    """Return the mesh of a shape without a file, in its frame, or None for a shape of size zero.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def _sizes(shape: Element, name: str, count: int, default: str = "") -> Floats:
 
 
 def _scaled(mesh: SceneMesh, factors: Sequence[float] | Floats) -> SceneMesh | None:
-    """Return a mesh scaled along the axes; None if a factor is zero."""
+    """Return a mesh scaled along the axes, or None if a factor is zero."""
     scale = np.asarray(factors, np.float64)
     return mesh.moved(mesh.name, np.diag(scale), np.zeros(3)) if scale.all() else None
 
@@ -118,7 +118,7 @@ _SHAPES: dict[str, Callable[[Element], SceneMesh | None]] = {
 
 
 def polyline_mesh(polylines: Sequence[Element]) -> SceneMesh | None:
-    """Return outlines extruded along z to the height of the first; None without an area.
+    """Return outlines extruded along z to the height of the first, or None without an area.
 
     Further outlines within the first are its holes, others are outlines beside it.
     """
@@ -224,7 +224,7 @@ def height_map_mesh(shape: Element, image: Path, allowance: Allowance) -> SceneM
 
 
 def road_mesh(road: Element) -> SceneMesh | None:
-    """Return a strip of a road's width along its points; None without two points."""
+    """Return a strip of a road's width along its points, or None without two points."""
     width = _sizes(road, "width", 1, "1").item()
     texts = [point.text or "" for point in road.findall("point")]
     points = np.array([numbers_in(text, "<point>", 3) for text in texts]).reshape(-1, 3)

@@ -22,18 +22,24 @@ def lidar_elements(link: Element) -> Iterator[Element]:
 
 
 def figures_of(sensor: Element) -> Element | None:
-    """Return the <lidar> or <ray> of a <sensor>; None without any."""
+    """Return the <lidar> or <ray> of a <sensor>, or None without any."""
     figures = sensor.find("lidar")
     return sensor.find("ray") if figures is None else figures
 
 
 def flags_of(visual: Element) -> int:
-    """Return the <visibility_flags> of a visual; LidarError if they are no number of 32 bits."""
+    """Return the <visibility_flags> of a visual.
+
+    Raises LidarError if they are not a number of 32 bits.
+    """
     return _bits(visual, "visibility_flags")
 
 
 def mask_of(sensor: Element) -> int:
-    """Return the <visibility_mask> of a lidar; LidarError if it is no number of 32 bits."""
+    """Return the <visibility_mask> of a lidar.
+
+    Raises LidarError if it is not a number of 32 bits.
+    """
     figures = figures_of(sensor)
     return ALL_BITS if figures is None else _bits(figures, "visibility_mask")
 

@@ -52,7 +52,7 @@ def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) 
 
 
 def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | None:
-    """Return the skin of an actor; None without a skin, or if its file is missing."""
+    """Return the skin of an actor, or None without a skin, or if its file is missing."""
     skin = actor.find("skin")
     if skin is None:
         return None
@@ -65,7 +65,10 @@ def _skin(actor: Element, source: Source, meshes: LinkMeshes) -> SceneMesh | Non
 
 
 def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]:
-    """Return times (k,), seconds, and poses (k, 4, 4) of an actor; k is 1 if the actor stands."""
+    """Return times (k,), seconds, and poses (k, 4, 4) of an actor.
+
+    For an actor that stands, k is 1.
+    """
     script = actor.find("script")
     entries = [] if script is None else script.findall("trajectory/waypoint")
     if not entries:
@@ -87,7 +90,10 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
 
 
 def _waypoint_pose(waypoint: Element) -> Floats:
-    """Return the pose (4, 4) of a waypoint in the world; LidarError without a pose."""
+    """Return the pose (4, 4) of a waypoint in the world.
+
+    Raises LidarError without a pose.
+    """
     pose = waypoint.find("pose")
     if pose is None:
         raise LidarError("a <waypoint> has no <pose>.")

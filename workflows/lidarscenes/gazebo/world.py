@@ -154,7 +154,7 @@ def is_in_reach(matrix: Floats) -> bool:
 
 
 def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visuals, or the collision shapes, of all links; actors move."""
+    """Read the visuals, or the collision shapes, of all links, and make moving links actors."""
     world = load_world(data, path, options.folders)
     content = content_of(world, options)[0]
     if not content.meshes and not content.moving:
@@ -253,7 +253,7 @@ def _roads(world: World, meshes: LinkMeshes) -> Iterator[PlacedNode]:
 
 
 def _state_of(world: Element) -> _State:
-    """Return the last state of a world; an empty state without <state>."""
+    """Return the last state of a world, or an empty state without <state>."""
     state = _State()
     elements = world.findall("state")
     if not elements:

@@ -41,7 +41,10 @@ class Assets:
         self.root = cache(_root)
 
     def file(self, name: str) -> Path:
-        """Return the path of a file by its name; LidarError if no folder has the file."""
+        """Return the path of a file by its name.
+
+        Raises LidarError if no folder has the file.
+        """
         for folder in self.folders:
             if (folder / name).is_file():
                 return folder / name
@@ -75,7 +78,10 @@ class Assets:
 
 
 def _root(path: Path) -> Element:
-    """Return the <document> of a file; LidarError if the file is not a document of HELIOS++."""
+    """Return the <document> of a file.
+
+    Raises LidarError if the file is not a document of HELIOS++.
+    """
     try:
         with explained(f"{path} cannot be read"):
             root = xml_root(read(path))
@@ -89,13 +95,19 @@ def _root(path: Path) -> Element:
 
 
 def read(path: Path) -> bytes:
-    """Return the content of a plain file; LidarError for a larger file than the memory holds."""
+    """Return the content of a plain file.
+
+    Raises LidarError for a larger file than the memory holds.
+    """
     with explained(f"{path} cannot be read"), prefixed(path):
         return read_input(path)
 
 
 def number(values: Element | dict[str, str], name: str, default: float) -> float:
-    """Return an attribute as a finite number; LidarError for text that is not a finite number."""
+    """Return an attribute as a finite number.
+
+    Raises LidarError for text that is not a finite number.
+    """
     text = values.get(name)
     if text is None:
         return default
@@ -111,7 +123,7 @@ def flag(values: dict[str, str], name: str, default: bool) -> bool:
 
 
 def vector(values: Element | dict[str, str] | None) -> Floats:
-    """Return x, y and z of an element or its attributes: (3,); zeros for missing attributes."""
+    """Return x, y and z of an element or its attributes: (3,), or zeros for missing attributes."""
     return np.array([number({} if values is None else values, axis, 0.0) for axis in "xyz"])
 
 
@@ -133,7 +145,10 @@ def rotation(element: Element | None) -> Floats:
 
 
 def clean(values: Floats | float | Sequence[float]) -> list[float] | float:
-    """Return numbers for a scenario, rounded to 12 digits; roundings of zero are zero."""
+    """Return numbers for a scenario, rounded to 12 digits.
+
+    Roundings of zero are zero.
+    """
     array = np.asarray(values, np.float64)
     if array.ndim:
         return [clean(value) for value in array.tolist()]  # type: ignore[misc]

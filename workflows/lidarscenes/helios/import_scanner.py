@@ -99,7 +99,10 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
 
 
 def _element(files: Assets, reference: _Reference) -> Element:
-    """Return the <scanner> of a reference; LidarError if the reference does not name one."""
+    """Return the <scanner> of a reference.
+
+    Raises LidarError if the reference does not name one.
+    """
     elements = files.root(reference.file).findall("scanner")
     by_id = {element.get("id", ""): element for element in elements}
     if reference.scanner:
@@ -117,7 +120,7 @@ def _element(files: Assets, reference: _Reference) -> Element:
 
 
 def _settings(files: Assets, home: Path, scanner: Element) -> dict[str, str] | None:
-    """Return the settings beside a scanner: with its id, or the only ones; None without them."""
+    """Return the settings beside a scanner, by its id, or the only ones, or None without any."""
     elements = files.root(home).findall("scannerSettings")
     fitting = [e for e in elements if e.get("id") == scanner.get("id")]
     if not fitting and len(files.root(home).findall("scanner")) == 1 and len(elements) == 1:

@@ -79,7 +79,10 @@ class HeliosTrajectory:
 def read_legs(
     survey: Element, assets: Assets, home: Any, height: Callable[[float, float], float]
 ) -> list[Leg]:
-    """Return the legs of a survey; `height` returns the height of the ground at x, y, metres."""
+    """Return the legs of a survey.
+
+    `height` returns the height of the ground at x, y, metres.
+    """
     legs = []
     for index, element in enumerate(survey.findall("leg")):
         with prefixed(f"leg {index}"):
@@ -152,7 +155,10 @@ def standing_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosT
 
 
 def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> HeliosTrajectory:
-    """Return the trajectory in the file of an interpolated platform; legs are its stretches."""
+    """Return the trajectory in the file of an interpolated platform.
+
+    Legs are its stretches.
+    """
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
         raise LidarError("an interpolated platform needs one trajectory, the same in all legs.")

@@ -68,7 +68,10 @@ class Device:
 
 
 class HeliosScanner:
-    """Attributes of a scanner; for a channel, its attributes take precedence over the scanner's."""
+    """Attributes of a scanner.
+
+    For a channel, its attributes take precedence over the scanner's.
+    """
 
     def __init__(self, element: Element, channel: Element | None = None) -> None:
         self._elements = [element] if channel is None else [channel, element]
@@ -86,7 +89,10 @@ class HeliosScanner:
 
 
 def channels(element: Element) -> dict[str, HeliosScanner]:
-    """Return the channels of a scanner {id: channel}; {"": scanner} without channels."""
+    """Return the channels of a scanner {id: channel}.
+
+    {"": scanner} without channels.
+    """
     elements = element.findall("channels/channel")
     if not elements:
         return {"": HeliosScanner(element)}
@@ -174,7 +180,10 @@ class _Head(NamedTuple):
     def from_settings(
         cls, scanner: HeliosScanner, settings: dict[str, str], line: _Line | None
     ) -> _Head:
-        """Return the head of a scanner with the settings of a leg; `line` of rotating optics."""
+        """Return the head of a scanner with the settings of a leg.
+
+        `line` is the line of rotating optics.
+        """
         axis = vector(scanner.child("headRotateAxis"))
         axis = axis if np.linalg.norm(axis) > 0.1 else _Z
         start_deg = number(settings, "headRotateStart_deg", 0)
@@ -189,7 +198,10 @@ class _Head(NamedTuple):
 
 
 def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> ScannerSection:
-    """Return a sensor whose head turns; LidarError if the head cannot turn as the settings say."""
+    """Return a sensor whose head turns.
+
+    Raises LidarError if the head cannot turn as the settings say.
+    """
     aim = _aim(rotation(scanner.child("beamOrigin")))
     vertical = abs(head.axis[2]) >= (1 - 1e-12) * np.linalg.norm(head.axis)
     if line is None or aim is None or not vertical:
@@ -213,7 +225,7 @@ class _Aim(NamedTuple):
 
 
 def _aim(emitter: Floats) -> _Aim | None:
-    """Return the angles of a rotation (3, 3); None if the rotation rolls."""
+    """Return the angles of a rotation (3, 3), or None if the rotation rolls."""
     if abs(emitter[2, 0]) > 1e-12:
         return None
     tilt = np.arctan2(emitter[2, 1], emitter[2, 2])
@@ -222,7 +234,7 @@ def _aim(emitter: Floats) -> _Aim | None:
 
 
 def _exact_us(pulses: int, pulse_hz: float) -> int | str:
-    """Return the exact duration of `pulses`, microseconds; a fraction as text."""
+    """Return the exact duration of `pulses`, microseconds, with a fraction as text."""
     exact = Fraction(pulses * 1_000_000) / Fraction(pulse_hz)
     return exact.numerator if exact.denominator == 1 else str(exact)
 
@@ -245,7 +257,10 @@ class _Line:
     def from_settings(
         cls, scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
     ) -> _Line:
-        """Return the line of a scanner with the settings of a leg; LidarError without pulses."""
+        """Return the line of a scanner with the settings of a leg.
+
+        Raises LidarError without pulses.
+        """
         max_deg = scanner.number("scanAngleMax_deg")
         effective_deg = scanner.number("scanAngleEffectiveMax_deg")
         resolution_deg = number(settings, "verticalResolution_deg", 0)
@@ -314,7 +329,10 @@ class _Line:
         return data if deg_per_s > 0 else {"clockwise": True, **data}
 
     def _angles(self, aim: _Aim) -> dict[str, Any]:
-        """Return the angles of the pulses; pulses beyond the zenith have the opposite azimuth."""
+        """Return the angles of the pulses.
+
+        Pulses beyond the zenith have the opposite azimuth.
+        """
         angles = self.first_deg + aim.tilt_deg + self.step_deg * np.arange(self.count)
         if np.abs(angles).max() <= 90 + _SLACK:
             first, last = (clean(end) for end in angles[[0, -1]].clip(-90, 90))
@@ -343,7 +361,10 @@ def _mirror(
 def _oscillating(
     scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float
 ) -> ScannerSection:
-    """Return a sensor with a mirror that swings; the scan product limits its angle."""
+    """Return a sensor with a mirror that swings.
+
+    The scan product limits the angle of the mirror.
+    """
     scan_hz = _scan_hz(scanner, settings)
     max_deg = scanner.number("scanProduct", 1e6) / scan_hz
     half_deg = min(number(settings, "scanAngle_deg", 0), max_deg)
@@ -421,7 +442,10 @@ def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
 def _scan_hz(
     scanner: HeliosScanner, settings: dict[str, str], requested_hz: float | None = None
 ) -> float:
-    """Return the lines a second; LidarError if they are not within the scanner's limits."""
+    """Return the lines a second.
+
+    Raises LidarError if they are not within the scanner's limits.
+    """
     rate_hz = number(settings, "scanFreq_hz", 0) if requested_hz is None else requested_hz
     min_hz = scanner.number("scanFreqMin_Hz")
     max_hz = scanner.number("scanFreqMax_Hz") or np.inf

@@ -128,7 +128,10 @@ class HeliosPart:
 
 
 class HeliosScene:
-    """The parts of a scene, and the ground among the parts; `folder` is for meshes of points."""
+    """The parts of a scene, and the ground among the parts.
+
+    `folder` is for meshes of points.
+    """
 
     def __init__(
         self, element: Element, assets: Assets, folder: Path, surfels: SurfelMaker
@@ -199,7 +202,7 @@ class HeliosScene:
         return SimplifiedScene.from_scene(Scene.from_meshes(meshes)).scene if meshes else None
 
     def height(self, x: float, y: float) -> float:
-        """Return the height of the lowest ground at x, y, in metres; 0 without ground."""
+        """Return the height of the lowest ground at x, y, in metres, or 0 without ground."""
         heights = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
         if not len(heights):
             self._missing.add(f"{x:g}, {y:g}")
@@ -229,7 +232,10 @@ class HeliosScene:
         return [*entries, {"objects": "*"}]
 
     def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
-        """Return the reflectance at a wavelength by a named spectrum; None without the spectrum."""
+        """Return the reflectance at a wavelength by a named spectrum.
+
+        Returns None without the spectrum.
+        """
         for root in self._assets.folders:
             for folder in (root / "spectra", root / "data" / "spectra"):
                 text = _text(folder / f"{name}.txt")
@@ -287,7 +293,10 @@ class _PartDraft:
             )
 
     def parts(self) -> list[HeliosPart]:
-        """Return a part for each file; LidarError without files."""
+        """Return a part for each file.
+
+        Raises LidarError without files.
+        """
         if not self.files:
             raise LidarError("no filter loads a file.")
         return [
@@ -309,7 +318,10 @@ class _PartDraft:
 def _entries(
     name: str, mesh: SceneMesh | SceneInstance, kinds: dict[str, dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Return the entries of `materials` for an object; `kinds` are {name of a material: fields}."""
+    """Return the entries of `materials` for an object.
+
+    `kinds` are {name of a material: fields}.
+    """
     shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
     objects = escape(name)
     if shape.materials is None:  # of a file without materials: the part has at most one
@@ -364,7 +376,7 @@ def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
 
 
 def _text(path: Path) -> str:
-    """Return the content of a file; empty if the file cannot be read."""
+    """Return the content of a file, or no text if the file cannot be read."""
     try:
         return read_input_text(path, "replace")
     except (OSError, ValueError, LidarError):  # a zero in the name
@@ -372,7 +384,10 @@ def _text(path: Path) -> str:
 
 
 def _numbers(text: str, count: int) -> Floats:
-    """Return `count` finite numbers separated by semicolons; LidarError for wrong text."""
+    """Return `count` finite numbers separated by semicolons.
+
+    Raises LidarError for wrong text.
+    """
     try:
         values = np.array([float(word) for word in text.split(";")])
     except ValueError:

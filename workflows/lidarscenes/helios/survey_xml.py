@@ -114,7 +114,10 @@ def import_survey(
 
 
 class _Import:
-    """A survey whose XML files have been read; `files` returns the scenario's files."""
+    """A survey whose XML files have been read.
+
+    `files` returns the scenario's files.
+    """
 
     def __init__(
         self, survey: Path, asset_folders: Sequence[Path], folder: Path, surfels: SurfelMaker
@@ -159,7 +162,7 @@ class _Import:
         return self._assets.asset(reference, kind, self._home).element
 
     def _read_legs(self) -> HeliosTrajectory:
-        """Read the legs and the platform; return the trajectory, and fill `_sensors`."""
+        """Read the legs and the platform, fill `_sensors`, and return the trajectory."""
         legs = read_legs(self._element, self._assets, self._home, self.scene.height)
         trajectory = None
         if self._element.get("platform") == "interpolated":
@@ -193,7 +196,7 @@ class _Import:
         return mount
 
     def _moves(self, platform: Element) -> bool:
-        """Return whether a platform moves from leg to leg; note its unsupported features."""
+        """Return whether a platform moves from leg to leg, and note its unsupported features."""
         kind = platform.get("type", "").lower()
         if kind in ("groundvehicle", "multicopter"):
             self._notes.append(
@@ -257,7 +260,10 @@ class _Import:
         }
 
     def _file_of(self, data: dict[str, Any]) -> str:
-        """Return the name of a sensor's file; equal sensors share a file."""
+        """Return the name of a sensor's file.
+
+        Equal sensors share a file.
+        """
         stem = re.sub(r"[^\w.-]+", "_", str(data["name"])).strip("._").lower() or "sensor"
         name = f"{stem}.yaml"
         number = 1
@@ -297,7 +303,7 @@ class _Import:
         return {**files, **sensors, SCENARIO_FILE: text}
 
     def _full_waveform(self) -> dict[str, str]:
-        """Return the FWFSettings of the scanner; settings of the survey take precedence."""
+        """Return the FWFSettings of the scanner, after the settings of the survey."""
         elements = (self._first.child("FWFSettings"), self._element.find("FWFSettings"))
         settings: dict[str, str] = {}
         for element in elements:
@@ -343,7 +349,9 @@ def returns_section(
 
 
 def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
-    """Return the fields of `returns` by FWFSettings; none without settings of waveforms.
+    """Return the fields of `returns` by FWFSettings.
+
+    There are none without settings of waveforms.
 
     The time of HELIOS++ is range over the speed of light: half of the time that light takes to a
     surface and back.

@@ -103,7 +103,10 @@ def _options(path: Path, assets: Sequence[Path]) -> ReadOptions:
 
 
 def _loaded(path: Path, assets: Sequence[Path]) -> Any:
-    """Return the arrays of a model; LidarError if the file cannot be read."""
+    """Return the arrays of a model.
+
+    Raises LidarError if the file cannot be read.
+    """
     with explained("it cannot be read"):
         data = read_input(path)
     try:

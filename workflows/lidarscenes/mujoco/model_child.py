@@ -40,7 +40,10 @@ _OF_DATA = ("xpos", "xmat", "site_xpos", "site_xmat", "cam_xpos", "cam_xmat")
 
 
 class NoKeyframeError(Exception):
-    """The model lacks a keyframe; the argument has the names of its keyframes."""
+    """The model lacks a keyframe.
+
+    The argument of the error has the names of its keyframes.
+    """
 
 
 def main(path: str, request: dict[str, Any]) -> None:

@@ -175,7 +175,10 @@ def _placed(model: Any, options: ReadOptions) -> list[PlacedNode]:
 
 
 def _choice(model: Any, options: MujocoOptions, bodies: list[int], geoms: list[int]) -> Choice:
-    """Return what is seen of a model; MeshFileError for too many geoms."""
+    """Return what is seen of a model.
+
+    Raises MeshFileError for too many geoms.
+    """
     plane_m = max(_MIN_PLANE_M, _PLANE_SIZES * min(model.extent_m, 1e6))
     choice = Choice(options.groups, bodies, geoms, "body", plane_m=plane_m)
     seen = np.array(seen_geoms(model, choice), np.int64)
@@ -201,7 +204,7 @@ def _sag_m(model: Any, geoms: Ints) -> float:
 
 
 def _round_triangles(kind: int, size: Floats, sag_m: float) -> int:
-    """Return the number of triangles of a round geom; 0 of other geoms."""
+    """Return the number of triangles of a round geom, or 0 of other geoms."""
     match kind:
         case GeomType.SPHERE | GeomType.CAPSULE | GeomType.ELLIPSOID:
             radius = float(size.max() if kind == GeomType.ELLIPSOID else size[0])

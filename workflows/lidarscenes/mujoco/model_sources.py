@@ -80,7 +80,7 @@ def _count(count: int) -> None:
 
 
 def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:
-    """Yield the names of the files that elements name; of elements with `tags`, if given."""
+    """Yield the names of the files that elements name, or only elements with `tags`."""
     for element in root.iter():
         if not tags or element.tag in tags:
             for attribute, name in element.items():
@@ -109,7 +109,10 @@ def _targets(name: str, folders: set[Path], options: ReadOptions) -> Iterator[Pa
 
 
 def _included_root(file: Path) -> Element:
-    """Return the root element of an included file; ValueError if it is not XML."""
+    """Return the root element of an included file.
+
+    Raises ValueError if it is not XML.
+    """
     try:
         root = lenient_root(read_input(file))
     except ValueError as error:

@@ -131,7 +131,10 @@ def parked_cars(blocks: Floats, count: int, seed: int) -> list[SceneInstance]:
 
 
 def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) -> Ints:
-    """Return the rows (count,) of chosen positions, by weights (n,); LidarError if n is less."""
+    """Return the rows (count,) of chosen positions, by weights (n,).
+
+    Raises LidarError if n is less.
+    """
     if len(weights) < count:
         raise LidarError(
             f"The city has room for {len(weights):,} {plural}, not {count:,}: give it more "

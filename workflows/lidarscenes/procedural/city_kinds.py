@@ -116,7 +116,10 @@ def _eaves(storeys: int) -> float:
 
 
 def _dwelling(width: float, depth: float, storeys: int, hip: float) -> Solid:
-    """Return the walls and the roof of a dwelling; `hip` is the inset of the ridge's ends."""
+    """Return the walls and the roof of a dwelling.
+
+    `hip` is the inset of the ridge's ends.
+    """
     eaves = _eaves(storeys)
     walls = loft(rectangle(width, depth), [(0, -0.15), (0.4, -0.15), (0.4, 0), (eaves, 0)])
     roof = gable(width + 1, depth + 1, eaves - 0.05, 0.42 * depth, hip)
@@ -191,7 +194,10 @@ def _lamp() -> Solid:
 
 
 def joined(parts: Iterable[Solid]) -> Solid:
-    """Return a solid of several solids; touching or overlapping parts keep their surfaces."""
+    """Return a solid of several solids.
+
+    Touching or overlapping parts keep their surfaces.
+    """
     return Solid(*stacked(parts))
 
 

@@ -27,7 +27,10 @@ _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 @dataclass(frozen=True)
 class Species:
-    """Proportions of a tree; heights of the crown are shares, from its lowest branch to the top."""
+    """Proportions of a tree.
+
+    Heights of the crown are shares, from its lowest branch to the top.
+    """
 
     name: str
     height_m: float

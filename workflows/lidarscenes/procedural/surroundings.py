@@ -207,7 +207,7 @@ def _has_floor(views: Views) -> bool:
 
 
 def is_open(scene: Scene) -> bool:
-    """Return whether a scene's surfaces are open, such as a terrain; casts no rays."""
+    """Return whether a scene's surfaces are open, such as a terrain, without casting rays."""
     return _openness(scene) > _OPEN
 
 

@@ -96,7 +96,10 @@ class Intervals:
 
     @classmethod
     def between(cls, start: float, stop: float, breaks: Floats) -> Intervals:
-        """Return the intervals between two distances; pieces start at the breaks (b,)."""
+        """Return the intervals between two distances.
+
+        Pieces start at the breaks (b,).
+        """
         inside = np.sort(breaks[(breaks > start + GAP_M) & (breaks < stop - GAP_M)])
         is_far = inside[1:] - inside[:-1] > GAP_M
         count = np.count_nonzero(is_far) + 1 if len(inside) else 0
@@ -324,11 +327,11 @@ class _Columns(NamedTuple):
         return cls(count, *(np.concatenate(parts) for parts in (intervals, right, left)))
 
     def largest_of_columns(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest of values (r, k) in intervals (n,); see `_largest`."""
+        """Return the largest of values (r, k) in intervals (n,), as `_largest` does."""
         return self._largest(self.intervals, values, ends)
 
     def largest_of_cells(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest of values (q, k) in intervals (n,); see `_largest`."""
+        """Return the largest of values (q, k) in intervals (n,), as `_largest` does."""
         return self._largest(self.intervals[self.right], values, ends)
 
     def _largest(self, intervals: Ints, values: Floats, ends: Floats) -> Floats:

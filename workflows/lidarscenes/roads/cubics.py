@@ -14,7 +14,9 @@ from .elements import number
 
 
 class Cubics:
-    """Cubic polynomials, each valid from its start to the start of the next; 0 without any.
+    """Cubic polynomials, each valid from its start to the start of the next.
+
+    Without any polynomial, the value is 0.
 
     Before the first start, the value is that of the first start.
 

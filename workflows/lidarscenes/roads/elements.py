@@ -16,7 +16,9 @@ _WITHOUT_GEOMETRY = {"userData", "dataQuality", "link", "validity", "vectorScene
 
 
 def number(element: Element, name: str, default: float | None = None) -> float:
-    """Return a number of an element; MeshFileError if it is missing without a default, or broken.
+    """Return a number of an element.
+
+    Raises MeshFileError if it is missing without a default, or broken.
 
     An empty text is missing.
     """
@@ -37,7 +39,10 @@ def number(element: Element, name: str, default: float | None = None) -> float:
 
 
 def positive(element: Element, name: str, default: float | None = None) -> float:
-    """Return a number of 0 or more of an element; MeshFileError if it is negative."""
+    """Return a number of 0 or more of an element.
+
+    Raises MeshFileError if it is negative.
+    """
     value = number(element, name, default)
     if value < 0:
         raise MeshFileError(
@@ -63,11 +68,14 @@ class UnreadElements:
                 self.add(child.tag)
 
     def __str__(self) -> str:
-        """Return counts and tags, or words: «2 bridge, 3 objects without a size»; may be empty."""
+        """Return counts and tags, or words: «2 bridge, 3 objects without a size».
+
+        The text may be empty.
+        """
         return ", ".join(_counted(count, tag) for tag, count in self._counts.items())
 
 
 def _counted(count: int, tag: str) -> str:
-    """Return a count and a tag; of words, the first is in the plural for several."""
+    """Return a count and a tag, or words whose first is in the plural for several."""
     noun, space, rest = tag.partition(" ")
     return f"{plural(count, noun)} {rest}" if space else f"{count} {tag}"

@@ -86,7 +86,9 @@ class PlanTable:
         self._bend_table = np.zeros((0, 2))
 
     def add(self, geometries: Sequence[Element], offset: float, length: float) -> Floats:
-        """Add the geometries of a road that starts at a distance; return their starts on the road.
+        """Add the geometries of a road that starts at a distance.
+
+        Returns their starts on the road.
 
         The last geometry ends with the road, of `length` metres.
         """
@@ -131,7 +133,10 @@ class PlanTable:
         return points
 
     def _clothoid_points(self, distances: Floats, rows: Ints) -> PlanPoints:
-        """Return points on clothoids; of rows of cubics, anything."""
+        """Return points on clothoids.
+
+        Points in rows of cubics have no meaning.
+        """
         start, x, y, heading, curvature, growth = self._table[rows].T
         along = distances - start
         sines, cosines = sin_cos(heading + (curvature + growth / 2 * along) * along)
@@ -247,7 +252,10 @@ def _cubic_points(cubic: _Cubic, distances: Floats) -> PlanPoints:
 
 
 def _parameters(cubic: _Cubic, along: Floats) -> Floats:
-    """Return the parameters of a cubic at distances (k,) from its start; its end beyond."""
+    """Return the parameters of a cubic at distances (k,) from its start.
+
+    Beyond its end, the parameters stay at the end.
+    """
     rows = np.searchsorted(cubic.distances, along, "right") - 1
     rows = np.clip(rows, 0, len(cubic.distances) - 2)
     gaps = cubic.distances[rows + 1] - cubic.distances[rows]

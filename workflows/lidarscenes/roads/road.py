@@ -90,7 +90,9 @@ class Road:
             unread.check(profile, ("superelevation", "crossfall", "shape"))
 
     def place(self, table: PlanTable, offset: float) -> float:
-        """Add the reference line to a table at an offset; return the offset of the next road.
+        """Add the reference line to a table at an offset.
+
+        Returns the offset of the next road.
 
         MeshFileError if the geometry does not reach the length of the road.
         """
@@ -113,7 +115,7 @@ class Road:
 
     @cached_property
     def shapes(self) -> LateralShapes | None:
-        """Lateral shapes of the road; None without any."""
+        """Lateral shapes of the road, or None without any."""
         elements = self.element.findall("lateralProfile/shape")
         return LateralShapes(elements) if elements else None
 

@@ -257,7 +257,7 @@ def _typed_line(
 def _dashes(
     start: float, stop: float, length: float, space: float, allowance: Allowance
 ) -> tuple[Floats, Floats]:
-    """Return starts and stops (d,) of dashes; a single dash without space or length."""
+    """Return starts and stops (d,) of dashes, or of a single dash without space or length."""
     if not start < stop:
         return np.zeros(0), np.zeros(0)
     if space <= 0 or length <= 0:
@@ -270,6 +270,6 @@ def _dashes(
 
 
 def _colour(element: Element, default: str) -> str:
-    """Return the colour of a mark or line; the standard colour is white."""
+    """Return the colour of a mark or line, by default the standard colour white."""
     colour = element.get("color") or default
     return "white" if colour == "standard" else colour[:20]

@@ -254,7 +254,7 @@ class _Rail(NamedTuple):
 
     @classmethod
     def of(cls, road: Road, element: Element, repeat: Element) -> _Rail | None:
-        """Return the rail of a <repeat>; None without a size."""
+        """Return the rail of a <repeat>, or None without a size."""
         start = number(repeat, "s")
         stop = min(start + positive(repeat, "length", 0.0), road.length)
         base = _Placement.of(element)
@@ -542,5 +542,5 @@ def _paint_of(element: Element) -> str:
 
 
 def _paint_colour(colour: str | None) -> str:
-    """Return the colour of paint; the standard colour is white."""
+    """Return the colour of paint, by default the standard colour white."""
     return "white" if colour in (None, "", "standard") else colour[:MAX_SHOWN]

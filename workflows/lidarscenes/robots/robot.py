@@ -83,7 +83,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Links, and the joints between links; read by `load_robot`.
+    """Links, and the joints between links, read by `load_robot`.
 
     Values of joints are radians or metres. `joints` of the methods are a table (a file with a
     header), or a mapping: of a joint's name to its value, or, with time_s, to its values at these
@@ -237,7 +237,10 @@ class Robot:
     def _path(
         self, link: str, base: Trajectory, times_s: Floats, values: Mapping[str, Floats]
     ) -> Trajectory:
-        """Return the trajectory of a link; joints whose values do not change are rigid."""
+        """Return the trajectory of a link.
+
+        Joints whose values do not change are rigid.
+        """
         chain: list[Joint] = []
         while link in self.joints:
             chain.insert(0, self.joints[link])
@@ -286,7 +289,10 @@ class Robot:
         return times, table
 
     def _check_table(self, times: Floats, table: Mapping[str, Floats]) -> None:
-        """Check the times (k,) and values {joint: (k,)} of a table; LidarError if wrong."""
+        """Check the times (k,) and values {joint: (k,)} of a table.
+
+        Raises LidarError if these are wrong.
+        """
         for name, value in table.items():
             if name not in self.moving:
                 raise LidarError(
@@ -335,7 +341,10 @@ class Robot:
     def _read_values(
         self, path: Path, ignore: Sequence[str], time_unit: TimeUnit | None
     ) -> dict[str, Floats]:
-        """Return the values in a file with a table of joints; LidarError for an unusable file."""
+        """Return the values in a file with a table of joints.
+
+        Raises LidarError for an unusable file.
+        """
         quantities = [
             Quantity(
                 joint.name,
@@ -463,7 +472,10 @@ class LinkPath:
         return (motion.velocities * within).T, (motion.rates * within).T
 
     def _root_motion(self, station: int, times_ns: Floats, moving: bool) -> _LinkMotion:
-        """Return the motion of the root at times (k,); velocities are zero unless `moving`."""
+        """Return the motion of the root at times (k,).
+
+        Velocities are zero unless `moving`.
+        """
         positions, rotations = full_poses(self.base, station, times_ns)
         linear = angular = np.zeros((len(times_ns), 3))
         if moving:
@@ -477,7 +489,10 @@ class LinkPath:
         )
 
     def _moments_s(self, times_ns: Floats) -> Floats:
-        """Return times (k,) by the clock of the joints' values, seconds; LidarError if outside."""
+        """Return times (k,) by the clock of the joints' values, seconds.
+
+        Raises LidarError for times outside.
+        """
         moments_s = times_ns / 1e9 + self.start_s
         first_s = moments_s.min(initial=np.inf)
         last_s = moments_s.max(initial=-np.inf)
@@ -539,7 +554,7 @@ class _LinkMotion(NamedTuple):
 
 
 def _product(left_matrices: Floats, right_matrices: Floats) -> Floats:
-    """Return the products of matrices (3, 3, k) and (3, m, k); k may be 1."""
+    """Return the products of matrices (3, 3, k) and (3, m, k), where k may be 1."""
     return np.asarray(
         (
             left_matrices[:, 0, None] * right_matrices[0]

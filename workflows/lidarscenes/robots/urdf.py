@@ -151,13 +151,16 @@ def _name(element: Element) -> str:
 
 
 def _material(visual: Element) -> FaceMaterials | None:
-    """Return the material of a visual, by its name; None without a material."""
+    """Return the material of a visual, by its name, or None without a material."""
     material = visual.find("material")
     return None if material is None else FaceMaterials.named(material.get("name", ""))
 
 
 def _named(root: Element, kind: str) -> list[Element]:
-    """Return the elements of a kind; LidarError unless all have different names."""
+    """Return the elements of a kind.
+
+    Raises LidarError unless all have different names.
+    """
     elements = root.findall(kind)
     if len(elements) > _MAX_LINKS:
         raise LidarError(f"it has {len(elements):,} {kind}s; at most {_MAX_LINKS:,} are read.")
@@ -170,7 +173,7 @@ def _named(root: Element, kind: str) -> list[Element]:
 
 
 def _numbers(element: Element | None, name: str, count: int, default: str) -> Floats:
-    """Return `count` numbers of an attribute; of `default` without attribute or element."""
+    """Return `count` numbers of an attribute, or of `default` without attribute or element."""
     text = default if element is None else element.get(name, default)
     try:
         values = np.array(text.split(), np.float64)
@@ -228,7 +231,10 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
 
 
 def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
-    """Return the links, each after its parent; LidarError unless links and joints are a tree."""
+    """Return the links, each after its parent.
+
+    Raises LidarError unless links and joints are a tree.
+    """
     roots = [link for link in links if link not in joints]
     if not links:
         raise LidarError("it has no link.")
@@ -352,7 +358,10 @@ class _LinkMeshes:
         return np.ones(3), [capsule(radius, length, SIDES, "capsule")]
 
     def _sizes(self, sizes: Floats) -> Floats:
-        """Return sizes of a shape; LidarError for a negative size."""
+        """Return sizes of a shape.
+
+        Raises LidarError for a negative size.
+        """
         if (sizes < 0).any():
             raise LidarError(f"a size is {sizes.min()}; it must not be negative.")
         return sizes
@@ -435,7 +444,7 @@ def _is_package(folder: Path) -> bool:
 
 
 def _name_of(folder: Path) -> str:
-    """Return the name in the package.xml of a folder; empty without a readable package.xml."""
+    """Return the name in the package.xml of a folder, or no text without a readable package.xml."""
     file = folder / "package.xml"
     try:
         return (xml_root(read_input(file)).findtext("name") or "").strip()

@@ -72,7 +72,10 @@ def _section(rays: FiredRays) -> dict[str, float | str]:
 
 
 def _read(path: Path) -> ReadSensor:
-    """Return the sensor of a file; LidarError if the file cannot be used."""
+    """Return the sensor of a file.
+
+    Raises LidarError if the file cannot be used.
+    """
     if path.suffix.lower() in USD_ENDINGS:
         return read_omnilidar(path)
     try:

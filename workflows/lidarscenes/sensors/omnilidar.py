@@ -83,7 +83,10 @@ class _Prim(NamedTuple):
 
 
 def _read_prim(path: Path) -> _Prim:
-    """Read the first OmniLidar prim of a file; ValueError if there is none."""
+    """Read the first OmniLidar prim of a file.
+
+    Raises ValueError if the file has no such prim.
+    """
     allowance = Allowance(check_input(path), "write it again with fewer rays")
     child = Child(
         Path(__file__).with_name("omnilidar_child.py"),
@@ -101,7 +104,10 @@ def _read_prim(path: Path) -> _Prim:
 
 
 def _sensor(prim: _Prim) -> ReadSensor:
-    """Return the rays of a prim; ValueError if its attributes make no pattern."""
+    """Return the rays of a prim.
+
+    Raises ValueError if its attributes make no pattern.
+    """
     states = _states(prim)
     rate_hz = prim.number("scanRateBaseHz", 10)
     if not rate_hz > 0:
@@ -141,7 +147,10 @@ class _Pattern(NamedTuple):
 
 
 def _states(prim: _Prim) -> list[_State]:
-    """Return the emitter states in their order; ValueError if one cannot be used."""
+    """Return the emitter states in their order.
+
+    Raises ValueError if a state cannot be used.
+    """
     names = sorted(
         {name[len(_STATE) :].partition(":")[0] for name in prim.arrays if name.startswith(_STATE)}
     )
@@ -178,7 +187,10 @@ def _solid_state(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
 
 
 def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
-    """Return the rays of the ticks of a scan; ValueError without a rate of ticks."""
+    """Return the rays of the ticks of a scan.
+
+    Raises ValueError without a rate of ticks.
+    """
     tick_hz = prim.number("patternFiringRateHz", 0) or prim.number("reportRateBaseHz", 0)
     if not tick_hz > 0:
         raise ValueError("it has neither patternFiringRateHz nor reportRateBaseHz")

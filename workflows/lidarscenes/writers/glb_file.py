@@ -69,7 +69,7 @@ class _Writer:
         }
 
     def _put(self, kind: str, part: dict[str, Any]) -> int:
-        """Add a part of a kind, such as «nodes»; return its number."""
+        """Add a part of a kind, such as «nodes», and return its number."""
         parts = self._tree.setdefault(kind, [])
         parts.append(part)
         return len(parts) - 1
@@ -168,7 +168,7 @@ class _Writer:
         return attributes
 
     def _array(self, rows: AnyArray, kind: str) -> int:
-        """Add an accessor of attributes, or of indices (scalars); return its number."""
+        """Add an accessor of attributes, or of indices (scalars), and return its number."""
         view = self._view(rows.tobytes(), target=34963 if kind == "SCALAR" else 34962)
         limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self._put(
@@ -183,7 +183,7 @@ class _Writer:
         )
 
     def _view(self, data: bytes, **fields: Any) -> int:
-        """Add a view of data in the buffer; return its number."""
+        """Add a view of data in the buffer, and return its number."""
         view = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data), **fields}
         data += b"\0" * (-len(data) % 4)
         self._pieces.append(data)
@@ -216,7 +216,7 @@ class _Writer:
         return self._materials[key]
 
     def _texture(self, image: Image.Image) -> int:
-        """Add a texture of an image; return its number."""
+        """Add a texture of an image, and return its number."""
         png = io.BytesIO()
         image.save(png, "png")
         view = self._view(png.getvalue())
@@ -226,7 +226,10 @@ class _Writer:
         return self._put("textures", {"source": source, "sampler": 0})
 
     def data(self) -> bytes:
-        """Return the content of the file; LidarError for more than 4 GiB."""
+        """Return the content of the file.
+
+        Raises LidarError for more than 4 GiB.
+        """
         self._tree["buffers"] = [{"byteLength": self._size}]
         text = json.dumps(self._tree, separators=(",", ":")).encode()
         text += b" " * (-len(text) % 4)

@@ -110,7 +110,7 @@ def write_scenario(
 
 
 def _relative(entry: Mapping[str, Any], folder: Path) -> Any:
-    """Return an entry of `scene.files` with paths from a folder; the file's name if it is all."""
+    """Return an entry of `scene.files` with paths from a folder, or the file's name alone."""
     paths = {
         name: Path(os.path.relpath(value.resolve(), folder.resolve())).as_posix()
         for name, value in entry.items()
@@ -153,7 +153,10 @@ def _pose(matrix: Floats) -> dict[str, Any]:
 
 
 class _Files:
-    """Data files of lidars; lidars with the same figures share a file."""
+    """Data files of lidars.
+
+    Lidars with the same figures share a file.
+    """
 
     def __init__(self) -> None:
         self._data: dict[str, dict[str, Any]] = {}  # {name: content}
@@ -183,5 +186,8 @@ def _dumped(data: dict[str, Any]) -> str:
 
 
 def clean(value: float) -> float:
-    """Return a number for a file, rounded to 12 digits; roundings of zero are zero."""
+    """Return a number for a file, rounded to 12 digits.
+
+    Roundings of zero are zero.
+    """
     return float(f"{value:.12g}") if abs(value) > _ZERO else 0.0
