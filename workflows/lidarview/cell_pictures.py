@@ -130,7 +130,10 @@ def _positions_in_words(sensors: list[SensorPositions]) -> str:
 
 
 def draw_cloud(cloud: CloudLike) -> bytes | None:
-    """Draw points coloured by height; of many, an even choice. None for an empty cloud."""
+    """Draw points coloured by height.
+
+    Of many points, an even choice is drawn. Returns None for an empty cloud.
+    """
     total = len(cloud)
     positions = _sampled(cloud, -(-total // MAX_POINTS) or 1)
     if not len(positions):

@@ -91,7 +91,7 @@ class PlannedPath:
 
 @dataclass(frozen=True, eq=False)
 class PlanningPicture:
-    """A search for a path in the plane, for pictures; metres, local coordinates."""
+    """A search for a path in the plane, for pictures, in metres of local coordinates."""
 
     start: tuple[float, float]
     target: tuple[float, float]
@@ -197,7 +197,10 @@ class PictureContent:
         return names.get(column.name) or ()
 
     def save(self, path: Path) -> None:
-        """Write the content as a NumPy archive; the same content gives the same bytes."""
+        """Write the content as a NumPy archive.
+
+        The same content gives the same bytes.
+        """
         names = {
             "objects": self.scene.names,
             "actors": [actor.name for actor in self.scene.actors],
@@ -265,7 +268,10 @@ class PictureContent:
         return arrays
 
     def _planning_arrays(self) -> dict[str, Any]:
-        """Return the search and its best path, {name in the file: array}; empty without a path."""
+        """Return the search and its best path, {name in the file: array}.
+
+        The result is empty without a path.
+        """
         planning = self.planning
         if planning is None or planning.best is None:
             return {}
@@ -281,7 +287,9 @@ class PictureContent:
 
     @classmethod
     def load(cls, path: Path) -> PictureContent:
-        """Read a file that `save` wrote; LidarError if the file is damaged.
+        """Read a file that `save` wrote.
+
+        Raises LidarError if the file is damaged.
 
         No code in the file is run.
         """
@@ -290,13 +298,16 @@ class PictureContent:
 
     @classmethod
     def load_from(cls, folder: Path) -> PictureContent | None:
-        """Read the file in the folder of a result; None if there is none."""
+        """Read the file in the folder of a result, or None if there is none."""
         path = folder / PICTURE_FILE
         return cls.load(path) if path.exists() else None
 
     @classmethod
     def _from_arrays(cls, arrays: Mapping[str, Any]) -> PictureContent:
-        """Build the content from the arrays of a file; ValueError for another format."""
+        """Build the content from the arrays of a file.
+
+        Raises ValueError for another format.
+        """
         if (version := int(arrays["format"])) != _FORMAT:
             raise ValueError(f"it is of format {version}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())

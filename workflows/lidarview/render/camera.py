@@ -42,7 +42,7 @@ class Camera:
         return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
     def look_up(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
-        """Return values (n,) of an image at pixels (n, 2); `outside` beside the image."""
+        """Return values (n,) of an image at pixels (n, 2), and `outside` beside the image."""
         position = np.asarray(pixels)
         inside = np.all((position >= 0) & (position < np.array(self.size)), axis=1)
         column, row = np.where(inside[:, None], position, 0).astype(np.int64).T

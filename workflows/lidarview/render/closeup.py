@@ -84,7 +84,10 @@ def floor_and_cut(
 
 
 def _relative_spread(heights: Floats) -> float:
-    """Return the spread of the middle half of heights (n,), over the median; 0 without heights."""
+    """Return the spread of the middle half of heights (n,), over the median.
+
+    The spread of no heights is 0.
+    """
     if not len(heights):
         return 0.0
     lower, middle, upper = np.percentile(heights, [25, 50, 75])

@@ -79,13 +79,19 @@ def values_of(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
 
 
 def colours_of_normals(normals: AnyArray) -> Bytes:
-    """Return the colours (n, 3) of unit vectors (n, 3); grey for NaN, of points on no surface."""
+    """Return the colours (n, 3) of unit vectors (n, 3).
+
+    NaN, for points on no surface, is grey.
+    """
     known = np.isfinite(normals).all(axis=1, keepdims=True)
     return np.asarray(np.where(known, 127.5 * (1 + normals), 127.5).round().astype(np.uint8))
 
 
 def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
-    """Return the word for a label; `names` are the words for the values 0, 1, 2, …."""
+    """Return the word for a label.
+
+    `names` are the words for the values 0, 1, 2, ….
+    """
     if 0 <= value < len(names) and names[value]:
         return names[value]
     if value < 0 and column.name == MATERIAL:

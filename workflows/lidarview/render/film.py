@@ -91,7 +91,10 @@ class _FilmPoints:
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """Content of a film; local coordinates in metres, times since the survey's start."""
+    """Content of a film.
+
+    Coordinates are local, in metres. Times are since the survey's start.
+    """
 
     moments_ns: Floats  # (k,) of the frames
     parts: Iterable[tuple[Floats, Floats]]  # per frame: new points (n, 3), colours (n, 4) in 0 to 1
@@ -196,7 +199,10 @@ def _shape(corners: AnyFloats, colour: Floats) -> _Shape:
 def _draw_surfaces(
     shapes: Sequence[_Shape], camera: Camera, focus: float, top: float
 ) -> tuple[AnyFloats, Floats]:
-    """Draw surfaces; return the image (height, width, 4), and the depth (height, width), metres."""
+    """Draw surfaces.
+
+    Returns the image (height, width, 4), and the depth (height, width), metres.
+    """
     width, height = SIZE
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
     rays = camera.rays(grid.reshape(-1, 2) + 0.5)

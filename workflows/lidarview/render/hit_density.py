@@ -24,7 +24,9 @@ _MAX_RATIO = 300.0  # densest to sparsest colour
 def hit_colours(
     scene: Scene, corners: Floats32, hits: Floats, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, tuple[float, float]]:
-    """Colour triangles by hits per square metre; large triangles with many hits are divided.
+    """Colour triangles by hits per square metre.
+
+    Large triangles with many hits are divided.
 
     Large triangles have the density of a grid of points, the finest grid with enough points in its
     cells; small triangles share their hits with neighbours, as in `hit_density`.

@@ -64,7 +64,10 @@ class _Window(NamedTuple):
 
 
 def draw_pattern(path: Path, sensor: Sensor) -> None:
-    """Write the picture of `pattern_page`; LidarError if the file, a .png, cannot be written."""
+    """Write the picture of `pattern_page`.
+
+    Raises LidarError if the file, a .png, cannot be written.
+    """
     pattern_page(sensor).save(path)
 
 
@@ -172,7 +175,7 @@ def _window(pattern: _Pattern) -> _Window:
 
 
 def _coverages(met_s: Floats, has_shares: bool) -> list[tuple[str, Bools]]:
-    """Return headings, and the covered cells, of `TIMES_S`; equal ones together."""
+    """Return headings, and the covered cells, of `TIMES_S`, with equal headings together."""
     field = np.isfinite(met_s).sum()
     covered = {seconds: met_s <= seconds for seconds in TIMES_S}
     groups = groupby(TIMES_S, key=lambda seconds: int(covered[seconds].sum()))

@@ -54,7 +54,10 @@ MIN_AXIS = 36.0  # a shorter height axis has no room for numbers
 
 
 class Page:
-    """A picture under construction; its size is (width, height) in pixels."""
+    """A picture under construction.
+
+    Its size is (width, height) in pixels.
+    """
 
     def __init__(self, size: tuple[int, int]) -> None:
         self.size = size
@@ -176,7 +179,9 @@ class Page:
             )
 
     def _name_actors(self, axes: Axes, shot: SurfaceView) -> None:
-        """Name the actors, if there are not too many, above their positions; paler if hidden.
+        """Name the actors, if there are not too many, above their positions.
+
+        Names of hidden actors are paler.
 
         Of a robot, whose links are called ROBOT/LINK, the first link has its name.
         """
@@ -220,7 +225,10 @@ class Page:
             self._text(axes, position, shortened(name), 6.6, ink, **style)
 
     def numbers(self, axes: Axes, shot: SurfaceView) -> None:
-        """Write numbers from 1 on the sensors' markers; hidden sensors have white markers."""
+        """Write numbers from 1 on the sensors' markers.
+
+        Hidden sensors have white markers.
+        """
         pixels, is_visible = shot.visible(shot.sensors)
         area = _MARK if len(pixels) < 10 else _MARK_OF_TWO_DIGITS
         for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # the front last
@@ -293,7 +301,9 @@ class Page:
         axes.set_title(text, loc="left", parse_math=False, **style)
 
     def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
-        """Draw a legend of (name, colour) in the right margin; the last line counts the rest.
+        """Draw a legend of (name, colour) in the right margin.
+
+        The last line counts the rest.
 
         An empty name of the sensor leaves the sensor out.
         """
@@ -327,7 +337,7 @@ class Page:
         parent: Axes | Figure | None = None,
         **options: Any,
     ) -> None:
-        """Draw a legend of handles in the right margin, or on a parent; `size` in points."""
+        """Draw a legend of handles in the right margin, or on a parent, with `size` in points."""
         style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | options
         style = {"handletextpad": 0.5, "handlelength": 1.4} | style
         legend = (parent or self.figure).legend(
@@ -381,7 +391,9 @@ class Page:
             _label_in_full(axes.yaxis)
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG, in its light colours; a link at the path is replaced.
+        """Write the page as a PNG, in its light colours.
+
+        A link at the path is replaced.
 
         Raises
         ------
@@ -416,7 +428,7 @@ class Page:
 
 
 def label_logarithms(axis: Axis, is_narrow: bool) -> None:
-    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis; powers of ten if not narrow."""
+    """Write numbers such as 1, 2, 5 and 10 at a logarithmic axis, or powers of ten if narrow."""
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if is_narrow else (1,)))
     axis.set_major_formatter(lambda value, _: f"{value:,.12g}")
     axis.set_minor_formatter(NullFormatter())

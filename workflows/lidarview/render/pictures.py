@@ -146,7 +146,9 @@ def draw_cloud(
 
 
 def _group_objects(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
-    """Return the kinds of objects (objects,), and the names of kinds; the last objects are actors.
+    """Return the kinds of objects (objects,), and the names of kinds.
+
+    The last objects are actors.
 
     Each actor is a kind, and so are all links of a robot together.
     """
@@ -184,7 +186,9 @@ def _object_colours(scene: Scene, kinds: Ints) -> Floats:
 def with_points(
     image: Floats32, shot: SurfaceView, points: Floats, colours: Floats, solid: bool = False
 ) -> Floats32:
-    """Draw points (n, 3) as discs over an image; larger discs close gaps if `solid`.
+    """Draw points (n, 3) as discs over an image.
+
+    Larger discs close gaps if `solid`.
 
     Only points on the surface of their pixel are drawn: others are hidden, or on a wall that was
     removed. Points have the light of the surface.

@@ -40,7 +40,10 @@ _PIECE_GAP = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Hits of the camera's rays; every array has a row for each ray."""
+    """Hits of the camera's rays.
+
+    Every array has a row for each ray.
+    """
 
     triangle: Ints  # (n,) or SKY, GROUND
     distance: Floats32  # (n,) metres, infinite for the sky
@@ -106,7 +109,7 @@ class SurfaceView:
 
     @property
     def depth(self) -> Floats32:
-        """Depth (height, width) from the eye to surfaces, metres; infinite without a surface."""
+        """Depth (height, width) from the eye to surfaces, metres, or infinite without a surface."""
         return self.pixel_samples.distance.reshape(self.camera.size[::-1])
 
     def paint(self, face_colours: Floats, contrast: float = 1.0) -> Floats32:
@@ -273,7 +276,7 @@ class _OpenScene(NamedTuple):
 
     @property
     def remark(self) -> str:
-        """Remark on the shown part, for a caption; empty if the scene is shown completely."""
+        """Remark on the shown part, for a caption, or no text if the scene is shown completely."""
         if self.box is None:
             return ""
         width, depth, _ = np.ptp(self.box, axis=0)
@@ -316,7 +319,10 @@ class _Viewpoint:
     reach: float  # metres; surfaces farther from a point cast no shadow
 
     def sample(self, pixels: Floats) -> Samples:
-        """Cast rays through pixel coordinates (n, 2); the light of the samples is 1."""
+        """Cast rays through pixel coordinates (n, 2).
+
+        The light of the samples is 1.
+        """
         eye = self.camera.eye
         directions = self.camera.rays(pixels)
         distance, triangle, u, v = cast_through(self.surface, self.cutaway, eye, directions)

@@ -24,7 +24,7 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class PlotBox:
-    """A box with round ticks on its axes, above a ground rectangle; local metres."""
+    """A box with round ticks on its axes, above a ground rectangle, in local metres."""
 
     bounds: Floats  # (2, 3) lowest and highest corner of the shown part
     ground: Floats  # (2, 2) lowest and highest corner of the ground
@@ -66,7 +66,10 @@ class PlotBox:
 
 
 def make_axis(name: str, lower: float, upper: float, step: float, origin: float) -> Axis:
-    """Place round ticks between `lower` and `upper`, which are local; world = local + origin."""
+    """Place round ticks between `lower` and `upper`, which are local.
+
+    World coordinates are local coordinates plus `origin`.
+    """
     first = math.ceil((lower + origin) / step - 2e-3)
     last = math.floor((upper + origin) / step + 1e-6)
     world: Floats = np.arange(first, last + 1, dtype=np.float64) * step

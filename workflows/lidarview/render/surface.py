@@ -112,6 +112,6 @@ def spiral(count: int, lowest: float = 0.0, highest: float = 1.0) -> Floats:
 
 
 def unit(vectors: Floats) -> Floats:
-    """Scale vectors (n, 3) to length 1; zero vectors stay zero."""
+    """Scale vectors (n, 3) to length 1, except zero vectors."""
     length = np.sqrt(dot(vectors, vectors))[:, None]
     return vectors / np.where(length > 0, length, 1.0)

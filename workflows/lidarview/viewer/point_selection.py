@@ -39,7 +39,10 @@ class HeldPoints:
         return len(self._cloud)
 
     def values(self, name: str, rows: Ints | slice) -> AnyArray:
-        """Return the values of a column at rows; columns x, y and z are world coordinates."""
+        """Return the values of a column at rows.
+
+        Columns x, y and z are world coordinates.
+        """
         if name in AXES:
             return np.asarray(self._cloud.positions[rows, AXES.index(name)])
         return self._cloud[name][rows]
@@ -77,7 +80,10 @@ class JoinedPoints:
         return int(self._firsts[-1])
 
     def values(self, name: str, rows: Ints | slice) -> AnyArray:
-        """Return the values of a column at ascending rows; x, y and z are world coordinates."""
+        """Return the values of a column at ascending rows.
+
+        Columns x, y and z are world coordinates.
+        """
         if isinstance(rows, slice):
             rows = np.arange(*rows.indices(len(self)))
         bounds = np.searchsorted(rows, self._firsts)
@@ -105,7 +111,9 @@ class Filter:
 
     @classmethod
     def read(cls, text: str, names: Sequence[str]) -> Filter:
-        """Read limits of known columns from an address, ``column,lowest,highest;…``.
+        """Read limits of known columns from an address, such as ``column,lowest,highest``.
+
+        Semicolons separate the columns.
 
         An entry ``!column,value,value`` leaves a value out. `names` are the known columns.
         ValueError if a limit is not a number.
@@ -154,7 +162,9 @@ class Filter:
 
 
 def read_scans(text: str) -> ScanRanges:
-    """Read ranges of scans from an address, ``first-last,…``; ranges that touch are joined.
+    """Read ranges of scans from an address, ``first-last,…``.
+
+    Ranges that touch are joined.
 
     ValueError if the text is no such list.
 
@@ -181,7 +191,7 @@ class Eye:
 
     @classmethod
     def read(cls, text: str) -> Eye:
-        """Read 16 numbers in the order of WebGL, column by column; else raise ValueError."""
+        """Read 16 numbers in the order of WebGL, column by column, else raise ValueError."""
         return cls(np.array([float(number) for number in text.split(",")]).reshape(4, 4).T.copy())
 
     def project(self, points: AnyFloats) -> tuple[AnyFloats, Bools]:
@@ -195,7 +205,7 @@ class Eye:
         return np.asarray(self.matrix[:, :3] @ points.T + self.matrix[:, 3:])
 
     def tiles(self, points: AnyFloats) -> Ints:
-        """Return the tile (n,) of the picture that each point (n, 3) is in; -1 outside."""
+        """Return the tile (n,) of the picture that each point (n, 3) is in, or -1 outside."""
         projected, inside = self.project(points)
         x_share, y_share = (np.clip(projected, -1, 0.9999).T + 1) / 2
         column = (x_share * _TILE_COLUMNS).astype(np.int64)

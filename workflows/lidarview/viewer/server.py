@@ -126,7 +126,10 @@ class SlowQuestions:
 
     @asynccontextmanager
     async def slot(self) -> AsyncIterator[None]:
-        """Hold a slot during the body, after waiting; HTTPError if too many questions wait."""
+        """Hold a slot during the body, after waiting.
+
+        Raises HTTPError if too many questions wait.
+        """
         if self._waiting >= MAX_WAITING:
             raise HTTPError(503, "too many slow questions wait")
         self._waiting += 1
@@ -194,7 +197,10 @@ class _Question(_Guarded):
     async def _answer(
         self, threads: ThreadPoolExecutor | None, question: str, arguments: Arguments
     ) -> None:
-        """Compute an answer in a thread and send the answer; Abandoned if the browser has left."""
+        """Compute an answer in a thread and send the answer.
+
+        Raises Abandoned if the browser has left.
+        """
         if self._disconnected.is_set():
             raise Abandoned
 
@@ -334,7 +340,7 @@ def page_server(
 
 
 def _open_socket(host: str, port: int) -> socket.socket:
-    """Listen on a port, or the next free port; on any port for 0, or if no port is free."""
+    """Listen on a port, or the next free port, or any port for 0 or if no port is free."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     candidates = range(port, min(port + _PORTS_TRIED, 65_536)) if port else range(0)
     for candidate in candidates:

@@ -66,7 +66,7 @@ def share(
     page: Path | None,
     writing: Callable[[str], AbstractContextManager[WritingProgress]] | None = None,
 ) -> None:
-    """Write a view as a film, a page or both; files are replaced.
+    """Write a view as a film, a page or both, and replace existing files.
 
     `writing` opens the display of an output's progress, with a caption; none by default.
 
@@ -111,7 +111,10 @@ def film_of(view: View, suffix: str, show: WritingProgress = _show_nothing) -> b
 
 
 def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) -> bytes:
-    """Encode frames in a width in pixels; `quality` is the number of colours of a .gif."""
+    """Encode frames in a width in pixels.
+
+    `quality` is the number of colours of a .gif.
+    """
     scaled = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
     if suffix == ".gif":  # with a palette for each frame, colours would flicker
         pixels = np.concatenate([np.asarray(frame)[::2, ::2] for frame in scaled])
@@ -192,7 +195,10 @@ def _film(view: View, max_frames: int) -> Film:
 def _follow(
     film: Film, sensor: SensorPositions, source: _FilmSource, spans: Sequence[ScanRanges]
 ) -> Film:
-    """Return a film that follows a sensor; `spans` are the scans of each frame."""
+    """Return a film that follows a sensor.
+
+    `spans` are the scans of each frame.
+    """
     middle = len(spans) // 2
     position = sensor.position_at(film.moments_ns[middle])
     ranges = np.linalg.norm(source.positions(_FRAME_POINTS, spans[middle]) - position, axis=1)
@@ -202,7 +208,10 @@ def _follow(
 
 
 def _scans_between(sweeps: Sweeps, start_ns: float, stop_ns: float) -> ScanRanges:
-    """Return the ranges of scans between two times; scans are even over each sweep."""
+    """Return the ranges of scans between two times.
+
+    Scans are even over each sweep.
+    """
     first = sweeps.scans[:-1]
     count = np.diff(sweeps.scans)
     scan_ns = np.maximum(sweeps.ends_ns - sweeps.begins_ns, 1.0) / count

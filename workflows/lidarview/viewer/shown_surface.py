@@ -70,7 +70,7 @@ class ShownSurface:
     def coloured(
         self, by: str, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and a legend.
+        """Return corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners, and a legend.
 
         Corners are local, metres; objects are indices of static objects.
 

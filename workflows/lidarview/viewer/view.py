@@ -1,4 +1,4 @@
-"""A survey or a cloud on a page: answers to the questions of the page; the command `view`."""
+"""A survey or a cloud on a page: answers to the questions of the page, and the command `view`."""
 
 from __future__ import annotations
 
@@ -134,7 +134,10 @@ class View:
         self.show(self.points)
 
     def show(self, points: Points, *, keep_scales: bool = False) -> None:
-        """Replace the points; colour scales stay those of earlier points with `keep_scales`."""
+        """Replace the points.
+
+        Colour scales stay those of earlier points with `keep_scales`.
+        """
         self.points = points
         self._finder = PointFinder(points, self.origin)
         if not keep_scales:
@@ -182,7 +185,7 @@ class View:
 
     @property
     def duration_ns(self) -> float:
-        """Duration of the survey in nanoseconds; 0 if unknown."""
+        """Duration of the survey in nanoseconds, or 0 if unknown."""
         if self.pictured is not None and self.pictured.duration_ns:
             return self.pictured.duration_ns
         if self.sweeps is None or not len(self.sweeps):
@@ -210,7 +213,9 @@ class View:
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _extent(self) -> tuple[Floats, Floats, Floats]:
-        """Return the origin (3,), world metres; the box (2, 3) and points (k, 3) to be in sight.
+        """Return the origin (3,), and what to show: the box (2, 3) and points (k, 3).
+
+        The origin is in world metres.
 
         The box contains the points, local, metres. The points are the corners of the scene, the
         positions of the sensors unless these are around an object, and both ends of the planned
@@ -364,7 +369,10 @@ class View:
 
     @property
     def planned(self) -> dict[str, Any] | None:
-        """Planned path and discs (x, y, radius) of obstacles, local metres; None without a path."""
+        """Planned path and discs (x, y, radius) of obstacles, local metres.
+
+        The answer is None without a path.
+        """
         planning = None if self.pictured is None else self.pictured.planning
         if self.path is None or planning is None:
             return None
@@ -380,7 +388,9 @@ class View:
         return dict(zip(*columns, strict=True))
 
     def _export(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Return a file with the points for a filter and ranges of scans; a ZIP for several files.
+        """Return a file with the points for a filter and ranges of scans.
+
+        Several files are returned as a ZIP.
 
         The answer has an error instead if points are too many, or the format refuses the points.
         """
@@ -416,7 +426,7 @@ class View:
 
     @property
     def _export_formats(self) -> Sequence[str]:
-        """Formats of a download; none for a sample of a run under way."""
+        """Formats of a download, or none for a sample of a run under way."""
         is_sample = isinstance(self.points, HeldPoints) and not isinstance(
             self.points, OrderedPoints
         )
@@ -642,7 +652,10 @@ def _never_abandoned() -> bool:
 
 
 def _read_limits(text: str) -> tuple[float, float]:
-    """Read the ends of a colour scale, ``lowest,highest``; ValueError if they are in disorder."""
+    """Read the ends of a colour scale, ``lowest,highest``.
+
+    Raises ValueError if the ends are in disorder.
+    """
     lower, upper = map(float, text.split(","))
     if not -math.inf < lower < upper < math.inf:
         raise ValueError(f"{text!r} are no ends of a colour scale")
@@ -690,7 +703,10 @@ class GrowingView:
         self._lock = threading.Lock()
 
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the page, see `View.answer`; "growth" is whether all are read."""
+        """Answer a question of the page, as `View.answer`.
+
+        The question "growth" asks whether all sweeps are read.
+        """
         if question == "growth":
             return {"complete": self._complete, "error": self._error}, {}
         is_sample = not self._complete
