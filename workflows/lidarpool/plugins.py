@@ -1,4 +1,4 @@
-"""What plug-ins that write and read clouds import; docs/how-to/plugins.md has an example."""
+"""The imports of plug-ins that write and read clouds, with an example in docs/how-to/plugins.md."""
 
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import Sweeps

@@ -109,7 +109,10 @@ class _Digest:
             self._hash.update(b"%d:" % len(data) + data)
 
     def add(self, value: Any) -> None:
-        """Add a value; an outer value that contains itself is marked as a circle."""
+        """Add a value.
+
+        An outer value that contains itself is marked as a circle.
+        """
         if id(value) in self._open:
             self._mark("circle")
             return

@@ -12,7 +12,10 @@ _SEAL = re.compile(rb',\n"crc": (\d{1,10})\}\n\Z')
 
 
 class SealedWriter:
-    """Writes the text of a JSON object piece by piece; `seal` ends the object with its CRC-32."""
+    """Writes the text of a JSON object piece by piece.
+
+    `seal` ends the object with its CRC-32.
+    """
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file

@@ -20,7 +20,10 @@ def shard_in_words(text: str) -> str:
 
 @dataclass(frozen=True, order=True)
 class Shard:
-    """Share `number` of `total` shares, counted from 1; LidarError if the number is too large."""
+    """Share `number` of `total` shares, counted from 1.
+
+    Raises LidarError if the number is too large.
+    """
 
     number: int
     total: int
@@ -36,7 +39,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str, environment: Mapping[str, str] = os.environ) -> Shard:
-        """Read ``3/10``; ``auto``, the task of a Slurm array; or ``auto/10``, a pod's index.
+        """Read ``3/10``, ``auto`` for the task of a Slurm array, or ``auto/10`` for a pod's index.
 
         LidarError for any further text, or if there is no such shard, array or index.
         """
@@ -56,7 +59,10 @@ class Shard:
             raise LidarError(f"{text!r} finds no shard in {variables}: give 3/10.") from error
 
     def jobs(self, count: int) -> range:
-        """Return the jobs of the share out of `count`; neighbours are in different shares."""
+        """Return the jobs of the share out of `count`.
+
+        Neighbours are in different shares.
+        """
         return range(self.number - 1, count, self.total)
 
     def scans(self, count: int) -> range:

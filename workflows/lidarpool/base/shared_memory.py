@@ -28,7 +28,7 @@ class Pickled(NamedTuple):
 
     @classmethod
     def from_value(cls, value: object) -> Pickled:
-        """Pickle a value; `buffers` are views of its arrays."""
+        """Pickle a value, with `buffers` for views of its arrays."""
         buffers: list[pickle.PickleBuffer] = []
         head = cloudpickle.dumps(value, protocol=5, buffer_callback=buffers.append)
         return cls(head, tuple(buffer.raw() for buffer in buffers))
@@ -55,7 +55,9 @@ class SharedHandle(NamedTuple):
     spans: tuple[tuple[int, int], ...]  # start and end of the head and of each buffer
 
     def load(self) -> Any:
-        """Return the value; its arrays lie in the shared memory, and are copied when written to.
+        """Return the value.
+
+        Its arrays lie in the shared memory, and are copied when written to.
 
         OSError if this process does not see the memory, as on another machine.
         """

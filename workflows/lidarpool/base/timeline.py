@@ -85,7 +85,10 @@ class Timeline:
         self.steps: list[Step] = []
 
     def mark(self, name: str) -> None:
-        """Note that a step ends now; a step that has ended before is not noted again."""
+        """Note that a step ends now.
+
+        A step that has ended before is not noted again.
+        """
         if all(step.name != name for step in self.steps):
             self.steps.append(Step(name, time.time() - self._started))
 

@@ -20,7 +20,7 @@ def trace(point: str, /, **fields: Any) -> None:
 
 
 def trace_to(sink: Sink | None) -> None:
-    """Call `sink(point, fields)` at each point of this process; None stops the calls.
+    """Call `sink(point, fields)` at each point of this process, until `sink` is None.
 
     It is called in the thread that reaches the point, before that thread continues: it can log the
     point, hold the thread, or end the process.

@@ -70,7 +70,7 @@ def format_name(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
 
 
 def sensor_formats(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a format of sensors; with --out, of the formats that have its ending."""
+    """Complete a format of sensors, with --out a format that has its ending."""
     del param
     file = ctx.params.get("out")
     rows = [row for row in FORMATS if file is None or file.suffix.lower() in row.endings]

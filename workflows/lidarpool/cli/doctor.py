@@ -43,7 +43,7 @@ _MIN_DISK_GIB = 1.0
 
 
 def examine() -> dict[str, Any]:
-    """Return the findings as plain data for JSON; `fix_first` is "" without a fault."""
+    """Return the findings as plain data for JSON, with `fix_first` "" without a fault."""
     figures: dict[str, Any] = {
         "versions": versions(),
         "machine": {
@@ -114,7 +114,7 @@ def _port_state(port: int) -> str:
 
 
 def _fix_first(figures: dict[str, Any]) -> str:
-    """Return the most urgent advice; "" without a fault."""
+    """Return the most urgent advice, or "" without a fault."""
     return next(_advice(figures), "")
 
 

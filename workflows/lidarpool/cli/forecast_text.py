@@ -99,7 +99,10 @@ def forecast_scenario(
 def _campaign_figures(
     campaign: CampaignSpec, options: RunOptions, forecast_job: Callable[[int], dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return the figures of some jobs of a campaign; `forecast_job` returns the figures of one."""
+    """Return the figures of some jobs of a campaign.
+
+    `forecast_job` returns the figures of one.
+    """
     campaign.check_files()
     jobs: list[dict[str, Any]] = []
     notes: list[str] = []

@@ -27,7 +27,9 @@ Importer = Callable[[Path, Path, Sequence[Path]], Iterable[str]]
 
 
 def importer_of(survey: Path) -> Plugin | None:
-    """Return the plug-in that imports a survey; None for those of lidarpool and unknown files.
+    """Return the plug-in that imports a survey.
+
+    Returns None for surveys that lidarpool imports itself, and for unknown files.
 
     Raises
     ------
@@ -57,7 +59,9 @@ def import_by(
     assets: Sequence[Path],
     check: Callable[[Path], object],
 ) -> list[str]:
-    """Write a survey as a scenario by a plug-in; see `import_whole`, whose errors it raises.
+    """Write a survey as a scenario by a plug-in.
+
+    Raises the errors of `import_whole`.
 
     Raises
     ------

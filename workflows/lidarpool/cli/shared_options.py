@@ -80,7 +80,10 @@ def combine(*options: Callable[[Command], Command]) -> Callable[[Command], Comma
 
 
 def _position(text: str) -> list[float]:
-    """Parse x,y,z; whole numbers stay integers, to be written without a decimal point."""
+    """Parse x,y,z.
+
+    Whole numbers stay integers, to be written without a decimal point.
+    """
     try:
         x, y, z = map(float, text.split(","))
     except ValueError as error:

@@ -257,7 +257,10 @@ def _coverage_figures(coverage: SurveyCoverage, built: Built) -> dict[str, Any]:
 
 
 def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, list[str]]:
-    """Build a scenario whose poses do not matter; return its notes, which are printed at once."""
+    """Build a scenario whose poses do not matter.
+
+    Returns its notes, which are printed at once.
+    """
     from ..scenario.advice import advice
     from ..scenario.build import build
     from ..scenario.default_poses import Placing

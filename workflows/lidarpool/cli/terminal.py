@@ -38,7 +38,7 @@ class Terminal(Screen):
 
     @property
     def _stream(self) -> Any:
-        """Stream for messages; None for a quiet command."""
+        """Stream for messages, or None for a quiet command."""
         return None if self.quiet or sys.stderr is None else TolerantStream(sys.stderr)
 
     @property
@@ -69,7 +69,10 @@ class Terminal(Screen):
 
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
-        """Show a status while the body runs; in a log, too, if the status is `logged`."""
+        """Show a status while the body runs.
+
+        If the status is `logged`, a log shows the status too.
+        """
         console = self.console
         if logged and console is None and self._stream:
             _tell(self._stream, words)
@@ -78,7 +81,10 @@ class Terminal(Screen):
 
     @contextmanager
     def writing(self, words: str) -> Iterator[WritingProgress]:
-        """Show a bar for each output that the body writes; in a log, `words` and lines."""
+        """Show a bar for each output that the body writes.
+
+        A log shows `words` and lines.
+        """
         console = self.console
         if console is not None:
             with progress_rows(console) as show:
@@ -89,7 +95,7 @@ class Terminal(Screen):
 
     @contextmanager
     def progress(self) -> Iterator[Show]:
-        """Show bars by stage with rates and time left; lines of text if not on a terminal."""
+        """Show bars by stage with rates and time left, or lines of text outside a terminal."""
         if (console := self.console) is not None:
             with bars(console) as show:
                 yield show
@@ -100,7 +106,10 @@ class Terminal(Screen):
     def starting(
         self, cluster: AbstractContextManager[Client], words: str, *, shares_terminal: bool = False
     ) -> Iterator[Client]:
-        """Show a status until the cluster has started; its workers log as this process does."""
+        """Show a status until the cluster has started.
+
+        Its workers log as this process does.
+        """
         with ExitStack() as stack:
             with self.status(words):
                 client = stack.enter_context(cluster)
@@ -116,7 +125,7 @@ def _tell(stream: Any, line: str) -> None:
 
 
 class WrittenLines:
-    """Progress of written outputs as lines of text in a stream; called as `WritingProgress`."""
+    """Progress of written outputs as lines of text in a stream, called as `WritingProgress`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -133,7 +142,7 @@ class WrittenLines:
 
 
 class PlainLines:
-    """Progress as lines of text in a stream; called with each `Progress`."""
+    """Progress as lines of text in a stream, called with each `Progress`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream

@@ -53,7 +53,7 @@ class Boxes:
 
 @dataclass(frozen=True, eq=False)
 class SweepBoxes:
-    """Boxes of the actors present during a sweep, k in number, at its start; as of `Boxes`."""
+    """Boxes of the actors present during a sweep, k in number, at its start, as in `Boxes`."""
 
     names: tuple[str, ...]
     types: tuple[str, ...]  # "Car" of "Car 1"

@@ -100,7 +100,7 @@ class _File(pye57.E57):
 
     @property
     def root(self) -> Any:
-        """Root of the file; while the header is written, an object that takes its fields."""
+        """Root of the file, or an object that takes its fields while the header is written."""
         return SimpleNamespace(set=self._set_field) if self._in_header else super().root
 
     def _set_field(self, name: str, node: Any) -> None:
@@ -239,7 +239,10 @@ def _read_scan(file: Any, number: int, header: Any) -> _Scan:
 
 
 def _positions_of_scan(columns: dict[str, AnyArray], kind: str) -> Floats:
-    """Take the coordinates of an E57 scan out of its columns; return Cartesian positions (n, 3)."""
+    """Take the coordinates of an E57 scan out of its columns.
+
+    Returns Cartesian positions (n, 3).
+    """
     if kind == "cartesian":
         return np.stack([columns.pop(f"cartesian{axis}") for axis in "XYZ"], axis=1)
     range_m = columns.pop("sphericalRange")

@@ -40,7 +40,10 @@ class FilePoints:
 
 
 def from_columns(columns: Columns) -> FilePoints:
-    """Return the content of columns that include x, y and z; ValueError if an axis is missing."""
+    """Return the content of columns that include x, y and z.
+
+    Raises ValueError if an axis is missing.
+    """
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
@@ -48,7 +51,10 @@ def from_columns(columns: Columns) -> FilePoints:
 
 
 def of_scans(scans: Sequence[CloudScan]) -> FilePoints:
-    """Return the points of scans, joined in the frame of the file; LidarError beyond the memory."""
+    """Return the points of scans, joined in the frame of the file.
+
+    Raises LidarError beyond the memory.
+    """
     check_count(sum(len(scan.positions) for scan in scans))
     return replace(joined([_placed(scan) for scan in scans]), units_m=scans[0].units_m)
 

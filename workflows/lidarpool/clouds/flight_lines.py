@@ -169,7 +169,7 @@ def _level(moves: Floats, axes: Floats) -> Floats:
 
 
 def _flight_lines(directions: Floats, begins_ns: Floats) -> Ints:
-    """Return the flight line of each sweep (n,), from 0; `directions` (n, 3) are of unit length.
+    """Return the flight line of each sweep (n,), from 0, by unit vectors `directions` (n, 3).
 
     Sweeps in a turn of the carrier belong to the line before.
     """

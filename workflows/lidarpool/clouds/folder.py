@@ -116,7 +116,7 @@ def send(path: Path, output: Path | Storage) -> str:
 
 @contextmanager
 def local_folder(output: Path | Storage) -> Iterator[Path]:
-    """Yield a folder itself; for storage a temporary folder with the last name of its URL."""
+    """Yield a folder itself, or for storage a temporary folder with the last name of its URL."""
     if not isinstance(output, Storage):
         yield output
         return

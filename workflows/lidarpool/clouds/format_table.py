@@ -1,4 +1,4 @@
-"""The table of formats: modules that write and read each, and its requirements; a row a format.
+"""The table of formats, a row a format: modules that write and read each, and its requirements.
 
 It is quick to import: help and completion of the command read it. Packages add formats as plug-ins
 of the group `GROUP`, whose names are the names of the formats.
@@ -152,7 +152,9 @@ class FormatRow:
         return getattr(module, name)
 
     def reader(self, function: str, name: str) -> Any:
-        """Return a function of the module that reads; LidarError without a package it needs.
+        """Return a function of the module that reads.
+
+        Raises LidarError without a required package.
 
         `name` is that of the file or folder in the message.
         """
@@ -418,7 +420,10 @@ def data_set_title(data_set: str) -> str:
 
 
 def _row_of_plugin(plugin: Plugin) -> FormatRow:
-    """Return the row of a plug-in; LidarError for a plug-in that cannot be used."""
+    """Return the row of a plug-in.
+
+    Raises LidarError for a plug-in that cannot be used.
+    """
     row = plugin.load(FormatRow)
     if row.data_set:
         raise LidarError(

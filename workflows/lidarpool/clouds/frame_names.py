@@ -24,7 +24,7 @@ def points_topic(name: str, frame: str) -> str:
 
 
 def survey_start_ns(sweeps: Sweeps) -> int:
-    """Return the start of a survey, ns since 1970-01-01 UTC; `START_NS` without a date.
+    """Return the start of a survey, ns since 1970-01-01 UTC, or `START_NS` without a date.
 
     Not 0: at time 0, tf2 would take the newest frames for all times.
     """

@@ -172,7 +172,7 @@ def _camera(sweeps: Sweeps, sensor: int) -> Floats:
 
 
 def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
-    """Return the lines of label_2, without a picture; truncation and occlusion are not computed.
+    """Return the lines of label_2, without a picture, so without truncation and occlusion.
 
     The position is the middle of the underside; boxes are turned about the camera's y alone.
     """
@@ -265,7 +265,10 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
 
 
 def _matrices(path: Path) -> Floats:
-    """Return the matrices (n, 3, 4) of a file, one in each line; ValueError names a wrong line."""
+    """Return the matrices (n, 3, 4) of a file, one in each line.
+
+    Raises ValueError that names a wrong line.
+    """
     reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
     try:
         return reader.read(read_input_text(path).splitlines(), 1).reshape(-1, 3, 4)
@@ -274,7 +277,7 @@ def _matrices(path: Path) -> Floats:
 
 
 def _calibration(path: Path) -> Floats:
-    """Return the matrix (4, 4) from the lidar to the camera; the identity without a file."""
+    """Return the matrix (4, 4) from the lidar to the camera, or the identity without a file."""
     if path.exists():
         for number, line in enumerate(read_input_text(path).splitlines(), 1):
             key, _, values = line.partition(":")

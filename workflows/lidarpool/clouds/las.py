@@ -117,7 +117,7 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
 
 
 def _start_s(sweeps: Sweeps) -> float:
-    """Return the start of a survey in adjusted standard GPS time, seconds; 0 without a start."""
+    """Return the start of a survey in adjusted standard GPS time, seconds, or 0 without a start."""
     if sweeps.start_ns is None:
         return 0.0
     return (sweeps.start_ns - _GPS_NS) / 1e9 + _LEAP_S - _ADJUSTED_S
@@ -154,7 +154,10 @@ def _header(columns: set[str], sweeps: Sweeps, packets: _Packets | None) -> lasp
 
 
 def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, name: str) -> None:
-    """Set the grid of positions in a header; LidarError if the cloud is too wide."""
+    """Set the grid of positions in a header.
+
+    Raises LidarError if the cloud is too wide.
+    """
     lower, upper = np.asarray(cloud.bounds, np.float64)
     header.scales = np.full(3, precision_m)
     header.offsets = np.floor((lower + upper) / 2)
@@ -198,7 +201,10 @@ class _Packets:
 
     @classmethod
     def from_cloud(cls, cloud: CloudLike) -> _Packets | None:
-        """Return the packets of a cloud, or None without waveforms; reads the cloud once."""
+        """Return the packets of a cloud, or None without waveforms.
+
+        Reads the cloud once.
+        """
         if not getattr(cloud, "has_waveforms", False):  # clouds in files never have any
             return None
         kinds: set[tuple[int, int]] = set()
@@ -272,7 +278,10 @@ def _name(name: str) -> str:
 
 
 def open_file(source: RecordingSource) -> Recording:
-    """Open the points of a .las or .laz, in parts; a sample is read evenly in the file."""
+    """Open the points of a .las or .laz, in parts.
+
+    A sample is read evenly in the file.
+    """
     path = source.path
     with reading(source.name):
         system = las_system(path)
@@ -329,7 +338,10 @@ def _some_positions(reader: laspy.LasReader, count: int) -> Floats:
 
 
 def read_points(path: Path) -> FilePoints:
-    """Read the points of a .las or .laz; LidarError if they exceed the memory."""
+    """Read the points of a .las or .laz.
+
+    Raises LidarError if they exceed the memory.
+    """
     system = las_system(path)
     with open_las(path) as reader:
         check_count(reader.header.point_count)

@@ -131,7 +131,10 @@ def _layout(file: BinaryIO) -> tuple[int, int, int]:
 
 
 def _unpacked(file: BinaryIO, layout: struct.Struct, offset: int) -> tuple[int, ...]:
-    """Unpack numbers at an offset of a file; ValueError if the file is shorter."""
+    """Unpack numbers at an offset of a file.
+
+    Raises ValueError if the file is shorter.
+    """
     file.seek(offset)
     data = file.read(layout.size)
     if len(data) < layout.size:

@@ -219,7 +219,10 @@ def _no_map() -> bytes:
 
 
 class _Tables:
-    """Tables of a survey; tokens of rows are derived from the survey and the job."""
+    """Tables of a survey.
+
+    Tokens of rows are derived from the survey and the job.
+    """
 
     def __init__(self, sweeps: Sweeps, entry: Entry | None) -> None:
         self.sweeps = sweeps

@@ -98,13 +98,16 @@ def _write_messages(writer: Any, messages: _Messages, cloud: CloudLike, sweeps: 
 
 
 def _names(sweeps: Sweeps) -> list[str]:
-    """Return the names of the sensors for topics; "" for a single sensor without a name."""
+    """Return the names of the sensors for topics, "" for a single sensor without a name."""
     return plain_names(sweeps.sensors) if any(sweeps.sensors) else ["" for _ in sweeps.sensors]
 
 
 @dataclass(frozen=True)
 class _EncodedMessage:
-    """A message with further fields that are encoded already; the library writes both."""
+    """A message with further fields that are encoded already.
+
+    The library writes both.
+    """
 
     message: Any
     encoded_fields: bytes

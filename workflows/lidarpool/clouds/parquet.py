@@ -31,7 +31,7 @@ _GROUP_ROWS = 65_536
 
 
 class Pieces(pieces.Pieces):
-    """A file for each million points; units and meanings are in the metadata of the fields.
+    """A file for each million points, with units and meanings in the metadata of the fields.
 
     In a data set it is a partition, `points/job=7`, in groups of rows; readers of single sweeps
     read one or two groups.
@@ -115,7 +115,7 @@ class Reader(sweep_reader.Reader):
         return self._held[key]
 
     def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep; only groups of rows with its scans are read."""
+        """Return the points of a sweep, read from the groups of rows with its scans."""
         first, stop = self.sweeps.scans[sweep : sweep + 2].tolist()
         scan = pyarrow.dataset.field("scan")
         in_range = (scan >= first) & (scan < stop)

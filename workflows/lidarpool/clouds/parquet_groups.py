@@ -42,12 +42,18 @@ def check_groups(groups: Iterable[Any], columns: Sequence[str], size: int) -> No
 
 
 def group_allowance(size: int) -> Allowance:
-    """Return the allowance of groups of rows that are in memory together; `size` is in bytes."""
+    """Return the allowance of groups of rows that are in memory together.
+
+    `size` is in bytes.
+    """
     return Allowance(size, _ADVICE)
 
 
 def read_group(group: Any, columns: Sequence[str], allowance: Allowance) -> pa.Table:
-    """Read columns of a group of rows; LidarError above the allowance."""
+    """Read columns of a group of rows.
+
+    Raises LidarError above the allowance.
+    """
     allowance.take(_bytes_of(group, columns))
     # Threads of their own would be many beside those of the workers that load data.
     return group.to_table(columns=list(columns), use_threads=False)

@@ -22,7 +22,9 @@ from .recording import NoiseFilter, Read, Recording, RecordingSource
 
 
 class Pieces(pieces.Pieces):
-    """A file for each sweep, with all columns; red, green and blue are a single field `rgb`.
+    """A file for each sweep, with all columns.
+
+    Red, green and blue are a single field `rgb`.
 
     With times, points are in the sensor frame at their own firing, and times are seconds since the
     start of the sweep, as float32. Compensated points, and points of a cloud without times, are in
@@ -65,7 +67,7 @@ class Pieces(pieces.Pieces):
 
 
 def open_file(source: RecordingSource) -> Recording:
-    """Open a file as a sweep; VIEWPOINT has the pose of the sensor."""
+    """Open a file as a sweep, with the pose of the sensor from VIEWPOINT."""
     return _open_files(source, [source.path])
 
 

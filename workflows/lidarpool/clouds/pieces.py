@@ -35,7 +35,9 @@ WrittenRange = tuple[int, list[Any]]
 
 @dataclass(frozen=True)
 class Entry:
-    """A job in a data set; number and name distinguish its files from files of further jobs.
+    """A job in a data set.
+
+    Number and name distinguish its files from files of further jobs.
 
     `values` are the varied values, by name.
     """
@@ -85,7 +87,10 @@ class Pieces:
         return {}
 
     def write(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the files of pieces, a piece in memory at a time; OSError on failure."""
+        """Write the files of pieces, a piece in memory at a time.
+
+        Raises OSError on failure.
+        """
         count = 0
         details = []
         for number, points in enumerate(self.read(first, stop), first):
@@ -104,7 +109,7 @@ class Pieces:
         return [(first, min(first + size, count)) for first in range(0, count, size)]
 
     def finish(self, storage: Storage, written: Iterable[WrittenRange]) -> list[Any]:
-        """Write the shared files; return the details of all pieces.
+        """Write the shared files, and return the details of all pieces.
 
         LidarError if the cloud is not of these sweeps, or not in order; OSError.
         """
@@ -133,7 +138,9 @@ class RangeWriter:
     _mark: bytes = field(default_factory=lambda: secrets.token_hex(8).encode())
 
     def __call__(self, span: PieceRange) -> WrittenRange | None:
-        """Write the files of a range; OSError on failure.
+        """Write the files of a range.
+
+        Raises OSError on failure.
 
         Returns
         -------
@@ -163,7 +170,9 @@ class RangeWriter:
         self.storage.remove([_MARK])
 
     def write(self, workers: RangeWorkers | None = None) -> None:
-        """Write all files, in threads the ranges that workers have not written; OSError on failure.
+        """Write all files, in threads the ranges that workers have not written.
+
+        Raises OSError on failure.
 
         Raises
         ------

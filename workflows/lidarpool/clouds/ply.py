@@ -57,7 +57,9 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 
 class GrowingPly:
-    """A binary PLY file to which points are appended; the file is complete after `finish`.
+    """A binary PLY file to which points are appended.
+
+    The file is complete after `finish`.
 
     Open3D writes the first points to a temporary file, whose rows and header show its layout, and
     further points follow as such rows. The bytes are the same as if Open3D wrote all points at
@@ -285,7 +287,10 @@ def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
 
 
 def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
-    """Write a cloud with positions of a type; LidarError if Open3D reports an error."""
+    """Write a cloud with positions of a type.
+
+    Raises LidarError if Open3D reports an error.
+    """
     o3d = load_open3d()  # here, because read_cloud does not need it
     points = o3d.t.geometry.PointCloud()
     points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions, real))

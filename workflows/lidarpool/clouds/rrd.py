@@ -62,7 +62,9 @@ def write_rrd(
 
 @contextmanager
 def _recording_to(path: Path) -> Iterator[rr.RecordingStream]:
-    """Yield a recording that is written to a file; OSError if the file cannot be written.
+    """Yield a recording that is written to a file.
+
+    Raises OSError if the file cannot be written.
 
     Rerun's own writer logs the error of a full disk, and waits for ever: it writes to a pipe, from
     which a thread writes to the file.
@@ -92,7 +94,10 @@ def _recording_to(path: Path) -> Iterator[rr.RecordingStream]:
 
 
 def _copy(source: int, file: BinaryIO) -> None:
-    """Copy a pipe to a file; after an error, read on to the end, so that no writer waits."""
+    """Copy a pipe to a file.
+
+    After an error, read on to the end, so that no writer waits.
+    """
     error: OSError | None = None
     with open(source, "rb", buffering=0) as pipe:
         while data := pipe.read(_PIPE_BYTES):
@@ -196,7 +201,7 @@ class RerunLog:
 
 
 def _normals(corners: Floats32) -> Floats32:
-    """Return the unit normals (f, 3) of triangles (f, 3, 3); zero for triangles without area."""
+    """Return the unit normals (f, 3) of triangles (f, 3, 3), zero for triangles without area."""
     a, b, c = corners.swapaxes(0, 1)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)

@@ -125,7 +125,7 @@ def path_in_world(corners: Floats, origin: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class ActorBoxes:
-    """Boxes of the actors in a sweep, a in number, as of `Boxes`; metres, world coordinates."""
+    """Boxes of the actors in a sweep, a in number, as in `Boxes`, metres, world coordinates."""
 
     names: Sequence[str]
     types: Sequence[str]
@@ -209,7 +209,7 @@ class SweepSequence:
 
 
 def sendable(columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
-    """Return the columns of numbers, integers of 64 bits as float64; waveforms are left out."""
+    """Return the columns of numbers, integers of 64 bits as float64, without waveforms."""
     numbers = {name: values for name, values in columns.items() if values.dtype.kind in "biuf"}
     return {
         name: values.astype(_SENT_TYPES.get(values.dtype.str[1:], values.dtype), copy=False)

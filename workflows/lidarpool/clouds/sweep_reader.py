@@ -1,4 +1,4 @@
-"""Readers of single sweeps of a job in a data set; each format has a `Reader` of its own."""
+"""Readers of single sweeps of a job in a data set, a class `Reader` for each format."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ class Reader:
         raise NotImplementedError
 
     def read(self, sweep: int) -> PointColumns:
-        """Return the points of a sweep; any exception if they cannot be read."""
+        """Return the points of a sweep.
+
+        Raises any exception if the points cannot be read.
+        """
         raise NotImplementedError
 
     def expect(self, sweep: int) -> None:
@@ -72,7 +75,10 @@ class Reader:
         return path
 
     def rows(self, name: str, row: np.dtype[Any], count: int | None = None) -> AnyArray:
-        """Read a file of rows; ValueError for a partial row, or another number than `count`."""
+        """Read a file of rows.
+
+        Raises ValueError for a partial row, or another number than `count`.
+        """
         points_file = self.last
         self.last = name
         if self.storage.is_local:

@@ -56,7 +56,10 @@ class Pieces(pieces.Pieces):
         return super().spans()
 
     def write(self, storage: Storage, first: int, stop: int) -> WrittenRange:
-        """Write the tar files of ranges, a single file in memory at a time; OSError on failure."""
+        """Write the tar files of ranges, a single file in memory at a time.
+
+        Raises OSError on failure.
+        """
         count = 0
         boxes_of_sweeps = []
         for begin, end in self.spans():
@@ -142,7 +145,7 @@ class Reader(sweep_reader.Reader):
         return [_shard(self.entry, int(self._offsets[sweep, 0]))]
 
     def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep; only the bytes of the sweep are read."""
+        """Return the points of a sweep, and read only the bytes of the sweep."""
         _, first, stop = self._offsets[sweep].tolist()
         sample = self.storage.read(self.files(sweep)[0], first, stop)
         if len(sample) < stop - first:

@@ -36,7 +36,10 @@ _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  
 @dataclass(frozen=True)
 @checked_fields
 class Format:
-    """A format that a cloud is exported to; in YAML also just its name."""
+    """A format that a cloud is exported to.
+
+    In YAML, the format alone will do.
+    """
 
     format: Annotated[str, about(f"{_FILES}; or of a plug-in", json_schema_extra=_NAMES)]
     layout: Annotated[
@@ -266,7 +269,10 @@ class Format:
     def write_to_storage(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
     ) -> None:
-        """Write a multi-file format into a storage through workers; LidarError leaves no file."""
+        """Write a multi-file format into a storage through workers.
+
+        After a LidarError, no file is left.
+        """
         folder = Storage(storage.path(self.row.file))
         with explained(f"{folder} cannot be written"):
             try:

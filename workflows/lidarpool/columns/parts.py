@@ -43,12 +43,15 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
 
 def part_name(mark: str, job: int, first: int, stop: int) -> str:
-    """Return the name of the part of scans; repeated work writes the same bytes to the part."""
+    """Return the name of the part of scans.
+
+    Repeated work writes the same bytes to the part.
+    """
     return f"{mark}-{job:06d}-{first:08d}-{stop:08d}.npz"
 
 
 def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
-    """Return job, first scan and end from the name of a run's part; None for foreign names."""
+    """Return job, first scan and end from the name of a run's part, or None for foreign names."""
     match = _PART.fullmatch(name)
     if match is None or match[1] != mark:
         return None
@@ -80,7 +83,7 @@ def deletable_files(storage: Storage, mark: str | None) -> list[str]:
 
 
 def _mark_of(name: str) -> str:
-    """Return the mark in the name of a file of a run; empty for foreign names."""
+    """Return the mark in the name of a file of a run, or no text for foreign names."""
     match = _PART.fullmatch(name) or _OTHER.fullmatch(name)
     return match[1] if match else ""
 
@@ -112,7 +115,7 @@ def pack(part: PartColumns) -> bytearray:
 
 
 def unpack(data: bytes) -> PartColumns:
-    """Inverse of `pack`; every array's checksum is compared.
+    """Inverse of `pack`, which compares the checksum of every array.
 
     LidarError if the data is not a part, or damaged; the message is a clause.
     """
@@ -138,7 +141,10 @@ def unpack(data: bytes) -> PartColumns:
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
-    """Read a part; LidarError if the part is missing, unreadable or damaged."""
+    """Read a part.
+
+    Raises LidarError if the part is missing, unreadable or damaged.
+    """
     try:
         return unpack(storage.read(name))
     except LidarError as error:
@@ -152,7 +158,10 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
 
 def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
-    """Read only the triangles of a part and the hits of each; errors as of `read_part`."""
+    """Read only the triangles of a part and the hits of each.
+
+    Raises the errors of `read_part`.
+    """
     if not storage.is_local:
         part = read_part(storage, name)
         return part.triangles, part.hits
@@ -168,7 +177,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 @dataclass(eq=False, repr=False)
 class StoredCloud(CloudDisplay):
-    """The points of parts in (scan, ray) order, read in chunks; a `CloudLike`."""
+    """The points of parts in (scan, ray) order, read in chunks, as a `CloudLike`."""
 
     storage: Storage  # of the parts
     names: Sequence[str]  # of the parts, in scan order
@@ -194,7 +203,7 @@ class StoredCloud(CloudDisplay):
 
     @property
     def bounds(self) -> Floats:
-        """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
+        """Lowest and highest coordinates, (2, 3), metres, or zeros without points."""
         if self.cells is None:
             return np.zeros((2, 3))
         return positions_of(self.cells, self.precision_m, self.origin)

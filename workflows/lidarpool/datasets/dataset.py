@@ -77,7 +77,9 @@ def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
 @dataclass(frozen=True)
 @checked_fields
 class DataSet:
-    """The files of many jobs in a folder or storage; small when pickled, any process writes jobs.
+    """The files of many jobs in a folder or storage.
+
+    The object is small when pickled. Any process writes jobs.
 
     - kitti: `sequences/07` of job 7, of further sensors `sequences/07_NAME`
     - nuscenes: a scene for each job; `finish` writes the tables
@@ -137,7 +139,9 @@ class DataSet:
         *,
         listing: Listing | None = None,
     ) -> JobRow:
-        """Write the files of a job, always the same bytes; return its row with counts of points.
+        """Write the files of a job, always the same bytes.
+
+        Returns its row with counts of points.
 
         Points are read in order, a sweep at a time or, for Parquet, a million. Every file appears
         completely or not at all. `made_of` has names and hashes of the input files of the job;
@@ -192,7 +196,10 @@ class DataSet:
         return row
 
     def write_failed(self, rows: Iterable[JobRow]) -> None:
-        """Write the manifests of jobs that have failed; LidarError on failure."""
+        """Write the manifests of jobs that have failed.
+
+        Raises LidarError on failure.
+        """
         with explained(f"{self.storage} cannot be written"):
             storage = Listing.from_storage(self.storage)
             failed = (row for row in rows if not row.done)
@@ -320,7 +327,10 @@ class DataSet:
             yield name, row, damaged_file
 
     def _manifest(self, name: str) -> dict[str, Any]:
-        """Read the manifest of a job; empty if missing, damaged or of another job."""
+        """Read the manifest of a job.
+
+        The manifest is empty if missing, damaged or of another job.
+        """
         try:
             manifest: dict[str, Any] = json.loads(self.storage.read(manifest_file(name)))
             valid = manifest.pop("crc") == _crc(manifest)
@@ -383,7 +393,7 @@ def _crc(manifest: Mapping[str, Any]) -> int:
 
 
 def _write_pieces(pieces: Pieces, storage: Storage) -> list[Any]:
-    """Write all pieces of a job; return their details."""
+    """Write all pieces of a job, and return their details."""
     # In an object store each file takes a request.
     spans = [(0, len(pieces))] if storage.is_local else pieces.spans(_REQUESTS)
     with ThreadPoolExecutor(_REQUESTS, "write") as pool:

@@ -28,7 +28,7 @@ _LETTER = 11.5  # width of a letter of a label, pixels
 
 
 def rank_correlation(a: AnyArray, b: AnyArray) -> float | None:
-    """Return Spearman's rank correlation, with mean ranks for ties; None for constant values.
+    """Return Spearman's rank correlation, with mean ranks for ties, or None for constant values.
 
     Examples
     --------
@@ -62,7 +62,7 @@ class Varied:
         return np.bincount(self.known_values.astype(np.intp), minlength=len(self.labels))
 
     def folded(self) -> Varied:
-        """Return at most `MAX_LABELS` labels; the rarest labels share the last label."""
+        """Return at most `MAX_LABELS` labels, the last shared by the rarest labels."""
         labels = self.labels
         if len(labels) <= MAX_LABELS:
             return self

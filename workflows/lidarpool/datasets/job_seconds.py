@@ -50,7 +50,7 @@ def read_seconds(storage: Storage) -> Mapping[int, float]:
 
 
 def known_seconds(storage: Storage) -> Mapping[int, float]:
-    """Return the casting times of jobs as `read_seconds`; empty if the file is unusable."""
+    """Return the casting times of jobs as `read_seconds`, or {} if the file is unusable."""
     try:
         return read_seconds(storage)
     except LidarError:

@@ -181,7 +181,10 @@ class Tally:
 
     @property
     def classes(self) -> dict[int, int]:
-        """Points of each class that has any, {class: points}; empty without a column ``class``."""
+        """Points of each class that has any, {class: points}.
+
+        The result is empty without a column ``class``.
+        """
         return dict(sorted(self._classes.items()))
 
     @property
@@ -326,7 +329,10 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
 
 
 def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> JobRow:
-    """Return the job of a row of jobs.csv; ValueError for an invalid row."""
+    """Return the job of a row of jobs.csv.
+
+    Raises ValueError for an invalid row.
+    """
     if len(cells) != len(header):
         raise ValueError(f"{len(cells)} cells in {len(header)} columns")
     first = len(_HEAD)

@@ -53,7 +53,7 @@ class _Run:
 
 
 class SavedSweeps:
-    """A sequence of the sweeps of a data set in an order; see `sweeps`.
+    """A sequence of the sweeps of a data set in an order, made by `sweeps`.
 
     An item is read on access; a loop reads ahead in threads. Several threads may access items, and
     forked processes or processes with a pickled copy. `classes` are names of semantic classes,
@@ -90,7 +90,10 @@ class SavedSweeps:
         return self.ahead(range(len(self)))
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Yield the sweeps of these indices in order; the next sweeps are read meanwhile."""
+        """Yield the sweeps of these indices in order.
+
+        The next sweeps are read meanwhile.
+        """
         if self._storage.is_local and self._written.row.raw:
             # Handing such a sweep from thread to thread takes as long as reading it.
             upcoming, current = tee(map(self._locate, indices))
@@ -288,7 +291,10 @@ def sweeps(
 
 
 def read_index(storage: Storage) -> dict[str, Any]:
-    """Read the index of a data set, with jobs by number; LidarError if the set is unfinished."""
+    """Read the index of a data set, with jobs by number.
+
+    Raises LidarError if the set is unfinished.
+    """
     refuse_missing(storage, "give the folder of a data set, the --out of a campaign.")
     try:
         head = unsealed(storage.read(INDEX_FILE))

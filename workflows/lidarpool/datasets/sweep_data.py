@@ -56,7 +56,7 @@ class Sweep:
         boxes: Boxes | None,
         index: int | EllipsisType = ...,
     ) -> Sweep:
-        """Return a sweep by its number in the job; boxes and index as of `SweepBoxes.select`."""
+        """Return a sweep by its number in the job, with boxes and index of `SweepBoxes.select`."""
         return cls(
             job.name,
             job.number,
@@ -89,15 +89,21 @@ class Sweep:
 
     @property
     def intensity(self) -> Floats32 | None:
-        """Received energy, float32 (n,), see the column; None if the data set lacks the column."""
+        """Received energy, float32 (n,).
+
+        The value is None if the data set lacks the column.
+        """
         return self.columns.get("intensity")
 
     @property
     def classes(self) -> NDArray[np.uint16] | None:
-        """Semantic classes, uint16 (n,), 0 for none; None if the data set lacks the column."""
+        """Semantic classes, uint16 (n,), 0 for points without a class.
+
+        The value is None if the data set lacks the column.
+        """
         return self.columns.get("class")
 
     @property
     def objects(self) -> Ints32 | None:
-        """Instances, int32 (n,), indices into `object_names`; None if the column is missing."""
+        """Instances, int32 (n,), indices into `object_names`, or None if the column is missing."""
         return self.columns.get("object")

@@ -1,4 +1,7 @@
-"""Sweeps for PyTorch; imported by `torch()` of sweeps alone, since torch may not be installed."""
+"""Sweeps for PyTorch.
+
+Imported by `torch()` of sweeps alone, since torch may not be installed.
+"""
 
 from __future__ import annotations
 

@@ -374,7 +374,7 @@ def _grid_positions(scene: Scene, spacing_m: float) -> tuple[Floats, tuple[int, 
 
 
 def _floor_heights(scene: Scene, caster: RayCaster, positions: Floats) -> Floats:
-    """Return the heights (c,) of the floor at x and y of positions, local; infinite for none."""
+    """Return the heights (c,) of the floor at x and y of positions, infinite without a floor."""
     origins = positions.copy()
     up = np.tile([0.0, 0.0, 1.0], (len(origins), 1))
     origins[:, 2] = scene.bounds[0, 2] - 1
@@ -480,7 +480,7 @@ def _sample_surfaces(scene: Scene) -> _SurfaceSamples:
 def _sample_triangles(
     rng: np.random.Generator, face_areas: Floats, areas: Floats, counts: Ints
 ) -> Ints:
-    """Draw triangles (n,) by their areas, `counts` for each object; triangles are by object."""
+    """Draw triangles (n,) by their areas, `counts` for each object, sorted by object."""
     owner = np.repeat(np.arange(len(counts)), counts)
     nth = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     offsets = (nth + rng.random(len(owner))) / counts[owner] * areas[owner]

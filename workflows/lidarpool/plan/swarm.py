@@ -1,4 +1,4 @@
-"""A particle swarm: moves particles, and records the best; its random numbers."""
+"""A particle swarm, which moves particles and records the best, and its random numbers."""
 
 from __future__ import annotations
 

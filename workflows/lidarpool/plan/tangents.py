@@ -29,7 +29,10 @@ Graph = dict[int, list[tuple[int, float]]]  # {node: [(neighbour, length of the 
 
 
 class _Tangents(NamedTuple):
-    """Common tangents; tangent t touches circle `circles[t, 0]` at `contacts[t, 0]`, and so on."""
+    """Common tangents.
+
+    Tangent t touches circle `circles[t, 0]` at `contacts[t, 0]`, and so on.
+    """
 
     circles: Indices  # (t, 2)
     contacts: Floats  # (t, 2, 2)
@@ -157,7 +160,10 @@ def _free_tangents(
 
 
 def _graph(tangents: _Tangents, centres: Floats, radii: Floats) -> Graph:
-    """Return the graph of tangents and arcs; nodes 0 and 1 are start and target."""
+    """Return the graph of tangents and arcs.
+
+    Nodes 0 and 1 are start and target.
+    """
     graph: Graph = defaultdict(list)
 
     def connect(node: int, neighbour: int, length: float) -> None:
@@ -209,7 +215,7 @@ def _open_arcs(
 
 
 def _dijkstra(graph: Graph, source: int, sink: int) -> float:
-    """Return the length of the shortest path from `source` to `sink`; inf without a path."""
+    """Return the length of the shortest path from `source` to `sink`, or inf without a path."""
     best = {source: 0.0}
     queue = [(0.0, source)]
     while queue:

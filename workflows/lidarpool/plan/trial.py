@@ -1,4 +1,4 @@
-"""A trial, which runs a swarm on any worker; and the plan, the best of the trials."""
+"""A trial, which runs a swarm on any worker, and the plan, which is the best of the trials."""
 
 from __future__ import annotations
 

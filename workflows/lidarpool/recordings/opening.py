@@ -33,7 +33,7 @@ _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if
 
 
 class UnknownFormatError(LidarError):
-    """The format of a file or folder is not read; `advice` is a clause, or empty."""
+    """The format of a file or folder is not read, with `advice`, a clause or no text."""
 
     def __init__(self, name: str, advice: str) -> None:
         super().__init__(f"{name} is not read: {advice}give {KINDS}.")
@@ -41,7 +41,9 @@ class UnknownFormatError(LidarError):
 
 
 def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, Recording]:
-    """Open all sensors, or topics, of a recording, {name: recording}; "" for a single one.
+    """Open all sensors, or topics, of a recording, {name: recording}.
+
+    A single sensor has the name "".
 
     Of several sequences with coordinates of their own, the first.
 
@@ -71,7 +73,9 @@ def open_recording(
     unit: str | None = None,
     keep_noise: bool = False,
 ) -> Recording:
-    """Open a cloud or recording: `KINDS`; or a cloud in memory, which has sweeps if of a result.
+    """Open a cloud or recording of `KINDS`, or a cloud in memory.
+
+    A cloud in memory has sweeps if it belongs to a result.
 
     `sensor` chooses one of several sensors, or the topic of a bag; `intensity` is the column of the
     intensity, if not one of the usual names; `name` is that of a cloud in memory; `unit` is that of

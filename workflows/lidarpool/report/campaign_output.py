@@ -84,7 +84,10 @@ class DataSetOutput(Output[CampaignRun]):
     # -- existing files -----------------------------------------------------------------------
 
     def begin(self, run: Run[CampaignRun]) -> CampaignRun | None:
-        """Refuse, remove or check a finished data set; return its sums if no job is left to do."""
+        """Refuse, remove or check a finished data set.
+
+        Returns its sums if no job is left to do.
+        """
         storage = self.dataset.storage
         options = run.options
         run_folder = storage.below(RUN_FOLDER)
@@ -273,7 +276,10 @@ def _is_tabled(storage: Storage, rows: Sequence[JobRow]) -> bool:
 
 
 def read_notes(storage: Storage) -> list[str]:
-    """Return the notes in the report of a data set; a note says if the report is unusable."""
+    """Return the notes in the report of a data set.
+
+    A note says if the report is unusable.
+    """
     try:
         notes = json.loads(storage.read(LAST_FILE))["notes"]
         if isinstance(notes, list):
@@ -290,7 +296,9 @@ def write_shared(
     sums: CampaignRun,
     rows: Callable[[], Iterator[JobRow]],
 ) -> tuple[CampaignRun, dict[str, Any]]:
-    """Write the shared files of a data set; the last file marks the data set as complete.
+    """Write the shared files of a data set.
+
+    The last file marks the data set as complete.
 
     `record` is for CAMPAIGN_FILE. Returns the sums, with names of classes, and the content of
     report.json.
@@ -395,7 +403,7 @@ def verify(storage: Storage, number: int | None = None) -> str:
 
 
 def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
-    """Check that a data set is of this campaign and software; return its record.
+    """Check that a data set is of this campaign and software, and return its record.
 
     LidarError names each difference.
     """
@@ -434,7 +442,10 @@ def dataset_files(storage: Storage, *, begun: bool) -> list[str]:
 
 
 def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
-    """Remove a data set and its run; LidarError, before any removal, for further files."""
+    """Remove a data set and its run.
+
+    Raises LidarError, before any removal, for further files.
+    """
     begun = CAMPAIGN_FILE in storage.sizes() or FILE in run_folder.sizes()
     files = dataset_files(storage, begun=begun)
     with explained(f"{storage} cannot be removed"):

@@ -169,7 +169,7 @@ def _remarks(figures: Figures, informative: Varied | None, hidden: int) -> str:
 
 
 def _most_informative(scales: Sequence[Varied], points: Floats, is_done: Bools) -> Varied | None:
-    """Return the quantity of few labels whose groups differ most in points; None without any."""
+    """Return the quantity of few labels whose groups differ most in points, or None without any."""
     variances = {}  # {quantity: variance of the means of its groups}
     for scale in scales:
         is_known = is_done & np.isfinite(scale.values)
@@ -181,7 +181,7 @@ def _most_informative(scales: Sequence[Varied], points: Floats, is_done: Bools) 
 
 
 def draw_results(figures: Figures) -> Page | None:
-    """Draw how points and hits are distributed over jobs; None if no job is done."""
+    """Draw how points and hits are distributed over jobs, or None if no job is done."""
     is_done = ~figures.failures
     points, rays, hits = (figures.per_job(name)[is_done] for name in ("points", "rays", "hits"))
     with np.errstate(invalid="ignore"):
@@ -193,14 +193,14 @@ def draw_results(figures: Figures) -> Page | None:
 
 
 def draw_times(figures: Figures) -> Page | None:
-    """Draw how casting times are distributed over jobs; None if no job is done."""
+    """Draw how casting times are distributed over jobs, or None if no job is done."""
     seconds = figures.per_job("seconds")[~figures.failures]
     quantity = Varied("casting a job, all its tasks, s", seconds)
     return _draw_distributions((quantity,), "What it took", "Jobs by casting time")
 
 
 def _draw_distributions(quantities: Sequence[Varied], title: str, caption: str) -> Page | None:
-    """Draw the numbers of jobs by quantities, side by side; None without any job."""
+    """Draw the numbers of jobs by quantities, side by side, or None without any job."""
     if not len(quantities[0].values):
         return None
     height = 250
@@ -317,7 +317,7 @@ def _draw_percentiles(
 
 
 def _groups_of_near(x: Floats, jobs: Indices) -> list[Indices]:
-    """Return groups of jobs with near values x (jobs,), in their order; none of too few jobs.
+    """Return groups of jobs with near values x (jobs,), in their order, or none for too few jobs.
 
     Jobs with equal values are in one group.
     """

@@ -84,7 +84,7 @@ class CloudCounts:
             )
 
     def add_positions(self, points: StoredCloud, path: Path, *, from_above: bool) -> None:
-        """Add the positions of all points, from their PLY file; see `PositionCounts`.
+        """Add the positions of all points, from their PLY file, as in `PositionCounts`.
 
         `above` is counted only if `from_above`, because it takes as long as all else.
         """
@@ -118,7 +118,9 @@ class CloudCounts:
 
 
 class PositionCounts:
-    """Numbers of points in a grid and seen from above; the bounds of all points must be known.
+    """Numbers of points in a grid and seen from above.
+
+    The bounds of all points must be known.
 
     `above` (rows, columns) are the numbers of points seen from above, the first row in the south.
 
@@ -167,7 +169,7 @@ class PositionCounts:
 
     @property
     def density(self) -> float | None:
-        """Points per square metre, the median over the surfaces; None without points."""
+        """Points per square metre, the median over the surfaces, or None without points."""
         if not self._cells.any():
             return None
         cells = self._cells.reshape(3 * (_CELLS,))

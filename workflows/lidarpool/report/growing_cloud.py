@@ -99,7 +99,7 @@ class CloudWriter:
             self.file.flush()
 
     def finish(self, points: StoredCloud, *, from_above: bool) -> CloudCounts:
-        """Complete the file; return the counts of all `points`, see `CloudCounts.add_positions`."""
+        """Complete the file, and return the counts of `points` as `CloudCounts.add_positions`."""
         self.file.finish()
         self.counts.add_positions(points, self._path, from_above=from_above)
         return self.counts
@@ -108,7 +108,7 @@ class CloudWriter:
 def write_cloud(
     path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene, *, from_above: bool
 ) -> CloudCounts:
-    """Write all points to a PLY file, which must not exist; return their counts.
+    """Write all points to a PLY file, which must not exist, and return their counts.
 
     See `CloudCounts.add_positions` for `from_above`.
 
@@ -174,7 +174,7 @@ class GrowingCloud:
         self._discard()
 
     def add(self, parts: Sequence[Receipt]) -> None:
-        """Append committed parts once all earlier scans are appended; return at once."""
+        """Append committed parts once all earlier scans are appended, and return at once."""
         if not parts:
             return
         self._committed_scans += sum(part.stop - part.first for part in parts)
@@ -184,7 +184,7 @@ class GrowingCloud:
             self._thread.start()
 
     def finish(self, path: Path, points: StoredCloud, *, from_above: bool) -> CloudCounts | None:
-        """Move the file to a path once it has all `points`; return their counts.
+        """Move the file to a path once it has all `points`, and return their counts.
 
         None if the file failed, or was never begun. See `CloudCounts.add_positions` for
         `from_above`.
@@ -233,7 +233,10 @@ class GrowingCloud:
                 self._append(part)
 
     def _append(self, part: _Part) -> None:
-        """Append a part with points; begin the file anew if its positions need another type."""
+        """Append a part with points.
+
+        If the positions need another type, the file is begun anew.
+        """
         self._check_room(part)
         cells = np.array(part.cell_box, np.int64).reshape(2, 3)
         if self._points.cells is not None:
@@ -253,7 +256,10 @@ class GrowingCloud:
             self._writer.flush()
 
     def _new_writer(self, position_type: np.dtype[np.floating]) -> CloudWriter:
-        """Return the writer of a new file; its number of points is estimated from the parts."""
+        """Return the writer of a new file.
+
+        Its number of points is estimated from the parts.
+        """
         rows = sum(part.rows for part in self._appended)
         scans = self._next_scan - self._job.scans.start
         expected_count = rows * len(self._job.scans) // scans

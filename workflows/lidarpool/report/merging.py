@@ -60,7 +60,9 @@ _AGAIN = "run their shards again with --resume (of a campaign --verify), and mer
 
 @dataclass(frozen=True)
 class _Part:
-    """Shards of a run in a folder; `record` is the content of CAMPAIGN_FILE of a data set.
+    """Shards of a run in a folder.
+
+    `record` is the content of CAMPAIGN_FILE of a data set.
 
     `run_size` is the number of all jobs or scans of the run; `told` are the notes of its report;
     points and trials are of a survey.
@@ -186,7 +188,10 @@ def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None
 
 
 def _read_part(storage: Storage) -> _Part:
-    """Read a finished shard, or data set of several shards; LidarError if damaged or unfinished."""
+    """Read a finished shard, or data set of several shards.
+
+    Raises LidarError if damaged or unfinished.
+    """
     refuse_missing(storage, "give the folder of a shard, the --out of lidarpool run --shard.")
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
@@ -203,7 +208,10 @@ def _read_part(storage: Storage) -> _Part:
 
 
 def _read_dataset(storage: Storage, shard_count: int = 1) -> _Part:
-    """Read a data set of shards; a complete data set has the `shard_count` shards."""
+    """Read a data set of shards.
+
+    A complete data set has the `shard_count` shards.
+    """
     record = read_record(storage)
     shards = [Shard.parse(text) for text in record["shards"]]
     if shards == [ALL]:
@@ -213,7 +221,9 @@ def _read_dataset(storage: Storage, shard_count: int = 1) -> _Part:
 
 
 def _read_survey(storage: Storage, run: Storage) -> _Part:
-    """Read a shard of a survey; LookupError for an unfinished shard or another run.
+    """Read a shard of a survey.
+
+    Raises LookupError for an unfinished shard or another run.
 
     LidarError if the database is damaged.
     """
@@ -243,7 +253,9 @@ def _read_survey(storage: Storage, run: Storage) -> _Part:
 
 
 def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) -> list[str]:
-    """Check that parts are of the same run and, unless `partial`, complete; return all notes.
+    """Check that parts are of the same run and, unless `partial`, complete.
+
+    Returns all notes.
 
     Shards of the `earlier` data set may be in further parts, too. LidarError names wrong parts.
     """
@@ -393,7 +405,10 @@ class _RowFile:
 
 
 def _take_jobs(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
-    """Take the jobs of a part into a data set; yield their rows, add files to `damaged`."""
+    """Take the jobs of a part into a data set.
+
+    Yields their rows, and adds files to `damaged`.
+    """
     for _, row, wrong in dataset.take(part.storage, fingerprint(dict(part.record["identity"]))):
         damaged += [wrong] if wrong else []
         if row is not None:
@@ -435,7 +450,10 @@ def _lacking(parts: Sequence[_Part], rows: Iterator[JobRow]) -> list[str]:
 
 
 def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
-    """Yield the rows of all jobs by number; of a job in several parts, a row that is done."""
+    """Yield the rows of all jobs by number.
+
+    Of a job in several parts, a row that is done is taken.
+    """
     number = attrgetter("number")
     tables = [file.rows() for file in files]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
@@ -482,7 +500,10 @@ class _Merged(SurveyOutput):
     casts = False
 
     def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
-        """Take all points into the run's store; LidarError names damaged files."""
+        """Take all points into the run's store.
+
+        Raises LidarError that names damaged files.
+        """
         store = run.store
         damaged = list[str]()
         only = store.only_job
@@ -490,7 +511,7 @@ class _Merged(SurveyOutput):
         assert only is not None, "of a survey"
 
         def take(source: Storage, part_file: Receipt) -> Receipt | None:
-            """Take a file and return its receipt; None if the file is missing or damaged."""
+            """Take a file and return its receipt, or None if the file is missing or damaged."""
             name = part_name(mark, 0, part_file.first, part_file.stop)
             with (
                 explained(f"{source.path(part_file.name)} cannot be taken"),

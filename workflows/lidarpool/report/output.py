@@ -50,7 +50,9 @@ _OF_FORMATS = {row.file: row for row in FORMATS.values() if row.file != CLOUD}
 
 @dataclass(eq=False)
 class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
-    """The result of a survey in a folder or storage; the run returns the result and its report.
+    """The result of a survey in a folder or storage.
+
+    The run returns the result and its report.
 
     `formats` are written beside the cloud. `extent` is "cloud"; "page" for the page and the content
     of pictures, too; or "pictures" for the pictures, too. `judge` returns a note on the result.
@@ -242,7 +244,10 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     def _write_cloud(
         self, path: Path, result: RunResult, sweeps: Sweeps, show: WritingProgress
     ) -> CloudCounts:
-        """Write the cloud, or move the file there that has grown; return the counts of points."""
+        """Write the cloud, or move the file there that has grown.
+
+        Returns the counts of points.
+        """
         points = _shown_points(result, CLOUD, show)
         on_page = self.extent != "cloud"
         with explained(f"{path} cannot be written"):
@@ -287,7 +292,7 @@ def _shown_points(result: RunResult, file: str, show: WritingProgress) -> Stored
 
 
 def _write_sweeps(staged: Path, result: RunResult, sweeps: Sweeps) -> Sweeps:
-    """Write the sweeps, and instruments if any; return sweeps that refer to these files."""
+    """Write the sweeps, and instruments if any, and return sweeps that refer to these files."""
     sweeps.save(staged / SWEEPS_FILE)
     instruments = sweeps.instruments
     if instruments is None:
@@ -339,7 +344,7 @@ class _Earlier(NamedTuple):
 
 
 def _earlier(storage: Storage) -> _Earlier:
-    """Return the result in a folder; empty if there is no result, or a damaged result."""
+    """Return the result in a folder, or no text if there is no result, or a damaged result."""
     try:
         report = json.loads(storage.read(REPORT))
         identity = {name: report["identity"][name] for name in _SURVEY}

@@ -105,7 +105,10 @@ def draw_pictures(
 def _picture_makers(
     shown: PictureContent, cloud: Path, size: tuple[int, int], colour: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw pictures; the file `cloud` is read on demand."""
+    """Return functions that draw pictures.
+
+    The file `cloud` is read on demand.
+    """
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
@@ -226,7 +229,10 @@ def farthest(path: Floats, other: Floats) -> float:
 
 
 def _path_axes(page: Page, limits: Floats, origin: Floats) -> Axes:
-    """Add axes in world coordinates with local limits (2, 2); `origin` (2,) is the local origin."""
+    """Add axes in world coordinates with local limits (2, 2).
+
+    `origin` (2,) is the local origin.
+    """
     (x0, y0), (x1, y1) = limits.tolist()
     axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
     step = nice_step((x1 - x0) / 8)

@@ -30,7 +30,10 @@ _CONNECT_TIMEOUT = "30s"  # for a host to answer
 
 
 class WorkerGroup(BaseModel):
-    """Workers of a partition; extra fields override arguments of the cluster."""
+    """Workers of a partition.
+
+    Extra fields override arguments of the cluster.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
 
@@ -52,7 +55,7 @@ class WorkerGroup(BaseModel):
         return f"{self.adapt[0]} to {self.worker_limit}" if self.adapt else str(self.worker_limit)
 
     def mistake(self) -> str:
-        """Return a message about a wrong number of workers; empty if there is no mistake."""
+        """Return a message about a wrong number of workers, or no text if there is no mistake."""
         if self.adapt is None:
             return "" if self.idle_s is None else "idle_s needs adapt beside it, such as [0, 8]."
         if "workers" in self.model_fields_set:
@@ -64,7 +67,7 @@ class WorkerGroup(BaseModel):
 
 
 class ClusterFile(BaseModel):
-    """The cluster to start; see docs/how-to/queues.md."""
+    """The cluster to start, as docs/how-to/queues.md describes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -159,7 +162,10 @@ class ClusterFile(BaseModel):
             yield cluster
 
     def _factory(self) -> Any:
-        """Import and return the class of the cluster; LidarError if the class is no cluster."""
+        """Import and return the class of the cluster.
+
+        Raises LidarError if the name is not of such a class.
+        """
         package, _, name = self.cluster.rpartition(".")
         try:
             # Keeps the signal handlers of this process: dask-jobqueue installs its own.

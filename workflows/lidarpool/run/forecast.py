@@ -250,7 +250,7 @@ def _disk_mistakes(disk: dict[str, Any], *, stored: bool) -> list[str]:
 
 
 def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
-    """Return a message if the memory is too small; 0 available bytes are unknown."""
+    """Return a message if the memory is too small, where 0 available bytes are unknown."""
     if not available_bytes or available_bytes >= required_bytes:
         return []
     return [
@@ -261,7 +261,10 @@ def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
 
 
 def _unseen(job: Job) -> dict[str, list[str]]:
-    """Return the names of the objects that sensors do not see; sensors that see all are missing."""
+    """Return the names of the objects that sensors do not see.
+
+    The result lacks sensors that see all.
+    """
     scene = job.scene
     pairs = zip(job.survey.carried, unseen_objects(scene, job.survey), strict=True)
     names = scene.all_names
@@ -305,7 +308,10 @@ def _existing(folder: Path) -> Path:
 
 
 def _folder_notes(location: Path | Storage) -> list[str]:
-    """Return notes on the folder of a result; LidarError if the folder cannot be written."""
+    """Return notes on the folder of a result.
+
+    Raises LidarError if the folder cannot be written.
+    """
     if isinstance(location, Storage):
         location.claim()  # leaves nothing
     elif not (folder := _existing(location)).is_dir():

@@ -36,7 +36,9 @@ CONTENT = ("scene", "survey", "planning")  # the fields of a job that its result
 
 
 def identity_of(job: Job) -> dict[str, str]:
-    """Return fingerprints of the inputs of a job; equal fingerprints give equal bytes.
+    """Return fingerprints of the inputs of a job.
+
+    Equal fingerprints give equal bytes.
 
     JobError if a sensor, column or trajectory has a field without a fingerprint.
     """
@@ -77,7 +79,7 @@ class Jobs(Protocol):
 
     @property
     def only_job(self) -> Job | None:
-        """The job of a survey, whose points and frames the run returns; None for a campaign."""
+        """The job of a survey, whose points and frames the run returns, or None for a campaign."""
         ...
 
     @property
@@ -92,7 +94,7 @@ class Jobs(Protocol):
 
     @property
     def title(self) -> str:
-        """Title of all jobs, for pages; empty for none."""
+        """Title of all jobs, for pages, or no text."""
         ...
 
     @property
@@ -116,7 +118,10 @@ class Jobs(Protocol):
         ...
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Make a job with additional columns; `cache` has scenes that jobs share."""
+        """Make a job with additional columns.
+
+        `cache` has scenes that jobs share.
+        """
         ...
 
     def name(self, number: int) -> str:
@@ -124,7 +129,7 @@ class Jobs(Protocol):
         ...
 
     def split(self, number: int) -> str:
-        """Return the name of a job's split; empty for none."""
+        """Return the name of a job's split, or no text without splits."""
         ...
 
     def values(self, number: int) -> Mapping[str, Value]:
@@ -255,7 +260,10 @@ class JobMaker:
             return failed_row(self._jobs, number, reason)
 
     def _put(self, entry: Job | JobRow | BaseException | None) -> bool:
-        """Put a job, row or error into the queue; return False if the maker was stopped before."""
+        """Put a job, row or error into the queue.
+
+        Returns False if the maker was stopped before.
+        """
         while not self._stopped.is_set():
             scenes = [ready.scene for ready in [*self._ready.queue] if isinstance(ready, Job)]
             self._full = len({id(scene.vertices) for scene in scenes}) > MAX_SCENES

@@ -59,7 +59,10 @@ class RunOptions(TaskOptions):
     def with_pool(
         self, pool: PoolSection, overrides: Mapping[str, Any] = MappingProxyType({})
     ) -> RunOptions:
-        """Fill in a scenario's section `pool`; options in `overrides` that are not None stay."""
+        """Fill in a scenario's section `pool`.
+
+        Options in `overrides` that are not None stay.
+        """
         options = declared(pool, TaskOptions)
         options |= {name: overrides[name] for name in options if overrides.get(name) is not None}
         options["gpu_workers"] = self.gpu_workers or pool.gpu

@@ -20,7 +20,7 @@ LOOK_EVERY_S = 1.0
 
 
 class TrialPump:
-    """Runs the trials of a planning; `step` it until `finished`.
+    """Runs the trials of a planning, by `step` until `finished`.
 
     `earlier_trials` were finished by an earlier run.
     """
@@ -45,7 +45,7 @@ class TrialPump:
         return len(self.trials) == self.planning.trials
 
     def step(self) -> bool:
-        """Take results and submit more trials; return True if there were changes.
+        """Take results and submit more trials, and return True if there were changes.
 
         LidarError if a trial has failed.
         """

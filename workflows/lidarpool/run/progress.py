@@ -54,7 +54,7 @@ class Progress:
 
     @property
     def sweeps_in_words(self) -> str:
-        """Number of sweeps that are done, «12 of 100 sweeps»; empty for a campaign."""
+        """Number of sweeps that are done, «12 of 100 sweeps», or no text for a campaign."""
         return f"{self.sweeps_done:,} of {plural(self.sweeps, 'sweep')}" if self.sweeps else ""
 
 
@@ -81,32 +81,38 @@ class Pace:
         self._first: tuple[float, int] | None = None
 
     def rate(self, seconds: float, count: int) -> float:
-        """Return the rate, 1/s; 0 until the count has grown."""
+        """Return the rate, 1/s, or 0 until the count has grown."""
         start_s, first_count = self._first = self._first or (seconds, count)
         return (count - first_count) / (seconds - start_s) if seconds > start_s else 0.0
 
     def time_left(self, seconds: float, count: int, total: int) -> str:
-        """Return the remaining time in words; empty until the estimate is good, and at the end."""
+        """Return the remaining time in words.
+
+        The text is empty until the estimate is good, and at the end.
+        """
         rate = self.rate(seconds, count)
         sure = rate and (count >= SURE_SHARE * total or seconds >= SURE_S) and count < total
         return time_in_words((total - count) / rate) if sure else ""
 
     def text(self, seconds: float, count: int, total: int) -> str:
-        """Return rate and remaining time; empty until the count has grown."""
+        """Return rate and remaining time, or no text until the count has grown."""
         rate = self.rate(seconds, count)
         time_left = self.time_left(seconds, count, total)
         return f"{in_words(rate)}/s{f'  {time_left} left' if time_left else ''}" if rate else ""
 
 
 def waiting_reason(progress: Progress) -> str:
-    """Return why the run waits; empty if the run does not wait."""
+    """Return why the run waits, or no text if the run does not wait."""
     slots = progress.waits_for
     return f"waits for slots of {slots}, which other runs hold" if slots else ""
 
 
 @contextmanager
 def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
-    """Progress bars, created on first update; yields `update(name, count, total, unit)`."""
+    """Progress bars, created on first update.
+
+    Yields `update(name, count, total, unit)`.
+    """
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),
@@ -127,7 +133,10 @@ def progress_rows(console: Console) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def bars(console: Console) -> Iterator[Show]:
-    """Progress bars of the stages with rates and remaining time; yields their update function."""
+    """Progress bars of the stages with rates and remaining time.
+
+    Yields their update function.
+    """
     paces = {label: Pace() for label, _, _ in STAGES}
     with progress_rows(console) as move:
 
@@ -148,7 +157,7 @@ def bars(console: Console) -> Iterator[Show]:
 
 @contextmanager
 def bars_here() -> Iterator[Show]:
-    """Progress bars in a notebook cell or at a terminal; elsewhere, a function without effect."""
+    """Progress bars in a notebook cell or at a terminal, else a function without effect."""
     console = Console(stderr=cell_display() is None)
     if console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal):
         with bars(console) as show:
@@ -182,11 +191,17 @@ class Screen:
         return nullcontext()
 
     def writing(self, words: str) -> AbstractContextManager[WritingProgress]:
-        """Return a context that shows the progress of writing; its value is the update function."""
+        """Return a context that shows the progress of writing.
+
+        Its value is the update function.
+        """
         return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:
-        """Return a context that shows the progress of a run; its value is the update function."""
+        """Return a context that shows the progress of a run.
+
+        Its value is the update function.
+        """
         return bars_here() if self._on_progress is None else nullcontext(self._on_progress)
 
     def starting(

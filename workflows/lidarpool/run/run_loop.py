@@ -127,7 +127,9 @@ class RunLoop:
         return self._maker.ended and not self._store.under_way
 
     def step(self) -> bool:
-        """Begin jobs, step pipeline and writer once, and commit ended jobs; True after changes.
+        """Begin jobs, step pipeline and writer once, and commit ended jobs.
+
+        Returns True after changes.
 
         LidarError if a failure concerns all jobs.
         """
@@ -161,7 +163,7 @@ class RunLoop:
         return moved
 
     def _admit(self) -> bool:
-        """Begin jobs that are ready, if there is room; return True if any was begun."""
+        """Begin jobs that are ready, if there is room, and return True if any was begun."""
         moved = False
         max_under_way = EXTRA_JOBS + 2 * self._pipeline.workers.slot_count
         # Small jobs begin together, as many as have batches in one task, and go on together: then
@@ -236,7 +238,7 @@ class RunLoop:
         return JobFiles(row, under_way.points(), job.sweeps, job.made_of)
 
     def _fail(self, number: int, error: LidarError) -> None:
-        """Record the row of a failed job; raise the error if the run is a survey's."""
+        """Record the row of a failed job, or raise the error if the run is a survey's."""
         if self._store.only_job is not None:
             raise error
         self._rows.append(failed_row(self._store.jobs, number, error))
@@ -289,7 +291,9 @@ class RunLoop:
     # -- to the end --------------------------------------------------------------------------
 
     def run(self, first: Job, show: Show) -> None:
-        """Cast, write and plan all jobs; on any error, all tasks have been stopped.
+        """Cast, write and plan all jobs.
+
+        On any error, all tasks have been stopped.
 
         `first` is the first job, and `show` is called with the progress.
         """
@@ -317,7 +321,7 @@ class RunLoop:
             self._store.notes.append(note)
 
     def _loop(self, first: Job, show: Show) -> None:
-        """Step pipeline, writer and planning until all have finished; show progress meanwhile.
+        """Step pipeline, writer and planning until all have finished, and show progress meanwhile.
 
         `step` steps the first two until the last job has ended; then the stages of the pipeline are
         closed, and the loop waits for their end.
@@ -353,7 +357,7 @@ class RunLoop:
         self._store.notes += watch.notes
 
     def _step_survey(self, started: float, watch: Watch) -> bool:
-        """Step pipeline and writer until all jobs have ended; return True if anything moved.
+        """Step pipeline and writer until all jobs have ended, and return True if anything moved.
 
         `started` is the time when the loop started, by the monotonic clock, seconds.
         """
@@ -371,7 +375,7 @@ class RunLoop:
         return moved
 
     def _step_planning(self, started: float, watch: Watch) -> bool:
-        """Step the trials until all have finished; return True if anything moved."""
+        """Step the trials until all have finished, and return True if anything moved."""
         if self._trials is None or "planning" in self.times:
             return False
         moved = self._trials.step()

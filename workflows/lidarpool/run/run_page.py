@@ -17,7 +17,9 @@ from .store.job_under_way import JobUnderWay
 
 
 class RunPage:
-    """Live page of a run; this base class shows no page.
+    """Live page of a run.
+
+    This base class shows no page.
 
     Methods are called in the run's thread and must return at once, `look` in a thread that removes
     the parts of ended jobs.
@@ -27,7 +29,10 @@ class RunPage:
         """Show the only job of a run, and the results of an earlier run."""
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
-        """Show the work on these partitions from now on; jobs are written to the data set."""
+        """Show the work on these partitions from now on.
+
+        Jobs are written to the data set.
+        """
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Show parts of the only job that were committed."""
@@ -38,7 +43,9 @@ class RunPage:
     def on_progress(
         self, progress: Progress, under_way: Callable[[], Sequence[Mapping[str, Any]]]
     ) -> None:
-        """Show the progress; KeyboardInterrupt if a user of the page has stopped the run.
+        """Show the progress.
+
+        Raises KeyboardInterrupt if a user of the page has stopped the run.
 
         `under_way` returns `JobUnderWay.status` of the jobs that are being cast or written.
         """
@@ -56,4 +63,7 @@ class RunPage:
         """
 
     def stay(self, cloud: Path | None = None) -> None:
-        """Keep the page until its user ends the page; points are read from the written `cloud`."""
+        """Keep the page until its user ends the page.
+
+        Points are read from the written `cloud`.
+        """

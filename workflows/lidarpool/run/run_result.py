@@ -23,7 +23,9 @@ from .pipeline.task_records import TaskRecord
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """Result of a survey without files; `lidarpool.api.result` adds methods to its result.
+    """Result of a survey without files.
+
+    `lidarpool.api.result` adds methods to its result.
 
     Parameters
     ----------
@@ -75,7 +77,10 @@ class RunResult:
 
     @property
     def thinned(self) -> str:
-        """Clause on points that were thinned out, to follow their number; empty if all are kept."""
+        """Clause on points that were thinned out, to follow their number.
+
+        The clause is empty if all points are kept.
+        """
         keep_every = self.survey.keep_every
         return (
             f", one of every {keep_every:,} hits of a scan (keep_every)" if keep_every > 1 else ""
@@ -83,7 +88,7 @@ class RunResult:
 
     @property
     def records(self) -> tuple[TaskRecord, ...]:
-        """Tasks of the run, with worker and time; every n-th of a stage with thousands."""
+        """Tasks of the run, with worker and time, every n-th of a stage with thousands."""
         return tuple(record for totals in self.stages for record in totals.records)
 
     @cached_property
@@ -139,7 +144,7 @@ class CampaignRun:
     def from_rows(
         cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **details: Any
     ) -> CampaignRun:
-        """Sum up the rows of a campaign; by default all jobs are of an earlier run."""
+        """Sum up the rows of a campaign, where by default all jobs are of an earlier run."""
         failed = []
         job_count = 0
         points = 0

@@ -61,7 +61,7 @@ class Output(Generic[R]):
         return nullcontext()
 
     def begin(self, run: Run[R]) -> R | None:
-        """Refuse files that must not be replaced; return the result if no work is left."""
+        """Refuse files that must not be replaced, and return the result if no work is left."""
         return None
 
     def prepare(self) -> None:
@@ -71,7 +71,7 @@ class Output(Generic[R]):
         """Compare the output with the results of an earlier run in the store."""
 
     def on_parts(self, parts: Sequence[Receipt]) -> None:
-        """Note that parts of the only job were committed; return at once."""
+        """Note that parts of the only job were committed, and return at once."""
 
     def finish(self, run: Run[R]) -> R:
         """Write the last files, and return the result."""
@@ -144,7 +144,7 @@ class Run(Generic[R]):
             return self.output.finish(self)
 
     def warn_of_empty_jobs(self, rows: Iterable[JobRow]) -> list[str]:
-        """Warn if jobs of a campaign have no points; return the warning as notes."""
+        """Warn if jobs of a campaign have no points, and return the warning as notes."""
         empty = [row for row in rows if row.done and not row.points]
         if not empty:
             return []
@@ -204,7 +204,7 @@ class Run(Generic[R]):
         self.stack.enter_context(self.cluster_stack)
 
     def _first_job(self) -> Job | None:
-        """Return the first job that can be made; None if all scans are cast."""
+        """Return the first job that can be made, or None if all scans are cast."""
         if (only_job := self.store.only_job) is not None:
             return None if only_job.complete or not self.output.casts else only_job.job
         jobs = self.jobs
@@ -279,7 +279,7 @@ class Run(Generic[R]):
         )
 
     def _warn_of_empty_cloud(self, job: Job) -> None:
-        """Warn that the only job has no points; add a note unless the run is a shard."""
+        """Warn that the only job has no points, and add a note unless the run is a shard."""
         shard = self.jobs.shard
         scans = None if shard == ALL else shard.scans(job.survey.scan_count)
         reason = empty_cloud_reason(job.scene, job.survey, scans)

@@ -128,7 +128,7 @@ class StreamedJob(PipelineJob):
         self.points_read = 0
 
     def take(self, number: int) -> Sweep | None:
-        """Remove and return a sweep; None if scans of the sweep are not yet cast."""
+        """Remove and return a sweep, or None if scans of the sweep are not yet cast."""
         job = self.job
         survey = self.survey
         sweeps = self.job.sweeps
@@ -159,7 +159,7 @@ class StreamedJob(PipelineJob):
 
 
 class _Casting:
-    """Casts the sweeps of a stream; takes the role of stages 1 and 4 for the dispatcher."""
+    """Casts the sweeps of a stream, in the role of stages 1 and 4 for the dispatcher."""
 
     collector_count = 1
     collectors: Mapping[str, str] = MappingProxyType({"reader": ""})  # {name: address}
@@ -219,7 +219,7 @@ class _Casting:
             self._casting.release()
 
     def _step(self) -> bool:
-        """Step the dispatcher once; return True if there were changes."""
+        """Step the dispatcher once, and return True if there were changes."""
         moved = self._begin_sweeps()
         moved |= self._dispatcher.check()
         if (locations := self._casting.look()) is not None:
@@ -241,7 +241,7 @@ class _Casting:
         return moved
 
     def _begin_sweeps(self) -> bool:
-        """Begin further sweeps, at most `ahead` of the reader; return True if any was begun."""
+        """Begin further sweeps, at most `ahead` of the reader, and return True if any was begun."""
         begun_before = len(self._sweeps_under_way)
         while len(self._sweeps_under_way) < self._stream.ahead and (
             self._next or self._begin_job()
@@ -257,7 +257,7 @@ class _Casting:
         return len(self._sweeps_under_way) > begun_before
 
     def _begin_job(self) -> bool:
-        """Take the next job, which may fail; return False if no job is ready."""
+        """Take the next job, which may fail, and return False if no job is ready."""
         if (entry := self._maker.take()) is None:
             return False
         if isinstance(entry, JobRow):
@@ -284,7 +284,10 @@ class _Casting:
         return True
 
     def _fetch(self) -> bool:
-        """Fetch the columns of casting tasks from their workers; return True if any was ordered."""
+        """Fetch the columns of casting tasks from their workers.
+
+        Returns True if any columns were ordered.
+        """
         orders = self._orders
         self._orders = []
         for order in orders:
@@ -310,7 +313,10 @@ class _Casting:
         self._casting.remove(streamed.job.number)
 
     def _warn_if_empty(self, streamed: StreamedJob) -> None:
-        """Warn of the first job without points; this process casts rays to find the reason."""
+        """Warn of the first job without points.
+
+        This process casts rays to find the reason.
+        """
         if streamed.points_read or self._warned:
             return
         self._warned = True

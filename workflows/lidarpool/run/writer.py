@@ -42,7 +42,10 @@ MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
 
 
 class JobFiles(NamedTuple):
-    """Input for writing a job; `row` lacks the counts of points."""
+    """Input for writing a job.
+
+    `row` lacks the counts of points.
+    """
 
     row: JobRow
     cloud: StoredCloud
@@ -56,7 +59,7 @@ JobOutcome = JobRow | LidarError
 def write_jobs(
     dataset: DataSet, probes: tuple[Any, Any], jobs: Sequence[JobFiles]
 ) -> tuple[list[JobOutcome] | None, TaskRecord]:
-    """Write the files of jobs on a LIDAR worker; return a row or an error of each job.
+    """Write the files of jobs on a LIDAR worker, and return a row or an error of each job.
 
     None in place of the rows if the worker does not see the data set, or the parts.
     """
@@ -68,7 +71,10 @@ def write_jobs(
 
 
 def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
-    """Write a job; return its row, or a JobError, or a LidarError if the storage is the cause."""
+    """Write a job.
+
+    Returns its row, or a JobError, or a LidarError if the storage is the cause.
+    """
     listing = Listing.from_storage(dataset.storage)
     try:
         return dataset.write_job(*job, listing=listing)
@@ -84,7 +90,9 @@ def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
 
 
 class JobWriter:
-    """Has LIDAR workers write jobs into a data set; the driver writes jobs that they cannot see.
+    """Has LIDAR workers write jobs into a data set.
+
+    The driver writes jobs that they cannot see.
 
     `parts_probe` is a file among the parts of the `store`, name and content: a worker that does not
     see this file, or a similar file in the data set, writes no job.
@@ -127,7 +135,7 @@ class JobWriter:
         self._waiting.append(files)
 
     def step(self, slots: int, *, more_to_come: bool) -> list[tuple[JobFiles, JobOutcome]]:
-        """Submit waiting jobs to free slots; return written jobs with their rows or errors.
+        """Submit waiting jobs to free slots, and return written jobs with their rows or errors.
 
         Jobs wait a moment for others of their task if there are `more_to_come`. Errors of single
         jobs are JobErrors; other errors are of the storage, or of a worker's software.
@@ -220,7 +228,7 @@ class LidarWorkers:
         self._tasks = cluster.tasks(LIDAR)
 
     def __call__(self, writer: RangeWriter, spans: Sequence[PieceRange]) -> dict[PieceRange, Range]:
-        """Write ranges; return the results of ranges whose workers see the folder.
+        """Write ranges, and return the results of ranges whose workers see the folder.
 
         The range of a worker that dies is written by another worker. LidarError if a worker cannot
         write, several workers die of a range, or LIDAR has no worker for too long.
@@ -284,7 +292,7 @@ def _fetch_writer(key: str) -> RangeWriter:
 
 
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
-    """Write a range on a worker; return its result and the record of the task."""
+    """Write a range on a worker, and return its result and the record of the task."""
     recorder = Recorder(EXPORT, LIDAR)
     with explained(f"the worker {recorder.finish().worker} cannot write there"):
         written_range = _fetch_writer(key)(span)

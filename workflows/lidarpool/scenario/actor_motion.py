@@ -56,7 +56,10 @@ _ROBOT_FIELDS = {"file", "opacity", "assets"}  # fields of a mesh file that appl
 
 
 class MountSection(Section, InstrumentPose):
-    """Position and angles of a sensor on its carrier; in YAML also just [x, y, z]."""
+    """Position and angles of a sensor on its carrier.
+
+    In YAML, [x, y, z] alone will do.
+    """
 
     link: Annotated[
         Text | None,
@@ -76,7 +79,10 @@ MountEntry = Annotated[MountSection, by_position(MountSection)]
 
 
 class CarriedSection(SensorSection):
-    """A sensor of a carrier: its mount, start and steps; in YAML also just the model."""
+    """A sensor of a carrier: its mount, start and steps.
+
+    In YAML, the model alone will do.
+    """
 
     mount: MountEntry = MountSection()
     start_s: Annotated[
@@ -109,7 +115,10 @@ CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
 
 
 class TimedPose(Section, Pose):
-    """A pose at a time; if no pose has an angle, the carrier faces its direction of travel."""
+    """A pose at a time.
+
+    If no pose has an angle, the carrier faces its direction of travel.
+    """
 
     # Any number: `seconds_of` names the unit that too large numbers probably have.
     time_s: Annotated[float, about("seconds, by the clock of the trajectory", ge=-1e20, le=1e20)]
@@ -125,7 +134,10 @@ TimeUnitEntry = Annotated[
 
 
 class TrajectorySection(Section):
-    """Poses over time, from a file, points or traffic; in YAML also just the file's name."""
+    """Poses over time, from a file, points or traffic.
+
+    In YAML, the file's name alone will do.
+    """
 
     file: Annotated[
         Text | None,
@@ -276,7 +288,10 @@ TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection
 
 
 class JointTable(Section):
-    """Values of a robot's joints from a table; in YAML also just the file's name."""
+    """Values of a robot's joints from a table.
+
+    In YAML, the file's name alone will do.
+    """
 
     file: Annotated[Text, about("a table with a header, from the scenario's folder")]
     time_unit: TimeUnitEntry = None
@@ -284,7 +299,10 @@ class JointTable(Section):
 
 
 class ActorSection(DeformingSection):
-    """An object or robot that moves or stands; its axes have x ahead and z up."""
+    """An object or robot that moves or stands.
+
+    Its axes have x ahead and z up.
+    """
 
     name: Annotated[Text, about("name of the object")]
     file: Annotated[
@@ -344,7 +362,7 @@ class ActorSection(DeformingSection):
 
     @property
     def robot(self) -> MeshFile | None:
-        """File of the actor, if the file is a robot's; else None."""
+        """File of the actor, if the file is a robot's, else None."""
         return self.file if self.file and self.file.file.lower().endswith(ROBOTS) else None
 
     def track(self, path: PathOf, standing: StandingSurfaces, carrier: Track | None) -> Track:

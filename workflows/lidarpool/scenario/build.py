@@ -83,7 +83,9 @@ MESH_PRECISION_M = 0.001
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Job:
-    """A survey of a scene, possibly with path planning; jobs of a `Campaign` are numbered.
+    """A survey of a scene, possibly with path planning.
+
+    Jobs of a `Campaign` are numbered.
 
     A function that makes jobs for a `Campaign` gives scene, survey and values: the campaign
     numbers, names and splits the jobs.
@@ -152,7 +154,7 @@ class Job:
 
     @cached_property
     def sweeps(self) -> Sweeps:
-        """Sweeps with poses and boxes of actors; takes seconds for thousands of poses."""
+        """Sweeps with poses and boxes of actors, in seconds for thousands of poses."""
         return Sweeps.from_survey(self.survey, self.scene)
 
 
@@ -282,7 +284,7 @@ class _SurveyParts(NamedTuple):
 
 
 def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
-    """Return the trajectory of the carrier in local coordinates; None without a trajectory."""
+    """Return the trajectory of the carrier in local coordinates, or None without a trajectory."""
     scenario = shapes.scenario
     entry = scenario.trajectory
     if entry is None:
@@ -669,7 +671,7 @@ def _class_names(
 
 
 def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
-    """Build the planning in local coordinates; None if the scenario asks for none."""
+    """Build the planning in local coordinates, or None if the scenario asks for no planning."""
     section = scenario.planning
     x0, y0, _ = scene.origin
     start = section.start
@@ -699,7 +701,7 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
 
 
 def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]]:
-    """Return the obstacles as discs (m, 3): x, y, radius, local, metres; and their labels (m,).
+    """Return the obstacles as discs (m, 3) of x, y, radius, local, metres, and their labels (m,).
 
     By default all static objects higher than `FLAT_M` are obstacles. `planning.clearance_m` is not
     added to the radii.

@@ -150,7 +150,9 @@ class CampaignSpec:
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> CampaignSpec:
-        """Take scenario or mesh files as jobs, unchanged; a job has the name of its file.
+        """Take scenario or mesh files as jobs, unchanged.
+
+        A job has the name of its file.
 
         Raises
         ------
@@ -190,7 +192,9 @@ class CampaignSpec:
         return self._jobs.names
 
     def values(self, number: int) -> dict[str, Value]:
-        """Return the values of a job, {name: value}; the value of a sample is its number of rows.
+        """Return the values of a job, {name: value}.
+
+        The value of a sample is its number of rows.
 
         A value of None is left out. Of a function, the job is made.
         """
@@ -201,11 +205,11 @@ class CampaignSpec:
         return self._jobs.name(self._checked_number(number))
 
     def split(self, number: int) -> str:
-        """Return the name of a job's split; empty without splits."""
+        """Return the name of a job's split, or no text without splits."""
         return self._splits(self._checked_number(number))
 
     def scenario(self, number: int) -> Scenario | None:
-        """Return the scenario of a job; None if a function makes the job.
+        """Return the scenario of a job, or None if a function makes the job.
 
         LidarError if its values do not fit together; the message names job and values.
         """
@@ -218,7 +222,9 @@ class CampaignSpec:
         return PoolSection() if scenario is None else scenario.pool
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Make a job; equal numbers give equal jobs. Jobs plan no paths.
+        """Make a job.
+
+        Equal numbers give equal jobs. Jobs plan no paths.
 
         `cache` has static scenes of other jobs, which this job may share; `columns` are names of
         columns that the data set needs.

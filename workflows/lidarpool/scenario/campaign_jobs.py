@@ -67,7 +67,7 @@ class JobSource:
         return {}
 
     def scenario(self, number: int) -> Scenario | None:
-        """Return the scenario of a job; None if a function makes the job."""
+        """Return the scenario of a job, or None if a function makes the job."""
         return None
 
     @property
@@ -118,7 +118,10 @@ class FunctionJobs(JobSource):
     def job(
         self, number: int, cache: SceneCache | None, columns: Sequence[str], fields: Any
     ) -> Job:
-        """Make a job, and check its values; noise without a seed gets a seed of the job."""
+        """Make a job, and check its values.
+
+        Noise without a seed gets a seed of the job.
+        """
         job = self._call(number)
         if extra := [name for name in job.values if name not in self.names]:
             raise LidarError(
@@ -149,7 +152,10 @@ class FunctionJobs(JobSource):
         return Job(job.scene, survey, values=values, **fields)
 
     def _call(self, number: int) -> Job:
-        """Call the function; LidarError if the function fails or returns no job."""
+        """Call the function.
+
+        Raises LidarError if the function fails or returns no job.
+        """
         with prefixed(f"job {number}"):
             try:
                 job = self._make(number, JobRandom(self._seed, number, "make").generator())
@@ -400,7 +406,7 @@ class _Base:
             self.files |= dict.fromkeys(scenario.files, scenario)
 
     def _trials(self, text: str) -> list[Any]:
-        """Return values for a path that are valid if all jobs are; rows of a table in pieces."""
+        """Return values for a path that are valid if all jobs are, rows of a table in pieces."""
         choice = self._vary[text]
         if choice.sample is None:
             return choice.limit_values
@@ -430,7 +436,10 @@ class _Base:
                     yield f"{value_line}: {message}"
 
     def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
-        """Return the scenario with drawn values; noise without a seed gets `noise_seed`."""
+        """Return the scenario with drawn values.
+
+        Noise without a seed gets `noise_seed`.
+        """
 
         def new_value(text: str, value: Any) -> Any:
             if text not in changes:  # the seed
@@ -489,6 +498,9 @@ def file_hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
 
 @cache
 def _hash(path: Path, *_: int) -> str:
-    """Return the SHA-256 of a file; a file is read once for each of its states."""
+    """Return the SHA-256 of a file.
+
+    A file is read once for each of its states.
+    """
     with open_input(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -68,7 +68,9 @@ _DIGITS = 12  # that numbers are rounded to, so that tables are readable and hol
 
 
 class JobRandom:
-    """Random numbers of a job for a purpose; each call draws the next.
+    """Random numbers of a job for a purpose.
+
+    Each call draws the next.
 
     The numbers are hashes, the same on every machine and in every year: of the campaign's seed,
     the job's number, the purpose, and the count of earlier draws for the purpose. A quantity that
@@ -123,7 +125,10 @@ class JobRandom:
         return _within(_short(float(number)), minimum, maximum)
 
     def normal(self, mean: float, std: float, limits: tuple[float, float] | None = None) -> float:
-        """Draw a normally distributed number; numbers outside the limits are drawn again."""
+        """Draw a normally distributed number.
+
+        Numbers outside the limits are drawn again.
+        """
         minimum, maximum = limits or (mean - SIGMAS * std, mean + SIGMAS * std)
         while True:
             number = _short(mean + std * self._standard())
@@ -196,7 +201,10 @@ Weight = Annotated[float, Field(ge=0, le=1e9)]
 
 
 class Normal(Section):
-    """A normal distribution; outside `limits` numbers are drawn again."""
+    """A normal distribution.
+
+    Outside `limits` numbers are drawn again.
+    """
 
     mean: Annotated[float, about("mean")]
     std: Annotated[float, about("standard deviation", gt=0)]
@@ -248,7 +256,7 @@ _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "samp
 
 
 class Choice(Section):
-    """Choice of a value for each job; a single field is given."""
+    """Choice of a value for each job, by a single field."""
 
     uniform: Annotated[
         MinMax[float] | None, about("a number between two, all equally likely", [0.5, 2])
@@ -486,7 +494,7 @@ class Splits:
             self._block += [name] * (round(cumulative * size) - len(self._block))
 
     def __call__(self, number: int) -> str:
-        """Return the split of a job; empty without splits."""
+        """Return the split of a job, or no text without splits."""
         if not self._block:
             return ""
         block, offset = divmod(number, len(self._block))
@@ -563,7 +571,10 @@ class _Cells(NamedTuple):
 
 
 def _read_cells(path: Path) -> _Cells:
-    """Read the cells of a table; ValueError if the table is empty."""
+    """Read the cells of a table.
+
+    Raises ValueError if the table is empty.
+    """
     lines = read_text(path).splitlines()
     first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
     reader = csv.reader(lines, delimiter=max(_DELIMITERS, key=first.count))

@@ -68,7 +68,9 @@ def place_sensor(
     roads: Sequence[str] = (),
     narrow: bool = False,
 ) -> Placing:
-    """Choose poses in a scene from mesh files; a landscape is not taken for an object.
+    """Choose poses in a scene from mesh files.
+
+    A landscape is not taken for an object.
 
     In a room or a landscape the poses are in the middle, or beside an object in the middle such as
     a tree; 1, 2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the
@@ -164,7 +166,7 @@ def _poses_above_floor(scene: Scene, position: Floats) -> tuple[Pose, ...]:
 
 
 def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene | None:
-    """Return the triangles of the objects whose names fit a pattern; None without any."""
+    """Return the triangles of the objects whose names fit a pattern, or None without any."""
     if not patterns:
         return None
     objects = np.concatenate([rows_named(pattern, scene.names) for pattern in patterns])
@@ -175,7 +177,7 @@ def _select_objects(scene: Scene, patterns: Sequence[str]) -> Scene | None:
 
 
 def _poses_beside(scene: Scene, middle: Floats, buildings: Sequence[str] = ()) -> tuple[Pose, ...]:
-    """Return free poses beside the middle (3,) of a scene, world coordinates; perhaps none.
+    """Return free poses beside the middle (3,) of a scene, world coordinates, perhaps none.
 
     In a scene with `buildings`, patterns of names, poses are outdoors: above a surface, and
     neither in a building nor on a building.
@@ -209,7 +211,7 @@ def _local_positions(poses: Sequence[Pose], scene: Scene) -> Floats:
 
 
 def surroundings_of(scene: Scene, positions: ArrayLike) -> Surroundings | None:
-    """Return the surroundings of local positions (k, 3); None if the scene is too large."""
+    """Return the surroundings of local positions (k, 3), or None if the scene is too large."""
     return _surroundings(_draw_instances(scene, positions))
 
 
@@ -305,7 +307,7 @@ def _draw_instances(scene: Scene, positions: ArrayLike) -> Scene:
 
 
 def _surroundings(scene: Scene) -> Surroundings | None:
-    """Return the surroundings in a scene; None if the scene has too many triangles."""
+    """Return the surroundings in a scene, or None if the scene has too many triangles."""
     count = len(scene.faces)
     if count > _MAX_TRIANGLES or (count > _MAX_SHEET_TRIANGLES and is_open(scene)):
         return None

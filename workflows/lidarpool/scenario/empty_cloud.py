@@ -53,7 +53,7 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
 
 
 def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
-    """Return a warning that jobs have no points; `reason` is the first job's, or empty."""
+    """Return a warning that jobs have no points, with `reason` of the first job or no text."""
     names = ", ".join(row.name for row in empty[:NAMED_JOBS])
     if unnamed := len(empty) - NAMED_JOBS:
         names += f" and {unnamed:,} more" * (unnamed > 0)

@@ -89,7 +89,7 @@ def _path_hint(scenario: Scenario, name: str) -> str:
 
 
 def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:
-    """Return the path of a field in a scenario, of the first entry of lists; empty if absent."""
+    """Return the path of a field in a scenario, in lists of the first entry, or an empty path."""
     node: Any = scenario
     keys: list[str] = []
     for section in names:

@@ -39,7 +39,10 @@ class StandingSurfaces:
         return np.zeros(3) if self._scene is None else self._scene.origin
 
     def of_objects(self, names: Sequence[str]) -> StandingSurfaces:
-        """Return the surfaces of the objects that fit names; LidarError if no triangle faces up."""
+        """Return the surfaces of the objects that fit names.
+
+        Raises LidarError if no triangle faces up.
+        """
         key = tuple(names)
         scene = self._scene
         if key in self._selections:
@@ -161,7 +164,10 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
 
 
 def _step_times(track: Track) -> Floats:
-    """Return times in seconds at steps of at most `STEP_M`; LidarError if there are too many."""
+    """Return times in seconds at steps of at most `STEP_M`.
+
+    Raises LidarError if there are too many.
+    """
     distances_m = np.linalg.norm(np.diff(track.positions, axis=0), axis=1)
     steps = np.maximum(np.ceil(distances_m / STEP_M), 1).astype(np.int64)
     if steps.sum() > MAX_STEPS:

@@ -82,7 +82,7 @@ class ObjectPassage:
 
 
 class _PassageCollector:
-    """Collects passages from messages; of those before the first time, the last is kept."""
+    """Collects passages from messages, with the last passage before the first time."""
 
     def __init__(self, section: TrafficSection, first_s: float, choice: TravellerChoice) -> None:
         self.passages: list[ObjectPassage] = []
@@ -97,7 +97,10 @@ class _PassageCollector:
         self.left_out: set[str] = set()  # identities that are not in `choice`
 
     def add(self, truth: Any) -> None:
-        """Add the moving objects of a message GroundTruth; ValueError if it is not valid."""
+        """Add the moving objects of a message GroundTruth.
+
+        Raises ValueError if it is not valid.
+        """
         if truth.timestamp is None:
             raise ValueError("a message has no timestamp")
         time_s = self._clock.seconds(truth.timestamp.seconds + truth.timestamp.nanos / 1e9)
@@ -130,7 +133,7 @@ class _PassageCollector:
         passage.rows.extend(row)
 
     def _passage(self, identity: int, moving: Any) -> ObjectPassage | None:
-        """Return the passage that an object continues, or a new one; None without a shape."""
+        """Return the passage that an object continues, or a new one, or None without a shape."""
         last_message, passage = self.travellers.get(identity, (-2, None))
         if passage is None or last_message < self.message - 1:
             kind = _kind_of(moving)
@@ -198,7 +201,10 @@ def read_osi(
 
 
 def _ground_truths(path: Path) -> Iterator[Any]:
-    """Yield the ground truth of each message of a trace; LidarError if it has none."""
+    """Yield the ground truth of each message of a trace.
+
+    Raises LidarError if the trace has no ground truth.
+    """
     osi: Any = import_module("betterosi")
     with reading(str(path)):
         if not input_size(path):
@@ -224,7 +230,7 @@ def _ground_truths(path: Path) -> Iterator[Any]:
 
 
 def _message_type(osi: Any, path: Path) -> str | None:
-    """Return the type of messages by the name of a trace; None if the content must tell.
+    """Return the type of messages by the name of a trace, or None if the content must tell.
 
     LidarError if the name tells of messages without ground truth.
     """
@@ -237,7 +243,7 @@ def _message_type(osi: Any, path: Path) -> str | None:
 
 
 def _pose_of(moving: Any) -> list[float]:
-    """Return the numbers of a row of `ObjectPassage`; NaN without a position."""
+    """Return the numbers of a row of `ObjectPassage`, or NaN without a position."""
     base = moving.base
     if base is None or base.position is None:
         return _ROW * [np.nan]
@@ -248,7 +254,10 @@ def _pose_of(moving: Any) -> list[float]:
 
 
 def _size_of(moving: Any) -> tuple[float, float, float] | None:
-    """Return length, width and height; None without dimensions. ValueError if they are absurd."""
+    """Return length, width and height, or None without dimensions.
+
+    Raises ValueError if the dimensions are absurd.
+    """
     size = None if moving.base is None else moving.base.dimension
     if size is None:
         return None

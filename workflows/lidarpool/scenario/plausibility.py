@@ -163,7 +163,7 @@ def _surroundings_of_sensors(
     samples: list[_SensorPosition],
     unseen: Sequence[Bools | None],
 ) -> list[Surroundings | None]:
-    """Return the surroundings that each sensor sees; None if a sensor sees nothing.
+    """Return the surroundings that each sensor sees, or None if a sensor sees nothing.
 
     `surroundings` are those of all objects, and `unseen` the masks of the sensors.
     """

@@ -278,7 +278,9 @@ class Scenario(Section):
     def with_sections(
         self, data: dict[str, Any], *, source: str, folder: Path | None = None
     ) -> Scenario:
-        """Return the scenario with sections replaced; unchanged sections are not validated again.
+        """Return the scenario with sections replaced.
+
+        Unchanged sections are not validated again.
 
         LidarError as `load`.
         """

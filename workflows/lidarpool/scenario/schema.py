@@ -111,7 +111,9 @@ _SECTIONS = {
 
 
 def short_scenario(data: Mapping[str, Any], note: str) -> str:
-    """Return a short commented scenario in YAML; sections that `data` lacks are examples.
+    """Return a short commented scenario in YAML.
+
+    Sections that `data` lacks are examples.
 
     `data` is the result of `mesh_data`, `note` a remark on its poses.
     """
@@ -146,7 +148,10 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
 
 
 def _section_lines(name: str, field: FieldInfo, values: dict[str, Any]) -> Iterator[str]:
-    """Yield the lines of a section or a top-level field; `values` replace defaults."""
+    """Yield the lines of a section or a top-level field.
+
+    `values` replace defaults.
+    """
     section = field.annotation
     if not (isinstance(section, type) and is_section(section)):
         yield from _field_lines(name, field, "", values)

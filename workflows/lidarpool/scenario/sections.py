@@ -86,7 +86,9 @@ class Section(BaseModel):
 
 
 class MeshFile(Section):
-    """A mesh file or raster and its placement; in YAML also just the file's name.
+    """A mesh file or raster and its placement.
+
+    In YAML, the file's name alone will do.
 
     The mesh is scaled, rotated about the world's x, y and z axes, and moved; `matrix` replaces
     all three. Relative names start from the scenario's folder.
@@ -123,7 +125,10 @@ class MeshFile(Section):
     @model_validator(mode="wrap")
     @classmethod
     def _with_options(cls, value: Any, handler: Callable[[Any], MeshFile]) -> MeshFile:
-        """Validate a file with the options of its format; ValueError for those of others."""
+        """Validate a file with the options of its format.
+
+        Raises ValueError for options of other formats.
+        """
         if cls is not MeshFile or not isinstance(value, dict):
             return handler(value)
         file = value.get("file")
@@ -192,7 +197,7 @@ MeshEntries = Several[MeshEntry]
 
 
 def _pose(value: Any) -> Any:
-    """Return a pose as a mapping; a list is its position."""
+    """Return a pose as a mapping, where a list is the position."""
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
@@ -213,7 +218,10 @@ PointXYZ = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # 
 
 
 class CopySection(Section, Pose):
-    """Position, angles and scale of a copy; in YAML also just [x, y] or [x, y, z]."""
+    """Position, angles and scale of a copy.
+
+    In YAML, [x, y] or [x, y, z] alone will do.
+    """
 
     position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
         PointXYZ,
@@ -223,7 +231,10 @@ class CopySection(Section, Pose):
 
 
 class CopyTable(Section):
-    """Poses of copies from a table; in YAML also just the file's name."""
+    """Poses of copies from a table.
+
+    In YAML, the file's name alone will do.
+    """
 
     file: Annotated[Text, about("a table with a header, from the scenario's folder")]
     columns: Annotated[
@@ -234,7 +245,10 @@ class CopyTable(Section):
 
 
 class Scatter(Section):
-    """Copies that stand upright on surfaces, at random; the same fields give the same copies."""
+    """Copies that stand upright on surfaces, at random.
+
+    The same fields give the same copies.
+    """
 
     count: Annotated[int, about("how many", ge=1, le=MAX_COPIES)]
     surfaces: Annotated[  # not "on", which YAML takes for true
@@ -273,7 +287,10 @@ class ShapeSection(Section):
 
 
 class AnimationSection(Section):
-    """An animation of an actor's .glb, .gltf or .usd; in YAML also just its name."""
+    """An animation of an actor's .glb, .gltf or .usd.
+
+    In YAML, its name alone will do.
+    """
 
     name: Annotated[Text | None, about("its name in the file; by default the first", "Walk")] = None
     speed_m_s: Annotated[
@@ -320,7 +337,10 @@ class DeformingSection(ShapeSection):
 
 
 class CopiesSection(ShapeSection):
-    """An object that stands at many positions, its mesh stored once; each copy is an object."""
+    """An object that stands at many positions, its mesh stored once.
+
+    Each copy is an object.
+    """
 
     name: Annotated[Text, about("name of the first; the others are numbered: Tree, Tree.2, …")]
     at: Annotated[
@@ -536,7 +556,9 @@ class SensorSection(Section):
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return the lidar on its carrier; LidarError if its files cannot be used.
+        """Return the lidar on its carrier.
+
+        Raises LidarError if its files cannot be used.
 
         `path` returns the path of a file in the scenario. Equal sections have the same sensor,
         unless their files have changed. A sensor with a data sheet has noise and returns of its
@@ -592,7 +614,10 @@ def _with_packets(sensor: Sensor, section: str) -> Sensor:
 
 
 class OutputSection(Section):
-    """Further files of the result; the columns that they need are written."""
+    """Further files of the result.
+
+    The columns that they need are written.
+    """
 
     write: Annotated[
         Several[Annotated[Format, by_text("format", Format)]],
@@ -649,7 +674,7 @@ Obstacles = Several[Annotated[Obstacle, by_text("object", Obstacle)]]
 
 
 class _Route:
-    """Fields that a scenario gives in world coordinates and by names; before fields of `Search`."""
+    """Fields in world coordinates and by names, which come before the fields of `Search`."""
 
     enabled: Annotated[
         bool | None, about("by default true if start and target are given", True)
@@ -706,7 +731,7 @@ class TaskOptions:
 
 
 class _Workers:
-    """Workers of a local cluster; they come first."""
+    """Workers of a local cluster, which come first."""
 
     gpu: Annotated[
         int | None, about("workers that cast rays; by default one for each GPU", 1, ge=1, le=10_000)
@@ -718,7 +743,9 @@ class _Workers:
 
 
 class PoolSection(Section, TaskOptions, _Workers):
-    """The partitions and their tasks; default sizes depend on the machine.
+    """The partitions and their tasks.
+
+    Default sizes depend on the machine.
 
     `gpu` and `other` set the workers of a local cluster, not of a cluster that is already
     running. The fields of `TaskOptions` apply to both.

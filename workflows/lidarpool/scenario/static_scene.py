@@ -171,7 +171,10 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
 
 
 class Shapes:
-    """Meshes and robots of a scenario, each file read once; notes go to `findings`."""
+    """Meshes and robots of a scenario, each file read once.
+
+    Notes go to `findings`.
+    """
 
     def __init__(self, scenario: Scenario, findings: Findings) -> None:
         self.scenario = scenario
@@ -210,7 +213,10 @@ class Shapes:
         return meshes[key]
 
     def robot(self, entry: MeshFile) -> Robot:
-        """Return the robot of a file; LidarError if the file cannot be used."""
+        """Return the robot of a file.
+
+        Raises LidarError if the file cannot be used.
+        """
         if entry not in self._robots:
             path = self.scenario.path(entry.file)
             tell = self.findings.notes.append
@@ -233,7 +239,9 @@ class Shapes:
         return None if entry.assets is None else self.scenario.path(entry.assets)
 
     def read(self, entry: MeshFile, animation: str | None = None) -> Objects:
-        """Read the objects of a file in world coordinates; LidarError if the file cannot be used.
+        """Read the objects of a file in world coordinates.
+
+        Raises LidarError if the file cannot be used.
 
         `animation` is the name of the animation that the meshes play; "" is the first of the file,
         None none.
@@ -356,7 +364,9 @@ _COPY_COLUMNS = (
 def copies_of(
     entry: CopiesSection, mesh: SceneMesh, standing: StandingSurfaces, path: PathOf
 ) -> list[SceneInstance]:
-    """Place the copies of an entry; `path` returns the path of a file in the scenario.
+    """Place the copies of an entry.
+
+    `path` returns the path of a file in the scenario.
 
     Raises
     ------
@@ -388,7 +398,10 @@ class _CopyPoses(NamedTuple):
     scales: Floats  # (n, 3)
 
     def set_missing_heights(self, standing: StandingSurfaces) -> None:
-        """Put copies without z onto the surface below; LidarError if there is no surface."""
+        """Put copies without z onto the surface below.
+
+        Raises LidarError if there is no surface.
+        """
         positions = self.positions
         rows = np.flatnonzero(np.isnan(positions[:, 2]))
         if len(rows):
@@ -462,7 +475,9 @@ def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> 
 
 
 def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSurfaces) -> Floats:
-    """Draw positions (n, 3) on surfaces, world metres; LidarError if there is no room.
+    """Draw positions (n, 3) on surfaces, world metres.
+
+    Raises LidarError if there is no room.
 
     `standing` are the surfaces of all objects. If none of the first positions is on a surface of
     the scatter, as under a roof, all other surfaces are ignored.
@@ -505,7 +520,7 @@ class _OccupiedPositions:
         self._cells: dict[tuple[int, int], list[tuple[float, float]]] = {}
 
     def occupy(self, x: float, y: float) -> bool:
-        """Occupy a position and return True; return False if an occupied position is too close."""
+        """Occupy a position and return True, or False if an occupied position is too close."""
         spacing_m = self._spacing_m
         if not spacing_m:
             return True

@@ -88,7 +88,10 @@ class VehicleSection(DeformingSection):
 
 
 class TrafficSection(Section):
-    """Vehicles and persons of a simulation; actors while they are in the simulation."""
+    """Vehicles and persons of a simulation.
+
+    Actors while they are in the simulation.
+    """
 
     file: Annotated[
         Text,
@@ -190,7 +193,10 @@ class Passage:
     rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` at each time
 
     def entry(self, section: TrafficSection) -> VehicleSection:
-        """Return the first entry that fits the type; LidarError if there is none."""
+        """Return the first entry that fits the type.
+
+        Raises LidarError if no entry fits.
+        """
         matching = section.entry_of(self.kind)
         if matching is not None:
             return matching
@@ -243,7 +249,10 @@ _READABLE_TIME = re.compile(r"(-?)(?:(\d+):)?(\d+):(\d\d):(\d\d(?:\.\d*)?)")
 
 
 def _readable_seconds(text: str) -> float | None:
-    """Return the seconds of a time such as 1:02:30:00.50, with days or without; None for others."""
+    """Return the seconds of a time such as 1:02:30:00.50, with days or without.
+
+    Returns None for other texts.
+    """
     match = _READABLE_TIME.fullmatch(text.strip())
     if match is None:
         return None
@@ -281,7 +290,9 @@ class _PassageCollector:
         self._vehicle_xy: tuple[str, str] | None = None  # of the time step's last vehicle
 
     def collect(self, elements: Iterable[tuple[str, Mapping[str, str]]], last_s: float) -> None:
-        """Collect from tags with attributes until a time; ValueError if they are not valid.
+        """Collect from tags with attributes until a time.
+
+        Raises ValueError if they are not valid.
 
         The first time step after the last time is needed as well.
         """
@@ -297,7 +308,10 @@ class _PassageCollector:
             raise ValueError("it has no time steps")
 
     def begin_step(self, text: str) -> None:
-        """Begin a time step; ValueError if its time is not after the last time step's."""
+        """Begin a time step.
+
+        Raises ValueError if its time is not after the last time step's.
+        """
         time_s = _readable_seconds(text)
         if time_s is not None and self._time_unit is not None:
             raise ValueError("its times are hours, minutes and seconds: leave out time_unit")
@@ -310,7 +324,10 @@ class _PassageCollector:
         self._vehicle_xy = None
 
     def add(self, tag: str, attributes: Mapping[str, str]) -> None:
-        """Add the row of a vehicle or person; ValueError or KeyError if the row is not valid."""
+        """Add the row of a vehicle or person.
+
+        Raises ValueError or KeyError if the row is not valid.
+        """
         if not attributes.keys() <= self._known_attributes:
             unknown = attributes.keys() - self._known_attributes
             _check_ignored(tag, unknown, self._ignore)
@@ -353,7 +370,10 @@ class _PassageCollector:
 
 
 def _number(element: str, key: str, text: str) -> float:
-    """Return the number in an attribute; ValueError if it is none."""
+    """Return the number in an attribute.
+
+    Raises ValueError if the attribute is not a number.
+    """
     try:
         return float(text)
     except ValueError:

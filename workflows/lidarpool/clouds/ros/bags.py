@@ -58,7 +58,7 @@ def write_rosbag2(
     compensated: bool = False,
     organized: bool = False,
 ) -> None:
-    """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
+    """Write a bag, a folder for `ros2 bag play`, with the parameters of `write_mcap`."""
     laid_out = LaidOut(layout, compensated, organized)
     # Readers of Humble accept no later version: from 9 on, profiles are lists.
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
@@ -159,7 +159,10 @@ class Reader(sweep_reader.Reader):
         return points, columns
 
     def _point_cloud(self, sweep: int) -> Any:
-        """Return the PointCloud2 of a sweep; ValueError if the bag lacks the message."""
+        """Return the PointCloud2 of a sweep.
+
+        Raises ValueError if the bag lacks the message.
+        """
         topic = sweep_topic(self.sweeps, sweep)
         connections = [opened for opened in self._bag.connections if opened.topic == topic]
         time_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])

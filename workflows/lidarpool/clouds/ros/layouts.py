@@ -88,7 +88,10 @@ class PointLayout(ABC):
         """Return the firings (n,), nanoseconds since the stamp: the inverse of `times`."""
 
     def rings(self, channels: Ints, traits: LidarTraits) -> Ints:
-        """Return the field of rings of channels (n,); channel 0 is the lowest beam."""
+        """Return the field of rings of channels (n,).
+
+        Channel 0 is the lowest beam.
+        """
         del traits
         return channels
 
@@ -114,7 +117,10 @@ class PointLayout(ABC):
 
 
 class VelodyneLayout(PointLayout):
-    """Layout of velodyne_pointcloud; times are seconds since the stamp."""
+    """Layout of velodyne_pointcloud.
+
+    Times are seconds since the stamp.
+    """
 
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("time", "<f4")])
     compensated_fields = np.dtype(fields.descr[:-1])
@@ -152,7 +158,7 @@ class _CountedNanoseconds(PointLayout):
 
 
 class AutowareLayout(_CountedNanoseconds):
-    """Layout of nebula, Autoware's driver: PointXYZIRCAEDT; compensated, PointXYZIRC."""
+    """Layout of nebula, Autoware's driver: PointXYZIRCAEDT, or PointXYZIRC if compensated."""
 
     fields = np.dtype([
         *_XYZ, ("intensity", "u1"), ("return_type", "u1"), ("channel", "<u2"), ("azimuth", "<f4"),
@@ -178,7 +184,10 @@ class AutowareLayout(_CountedNanoseconds):
 
 
 class OusterLayout(_CountedNanoseconds):
-    """Layout of ouster-ros (`original`); ring 0 is the highest beam."""
+    """Layout of ouster-ros (`original`).
+
+    Ring 0 is the highest beam.
+    """
 
     fields = np.dtype({
         "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
@@ -232,14 +241,17 @@ class _Reflectivities(PointLayout):
 
 
 class HesaiLayout(_Reflectivities):
-    """Layout of HesaiLidar_ROS_2.0; times are seconds since 1970, rings the maker's channels."""
+    """Layout of HesaiLidar_ROS_2.0.
+
+    Times are seconds since 1970, rings the maker's channels.
+    """
 
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("timestamp", "<f8")])
     compensated_fields = np.dtype(fields.descr[:-1])
     time_field = "timestamp"
 
     def rings(self, channels: Ints, traits: LidarTraits) -> Ints:
-        """Return the maker's numbers of the channels, from 0; by default 0 is the highest."""
+        """Return the maker's numbers of the channels, from 0, by default from the highest."""
         return _maker_numbers(traits)[channels]
 
     def channels(self, rings: Ints, traits: LidarTraits) -> Ints:
@@ -248,7 +260,10 @@ class HesaiLayout(_Reflectivities):
 
 
 class RoboSenseLayout(_Reflectivities):
-    """Layout of rslidar_sdk (`XYZIRT`); times are seconds since 1970, ring 0 is the lowest beam."""
+    """Layout of rslidar_sdk (`XYZIRT`).
+
+    Times are seconds since 1970, ring 0 is the lowest beam.
+    """
 
     fields = HesaiLayout.fields
     compensated_fields = HesaiLayout.compensated_fields
@@ -257,7 +272,9 @@ class RoboSenseLayout(_Reflectivities):
 
 
 class LivoxLayout(_Reflectivities):
-    """Layout of livox_ros_driver2 (PointXYZRTLT); times are nanoseconds since 1970.
+    """Layout of livox_ros_driver2 (PointXYZRTLT).
+
+    Times are nanoseconds since 1970.
 
     All points have the tag 0, a normal point.
     """
@@ -294,7 +311,10 @@ class LaidOut:
         return LAYOUTS[self.name]
 
     def row(self, columns: set[str]) -> np.dtype[np.void]:
-        """Return the type of a point; `columns` are the names of the columns of the cloud."""
+        """Return the type of a point.
+
+        `columns` are the names of the columns of the cloud.
+        """
         extra = [name for name, (_, needs) in EXTRA_FIELDS.items() if needs <= columns]
         return self.layout.row(extra, compensated=self.compensated)
 
@@ -347,14 +367,16 @@ def sensor_traits(sweeps: Sweeps, sweep: int) -> LidarTraits:
 
 
 def _maker_numbers(traits: LidarTraits) -> Ints:
-    """Return the maker's number of each channel, from 0; by default 0 is the highest: (c,)."""
+    """Return the maker's number of each channel (c,), from 0, by default from the highest."""
     if traits.lasers:
         return np.array(traits.lasers, np.int64)
     return np.arange(traits.channels)[::-1]
 
 
 def _return_types(columns: Mapping[str, AnyArray], mode: str) -> AnyArray:
-    """Return Autoware's types of the returns of a sweep, (n,); returns follow their pulses.
+    """Return Autoware's types of the returns of a sweep, (n,).
+
+    Returns follow their pulses.
 
     Of two returns of a pulse the nearer is first, and the brighter is strong; of two equally bright
     returns, the farther. A single return of a pulse is all of these.

@@ -87,7 +87,9 @@ def write_page(
 
 
 def put_picture(page: Path, name: str, svg: str) -> None:
-    """Insert a picture into a page of `write_page`; a page without room for the picture stays.
+    """Insert a picture into a page of `write_page`.
+
+    A page without room for the picture stays.
 
     LidarError if the page cannot be written.
     """
@@ -218,7 +220,7 @@ def _changed(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
 
 
 def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
-    """Lay out the tasks of a run, as far as there are records; return None if no task ran.
+    """Lay out the tasks of a run, as far as there are records, and return None if no task ran.
 
     The template gets groups of rows on a common axis, which starts with the first task: the stages,
     then each partition's workers. A row is of one stage, on one worker or on all; its bars are a
@@ -323,7 +325,10 @@ def sentence(note: str, names: Iterable[str] = ()) -> str:
 
 
 def printable(text: str) -> str:
-    """Replace unprintable characters; names in files may contain characters that reverse a line."""
+    """Replace unprintable characters.
+
+    Names in files may contain characters that reverse a line.
+    """
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )
@@ -356,7 +361,7 @@ def duration(seconds: float) -> str:
 
 
 def rate(number: float, seconds: float) -> str:
-    """Return a rate per second; a dash if the time is unknown."""
+    """Return a rate per second, or a dash if the time is unknown."""
     return f"{large(number / seconds)}/s" if seconds > 0 else "–"
 
 
@@ -382,7 +387,7 @@ def excess(fraction: float) -> str:
 
 
 def formatted(value: Any) -> str:
-    """Return numbers with four digits or a decimal, integers with all digits; text unchanged."""
+    """Return numbers with four digits or a decimal, integers with all digits, text unchanged."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):

@@ -32,7 +32,10 @@ LOOK_EVERY_S = 0.2
 
 
 class TooFewWorkersError(LidarError):
-    """Error for a partition without enough workers or slots; more workers may join."""
+    """Error for a partition without enough workers or slots.
+
+    More workers may join.
+    """
 
 
 class SurveyWorkers(NamedTuple):

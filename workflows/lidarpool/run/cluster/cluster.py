@@ -177,7 +177,10 @@ class Cluster:
         check_workers(job, self.options, self.backend, self._casting)
 
     def call(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call a callback of the user; its OSError must not look like an error of the cluster."""
+        """Call a callback of the user.
+
+        Its OSError must not look like an error of the cluster.
+        """
         try:
             callback(*arguments)
         except BaseException as error:
@@ -204,7 +207,7 @@ class Cluster:
 
     @contextmanager
     def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:
-        """Call `stop` on any error of the body; translate errors of a lost cluster.
+        """Call `stop` on any error of the body, and translate errors of a lost cluster.
 
         `stop` gets the reason. In the end the partitions may shrink.
         """
@@ -226,7 +229,10 @@ class Cluster:
             self._release_slots()
 
     def _is_lost(self, error: BaseException) -> bool:
-        """Return True if the scheduler is gone; calls may fail a moment before the client knows."""
+        """Return True if the scheduler is gone.
+
+        Calls may fail a moment before the client knows.
+        """
         deadline = time.monotonic() + LOST_S
         while (
             self.client.status == "running"

@@ -170,7 +170,9 @@ class StartedAhead(AbstractContextManager[Client]):
 
 @contextmanager
 def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
-    """Start a cluster and yield its client; the cluster ends with the body.
+    """Start a cluster and yield its client.
+
+    The cluster ends with the body.
 
     `tell` is called when the cluster has started, and with messages about failing workers.
     LidarError if the cluster does not start.
@@ -186,7 +188,9 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
 
 @contextmanager
 def _client_of(cluster: AbstractContextManager[SpecCluster]) -> Iterator[Client]:
-    """Start a cluster and yield its client; the cluster ends with the body.
+    """Start a cluster and yield its client.
+
+    The cluster ends with the body.
 
     Half a cluster cannot be stopped in good order: an interrupt waits until all workers are up, or
     all jobs in the queue, and an interrupt while workers are being stopped waits until they are.
@@ -252,7 +256,10 @@ def _check_address(address: str) -> None:
 
 
 async def _reach(address: str, security: Security, waiting: Waiting) -> None:
-    """Wait until a scheduler answers; a client would wait for ever for a silent scheduler."""
+    """Wait until a scheduler answers.
+
+    A client would wait for ever for a silent scheduler.
+    """
     reason = "nobody answers"
     while True:
         timeout: float = CONNECT_TIMEOUT_S
@@ -274,7 +281,10 @@ async def _reach(address: str, security: Security, waiting: Waiting) -> None:
 
 
 def _root(error: BaseException) -> BaseException:
-    """Return the first cause of an error; the answer of a foreign program may cause any error."""
+    """Return the first cause of an error.
+
+    The answer of a foreign program may cause any error.
+    """
     cause = error.__cause__ or error.__context__
     # An operation that a time-out has cut off says less than the time-out.
     if cause is None or isinstance(cause, asyncio.CancelledError):

@@ -19,7 +19,9 @@ T = TypeVar("T")
 
 
 class Tasks(Generic[T]):
-    """Submitted tasks of a partition; `book` has the records of finished tasks.
+    """Submitted tasks of a partition.
+
+    `book` has the records of finished tasks.
 
     Each task returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
     """
@@ -36,7 +38,7 @@ class Tasks(Generic[T]):
     def submit(
         self, purpose: T, function: Callable[..., Any], *arguments: Any, **options: Any
     ) -> None:
-        """Submit a task with its purpose; `options` as of `Partition.submit`."""
+        """Submit a task with its purpose, and `options` as of `Partition.submit`."""
         call = (call_with_plugins, self.plugins, function) if self.plugins else (function,)
         future = self.partition.submit(
             call_with_same_sources, self._sources, *call, *arguments, **options
@@ -44,7 +46,7 @@ class Tasks(Generic[T]):
         self.running[future] = purpose
 
     def take_done(self) -> list[tuple[T, Any]]:
-        """Remove the finished tasks; return their purposes and results."""
+        """Remove the finished tasks, and return their purposes and results."""
         finished = {future.key: future for future in self.running if future.status == "finished"}
         results: list[tuple[T, Any]] = []
         if not finished:
@@ -55,7 +57,7 @@ class Tasks(Generic[T]):
         return results
 
     def take_failed(self) -> list[tuple[T, Future]]:
-        """Remove failed and cancelled tasks; return their purposes and futures.
+        """Remove failed and cancelled tasks, and return their purposes and futures.
 
         Dask repeats lost tasks, but not these.
         """
@@ -68,6 +70,9 @@ class Tasks(Generic[T]):
         return look_for_tasks(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
-        """Cancel all tasks; tasks that have begun run to their end."""
+        """Cancel all tasks.
+
+        Tasks that have begun run to their end.
+        """
         self._client.cancel([*self.running])
         self.running.clear()

@@ -40,7 +40,7 @@ class Waiting:
         self._start_s = time.monotonic()
 
     def remaining_s(self, now_s: float | None = None) -> float:
-        """Return the remaining time in seconds; 0 after the limit."""
+        """Return the remaining time in seconds, or 0 after the limit."""
         now_s = time.monotonic() if now_s is None else now_s
         return max(0.0, self._start_s + self.seconds - now_s)
 
@@ -91,7 +91,10 @@ class Watch:
             self._waits.pop(name, None)
 
     def look(self) -> None:
-        """Check the partitions if the last check is old; LidarError if workers are missing."""
+        """Check the partitions if the last check is old.
+
+        Raises LidarError if workers are missing.
+        """
         now_s = time.monotonic()
         if now_s - self._looked < WATCH_EVERY_S:
             return

@@ -70,7 +70,10 @@ class _Payload:
 
 
 class WorkerState(Enum):
-    """How far a worker has come; a worker that leaves is forgotten, unless it was refused."""
+    """How far a worker has come.
+
+    A worker that leaves is forgotten, unless it was refused.
+    """
 
     CHECKING = auto()  # a task on the worker asks for its software
     CASTING = auto()  # it may cast
@@ -135,7 +138,7 @@ class CastingWorkers:
 
     @property
     def slot_count(self) -> int:
-        """Casting tasks that run at a time on all workers; at least 1."""
+        """Casting tasks that run at a time on all workers, at least 1."""
         return max(1, sum(self.slots.values()))
 
     @property
@@ -166,7 +169,9 @@ class CastingWorkers:
     # -- jobs ------------------------------------------------------------------------------
 
     def add(self, job: int, scene: Scene, survey: Survey) -> tuple[bytes, str]:
-        """Register a job; return its pickled survey, and a name that jobs of its scene share.
+        """Register a job.
+
+        Returns its pickled survey, and a name that jobs of its scene share.
 
         JobError if the job cannot be pickled.
         """
@@ -223,7 +228,10 @@ class CastingWorkers:
     def _payload_for(
         self, payload: _Payload, worker: str
     ) -> Pickled | SharedHandle | Future | None:
-        """Return the argument that brings a payload to a worker; None if the worker has a copy."""
+        """Return the argument that brings a payload to a worker.
+
+        Returns None if the worker has a copy.
+        """
         if worker in payload.holders:
             return None
         payload.recipients.add(worker)
@@ -238,7 +246,9 @@ class CastingWorkers:
     # -- casting ---------------------------------------------------------------------------
 
     def submit(self, batches: Iterable[tuple[int, BatchRange]], worker: str) -> str:
-        """Submit batches, each with its job, to a worker as a task; return the key of the task.
+        """Submit batches, each with its job, to a worker as a task.
+
+        Returns the key of the task.
 
         The jobs must share a scene.
         """
@@ -299,7 +309,10 @@ class CastingWorkers:
         return Outcome.PENDING
 
     def _count_lost_device(self, error: DeviceLost, worker: str) -> None:
-        """Note that a worker has lost its GPU; LidarError if that happens again and again."""
+        """Note that a worker has lost its GPU.
+
+        Raises LidarError if that happens again and again.
+        """
         if error.process in self._lost_devices:
             return
         self._lost_devices.add(error.process)
@@ -375,7 +388,7 @@ class CastingWorkers:
                 self._take(address, software, identities[address])
 
     def want(self, slots: int) -> None:
-        """Request a number of slots of an adaptive partition; 0 when all work is done.
+        """Request a number of slots of an adaptive partition, or 0 when all work is done.
 
         The driver binds each batch to a worker, so that no batch waits for workers to come.
         """
@@ -408,7 +421,7 @@ class CastingWorkers:
                 )
 
     def _take(self, address: str, software: Mapping[str, str], identity: Mapping[str, Any]) -> None:
-        """Record a worker that has answered the software check; refuse different software."""
+        """Record a worker that has answered the software check, and refuse different software."""
         worker = self._workers[address]
         worker.check = None
         if differs := difference(software, self._software):
@@ -451,7 +464,10 @@ def _is_here(address: str) -> bool:
 
 
 def share(partition: Partition, value: Any, **options: Any) -> Future:
-    """Submit a task that returns `value` for other tasks; Dask repeats it if a worker dies."""
+    """Submit a task that returns `value` for other tasks.
+
+    Dask repeats it if a worker dies.
+    """
     with warnings.catch_warnings():
         # A large value makes a large graph, which is the only way to have it recomputed.
         warnings.filterwarnings("ignore", message="Sending large graph")

@@ -27,7 +27,7 @@ class CommittedParts:
 
     @property
     def cells(self) -> Ints | None:
-        """Lowest and highest cell of all points, (2, 3); None without points."""
+        """Lowest and highest cell of all points, (2, 3), or None without points."""
         cells = [part.cell_box for part in self.ordered if part.cell_box]
         if not cells:
             return None
@@ -39,7 +39,10 @@ class CommittedParts:
         return [part for part in self.ordered[self._index(scan) :] if part.stop > scan]
 
     def part_of(self, scan: int) -> Receipt:
-        """Return the part of a committed scan; KeyError if the scan is not committed."""
+        """Return the part of a committed scan.
+
+        Raises KeyError if the scan is not committed.
+        """
         for part in self.ordered[self._index(scan) :][:1]:
             if scan in part.scans:
                 return part
@@ -69,7 +72,7 @@ class CommittedParts:
         self._count(part, -1)
 
     def _index(self, scan: int) -> int:
-        """Return the index of the last part that starts at or before a scan; 0 if there is none."""
+        """Return the index of the last part that starts at or before a scan, or 0 if none does."""
         return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
 
     def _count(self, part: Receipt, sign: int) -> None:
@@ -79,7 +82,9 @@ class CommittedParts:
 
 
 class CommittedJob:
-    """Committed results of a job; only the run's database changes parts and trials.
+    """Committed results of a job.
+
+    Only the run's database changes parts and trials.
 
     Parameters
     ----------

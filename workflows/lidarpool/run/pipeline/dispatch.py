@@ -107,7 +107,9 @@ class Dispatcher:
         return policies.max_under_way(slots, collectors, self.per_task)
 
     def room(self, job: PipelineJob) -> float:
-        """Return the weight of further batches of a job that may be under way; <= 0 if none.
+        """Return the weight of further batches of a job that may be under way.
+
+        No batch may be under way if the weight is 0 or less.
 
         There is no room if many batches of any jobs are younger than the oldest batch of this job:
         the sorter, and the memory, would have to hold their scans.
@@ -118,7 +120,7 @@ class Dispatcher:
         return self.max_weight - policies.weight(self.batches.values(), self.per_task)
 
     def slots_wanted(self, scan_count: int) -> int:
-        """Return the number of casting slots that `scan_count` scans are worth; at least 1."""
+        """Return the number of casting slots that `scan_count` scans are worth, at least 1."""
         scan_s = self._cast_seconds / self._cast_scans if self._cast_scans else None
         return max(1, policies.slots_wanted(scan_count, scan_s))
 
@@ -161,7 +163,7 @@ class Dispatcher:
                 self._batch_count += 1
 
     def offer(self) -> bool:
-        """Offer waiting batches to workers that have room; return True if any was offered."""
+        """Offer waiting batches to workers that have room, and return True if any was offered."""
         waiting = sorted(
             self.in_states(BatchState.WAITING), key=lambda batch: (batch.order, batch.first)
         )
@@ -185,7 +187,7 @@ class Dispatcher:
         return bool(chosen)
 
     def check(self) -> bool:
-        """Update the batches of casting tasks that have ended; return True if there are any.
+        """Update the batches of casting tasks that have ended, and return True if there are any.
 
         If the worker died or no longer has the job's scene, the batches are offered again. If
         casting has failed, and the task had batches of several jobs, they are offered again, too,
@@ -246,7 +248,7 @@ class Dispatcher:
         self.failed.pop(job, None)
 
     def _forget_task(self, batch: Batch) -> None:
-        """Detach a batch from its casting task; cancel or drop the task after its last batch."""
+        """Detach a batch from its casting task, and end the task after its last batch."""
         key = batch.key
         batch.key = ""
         if (task_batches := self._tasks.get(key)) is not None:
@@ -258,7 +260,7 @@ class Dispatcher:
     # -- poison batches ----------------------------------------------------------------------
 
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
-        """Count the death of a worker against its batch; divide or condemn the batch.
+        """Count the death of a worker against its batch, and divide or condemn the batch.
 
         See `policies.kills_alone` for the rule.
         """
@@ -314,7 +316,7 @@ class Dispatcher:
     # -- stage 4 -----------------------------------------------------------------------------
 
     def hand_over(self) -> bool:
-        """Assign batches that were cast to collectors; return True if any was assigned."""
+        """Assign batches that were cast to collectors, and return True if any was assigned."""
         if not (cast := self.in_states(BatchState.CAST)):
             return False
         orders: dict[str, list[CollectOrder]] = {}  # {collector: its message}
@@ -346,7 +348,7 @@ class Dispatcher:
         self._recast_uncollected([*task_batches], "its columns could not be fetched")
 
     def _recast_uncollected(self, batches: Iterable[Batch], reason: str) -> None:
-        """Offer the COLLECTING batches again, to be cast; skip batches in any further state."""
+        """Offer the COLLECTING batches again, to be cast, and skip batches in any further state."""
         for batch in batches:
             if batch.state is BatchState.COLLECTING:
                 self._offer_again(batch, reason)

@@ -51,7 +51,9 @@ def _serve(
     process: Callable[[Iterator[Any]], Iterable[int]],
     linger_s: float = 0.0,
 ) -> TaskRecord:
-    """Process the messages of the driver until a pipe is closed; return the record of the task.
+    """Process the messages of the driver until a pipe is closed.
+
+    Returns the record of the task.
 
     `process` gets an iterator of messages and yields the number of scans after each step. After the
     first message, `linger_s` seconds are waited for more.
@@ -98,7 +100,9 @@ def _send_news(
 
 @telling_departure()
 def generate(start: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
-    """Stage 1: describe the scans of surveys in order; the driver advises the scans of an item.
+    """Stage 1: describe the scans of surveys in order.
+
+    The driver advises the scans of an item.
 
     From the driver come lists of `Description`. An item is a `ScanRange`: the survey describes the
     scans equally on every worker. A survey that cannot be described is reported as `Failed`.

@@ -119,7 +119,10 @@ class LongStages:
         return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
-        """Create the pipes and the probe file; the caller must call `finish` afterwards."""
+        """Create the pipes and the probe file.
+
+        The caller must call `finish` afterwards.
+        """
         with storing(self._storage):
             self._storage.prepare()
             self._storage.write(*self.probe)
@@ -131,7 +134,9 @@ class LongStages:
     def wait(
         self, seconds: float, keys: Sequence[str], *, scans: bool, linger_s: float = 0.0
     ) -> None:
-        """Exchange messages with the stages; wait at most `seconds` for news or a task of `keys`.
+        """Exchange messages with the stages.
+
+        Waits at most `seconds` for news or a task of `keys`.
 
         After the first message, `linger_s` seconds are waited for more.
 
@@ -160,7 +165,7 @@ class LongStages:
         self._scans.advise(scans)
 
     def store_held(self, receipt: Receipt) -> bool:
-        """Store a part that its worker holds in memory; return False if the part is lost."""
+        """Store a part that its worker holds in memory, and return False if the part is lost."""
         self._hidden.add(receipt.held_at)
         data = take_held(self.client, receipt.held_at, receipt.name)
         if data is None:
@@ -186,7 +191,10 @@ class LongStages:
     # -- starting --------------------------------------------------------------------------
 
     def _start(self) -> None:
-        """Start all stages, each on a free slot; with too few slots, the next `look` retries."""
+        """Start all stages, each on a free slot.
+
+        With too few slots, the next `look` retries.
+        """
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
         with suppress(RuntimeError):  # another run has just removed it, see `_forget_lock`
@@ -264,7 +272,7 @@ class LongStages:
         return self._restart(now_s)
 
     def _restart(self, now_s: float) -> tuple[dict[str, str], list[str]]:
-        """Restart stages that died or wait for a slot; return as `look` does."""
+        """Restart stages that died or wait for a slot, and return as `look` does."""
         died: dict[str, str] = {}
         started: list[str] = []
         locations = self._look()
@@ -317,7 +325,10 @@ class LongStages:
             )
 
     def _count_death(self, name: str, worker: str) -> None:
-        """Count a death of a stage's worker; raise LidarError when the stage keeps dying."""
+        """Count a death of a stage's worker.
+
+        Raises LidarError when the stage keeps dying.
+        """
         died = self._deaths.setdefault(name, [])
         died.append(worker)
         if len(died) > MAX_DEATHS:
@@ -361,7 +372,7 @@ class LongStages:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """End the stages; call once everything is committed."""
+        """End the stages, once everything is committed."""
         # Stage 1 may still describe a survey that has failed.
         for pipe in self._pipes:
             if pipe is not self._news:

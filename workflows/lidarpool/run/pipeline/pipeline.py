@@ -58,7 +58,7 @@ class Commits(Protocol):
     def commit(
         self, receipts: Iterable[tuple[PipelineJob, Receipt]]
     ) -> list[tuple[PipelineJob, Receipt]]:
-        """Commit parts of jobs; return the parts that were not committed before."""
+        """Commit parts of jobs, and return the parts that were not committed before."""
         ...
 
     def summaries(self, part: Receipt) -> bytes:
@@ -181,12 +181,15 @@ class Pipeline:
     # -- one step ----------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Start the stages; the caller must call `stop` on failure, and `finish` always."""
+        """Start the stages.
+
+        The caller must call `stop` on failure, and `finish` always.
+        """
         self.stages.open()
         self._look()
 
     def step(self) -> bool:
-        """Process messages, workers and batches once; return True if there were changes.
+        """Process messages, workers and batches once, and return True if there were changes.
 
         LidarError if a failure concerns all jobs.
         """
@@ -246,7 +249,7 @@ class Pipeline:
                     self._end_complete([job])
 
     def _commit(self, receipts: Sequence[Receipt]) -> None:
-        """Commit the receipts of jobs under way; sort, report and record the new parts.
+        """Commit the receipts of jobs under way, and sort, report and record the new parts.
 
         Jobs that are complete with these parts end.
         """
@@ -273,7 +276,7 @@ class Pipeline:
         self._end_complete(of_jobs)
 
     def _is_stored(self, receipt: Receipt) -> bool:
-        """Return True if a part is in storage; store a part that its worker holds."""
+        """Return True if a part is in storage, and store a part that its worker holds."""
         if not receipt.held_at or self.stages.store_held(receipt):
             return True
         self.dispatcher.recast_part(receipt)
@@ -362,12 +365,15 @@ class Pipeline:
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
-        """End the stages; call once everything is committed."""
+        """End the stages, once everything is committed."""
         self.workers.want(0)  # the partition may shrink
         self.stages.close()
 
     def stop(self, reason: str) -> None:
-        """End all stages at once; `finish` must follow."""
+        """End all stages at once.
+
+        `finish` must follow.
+        """
         for job in self.jobs.values():
             self.dispatcher.drop(job)
         self.stages.stop(reason)

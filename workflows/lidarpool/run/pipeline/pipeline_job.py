@@ -18,7 +18,9 @@ from .stage_names import SORT
 
 
 class PipelineJob(CommittedJob):
-    """A job in the pipeline; subclasses say where the points of its scans are read.
+    """A job in the pipeline.
+
+    Subclasses say where the points of its scans are read.
 
     Parameters
     ----------
@@ -64,7 +66,7 @@ class PipelineJob(CommittedJob):
         trace(f"driver.{event}", job=self.number, scans=list(scans), **details)
 
     def hand_out(self, ordered: Summaries) -> int:
-        """Hand out frames in scan order; return the number of frames that are new."""
+        """Hand out frames in scan order, and return the number of frames that are new."""
         self.sorted_at = time.monotonic()
         earlier = self.frames
         survey = self.survey

@@ -38,7 +38,7 @@ LATE_FACTOR = 20.0  # longer than this multiple of the median casting time
 
 
 def max_scans_per_batch(scans_per_task: int, scan_count: int, slots: int) -> int:
-    """Return the largest number of scans of a batch; at least 1, since a scan is never split.
+    """Return the largest number of scans of a batch, at least 1, since a scan is never split.
 
     Parameters
     ----------
@@ -137,7 +137,9 @@ def slots_wanted(scan_count: int, scan_s: float | None) -> int:
 
 
 def kills_alone(batch: Batch, stage: str) -> int:
-    """Return the number of a stage's workers that died with a batch alone; < 0 if not yet suspect.
+    """Return the number of a stage's workers that died with a batch alone.
+
+    The number is negative if the batch is not yet suspect.
 
     After `SUSPECT_DEATHS` deaths a batch is suspect, and tried alone. An innocent batch succeeds
     then; a batch whose worker dies again is divided, down to single scans. A scan is the cause if
@@ -304,7 +306,9 @@ class Handover(NamedTuple):
 
 
 def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[Handover]:
-    """Choose collectors for batches that were cast; batches of a task stay together.
+    """Choose collectors for batches that were cast.
+
+    Batches of a task stay together.
 
     Batches with which a collector has died come alone. A collector on the host of the columns is
     preferred. A suspect batch is collected while no other batch is in stage 4: several collectors
@@ -341,7 +345,10 @@ def _host(address: str) -> str:
 
 
 def late_after_s(recent_casts: Sequence[tuple[float, int]]) -> float:
-    """Return the age in seconds after which a batch is late; inf without recent casting times."""
+    """Return the age in seconds after which a batch is late.
+
+    The age is infinite without recent casting times.
+    """
     if not recent_casts:
         return float("inf")
     return max(LATE_S, LATE_FACTOR * statistics.median(seconds for seconds, _ in recent_casts))

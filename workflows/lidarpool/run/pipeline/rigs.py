@@ -129,7 +129,10 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
 
 
 def _unpickled(data: Packed) -> Any:
-    """Return a value of the run's own driver; MemoryUnseen if its memory is not of this machine."""
+    """Return a value of the run's own driver.
+
+    Raises MemoryUnseen if its memory is not of this machine.
+    """
     if isinstance(data, SharedHandle):
         try:
             return data.load()
@@ -139,7 +142,10 @@ def _unpickled(data: Packed) -> Any:
 
 
 def drop(handles: Collection[str]) -> None:
-    """Drop cached rigs and scenes by their handles; unknown handles are ignored."""
+    """Drop cached rigs and scenes by their handles.
+
+    Unknown handles are ignored.
+    """
     for handle in handles:
         cached_rigs.pop(handle, None)
 
@@ -175,7 +181,7 @@ def intersect(
     scene: Packed | None = None,
     *plans: Packed | None,
 ) -> list[CastBatch]:
-    """Cast the rays of batches and make their columns; runs on a GPU worker.
+    """Cast the rays of batches and make their columns, on a GPU worker.
 
     The jobs share the static part of a scene. If the worker has no copy, the static part is
     unpickled from `scene`, and the rig of each job from its plan; rigs and scenes in `unneeded` are
@@ -237,7 +243,10 @@ def leaving_with_device(rig: Rig) -> Iterator[None]:
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
-    """Return sample points spread over each scan, (scans, samples, 3), metres; NaN if missing."""
+    """Return sample points spread over each scan, (scans, samples, 3), metres.
+
+    Missing points are NaN.
+    """
     sample_count = samples_of_scan(returns.survey.scan_count)
     starts = np.cumsum(returns.counts) - returns.counts
     steps = np.arange(sample_count) / max(sample_count - 1, 1)

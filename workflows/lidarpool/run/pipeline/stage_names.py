@@ -1,4 +1,4 @@
-"""Names of the stages and of the partitions that they run on; a leaf module."""
+"""Names of the stages and of the partitions that they run on, in a leaf module."""
 
 GPU = "GPU"
 LIDAR = "LIDAR"

@@ -42,7 +42,10 @@ class TaskRecord:
 
 
 class Recorder:
-    """Records time and worker of the current task; `finish` returns the record."""
+    """Records time and worker of the current task.
+
+    `finish` returns the record.
+    """
 
     def __init__(self, stage: str, partition: str) -> None:
         self.stage = stage

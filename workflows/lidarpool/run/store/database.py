@@ -174,7 +174,7 @@ class RunDatabase:
         return [number for (number,) in self._rows(query)]
 
     def hash_of(self, number: int) -> str:
-        """Return the hash of the inputs of a job under way; empty if no hash was stored."""
+        """Return the hash of the inputs of a job under way, or no text if no hash was stored."""
         rows = self._rows("SELECT hash FROM made_of WHERE job = ?", number)
         return "".join(text for (text,) in rows)
 
@@ -203,7 +203,7 @@ class RunDatabase:
         self.meta |= values
 
     def commit(self, receipts: Iterable[tuple[J, Receipt]]) -> list[tuple[J, Receipt]]:
-        """Commit parts of jobs in a transaction; return the newly committed parts.
+        """Commit parts of jobs in a transaction, and return the newly committed parts.
 
         A part with a scan that is committed already is left out. The number of frames that were
         handed out of these jobs is committed as well.
@@ -289,7 +289,7 @@ class RunDatabase:
         job.forget_committed()
 
     def save_frames(self, jobs: Iterable[CommittedJob]) -> None:
-        """Commit the number of frames handed out of jobs; each commit of a part does so anyway."""
+        """Commit the number of frames handed out of jobs, as each commit of a part does too."""
         unsaved = [job for job in jobs if job.frames != job.frames_written]
         if unsaved:
             with self._transaction():
@@ -326,7 +326,7 @@ class RunDatabase:
                 job.frames_written = job.frames
 
     def _insert(self, table: str, rows: Iterable[Sequence[Any]], conflict: str = "") -> None:
-        """Insert rows with their CRC-32; `conflict` is a clause such as ``OR REPLACE``."""
+        """Insert rows with their CRC-32, under a clause `conflict` such as ``OR REPLACE``."""
         # Not by a function that SQLite calls: an interrupt in it would look like damage.
         sealed_rows = [(*row, _crc32(*row)) for row in rows]
         placeholders = ", ".join("?" * (len(_COLUMNS[table]) + 1))
@@ -381,7 +381,10 @@ def parts_folder(mark: str) -> str:
 
 
 def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
-    """Return mark and location of parts from a database's values; ValueError if invalid."""
+    """Return mark and location of parts from a database's values.
+
+    Raises ValueError if invalid.
+    """
     mark = meta["mark"]
     location = meta.get("parts", "")
     if not re.fullmatch("[0-9a-f]{16}", mark):

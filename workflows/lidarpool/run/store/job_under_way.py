@@ -62,7 +62,7 @@ class JobUnderWay(PipelineJob):
         self._keeper = keeper
 
     def receipt(self, name: str) -> Receipt | None:
-        """Return the receipt of a part in storage; None if the part is damaged."""
+        """Return the receipt of a part in storage, or None if the part is damaged."""
         try:
             data = self.storage.read(name)
             return Receipt.from_part(unpack(data), self.number, name, len(data))
@@ -77,7 +77,7 @@ class JobUnderWay(PipelineJob):
 
     @property
     def committed_in_words(self) -> str:
-        """Number of committed scans or trials in words; empty if there are none."""
+        """Number of committed scans or trials in words, or no text if nothing is committed."""
         if self.parts.scans_done:
             return f"{self.parts.scans_done:,} of {len(self.scans):,} scans"
         if self.trials:

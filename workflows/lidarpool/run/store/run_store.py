@@ -195,7 +195,10 @@ class RunStore:
         return meta
 
     def _discard(self, earlier: _EarlierDatabase) -> None:
-        """Remove an earlier run without committed results; LidarError for a damaged database."""
+        """Remove an earlier run without committed results.
+
+        Raises LidarError for a damaged database.
+        """
         if earlier.damage is not None:
             reason = str(earlier.damage).replace(self._folder.url, self.location.url)
             raise LidarError(reason) from earlier.damage
@@ -265,7 +268,10 @@ class RunStore:
             )
 
     def _difference(self, meta: Mapping[str, str]) -> str:
-        """Return how the run of a database differs, as a clause; empty if the runs are the same."""
+        """Return how the run of a database differs, as a clause.
+
+        The clause is empty if the runs are the same.
+        """
         earlier = json.loads(meta["identity"])
         for name, value in self._run_identity.items():
             if earlier.get(name) != value:
@@ -296,12 +302,12 @@ class RunStore:
 
     @property
     def backend(self) -> str:
-        """Backend of the scans; empty until known."""
+        """Backend of the scans, or no text until the backend is known."""
         return self.db.meta.get("backend", "")
 
     @property
     def casting(self) -> dict[str, str]:
-        """Software of the workers that cast the scans, see `software`; empty until known."""
+        """Software of the workers that cast the scans, or no text until it is known."""
         return dict(json.loads(self.db.meta.get("casting", "{}")))
 
     def cast_with(self, backend: str, casting: Mapping[str, str]) -> None:
@@ -324,7 +330,7 @@ class RunStore:
 
     @property
     def committed_in_words(self) -> str:
-        """Number of committed scans, trials or jobs in words; empty if there are none."""
+        """Number of committed scans, trials or jobs in words, or no text without any."""
         if self.only_job is not None:
             return self.only_job.committed_in_words
         return f"{self.db.ended_count:,} of {len(self.jobs.numbers):,} jobs" if self.db.used else ""
@@ -352,7 +358,7 @@ class RunStore:
     # -- jobs --------------------------------------------------------------------------------
 
     def open_job(self, job: Job) -> JobUnderWay:
-        """Return a job under way; parts of an earlier run are checked first."""
+        """Return a job under way, after a check of the parts of an earlier run."""
         if job.number in self.under_way:
             return self.under_way[job.number]
         under_way = self._load(job)
@@ -443,7 +449,7 @@ class RunStore:
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
-        """Add a note on resuming to an error of the body; remove an empty store."""
+        """Add a note on resuming to an error of the body, and remove an empty store."""
         try:
             yield
         except BaseException as error:
@@ -461,7 +467,7 @@ class RunStore:
             raise
 
     def close(self) -> None:
-        """Close the database of an unfinished run; remove an empty store."""
+        """Close the database of an unfinished run, and remove an empty store."""
         used = self.db.used or self.begun
         self.db.close()
         if not used:
@@ -482,7 +488,7 @@ def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -
 
 
 def _hash_of(job: Job) -> str:
-    """Return the hash of a job's inputs; empty if an input has no fingerprint.
+    """Return the hash of a job's inputs, or no text if an input has no fingerprint.
 
     A job without a hash is not resumed.
     """
@@ -493,7 +499,10 @@ def _hash_of(job: Job) -> str:
 
 
 def _database_path(folder: Storage) -> Path:
-    """Return the path of the database in a local folder; LidarError if the file is a link."""
+    """Return the path of the database in a local folder.
+
+    Raises LidarError if the file is a link.
+    """
     folder.local(f"{FILE}-journal")  # SQLite would follow a link here, too
     return folder.local(FILE)
 

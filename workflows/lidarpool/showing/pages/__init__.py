@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # a result is viewed without the modules of runs, which take 
 
 
 def page_of(jobs: Jobs, live: Live) -> AbstractContextManager[RunPage]:
-    """Show jobs in the browser, or a viewer; what either needs is imported only then.
+    """Show jobs in the browser, or a viewer, and import only then what either needs.
 
     LidarError if the package of a viewer is missing.
     """

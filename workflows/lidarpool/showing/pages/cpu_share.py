@@ -8,7 +8,10 @@ from contextlib import contextmanager
 
 
 class CpuShare:
-    """A share of a core for an activity; processor time, since waiting does not count."""
+    """A share of a core for an activity.
+
+    Processor time, since waiting does not count.
+    """
 
     def __init__(self, share: float) -> None:
         self._share = share
@@ -21,7 +24,7 @@ class CpuShare:
 
     @property
     def wait_s(self) -> float:
-        """Seconds until the activity may run again; 0 or less if it may now."""
+        """Seconds until the activity may run again, or 0 or less if it may now."""
         return self._due_at - time.monotonic()
 
     @contextmanager

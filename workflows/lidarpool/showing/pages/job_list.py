@@ -105,7 +105,10 @@ class JobList:
         }
 
     def view_of(self, number: int) -> View:
-        """Return the view of a job; KeyError if there is no such job, or the job has failed."""
+        """Return the view of a job.
+
+        Raises KeyError if there is no such job, or the job has failed.
+        """
         row = self._rows[number]
         if not row.done:
             raise KeyError(number)

@@ -63,7 +63,7 @@ class JobViews:
                 self.jobs = {number: jobs[number] for number in [*jobs][-MAX_VIEWS:]}
 
     def view(self, number: int, name_of: Callable[[int], str]) -> View:
-        """Return the view of a job that was read or, with a name, written; else KeyError."""
+        """Return the view of a job that was read or, with a name, written, else KeyError."""
         if number in self.jobs:
             return self.jobs[number].view
         if number not in self._results and self._written is not None:

@@ -50,12 +50,15 @@ class ListedJobs:
         self.sums.update({ended: 1, "points": row.points, "rays": row.rays})
 
     def name_of(self, number: int) -> str:
-        """Return the name of a job that was done last; else KeyError."""
+        """Return the name of a job that was done last, else KeyError."""
         names = {job["number"]: job["name"] for job in list(self._ended)}
         return str(names[number])
 
     def news(self, readable: Container[int]) -> dict[str, Any]:
-        """Return the lists, for JSON; jobs with `readable` numbers can be opened as well."""
+        """Return the lists, for JSON.
+
+        Jobs with `readable` numbers can be opened as well.
+        """
         under_way = self.under_way
         return dict(self.sums) | {
             "names": list(self._names),
@@ -71,7 +74,7 @@ class ListedJobs:
         }
 
     def _words(self, values: Mapping[str, Value]) -> list[str]:
-        """Return values in the order of the table's columns; "" for a missing value."""
+        """Return values in the order of the table's columns, "" for a missing value."""
         shown = (values.get(name, "") for name in self._names)
         words = (f"{value:.4g}" if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

@@ -79,7 +79,10 @@ class LiveJob:
         self._all_read = True
 
     def finish(self, result: RunResult | None) -> None:
-        """Take a sample of all points, and all hits; the parts may then be removed."""
+        """Take a sample of all points, and all hits.
+
+        The parts may then be removed.
+        """
         if result is not None:
             with self._lock:
                 self._waiting = []
@@ -101,7 +104,10 @@ class LiveJob:
     # -- the page's side -----------------------------------------------------------------
 
     def gather(self) -> None:
-        """Read a few of the waiting parts; the run reports parts that cannot be read."""
+        """Read a few of the waiting parts.
+
+        The run reports parts that cannot be read.
+        """
         with self._lock:
             names = self._waiting[:PARTS_PER_READ]
             self._waiting = self._waiting[PARTS_PER_READ:]

@@ -85,7 +85,10 @@ class LivePage(RunPage):
     def on_progress(
         self, progress: Progress, under_way: Callable[[], Sequence[Mapping[str, Any]]]
     ) -> None:
-        """Record the progress; KeyboardInterrupt if a user of the page has stopped the run."""
+        """Record the progress.
+
+        Raises KeyboardInterrupt if a user of the page has stopped the run.
+        """
         if self.stopped.is_set():
             raise KeyboardInterrupt
         self._status.update(progress)
@@ -107,7 +110,10 @@ class LivePage(RunPage):
         self._views.read(row, job, is_only=self._count == 1)
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
-        """Show that the run is over, and the result of a survey; its parts may then be removed."""
+        """Show that the run is over, and the result of a survey.
+
+        Its parts may then be removed.
+        """
         if self._count == 1 and 0 in self._views.jobs:
             self._views.jobs[0].finish(result)
         self._listed.under_way = ()

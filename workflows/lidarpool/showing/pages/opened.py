@@ -1,4 +1,4 @@
-"""Opens for the viewer whatever lidarpool reads or writes; points are offered as files.
+"""Opens files that lidarpool reads or writes for the viewer, and offers points as files.
 
 Results, clouds, recordings and exports of lidarpool and other programs, meshes and scenarios are a
 view each; a data set is a list of jobs with a view each (`job_list.py`).
@@ -92,7 +92,10 @@ def open_view(
 
 
 def _is_previewed(path: Path) -> bool:
-    """Return True for a scenario or a mesh; LidarError if its file cannot be read."""
+    """Return True for a scenario or a mesh.
+
+    Raises LidarError if its file cannot be read.
+    """
     suffix = path.suffix.lower()
     if path.is_dir():
         return False

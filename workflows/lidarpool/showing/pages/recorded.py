@@ -168,7 +168,10 @@ def sampled_view(recording: Recording, title: str) -> View:
 
 
 def _cloud_of(recording: Recording) -> Cloud:
-    """Read a cloud; of a large cloud, take one point in a few."""
+    """Read a cloud.
+
+    Of a large cloud, take one point in a few.
+    """
     total = recording.point_count or 0
     step = max(1, -(-total // MAX_POINTS))
     pieces = Pieces()
@@ -212,7 +215,7 @@ def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
 
 
 def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[str]]:
-    """Read sweeps until memory is full; return their points, the sweeps, and notes."""
+    """Read sweeps until memory is full, and return their points, the sweeps, and notes."""
     recordings = [*sensors.values()]
     ordered, is_timed = _order(recordings)
     pieces = Pieces()
@@ -247,7 +250,7 @@ def _frame_poses(recording: Recording) -> Floats | None:
 def _add_sweep(
     pieces: Pieces, recording: Recording, number: int, frame_pose: Floats | None
 ) -> Floats | None:
-    """Read a sweep into the world frame, if its pose is known; return the pose.
+    """Read a sweep into the world frame, if its pose is known, and return the pose.
 
     `frame_pose` is the pose of a sweep that has none of its own.
     """
@@ -266,7 +269,10 @@ def _add_sweep(
 def recorded_sweeps(
     ordered: Sequence[_TimedSweep], poses: Sequence[Floats | None], names: Sequence[str]
 ) -> Sweeps:
-    """Return sweeps of one scan each, without actors; `names` are the names of the sensors."""
+    """Return sweeps of one scan each, without actors.
+
+    `names` are the names of the sensors.
+    """
     known = [np.eye(4) if pose is None else pose for pose in poses]
     matrices = np.array(known, np.float64).reshape(-1, 4, 4)
     count = len(ordered)

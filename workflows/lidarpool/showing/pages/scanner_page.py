@@ -94,7 +94,7 @@ def show(
 
 
 class ScannerPage(ScannerView):
-    """The page of scanners, in real time; see `show`."""
+    """The page of scanners, in real time, made by `show`."""
 
     def __init__(self, scanners: Sequence[Scanner], to: str | None, browser: bool) -> None:
         names = [_name(scanner) for scanner in scanners]
@@ -249,7 +249,7 @@ class SweepFeed:
             return self._view
 
     def _news(self) -> dict[str, Any]:
-        """Return the number of sweeps and their rate, for JSON; show newer points if due."""
+        """Return the number of sweeps and their rate, for JSON, and show newer points if due."""
         rate = ""
         with self._lock:
             moments = [*self._moments]
@@ -308,7 +308,7 @@ class SweepFeed:
         return Cloud(np.concatenate([positions for positions, _ in parts]), columns, custom)
 
     def _moved(self) -> dict[str, AnyArray]:
-        """Return where sensors and actors are, as arrays for the page; local metres, seconds."""
+        """Return the positions of sensors and actors, local metres, and seconds, as arrays."""
         with self._lock:
             scene = self._scene
             time_ns = self._time_ns

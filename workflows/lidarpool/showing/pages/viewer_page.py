@@ -94,7 +94,10 @@ class ViewerPage(RunPage):
                     self._viewer.show_sweep(reader.shown(sweep))
 
     def finish(self, seconds: float, result: RunResult | None = None) -> None:
-        """Show the result of a survey; its parts may then be removed."""
+        """Show the result of a survey.
+
+        Its parts may then be removed.
+        """
         if self._survey is not None:
             self._survey.close(result)
 
@@ -145,7 +148,10 @@ class SweepReader:
         return replace(surroundings, surface=Surface.from_scene(self._job.scene))
 
     def shown(self, sweep: int) -> ShownSweep:
-        """Return a sweep whose parts are in storage; LidarError if a part cannot be read."""
+        """Return a sweep whose parts are in storage.
+
+        Raises LidarError if a part cannot be read.
+        """
         start, stop = self.sequence.sweeps.scans[sweep : sweep + 2].tolist()
         with self._lock:
             parts = [
@@ -156,7 +162,10 @@ class SweepReader:
         return self.sequence.show(sweep, Cloud.joined(selected))
 
     def _read(self, name: str) -> Cloud:
-        """Return the points of a part; the last part is kept, as a part may have many sweeps."""
+        """Return the points of a part.
+
+        The last part is kept, as a part may have many sweeps.
+        """
         if self._last is None or self._last[0] != name:
             self._last = name, self._points.cloud_of(read_part(self._points.storage, name))
         return self._last[1]
@@ -234,7 +243,10 @@ class SurveyFeed:
                     self._send_next()
 
     def _send_next(self) -> None:
-        """Send the sweep that has waited longest; the run reports parts that cannot be read."""
+        """Send the sweep that has waited longest.
+
+        The run reports parts that cannot be read.
+        """
         with self._lock:
             sweep = self._waiting.pop(0)
         with suppress(LidarError):

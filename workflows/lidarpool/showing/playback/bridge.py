@@ -30,7 +30,7 @@ class BridgeOptions:
 
 
 class Bridge(ABC):
-    """Sends sweeps to receivers; a context manager that opens and closes what it sends by.
+    """Sends sweeps to receivers, as a context manager that opens and closes the connections.
 
     A subclass checks its options when it is made, and raises LidarError, in one line, for what it
     cannot send.
@@ -65,7 +65,10 @@ class Bridge(ABC):
 
     @classmethod
     def format_of(cls, settings: Mapping[str, Any]) -> Format | None:
-        """Return `format`, or that of `settings`; LidarError if these do not fit together."""
+        """Return `format`, or the format of `settings`.
+
+        Raises LidarError if these do not fit together.
+        """
         del settings
         return cls.format
 
@@ -94,18 +97,24 @@ class Bridge(ABC):
     def show_content(  # noqa: B027 - most receivers have no use for a scene
         self, content: Callable[[], PictureContent | None]
     ) -> None:
-        """Show scene and planned path before the first sweep; `content` returns both."""
+        """Show scene and planned path before the first sweep.
+
+        `content` returns both.
+        """
 
     @abstractmethod
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
-        """Send a sweep; with `--loop`, its times are `shift_ns` later than in the survey."""
+        """Send a sweep.
+
+        With `--loop`, its times are `shift_ns` later than in the survey.
+        """
 
     def finish(self) -> None:  # noqa: B027 - messages are sent at once
         """Send what is left after the last sweep, and wait until all is sent."""
 
     @property
     def summary(self) -> str:
-        """What was sent, for the user, once the context has ended; or nothing."""
+        """What was sent, for the user, once the context has ended, or no text."""
         return ""
 
     def __enter__(self) -> Self:

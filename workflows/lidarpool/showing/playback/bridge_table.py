@@ -1,4 +1,4 @@
-"""The table of bridges; quick to import, for the completion of commands."""
+"""The table of bridges, quick to import for the completion of commands."""
 
 from __future__ import annotations
 

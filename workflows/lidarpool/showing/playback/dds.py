@@ -67,7 +67,7 @@ class Network:
 
     @classmethod
     def to(cls, hosts: Sequence[str], environment: Mapping[str, str] = os.environ) -> Network:
-        """Return the network that reaches hosts, of a single interface; loopback without hosts.
+        """Return the network that reaches hosts, of a single interface, or loopback without hosts.
 
         The domain is that of ROS_DOMAIN_ID.
 
@@ -107,7 +107,10 @@ class Network:
 
 
 def _ipv4_address(host: str) -> str:
-    """Return the address of a host; LidarError for an unknown host, and without IPv4."""
+    """Return the address of a host.
+
+    Raises LidarError for an unknown host, and without IPv4.
+    """
     advice = "give a host or an IPv4 address, without a port"
     try:
         infos = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
@@ -130,7 +133,7 @@ def _interface_to(address: str) -> str:
 
 
 class RosPublisher:
-    """Publishes messages on topics of ROS 2; a context manager.
+    """Publishes messages on topics of ROS 2, as a context manager.
 
     Nodes find the topics on the interface of a network, and on its peers.
     """
@@ -160,7 +163,10 @@ class RosPublisher:
                 entity._delete(entity._ref)
 
     def publish(self, message: RosMessage) -> None:
-        """Publish a message; the topic is made with its first message."""
+        """Publish a message.
+
+        The topic is made with its first message.
+        """
         if message.topic not in self._writers:
             self._writers[message.topic] = self._writer(message.topic, message.kind)
         writer = self._writers[message.topic]

@@ -119,7 +119,7 @@ _START_NS = 50e6  # from the start of the schedule to the first datagram
 def recorded_streams(
     recording: PcapRecording, to: Sequence[str], api: Sequence[str]
 ) -> list[Stream]:
-    """Return a stream for each sensor of a recording, named by its address; see `streams_of`.
+    """Return a stream for each sensor of a recording, named by its address, as `streams_of`.
 
     An Ouster's interface answers if the metadata are beside the recording, as a .json.
     """
@@ -162,7 +162,7 @@ def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
 def play_recording(
     recording: PcapRecording, transmitter: Transmitter, schedule: Schedule, *, loop: bool = False
 ) -> None:
-    """Send the datagrams of a recording at their times; with `loop`, again and again."""
+    """Send the datagrams of a recording at their times, with `loop` again and again."""
     schedule.start(0, _START_NS)
     for lap in count() if loop else range(1):
         shift_ns = lap * recording.period_ns
@@ -206,7 +206,7 @@ def _read_datagrams(
 def _datagram(
     frame: bytes, link: int, fragments: dict[bytes, dict[int, bytes]]
 ) -> RecordedDatagram | None:
-    """Return the UDP datagram that a frame completes, at time 0; None for other frames."""
+    """Return the UDP datagram that a frame completes, at time 0, or None for other frames."""
     start = _ip_start(frame, link)
     if start is None or len(frame) < start + 20 or frame[start] >> 4 != 4:
         return None
@@ -231,7 +231,7 @@ def _datagram(
 
 
 def _ip_start(frame: bytes, link: int) -> int | None:
-    """Return where IPv4 begins in a frame; None for other frames."""
+    """Return where IPv4 begins in a frame, or None for other frames."""
     if link != _ETHERNET:
         return _LINK_BYTES[link]
     start = 14
@@ -243,7 +243,7 @@ def _ip_start(frame: bytes, link: int) -> int | None:
 def _join_fragments(
     fragments: dict[bytes, dict[int, bytes]], key: bytes, flags: int, content: bytes
 ) -> bytes | None:
-    """Keep a fragment of a datagram; return the datagram once all are there, else None."""
+    """Keep a fragment of a datagram, and return the datagram once all are there, else None."""
     parts = fragments.setdefault(key, {})
     parts[(flags & 0x1FFF) * 8] = content
     if not flags & 0x2000:

@@ -30,7 +30,9 @@ def play_sweeps(
     loop: bool = False,
     start_at_ns: int = 0,
 ) -> None:
-    """Send each sweep through a bridge when it is due; the schedule starts with the first sweeps.
+    """Send each sweep through a bridge when it is due.
+
+    The schedule starts with the first sweeps.
 
     With `loop`, all sweeps are sent again and again, with times that go on. A sweep that is not
     cast in time is sent late, and the user is told once. The schedule does not start before

@@ -64,7 +64,10 @@ class Ros2Bridge(Bridge):
         return f"topics of ROS 2 in domain {network.domain} on {network.address}{peers}"
 
     def prepare(self, sweep: int, points: Cloud) -> None:
-        """Publish static messages; LidarError if the cloud lacks columns of the layout."""
+        """Publish static messages.
+
+        Raises LidarError if the cloud lacks columns of the layout.
+        """
         self._format.check_columns(points)
         if self._messages is None:
             self._columns = {column.name for column in points.table}
@@ -125,7 +128,7 @@ class Ros2Bridge(Bridge):
             yield messages.clock(time_ns)
 
     def _instruments(self) -> Iterator[RosMessage]:
-        """Yield the messages of IMU and GNSS receiver, of each lap; none without instruments."""
+        """Yield the messages of IMU and GNSS receiver, of each lap, or none without instruments."""
         period_ns = self.options.period_ns
         for lap in count() if period_ns else range(1):
             last_message = None

@@ -54,7 +54,7 @@ class Schedule:
         self._origin_ns = time.monotonic_ns() + delay_ns - time_ns / self.rate
 
     def deadline_ns(self, time_ns: float) -> float:
-        """Return a time of the survey by the clock, nanoseconds; the schedule has started."""
+        """Return a time of the survey by the clock, nanoseconds, once the schedule has started."""
         assert self._origin_ns is not None
         return self._origin_ns + time_ns / self.rate
 
@@ -63,7 +63,7 @@ class Schedule:
         return (self.deadline_ns(0.0) + times_ns / self.rate).astype("<i8")
 
     def late_s(self, time_ns: float) -> float:
-        """Return by how much a time of the survey is over, seconds; negative before that time."""
+        """Return by how much a time of the survey is over, seconds, negative before that time."""
         return (time.monotonic_ns() - self.deadline_ns(time_ns)) / 1e9
 
     def wait_until(self, time_ns: float) -> None:

@@ -117,7 +117,10 @@ def open_source(
 
 
 def _recorded(folder: Path, source: Path | Storage) -> Played:
-    """Return the sweeps of a result in a folder; LidarError if files are missing."""
+    """Return the sweeps of a result in a folder.
+
+    Raises LidarError if files are missing.
+    """
     for name in (CLOUD, SWEEPS_FILE):
         if not (folder / name).exists():
             raise LidarError(

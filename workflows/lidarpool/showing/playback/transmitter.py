@@ -36,7 +36,7 @@ class Stream:
 
     @property
     def source_address(self) -> str:
-        """The address that datagrams come from: the interface's; empty for any."""
+        """The address that datagrams come from: the interface's, or no text for any."""
         to_this_machine = Address(self.destination.host).is_loopback
         return self.address.host if to_this_machine or not self.address.is_loopback else ""
 
@@ -52,7 +52,9 @@ class Stream:
         return f"{words}, port {ports}" if ports else words
 
     def to(self, receiver: Address) -> Stream:
-        """Return the stream to a receiver; LidarError if its datagrams cannot go there.
+        """Return the stream to a receiver.
+
+        Raises LidarError if its datagrams cannot go there.
 
         A port is that of the returns; other kinds of datagrams move by as much.
         """
@@ -121,7 +123,10 @@ def _loopback_address(number: int, has_own_address: bool) -> Address:
 
 
 def _by_sensor(texts: Sequence[str], names: Sequence[str], option: str) -> dict[str, Address]:
-    """Return the address of each sensor by its name; an address without a name is for all."""
+    """Return the address of each sensor by its name.
+
+    An address without a name is for all.
+    """
     addresses: dict[str, Address] = {}
     for text in texts:
         name, separator, address = text.rpartition("=")
@@ -200,7 +205,10 @@ class Transmitter:
         self._write_lateness()
 
     def _write_lateness(self) -> None:
-        """Write how late datagrams were; LidarError if the file cannot be written."""
+        """Write how late datagrams were.
+
+        Raises LidarError if the file cannot be written.
+        """
         file = self._lateness_file
         if file is not None:
             with explained(f"{file} cannot be written"):

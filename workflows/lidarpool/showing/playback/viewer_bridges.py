@@ -54,7 +54,10 @@ class ViewerBridge(Bridge):
         self._viewer.show_surroundings(Surroundings.from_sweeps(self.sweeps, content()))
 
     def send(self, sweep: int, points: Cloud, shift_ns: int) -> None:
-        """Send a sweep; with `--loop`, its times are `shift_ns` later than in the survey."""
+        """Send a sweep.
+
+        With `--loop`, its times are `shift_ns` later than in the survey.
+        """
         shown = self._sequence.show(sweep, points)
         times = {name: getattr(shown, name) + shift_ns for name in ("start_ns", "stamp_ns")}
         self._viewer.show_sweep(replace(shown, **times))

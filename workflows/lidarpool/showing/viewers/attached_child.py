@@ -16,7 +16,7 @@ _CHECK_S = 0.2  # whether the command has ended by itself
 
 
 def main(command: list[str]) -> int:
-    """Run a command until it ends, or stdin does; return its exit status."""
+    """Run a command until it ends, or stdin does, and return its exit status."""
     child = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     while child.poll() is None:
         readable, _, _ = select.select([0], [], [], _CHECK_S)

@@ -146,7 +146,7 @@ class FoxgloveServer(Viewer):
         self._send_entities(_PATH, [_entity("path", lines=[_line(path, _GREEN)])])
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points of a sweep, its frames and its boxes of actors; return at once."""
+        """Show the points of a sweep, its frames and its boxes of actors, and return at once."""
         self._start_ns = shown.start_ns
         if self._sends_time:
             self._server.broadcast_time(shown.start_ns)
@@ -186,7 +186,10 @@ class FoxgloveServer(Viewer):
         channel.log(message, log_time=time_ns)
 
     def _channel(self, topic: str, kind: Callable[..., Any]) -> Any:
-        """Return the channel of a topic; a new channel is advertised to clients."""
+        """Return the channel of a topic.
+
+        A new channel is advertised to clients.
+        """
         if topic not in self._channels:
             self._channels[topic] = kind(topic, context=self._context)
         return self._channels[topic]
@@ -248,7 +251,10 @@ def _transform(transform: Transform, stamp: Any) -> Any:
 
 
 def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
-    """Return the boxes of the actors that are present; boxes of absent actors are deleted."""
+    """Return the boxes of the actors that are present.
+
+    Boxes of absent actors are deleted.
+    """
     entities = []
     deletions = []
     for number, name in enumerate(boxes.names):

@@ -70,7 +70,7 @@ class RerunServer(Viewer):
         self._log.show_path(path)
 
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points of a sweep, its frames and its boxes of actors; return at once."""
+        """Show the points of a sweep, its frames and its boxes of actors, and return at once."""
         self._log.show_sweep(shown)
 
     def close(self) -> None:

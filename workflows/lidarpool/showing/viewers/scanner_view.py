@@ -33,7 +33,7 @@ from .viewer import Viewer, open_viewer
 
 
 class ScannerView(ABC):
-    """Shows the sweeps of scanners while a program scans; a context manager."""
+    """Shows the sweeps of scanners while a program scans, as a context manager."""
 
     def __init__(self, scanner: Scanner) -> None:
         self._scanner = scanner
@@ -64,7 +64,7 @@ class ScannerView(ABC):
         start_s: float = 0.0,
         scanner: Scanner | None = None,
     ) -> None:
-        """Show a sweep with its frames and the boxes of the actors; return at once.
+        """Show a sweep with its frames and the boxes of the actors, and return at once.
 
         Its time is the time of the call.
 
@@ -155,7 +155,7 @@ class Foxglove(_InViewer):
 
 
 class Rerun(_InViewer):
-    """Shows the sweeps of a scanner in Rerun, in real time; see `Foxglove`.
+    """Shows the sweeps of a scanner in Rerun, in real time, as `Foxglove` does.
 
     It prints the link of the viewer in the browser. By default it listens on 127.0.0.1:9876, with
     the page on the next port. It needs rerun-sdk (the extra `rerun`).

@@ -45,7 +45,7 @@ class Viewer(ABC):
 
     @abstractmethod
     def show_sweep(self, shown: ShownSweep) -> None:
-        """Show the points of a sweep, its frames and its boxes of actors; return at once."""
+        """Show the points of a sweep, its frames and its boxes of actors, and return at once."""
 
     @abstractmethod
     def close(self) -> None:
@@ -98,7 +98,9 @@ class Address(NamedTuple):
 
     @classmethod
     def choose(cls, text: str | None, port: int, count: int = 1) -> Address:
-        """Return the address of ADDRESS:PORT, ADDRESS or :PORT; the rest is loopback and `port`.
+        """Return the address of ADDRESS:PORT, ADDRESS or :PORT.
+
+        The rest is loopback and `port`.
 
         Without a text it is another free port if `port` is in use. All `count` ports from the port
         on must be free.
@@ -151,7 +153,10 @@ class Address(NamedTuple):
                 ) from error
 
     def wait_until_open(self, timeout_s: float, is_alive: Callable[[], bool]) -> None:
-        """Wait for a server to listen here; LidarError if the server has ended, or after a time."""
+        """Wait for a server to listen here.
+
+        Raises LidarError if the server has ended, or after a time.
+        """
         give_up_at = time.monotonic() + timeout_s
         while is_alive() and time.monotonic() < give_up_at:
             with suppress(OSError), socket.create_connection(self, timeout=1):

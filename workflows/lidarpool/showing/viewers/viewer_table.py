@@ -1,4 +1,4 @@
-"""The table of viewers; quick to import, for the help of commands."""
+"""The table of viewers, quick to import for the help of commands."""
 
 from __future__ import annotations
 
