@@ -1,1 +1,1 @@
-"""Kinds of scenes beside those of lidarsim: files, robots, procedural worlds, HELIOS++ surveys."""
+"""Kinds of scenes that lidarsim lacks: files, robots, procedural worlds, HELIOS++ surveys."""

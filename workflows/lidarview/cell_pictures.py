@@ -31,7 +31,7 @@ from .render.pictures import splat
 from .render.shot import take_shot
 from .render.stage import PlotBox
 
-MAX_BYTES = 60_000  # of a picture; notebooks keep all of them
+MAX_BYTES = 60_000  # bytes of a picture; notebooks keep all of them
 MAX_POINTS = 60_000
 MAX_TRIANGLES = 200_000
 _PALETTES = (128, 32)  # numbers of colours, until a picture is small enough
@@ -43,7 +43,7 @@ _SPREAD = (1, 99)  # percentiles of the positions that are in the picture
 def small_png(png: bytes) -> bytes:
     """Return a PNG with at most `MAX_BYTES`: with fewer colours, and if need be of half the size.
 
-    A picture of noise, of which both are too large, is returned in the last form.
+    If both are too large, as of a picture of noise, the last form is returned.
     """
     image = Image.open(io.BytesIO(png)).convert("RGB")
     half = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)

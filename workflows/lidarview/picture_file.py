@@ -85,7 +85,7 @@ class PlannedPath:
 
     @property
     def excess(self) -> float:
-        """Share by which the path is longer than the shortest path: 0.01 is 1%."""
+        """Length of the path over the shortest length, less 1: 0.01 is 1%."""
         return self.length_m / self.shortest_m - 1
 
 
@@ -109,14 +109,14 @@ class PictureContent:
     hit_counts: AnyArray  # (f,): of each triangle, triangles of actors last
     sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
     planning: PlanningPicture | None = None
-    duration_ns: float = 0.0  # of the survey, by its own clock
+    duration_ns: float = 0.0  # duration of the survey, by its own clock
     extra_columns: Sequence[
         Column
     ] = ()  # columns of the cloud's file that are not in the table of columns
     # (objects,): share of light that each object reflects, actors last; None if unknown.
     reflectance: Floats | None = None
-    coordinates: str = "world"  # of the cloud's points; or "sensor", which does not fit the scene
-    triangles: int = 0  # of the scene, though simpler instances may be drawn
+    coordinates: str = "world"  # frame of the cloud's points; "sensor" does not fit the scene
+    triangles: int = 0  # triangles of the scene, though simpler instances may be drawn
     classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
     materials: Sequence[str] | None = None  # names of the materials 0, 1, 2, …
     face_materials: Ints32 | None = None  # (f,): material of each static triangle, -1 for none
@@ -134,7 +134,7 @@ class PictureContent:
         sensors = sensor_positions(survey)
         positions = [sensor.positions for sensor in sensors]
         drawn = SimplifiedScene.from_scene(cut_masks(scene), near_positions=positions)
-        wavelength_nm = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
+        wavelength_nm = survey.carried[0].sensor.optics.wavelength_nm  # the first sensor
         kinds = scene.surface_kinds
         materials = MaterialTable.build(survey.materials, kinds, wavelength_nm, scene.has_voxels)
         content = cls(
@@ -426,7 +426,7 @@ def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
     sampled = replace(actor, trajectory=track)
     if (animation := actor.mesh.animation) is None:
         return sampled
-    # The animation may follow the trajectory, of which the samples lack the part before the survey.
+    # The animation may follow the trajectory. The samples lack its part before the survey.
     missing_s = actor.seconds(times[:1])[0] - sampled.seconds(times[:1])[0]
     mesh = replace(actor.mesh, animation=animation.pictured)
     return replace(sampled, mesh=mesh, offset_s=actor.offset_s + float(missing_s[0]))

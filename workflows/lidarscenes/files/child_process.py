@@ -1,4 +1,4 @@
-"""Files read by libraries that may end their process, in a process of its own.
+"""Files read by libraries that may end their process, in a separate process.
 
 A script of this package is that process. Its standard output has frames, each a line of JSON and
 the bytes of the arrays of its field `arrays`, a list of data types and shapes. A frame whose field

@@ -95,9 +95,9 @@ class _Polygons(NamedTuple):
 
     corners: list[Ints]  # vertices of the polygons without holes, an array for each object
     sizes: list[int]  # number of corners of each polygon without holes
-    owners: list[tuple[int, int]]  # of each polygon without holes
+    owners: list[tuple[int, int]]  # owners of polygons without holes
     holed_faces: list[Ints]  # triangles of the polygons with holes
-    holed_owners: list[tuple[int, int]]  # of each of these triangles
+    holed_owners: list[tuple[int, int]]  # owners of these triangles
 
 
 def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
@@ -147,7 +147,7 @@ class _CityFile:
         self._allowance = allowance
         self._colours = options.colours
         self._names_materials = options.materials
-        self._unit = options.unit  # that the user gives
+        self._unit = options.unit  # unit that the user gives
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(
@@ -271,7 +271,7 @@ class _CityFile:
         corners = np.concatenate(polygons.corners)
         sizes = np.array(polygons.sizes, np.int64)
         self._allowance.take(100 * len(corners))
-        # Each polygon has corners of its own, so that triangles belong to the polygon of a corner.
+        # No two polygons share corners, so that triangles belong to the polygon of a corner.
         simple = triangulated(points[corners], np.arange(len(corners)), sizes)
         polygon = np.searchsorted(np.cumsum(sizes), simple[:, 0], side="right")
         faces = np.concatenate([corners[simple], *polygons.holed_faces])
@@ -298,13 +298,13 @@ class _CityFile:
     def _surfaces(self, geometries: Sequence[_Json]) -> Iterator[tuple[list[list[int]], int]]:
         """Yield the rings of polygons and the numbers of their materials, -1 for none."""
         for geometry in geometries:
-            if geometry["type"] not in _DEPTHS:  # of a template
+            if geometry["type"] not in _DEPTHS:  # geometry of a template
                 self._unread[str(geometry["type"])[:40]] += 1
                 continue
             semantics = geometry.get("semantics") or {}
             kinds = dict(enumerate(surface["type"] for surface in semantics.get("surfaces") or ()))
             paint: _Json = {}
-            if self._colours or self._names_materials:  # of the first theme
+            if self._colours or self._names_materials:  # the first theme counts
                 paint = next(iter((geometry.get("material") or {}).values()), {})
             values = semantics.get("values"), paint.get("values", paint.get("value"))
             if self._colours and geometry.get("texture"):
@@ -358,7 +358,7 @@ class _System:
     epsg: int | None
     crs: Any  # None without rasterio, and if PROJ does not know the code
     is_of_angles: bool
-    unit_m: float = 1.0  # of x and y, metres
+    unit_m: float = 1.0  # unit of x and y, metres
     height_units: float = 1.0  # units of x and y in the unit of heights
 
     @classmethod
@@ -366,7 +366,7 @@ class _System:
         """Return the system of a file, or of the first line of a sequence, with its corners."""
         text = str((head.get("metadata") or {}).get("referenceSystem") or "")
         looks_like_angles = _looks_like_angles(corners)
-        codes = _CODES.findall(text)  # of a compound system, the first is horizontal
+        codes = _CODES.findall(text)  # the first code of a compound system is horizontal
         if not codes:
             return cls("", None, None, looks_like_angles or "CRS84" in text)
         authority, number = codes[0]
@@ -410,7 +410,7 @@ class _System:
 
 
 def _looks_like_angles(corners: Floats) -> bool:
-    """Return True if the corners (n, 3) of a city are those of degrees with heights in metres."""
+    """Return True if the corners (n, 3) of a city are degrees with heights in metres."""
     width, depth, height = np.ptp(corners, axis=0)
     is_small = np.abs(corners[:, :2]).max() <= 360
     return bool(is_small and height > _MAX_SLOPE * max(width, depth))

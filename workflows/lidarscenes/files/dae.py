@@ -49,7 +49,7 @@ class _Inputs(NamedTuple):
     """Points of a primitive, and the layout of the numbers in <p>."""
 
     points: Floats  # (v, 3)
-    offset: int  # of the indices of points in the numbers of a corner
+    offset: int  # offset of the indices of points in the numbers of a corner
     stride: int  # count of numbers of a corner
 
 
@@ -74,7 +74,7 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
                 f"its unit is {meter[:40]!r} metres, and a positive number was expected"
             )
     axis = (root.findtext("asset/up_axis") or "").strip()
-    content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # by its standard
+    content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # default
     return content
 
 

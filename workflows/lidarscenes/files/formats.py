@@ -6,8 +6,8 @@ from lidarsim.scene.files.mesh_formats import MeshFormat
 
 CITYJSON = (".json", ".cityjson", ".jsonl")
 ROBOTS = (".urdf", ".xacro")  # `urdf` refuses .xacro, and says what to do
-WORLDS = (".sdf", ".world")  # of Gazebo
-MODELS = (".xml",)  # of MuJoCo
+WORLDS = (".sdf", ".world")  # worlds of Gazebo
+MODELS = (".xml",)  # models of MuJoCo
 
 _USD = "lidarscenes.files.usd:read_usd"
 _RASTER = "lidarscenes.files.rasters:read_raster"

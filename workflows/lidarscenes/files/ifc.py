@@ -1,6 +1,6 @@
 """Buildings of IFC, .ifc and .ifczip, through ifcopenshell (licence LGPL-3.0-or-later).
 
-`ifc_child.py` reads the files in a process of its own. Shapes of elements are those of the geometry
+`ifc_child.py` reads the files in a separate process. The shapes of elements come from the geometry
 iterator of ifcopenshell, with openings cut out.
 """
 
@@ -64,10 +64,10 @@ _CLASSES: dict[int, tuple[str, tuple[str, ...]]] = {
 _OTHER_CLASS = (1, "unclassified")
 
 MIN_MEMORY_BYTES = 1024 * 2**20  # bytes that ifcopenshell and its process may take for any file
-MEMORY_TIMES = 30  # of the file's bytes
+MEMORY_TIMES = 30  # memory as a multiple of the file's bytes
 _END = b"END-ISO-10303-21"
 _END_BYTES = 200  # bytes of a file that contain its end
-_MAX_SCALE_ERROR = 0.1  # of a map conversion: metres of a map are metres of a building, nearly
+_MAX_SCALE_ERROR = 0.1  # limit: metres of a map are metres of a building, nearly
 _ADVICE = "export it in parts"
 _EMPTY = "holds no elements with a shape, such as walls and slabs, or none in these storeys"
 

@@ -24,10 +24,10 @@ from ifcopenshell.util.geolocation import get_crs, get_helmert_transformation_pa
 from ifcopenshell.util.unit import calculate_unit_scale, get_unit_scale
 from numpy.typing import NDArray
 
-MAX_WAIT_S = 300  # from one shape to the next; broken files may take for ever
-_MAX_PARENTS = 100  # of an element in the tree of a building; broken files have cycles
+MAX_WAIT_S = 300  # limit between two shapes; broken files may take for ever
+_MAX_PARENTS = 100  # limit for an element in the tree of a building; broken files have cycles
 
-_HEAD_BYTES = 2**16  # of a file, which contain its header
+_HEAD_BYTES = 2**16  # bytes of a file that contain its header
 _SCHEMA = re.compile(rb"FILE_SCHEMA\s*\(\s*\(\s*'([^']*)'", re.IGNORECASE)
 # Schemas whose entities have the attributes of a schema that the library reads, but for attributes
 # without a shape and for the order of Normals and Closed of triangulated face sets, which are not
@@ -46,7 +46,7 @@ _SAME_SCHEMAS = {
 # Classes, with their subclasses, that have shapes and reflect no light.
 _UNREAD = {
     "IfcSpatialElement",
-    "IfcSpatialStructureElement",  # of IFC2X3
+    "IfcSpatialStructureElement",  # type of IFC2X3
     "IfcFeatureElementSubtraction",  # openings
     "IfcAnnotation",
     "IfcGrid",
@@ -348,10 +348,10 @@ def main(path: str, request: dict[str, Any]) -> None:
     except UnreadSchemaError as error:
         schema, names = error.args
         write({"what": "schema", "schema": schema, "read": names})
-    except MemoryError:  # as if the library had ended the process
+    except MemoryError:  # treated as if the library had ended the process
         raise
-    except Exception as error:  # of any type, as readers of broken files are
-        if "shared_library::load" in str(error):  # of a schema: memory is short, not the file wrong
+    except Exception as error:  # readers of broken files raise errors of any type
+        if "shared_library::load" in str(error):  # memory is short, not the file wrong
             raise
         reason = " ".join(str(error).replace(path, os.path.basename(path)).split())  # noqa: PTH119
         write({"what": "error", "reason": (reason or type(error).__name__)[:300]})

@@ -1,7 +1,7 @@
 """XML of SDFormat and MJCF, as leniently as Gazebo and MuJoCo read it.
 
 Public files have comments with «--» and prefixes without a namespace, which end expat, and with
-expat ElementTree. Entities are refused, except those of XML itself and of characters.
+expat ElementTree. Entities are refused, except the entities of XML itself and of characters.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 from lidarsim.base.errors import CutShortError
 
-MAX_ELEMENTS = 1_000_000  # of a file; public worlds of Gazebo have up to 60,000
+MAX_ELEMENTS = 1_000_000  # limit for a file; public worlds of Gazebo have up to 60,000
 _MAX_DEPTH = 200
 
 _TAG = re.compile(

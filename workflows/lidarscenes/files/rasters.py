@@ -59,16 +59,16 @@ DRIVERS = {  # {ending: GDAL's name of the driver}
     ".dem": "USGSDEM", ".dt0": "DTED", ".dt1": "DTED", ".dt2": "DTED",
 }  # fmt: skip
 
-_MAX_BESIDE_BYTES = 65536  # of a file beside a raster
+_MAX_BESIDE_BYTES = 65536  # limit for a file beside a raster
 
 # Without this, a file that begins with integers is read as integers.
 _OPEN_OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}
 
-_BLOCK_VERTICES = 100_000  # that are reprojected at a time, through lists
-_PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and temporary arrays
+_BLOCK_VERTICES = 100_000  # number of vertices that are reprojected at a time, through lists
+_PIXEL_BYTES = 100  # bytes of a pixel in a mesh: vertices, two triangles, and temporary arrays
 MAX_UNASKED_PIXELS = 5_000_000  # pixels that are read without a window and a step; more take long
 _MAX_READ = 1_000_000_000  # pixels that make a coarser grid, which takes two minutes
-_WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
+_WIDEST_DEG = 12.0  # degrees of longitude; a UTM zone is 6 wide
 
 Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
 PixelRange = tuple[int, int]  # half-open
@@ -79,7 +79,7 @@ _HIGHEST_M = 9_000.0
 _NO_DATA = -9999.0  # which many programs write without saying so in the file
 _FOOT_M = 0.3048
 _US_FOOT_M = 1200 / 3937
-_UNIT_NAMES = {  # of heights, as files spell the names
+_UNIT_NAMES = {  # names of the units of heights, as files spell the names
     **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), _FOOT_M),
     **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus", "us_ft"), _US_FOOT_M),
@@ -215,7 +215,7 @@ class _Source:
     """An open raster, with the coordinates of its pixels."""
 
     file: Any
-    affine: Any  # from columns and rows to x and y
+    affine: Any  # transform from columns and rows to x and y
     crs: Any  # horizontal coordinate system of x and y; None for none on Earth
     up_m: float | None  # unit of heights of the vertical system, metres
 
@@ -312,8 +312,8 @@ def _systems(source: Any) -> tuple[Any, float | None]:
 def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
     """Return the coordinate system of the mesh, in true metres, or raise MeshFileError.
 
-    Appends a note if the metres of the raster are not true to scale, and if those of the mesh are
-    not at its edges.
+    Appends a note if the metres of the raster are not true to scale, and if the metres of the mesh
+    are not true at its edges.
     """
     crs = source.crs
     middle = _corners(source.file, source.affine).mean(axis=0)
@@ -409,7 +409,7 @@ def _affine(file: Any, path: Path) -> Any:
     affine = file.transform
     if affine.is_identity:
         affine = Affine(1, 0, 0, 0, -1, file.height)
-        if numbers := _read_beside(path, ".tfw").split():  # of the middle of the first pixel
+        if numbers := _read_beside(path, ".tfw").split():  # middle of the first pixel
             a, d, b, e, c, f = map(float, numbers)
             affine = Affine(a, b, c - (a + b) / 2, d, e, f - (d + e) / 2)
     if not np.isfinite(affine).all() or affine.determinant == 0:
@@ -433,7 +433,7 @@ class _RasterGrid:
     """Pixels of a raster, and their coordinates in the file and in the mesh."""
 
     file: Any
-    affine: Any  # from columns and rows to x and y
+    affine: Any  # transform from columns and rows to x and y
     crs: Any  # coordinate system of x and y
     target_crs: Any  # coordinate system of the mesh
 

@@ -52,8 +52,8 @@ _UNITS_M = {
 _SUPPORTED = re.compile(r"/(material|production|securecontent)/")
 
 # What a few letters make.
-_OBJECT_BYTES = 1000  # of an object, its placement, or a group of colours
-_COLOUR_BYTES = 100  # of a colour or material in a group
+_OBJECT_BYTES = 1000  # bytes of an object, its placement, or a group of colours
+_COLOUR_BYTES = 100  # bytes of a colour or material in a group
 
 _COLOUR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
 
@@ -70,7 +70,7 @@ class _MeshObject:
     components: list[_Placement] = field(default_factory=list)
     # Number of a group of colours, and index in it, of triangles without.
     default_property: tuple[str, str] = ("", "0")
-    shades: array[int] = field(default_factory=lambda: array("B"))  # of corners, if read
+    shades: array[int] = field(default_factory=lambda: array("B"))  # shades of corners, if read
     materials: list[str] = field(default_factory=list)  # names of triangles, if read
 
     @cached_property

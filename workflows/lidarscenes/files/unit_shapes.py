@@ -7,7 +7,7 @@ import numpy as np
 from lidarsim.scene.actors import box
 from lidarsim.scene.shapes import capsule, cylinder
 
-SIDES = 64  # of a circle: its sides are 0.12 % of the radius inside it at most
+SIDES = 64  # sides of a circle, 0.12 % of the radius inside it at most
 
 UNIT_BOX = box("box", (1, 1, 1)).moved("box", np.eye(3), np.array([0, 0, -0.5]))
 UNIT_BALL = capsule(1, 0, SIDES, "sphere")

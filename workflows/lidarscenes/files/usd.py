@@ -1,6 +1,6 @@
 """OpenUSD scenes, .usd .usda .usdc .usdz, through usd-core (Pixar, licence TOST-1.0).
 
-`usd_child.py` reads the scenes in a process of its own, and states the reasons. References
+`usd_child.py` reads the scenes in a separate process, and states the reasons. References
 to other files are resolved by usd-core; content from outside the scene's folder is refused.
 `usd_materials.py` reads masks and colours.
 """
@@ -71,7 +71,7 @@ def read_usd(data: bytes, path: Path, options: ReadOptions) -> Content:
         raise MeshFileError(f"is OpenUSD, which usd-core reads: {command}")
     if sys.platform == "win32":  # where a process has no limits of memory
         raise MeshFileError("is OpenUSD, which is not read on Windows: export it as .glb")
-    allowance = Allowance(0, SMALLER if options.animation is None else SHORTER)  # of all its files
+    allowance = Allowance(0, SMALLER if options.animation is None else SHORTER)  # all files share
     with closing(_frames(path, options, allowance)) as frames:
         stage, _ = next(frames)
         contents = _contents(frames, stage, path.stem, options, allowance)
@@ -107,7 +107,7 @@ def _contents(
 
 
 def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator[Frame]:
-    """Read a file in a process of its own, and yield the frames of its standard output."""
+    """Read a file in a separate process, and yield the frames of its standard output."""
 
     def take(frame: dict[str, Any], size: int) -> None:
         """Take the bytes of an array of a frame.

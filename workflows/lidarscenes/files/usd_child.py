@@ -26,15 +26,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Ar, Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
 
-MAX_WAIT_S = 300  # from one mesh to the next; broken files may take for ever
+MAX_WAIT_S = 300  # limit between two meshes; broken files may take for ever
 
 _RIGID = 1e-4  # largest change of the square of a scale
 # Largest deviation of the path of a moving prim between poses.
 _MAX_OFFSET_M = 1e-5
 _MAX_ANGLE_RAD = 1e-4
 _PROBES = (0.1459, 0.382, 0.618, 0.8541)  # shares of the time between two; of no repeating turns
-_MAX_HALVINGS = 12  # of the time between two samples
-_MAX_LINKS = 8  # of shaders that compute texture coordinates
+_MAX_HALVINGS = 12  # limit for halving the time between two samples
+_MAX_LINKS = 8  # limit for shaders that compute texture coordinates
 
 _EXCLUDED_PURPOSES = (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)  # purposes
 _SHOWN = (
@@ -80,9 +80,9 @@ class StageNodes:
         self.nodes: list[Any] = []
         self.matrices: list[NDArray[np.float64]] = []
         self.copies: list[NDArray[np.float64]] = []
-        self.moving: list[int] = []  # nodes that move, which are no children
+        self.moving: list[int] = []  # moving nodes that are not children
         self.motions: list[NDArray[np.float64]] = []  # (k, 13) of each: time code, then 3 rows of 4
-        self.counts: Counter[str] = Counter()  # for notes
+        self.counts: Counter[str] = Counter()  # counts for notes
 
     @property
     def start(self) -> float:
@@ -614,8 +614,8 @@ def _has_surface(prim: Any) -> bool:
 class _Animation(NamedTuple):
     """Motion of a stage, and the times of its poses."""
 
-    animations: list[dict[str, str]]  # of skeletons, by name
-    attributes: list[Any]  # that move
+    animations: list[dict[str, str]]  # names of the animations of skeletons
+    attributes: list[Any]  # moving attributes
     codes: list[float]  # time codes of the poses: one if no animation is asked for
 
 
@@ -737,7 +737,7 @@ def main(path: str, request: dict[str, Any]) -> None:
         )
         looks = Looks(request, write)
         for code in animation.codes:
-            stage.GetSessionLayer().Clear()  # of the pose before
+            stage.GetSessionLayer().Clear()  # forget the previous pose
             stage.SetEditTarget(stage.GetSessionLayer())
             for attribute in animation.attributes:
                 attribute.Set(Sdf.ValueBlock() if (value := attribute.Get(code)) is None else value)
@@ -749,7 +749,7 @@ def main(path: str, request: dict[str, Any]) -> None:
             write(
                 {
                     "what": "nodes",
-                    "files": _stage_files(stage),  # with the files of value clips
+                    "files": _stage_files(stage),  # includes the files of value clips
                     "roots": nodes.roots,
                     "nodes": nodes.nodes,
                     "counts": nodes.counts,
@@ -763,7 +763,7 @@ def main(path: str, request: dict[str, Any]) -> None:
             )
     except TooManyError as error:
         write({"what": "too many", "of": str(error)})
-    except Exception as error:  # of any type, as readers of broken files are
+    except Exception as error:  # readers of broken files raise errors of any type
         write({"what": "error", "reason": _reason(error, path)})
     output.flush()
     del silent

@@ -228,7 +228,7 @@ def material_pieces(
 ) -> Iterator[Piece]:
     """Cut polygons into triangles, divided by their materials.
 
-    `polygons` are sizes, the vertices at the corners, and whether each polygon is no hole.
+    `polygons` are sizes, the vertices at the corners, and whether each polygon is not a hole.
 
     Raises
     ------

@@ -47,7 +47,7 @@ class Appearance(NamedTuple):
     material
         Name of the material; empty without a name.
     is_retro
-        Whether the colour is that of <laser_retro>, which takes precedence over images.
+        Whether <laser_retro> gives the colour, and takes precedence over images.
     is_hidden
         Whether the visual is transparent altogether.
     """

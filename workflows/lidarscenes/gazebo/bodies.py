@@ -64,7 +64,7 @@ class Body:
     Attributes
     ----------
     frames
-        Frames of the model, with those of its nested models.
+        Frames of the model and of its nested models.
     links
         Links of the model itself.
     children

@@ -15,9 +15,9 @@ from lidarsim.base.words import did_you_mean, printable
 from lidarsim.motion.rotations import matrices, rotations_of
 from lidarsim.scene.transform import affine, inverted
 
-MAX_NUMBER = 1e8  # in a file, but for poses
+MAX_NUMBER = 1e8  # limit for numbers in a file, but for poses
 _MAX_POSE = 1e12  # number of a pose, beyond which it is as if it were infinite
-_MIN_NORM = 1e-6  # of a quaternion
+_MIN_NORM = 1e-6  # limit for the norm of a quaternion
 
 
 class RelativePose(NamedTuple):
@@ -108,7 +108,7 @@ def matrix_of(pose: Element) -> Floats:
 class Frames:
     """Frames of a world or model, by name.
 
-    `root` is the name of its own frame.
+    `root` is the name of the frame of the world or model itself.
     """
 
     def __init__(self, root: str) -> None:
@@ -163,7 +163,7 @@ class Frames:
         return self._matrices[chain[0] if chain else name]
 
     def _pose(self, name: str) -> RelativePose:
-        """Return the pose of a frame, also of a frame MODEL::FRAME of a nested model."""
+        """Return the pose of a frame, or of a frame MODEL::FRAME of a nested model."""
         model, mark, inner = name.partition("::")
         if name not in self._poses and mark and model in self.nested:
             self._poses[name] = RelativePose(self.nested[model].matrix(inner), model)

@@ -35,7 +35,7 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     folder
         The folder, which exists.
     assets
-        Folders in which models are looked for first.
+        Folders that are searched first for models.
 
     Returns
     -------
@@ -69,7 +69,7 @@ def _unseen_objects(
 ) -> dict[int, list[str]]:
     """Return the patterns of the objects that lidars do not see: {<visibility_mask>: patterns}.
 
-    Names are those of the scene of the world. Its meshes are read only if a lidar does not see a
+    The names come from the scene of the world. Its meshes are read only if a lidar does not see a
     visual.
     """
     visuals = [shape for link in world.links for shape in link.link.element.findall("visual")]

@@ -21,7 +21,7 @@ from .visibility_flags import LIDARS, figures_of, lidar_elements, mask_of
 from .world import PlacedLink, World
 
 _COLLISION_LIDARS = ("ray", "lidar")  # which meet collision shapes
-# Types of sensors of SDFormat 1.0 to 1.12 that are no lidars.
+# Types of sensors of SDFormat 1.0 to 1.12 that are not lidars.
 _OTHER_SENSORS = (
     *("air_pressure", "air_speed", "altimeter", "contact", "custom", "force_torque", "gps", "imu"),
     *("magnetometer", "navsat", "rfid", "rfidtag", "sonar"),
@@ -38,8 +38,8 @@ _NOISE_LEFT_OUT = {
     "dynamic_bias_stddev": "a bias that drifts",
     "precision": "a step",
 }
-_MAX_NAMES = 12  # that a line lists
-_RATE_HZ = 10.0  # of sensors that state none
+_MAX_NAMES = 12  # limit for the names that a line lists
+_RATE_HZ = 10.0  # default rate of sensors
 _FULL_TURN = 360.0
 _SLACK_DEG = 1e-3
 _MAX_SAMPLES = 1_000_000

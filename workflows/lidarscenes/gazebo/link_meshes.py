@@ -42,7 +42,7 @@ class LinkMesh(NamedTuple):
 
     mesh: SceneMesh
     flags: int  # <visibility_flags> of the first shape
-    suffix: str  # of the object's name: empty for the first mesh of a link
+    suffix: str  # end of the object's name: empty for the first mesh of a link
 
 
 @dataclass(eq=False)
@@ -76,7 +76,7 @@ class LinkMeshes:
         Returns an empty list without shapes.
 
         A link has several meshes if a lidar of the world sees some of its visuals and not others.
-        `name` is that of the link in the world, for notes; `scale` are three factors for all
+        `name` is the link's in the world, for notes; `scale` are three factors for all
         shapes.
         """
         key = (id(link.element), scale)
@@ -300,7 +300,7 @@ class LinkMeshes:
         return [mesh.moved(mesh.name, unit, np.zeros(3)) for mesh in flat]
 
     def _asset_folders(self, file: Source) -> list[Path]:
-        """Return the folders from which a mesh file may take images, the model's textures first."""
+        """Return the folders with images for a mesh file, the model's textures first."""
         textures = (folder / "materials" / "textures" for folder in file.path.resolve().parents)
         within = (folder for folder in textures if folder.is_relative_to(file.root))
         existing = (folder for folder in within if folder.is_dir())

@@ -8,7 +8,7 @@ from xml.etree.ElementTree import Element
 
 from lidarsim.base.words import listed, plural, printable
 
-_MAX_NAMES = 12  # that a note lists
+_MAX_NAMES = 12  # limit for the names that a note lists
 
 # Elements by their parents, of SDFormat 1.0 to 1.12, used or without a meaning for lidars.
 _POSED = ("pose", "frame", "plugin", "origin")
@@ -73,7 +73,7 @@ class Notes:
         self.hidden: dict[str, None] = {}  # links with visuals that are transparent altogether
         self.invisible: dict[str, None] = {}  # links with visuals that nothing sees
         self.remote: dict[str, None] = {}  # models that are too far away
-        self.bright: dict[str, None] = {}  # links whose <laser_retro> is above that of white
+        self.bright: dict[str, None] = {}  # links with a <laser_retro> brighter than white
         self.further: dict[str, None] = {}  # clauses
         self.of_meshes: dict[str, None] = {}  # lines on mesh files
 

@@ -26,11 +26,11 @@ FOLDER_VARIABLES = (
 )
 CACHE_VARIABLES = ("GZ_FUEL_CACHE_PATH", "IGN_FUEL_CACHE_PATH")
 CACHES = ("~/.gz/fuel", "~/.ignition/fuel")
-_MODELS = "~/.gazebo/models"  # of Gazebo classic
-_MAX_FOLDERS_UP = 5  # folders above a world in which models are looked for
-_PACKAGE = "package.xml"  # in the folder of a package of ROS
+_MODELS = "~/.gazebo/models"  # folder of Gazebo classic
+_MAX_FOLDERS_UP = 5  # folders above a world that are searched for models
+_PACKAGE = "package.xml"  # file in the folder of a package of ROS
 _CONFIGS = ("model.config", "manifest.xml")
-_MODEL = "model.sdf"  # of models without a configuration
+_MODEL = "model.sdf"  # file of models without a configuration
 _WORLD_FOLDERS = ("worlds", "world")
 _SDF_VERSION = (1, 12)  # the newest that is known
 
@@ -71,12 +71,12 @@ class Resources:
         The world, and its folder: with a package.xml at most five folders above that one, else the
         folder above a folder `worlds`.
     folders
-        Folders in which models are looked for by name, in order. In those above the world, only
-        folders with a model.config are models, and for ``package://`` those with a package.xml.
+        Folders that are searched for models by name, in order. In folders above the world, only
+        folders with a model.config are models, and for ``package://`` folders with a package.xml.
     trusted
         Resolved folders whose files may be read from anywhere.
     unmarked
-        Resolved folders in which any folder is a model: those that the user names, the world's
+        Resolved folders whose folders are all models: folders that the user names, the world's
         folder, and the world's package if it has a package.xml.
     caches
         Folders of downloads from Fuel.
@@ -185,7 +185,7 @@ class Resources:
     def _in_folders(self, location: str, scheme: str = "") -> Iterator[Candidate]:
         """Yield the paths NAME/FILE in all folders."""
         name, _, file = location.lstrip("/").partition("/")
-        file = file.lstrip("/")  # which would else be a path of its own
+        file = file.lstrip("/")  # else the file would be an absolute path
         if name in ("", ".", ".."):
             return
         marks = (_CONFIGS[0], _PACKAGE) if scheme == "package" else _CONFIGS[:1]
@@ -194,7 +194,7 @@ class Resources:
         for folder in self.folders:
             if (folder / name).is_dir():
                 model = folder / name
-            elif folder.name == name:  # of the package or model itself
+            elif folder.name == name:  # URI of the package or model itself
                 model = folder
             else:
                 continue

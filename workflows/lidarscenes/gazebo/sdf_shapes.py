@@ -21,8 +21,8 @@ from lidarsim.scene.shapes import capsule, revolve
 from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
 from .frames import numbers_in, numbers_of
 
-_PIXEL_BYTES = 72  # of a pixel of a height map: a vertex, and two triangles
-_PARALLEL = 1e-12  # of unit vectors: 1 minus the cosine between them
+_PIXEL_BYTES = 72  # bytes of a pixel of a height map: a vertex, and two triangles
+_PARALLEL = 1e-12  # limit for unit vectors: 1 minus the cosine between them
 
 
 def shape_mesh(shape: Element) -> SceneMesh | None:
@@ -33,7 +33,7 @@ def shape_mesh(shape: Element) -> SceneMesh | None:
     LidarError
         If numbers of the shape are missing or impossible.
     KeyError
-        If there is no such shape.
+        If the shape is unknown.
     """
     return _SHAPES[shape.tag](shape)
 

@@ -19,9 +19,9 @@ from .link_meshes import LinkMeshes
 from .notes import Notes
 from .resources import Source
 
-_LOOP_S = 600.0  # for which a script that loops is repeated
-_MAX_POSES = 5000  # of an actor
-_JUMP_S = 1e-3  # in which an actor goes from its last waypoint to its first
+_LOOP_S = 600.0  # duration of the repetitions of a script that loops
+_MAX_POSES = 5000  # limit for the poses of an actor
+_JUMP_S = 1e-3  # time of an actor between its last waypoint and its first
 
 
 class Actors(NamedTuple):

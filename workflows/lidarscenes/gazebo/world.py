@@ -44,7 +44,7 @@ from .visibility_flags import ALL_BITS, masks_of
 from .waypoint_actors import actors_of
 
 _ADVICE = "simplify its meshes, or export them in parts"
-_OLD_ROOT = "gazebo"  # of Gazebo before 1.9
+_OLD_ROOT = "gazebo"  # root of Gazebo before 1.9
 _NO_SCALE = (1.0, 1.0, 1.0)
 
 
@@ -83,7 +83,7 @@ class _State:
     """
 
     poses: dict[str, Floats] = field(default_factory=dict)  # (4, 4)
-    scales: dict[str, tuple[float, ...]] = field(default_factory=dict)  # of models
+    scales: dict[str, tuple[float, ...]] = field(default_factory=dict)  # scales of models
     inserted: list[Element] = field(default_factory=list)  # models
     deleted: set[str] = field(default_factory=set)  # names of models
 
@@ -200,7 +200,7 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
     path
         The file.
     folders
-        The file's folder, and further folders in which models are looked for.
+        The file's folder, and further folders that are searched for models.
 
     Raises
     ------

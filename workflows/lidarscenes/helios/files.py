@@ -19,16 +19,16 @@ from lidarsim.base.words import did_you_mean
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.transform import rotation_about
 
-# Folder in a checkout of HELIOS++ in which its surveys' data/scanners_als.xml lies.
+# Folder in a checkout of HELIOS++ that contains its surveys' data/scanners_als.xml.
 _PACKAGE = Path("python/pyhelios")
-_MAX_TEMPLATES = 10  # in a chain
+_MAX_TEMPLATES = 10  # length of a chain
 
 
 class Asset(NamedTuple):
     """An element of an XML file."""
 
     element: Element
-    home: Path  # the file, in which names without a file are looked up
+    home: Path  # the file for names without a file
 
 
 class Assets:

@@ -25,7 +25,7 @@ from .files import Assets, clean, number
 from .scanner_xml import Device, HeliosScanner, channels, device, unsupported_features
 from .survey_xml import AHEAD, returns_section
 
-_MAX_NAMES = 12  # of scanners in a message
+_MAX_NAMES = 12  # limit for scanners in a message
 
 
 class _Reference(NamedTuple):
@@ -65,7 +65,7 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
     folder
         The folder, which exists.
     assets
-        Folders in which referenced files are looked for first.
+        Folders that are searched first for referenced files.
 
     Returns
     -------

@@ -21,7 +21,7 @@ from lidarsim.scene.transform import rotation_about
 from .files import Assets, clean, flag, number, read, vector
 
 _SPEED = 70.0  # default, metres a second
-_BETWEEN_S = 0.001  # between legs, in which the carrier turns on the spot or goes to its next leg
+_BETWEEN_S = 0.001  # time between legs: the carrier turns on the spot or goes to its next leg
 _AFTER_S = 1.0  # duration of the trajectory after the last leg
 _FACING_Y_DEG = 90.0  # yaw of platforms that do not turn
 TRAJECTORY_FILE = "trajectory.tum"

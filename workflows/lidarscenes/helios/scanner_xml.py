@@ -30,7 +30,7 @@ _PRISM = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
 _HEAD = rotation_about(_Z, 90)
 _HEAD_STEP_DEG = 10.0  # rotation of a head in a scan; without a head, a scan is at most a cycle
 _FRAME_HZ = 10.0  # prisms have no cycle
-_SLACK = 1e-9  # of divisions whose exact quotients are whole numbers
+_SLACK = 1e-9  # slack for divisions whose exact quotients are whole numbers
 
 # A data file without name and light, and the rotation from the sensor frame to HELIOS++'s frame.
 ScannerSection = tuple[dict[str, Any], Floats]
@@ -173,7 +173,7 @@ class _Head(NamedTuple):
 
     axis: Floats  # (3,)
     start_deg: float
-    range_deg: float  # from start to stop
+    range_deg: float  # angle between start and stop
     deg_per_s: float  # 0 if the head stands
 
     @classmethod
@@ -243,7 +243,7 @@ def _exact_us(pulses: int, pulse_hz: float) -> int | str:
 class _Line:
     """Pulses of a polygon's line.
 
-    A line has time for `pulses_per_line` pulses, of which `count` are within its angles.
+    A line has time for `pulses_per_line` pulses. `count` pulses are within its angles.
     """
 
     first_deg: float

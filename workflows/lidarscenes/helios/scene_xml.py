@@ -47,9 +47,9 @@ class HeliosPart:
     scale: float
     offset: Floats  # (3,): metres
     falls: bool  # whether it is moved down or up to stand on the ground
-    library: Path | None = None  # for files other than .obj, with the material
+    library: Path | None = None  # file other than .obj, for the material
     material: str = ""  # name in the library
-    surfels: SceneMesh | None = None  # of a file of points
+    surfels: SceneMesh | None = None  # surfels from a file of points
 
     @cached_property
     def materials(self) -> dict[str, dict[str, str]]:
@@ -324,7 +324,7 @@ def _entries(
     """
     shape = mesh.mesh if isinstance(mesh, SceneInstance) else mesh
     objects = escape(name)
-    if shape.materials is None:  # of a file without materials: the part has at most one
+    if shape.materials is None:  # a file without materials: the part has at most one
         return [{"objects": objects, **kind} for kind in kinds.values() if kind][:1]
     object_kinds = {material: kinds.get(material, {}) for material in shape.materials.names}
     first, *following = object_kinds.values()

@@ -70,7 +70,7 @@ def import_survey(
     folder
         The new folder.
     assets
-        Folders in which referenced files are looked for first, before the folder of the survey and
+        Folders that are searched first for referenced files, before the folder of the survey and
         the folders above.
     check
         Reads the written `scenario.yaml` and raises a LidarError if it cannot be simulated.

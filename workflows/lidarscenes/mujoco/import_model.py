@@ -1,7 +1,8 @@
 """Models of MuJoCo as scenarios: their rangefinders are sensors, on one carrier that stands.
 
-The rangefinders of all sites of a body are the beams of one sensor, and those of a camera the beams
-of another. After https://mujoco.readthedocs.io/en/latest/XMLreference.html#sensor-rangefinder
+The rangefinders of all sites of a body are the beams of one sensor. The rangefinders of a camera
+are the beams of another sensor. After
+https://mujoco.readthedocs.io/en/latest/XMLreference.html#sensor-rangefinder
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ from .model_file import MujocoOptions, body_matrix, load_model, objects_of_bodie
 _RANGEFINDER = 7  # mjSENS_RANGEFINDER, of sensor_type
 _SITE = 6  # mjOBJ_SITE, of sensor_objtype
 _ORTHOGRAPHIC = 1  # mjPROJ_ORTHOGRAPHIC, of cam_projection
-_MAX_RAYS = 65_536  # of a camera
+_MAX_RAYS = 65_536  # rays of a camera
 _MAX_RATE_HZ = 1e6
 
 
 class _Group(NamedTuple):
     """Rangefinders that are the beams of a sensor."""
 
-    body: int  # that carries them
-    camera: int | None  # of the beams; None for beams of sites
+    body: int  # body that carries the rangefinders
+    camera: int | None  # camera of the beams; None for beams of sites
     cutoff_m: float  # 0 for none
     noise_m: float  # standard deviation
     rate_hz: float
@@ -55,7 +56,7 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
     folder
         The folder, which exists.
     assets
-        A folder besides the model's, from which files are read.
+        A folder besides the model's whose files may be read.
 
     Returns
     -------
@@ -144,7 +145,7 @@ def _rate_hz(model: Any, sensor: int) -> float:
 
 
 def _name(model: Any, group: _Group) -> str:
-    """Return the name of a sensor: that of its camera, else of its body."""
+    """Return the name of a sensor: the name of its camera, else of its body."""
     if group.camera is not None:
         return printable(names_of(model, "cam")[group.camera])
     return printable(names_of(model, "body")[group.body])
@@ -155,7 +156,7 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
     matrix, origins, directions = _beams(model, group, sites)
     x, y, z = directions.T
     elevations_deg = np.array(_degrees(arctan2(z, length(directions[:, :2]))))
-    order = np.argsort(elevations_deg, kind="stable")  # of channels, of any sensor
+    order = np.argsort(elevations_deg, kind="stable")  # order of the channels, as in any sensor
     origins = origins[order]
     beams: dict[str, Any] = {
         "elevation_deg": elevations_deg[order].tolist(),

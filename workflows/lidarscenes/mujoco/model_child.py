@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 MAX_WAIT_S = 120  # broken files may take for ever
 
-# Memory for simulating, of which the rays of a camera take 24 bytes each.
+# Memory for simulating. Each ray of a camera takes 24 bytes.
 _ARENA_BYTES = 128 * 2**20
 
 # Prefixes of the names of arrays, and the names after the prefix.
@@ -75,7 +75,7 @@ def main(path: str, request: dict[str, Any]) -> None:
         arrays = [np.ascontiguousarray(array) for array in fields.values()]
     except NoKeyframeError as error:
         frame = {"what": "keyframes", "names": error.args[0][:1000]}
-    except Exception as error:  # of any type, as readers of broken files are
+    except Exception as error:  # readers of broken files raise errors of any type
         reason = " ".join(str(error).split())
         frame = {"what": "error", "reason": reason.replace(os.path.dirname(path) + "/", "")}  # noqa: PTH120
     signal.alarm(0)  # who reads this may take long
@@ -90,7 +90,7 @@ def _state(path: str, keyframe: str | None) -> tuple[Any, Any]:
     """Return the model of a file, and its data at the reference pose or at a keyframe."""
     spec = mujoco.MjSpec.from_file(path)
     spec.memory = _ARENA_BYTES
-    spec.nstack = -1  # of old files, and in conflict with the memory
+    spec.nstack = -1  # old files have sizes that conflict with the memory
     model = spec.compile()
     data = mujoco.MjData(model)
     if keyframe is not None:

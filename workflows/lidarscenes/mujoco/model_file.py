@@ -1,6 +1,6 @@
 """Models of MuJoCo, .xml of MJCF, as scenes: the geoms that a lidar sees, at the initial state.
 
-MuJoCo itself (Apache-2.0) reads the files, in a process of its own: `model_child.py`. Geoms become
+MuJoCo itself (Apache-2.0) reads the files, in a separate process: `model_child.py`. Geoms become
 meshes as for `lidarsim.worlds.MujocoScanner`.
 """
 
@@ -55,7 +55,7 @@ _ADVICE = "simplify its meshes, or give it in parts"
 # Half of the side of planes without a size: at least metres, and as a multiple of the model's size.
 _MIN_PLANE_M = 200.0
 _PLANE_SIZES = 5.0
-_MAX_ROUND_TRIANGLES = 4_000_000  # of balls, ellipsoids, capsules and cylinders in all
+_MAX_ROUND_TRIANGLES = 4_000_000  # triangles of balls, ellipsoids, capsules and cylinders in all
 _MAX_SAG_M = 1.0
 
 
@@ -80,7 +80,7 @@ class MujocoOptions:
 def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the geoms of a model at its initial state, as objects of its bodies.
 
-    Geoms of the world itself are objects of their own if they have names.
+    Geoms of the world itself are separate objects if they have names.
     """
     model = load_model(data, path, options)
     content = placed_content(_placed(model, options))
@@ -101,7 +101,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
     ValueError
         If MuJoCo refuses the model.
     LidarError, MeshFileError
-        If MuJoCo is not installed, the file is no model, or takes too much memory.
+        If MuJoCo is not installed, the file is not a model, or takes too much memory.
     """
     allowance = Allowance(0, _ADVICE)
     check_sources(data, path, options, allowance)
@@ -141,7 +141,7 @@ def objects_of_bodies(model: Any, options: ReadOptions) -> dict[int, str]:
     seen = seen_geoms(model, _choice(model, options.own, bodies, geoms))
     content = placed_content(_placed(model, options))
     names = [printable(item.name) for item in content.meshes]
-    # The last object of a name is that of a body: geoms of the world come first.
+    # The last object of a name is a body's: geoms of the world come first.
     unique = dict(zip(names, unique_names(names), strict=True))
     body_names = [printable(name) for name in names_of(model, "body")]
     with_geoms = {int(body) for body in np.asarray(model.geom_bodyid)[seen]} - {0}

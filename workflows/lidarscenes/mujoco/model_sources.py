@@ -1,4 +1,4 @@
-"""Files of a model of MuJoCo: the files that the model includes, and those of meshes and textures.
+"""Files of a model of MuJoCo: included files, files of meshes, and files of textures.
 
 MuJoCo opens these files itself. The files are looked up here first, so that a model takes data from
 its own folder and from named folders only.
@@ -42,7 +42,7 @@ def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allo
     ValueError
         If a file is not XML.
     MeshFileError
-        If a file is no model of MuJoCo, or a file is in a folder that is not allowed.
+        If a file is not a model of MuJoCo, or a file is in a folder that is not allowed.
     """
     root = lenient_root(data)
     if root.tag != ROOT:

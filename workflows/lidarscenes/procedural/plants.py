@@ -37,11 +37,11 @@ class Species:
     trunk_m: float  # radius above the roots
     bare: float  # share of the height without branches
     crown: tuple[float, ...]  # lengths of branches, metres, at equal steps up the crown
-    angle_deg: tuple[float, float]  # of the lowest and the highest branch from the vertical
-    rise_deg: float  # angle by which a branch bends up from its foot to its end
+    angle_deg: tuple[float, float]  # angles of the lowest and the highest branch with the vertical
+    rise_deg: float  # angle between the foot of a branch and its end, upwards
     branches: int
-    twigs: int  # of a branch
-    leaves: int  # of a twig
+    twigs: int  # twigs per branch
+    leaves: int  # leaves per twig
     leaf_m: tuple[float, float]  # length and width of a triangle
     hang: float = 0.0  # downward part of the directions of twigs and leaves
     conifer: bool = False

@@ -14,7 +14,7 @@ from raybeam import RayCaster, available_backends
 
 from .floor import triangles_reaching
 
-RAYS = 1000  # from each position, and from outside
+RAYS = 1000  # rays of each position, and of the outside
 HAND_M = 0.1  # surfaces nearer than this are in the way
 CLEAR_M = 0.5  # around a sensor in a scene
 BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
@@ -27,7 +27,7 @@ _ENCLOSED = 0.95
 _CLOSED = 0.8
 _UPRIGHT = 0.9
 _FLOOR = 0.3
-_OPEN = 0.1  # openness from which on a surface is not closed
+_OPEN = 0.1  # a surface of this openness or more is not closed
 _LEAVES = 0.4  # maximum openness of leaves
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
 _MIN_ROOM_WIDTH_M = 2.0

@@ -19,7 +19,7 @@ from .plants import MAX_TREES, SCALES, SPECIES, all_trees, place_instances
 
 _COARSEST = 4  # cells of the first octave along a side
 _OCTAVES = 11
-_ROUGHNESS = 0.5  # height of each octave over that of the one before
+_ROUGHNESS = 0.5  # height of each octave over the height of the octave before
 _RELIEF = 0.16  # greatest height over the side's length
 
 # A cell has at most a tree, at the flattest of a few positions in its middle part.

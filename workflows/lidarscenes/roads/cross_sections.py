@@ -17,16 +17,16 @@ from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 
 GAP_M = 1e-6  # starts of pieces that are nearer to each other are one
 HEIGHT_SHARE = 0.1  # tolerance of heights, as a share of the tolerance in plan
-SAMPLES = 5  # of an interval, by which its curvatures are measured
+SAMPLES = 5  # points of an interval that measure its curvatures
 _MAX_SAMPLED_M = 30.0  # length of an interval
 _MAX_CUTS = 64  # parts of an interval that is longer
-MAX_STEPS = 1e9  # of an interval; no memory holds as many
+MAX_STEPS = 1e9  # limit for an interval; no memory holds as many
 _GROUP_SIZE = 1 << 17  # coordinates of surfaces that are measured together
 _STEP_SHARE = 0.01  # smallest step that gets two stations, as a share of the tolerance in plan
-_MARGIN = 0.94  # of tolerances, for what the second differences of samples do not show
+_MARGIN = 0.94  # share of tolerances, since the second differences of samples do not show all
 _LEAST_WIDTH_M = 1e-4  # cells that are narrower show no slope across the road
-_MAX_STEEPENING = 10.0  # of slopes inside a cell, where a road turns about a point of its surface
-_FOLDED_SHARE = 0.3  # of a cell; of cells that are folded further no height is kept
+_MAX_STEEPENING = 10.0  # steepening in a cell, where a road turns about a point of its surface
+_FOLDED_SHARE = 0.3  # share of a cell; cells that are folded further keep no height
 # Weights of the values of a parabola that extrapolate it: by a sample, and by half a sample.
 _FROM_MIDDLE = np.array([3.0, -3.0, 1.0])
 _FROM_PARTS = np.array([1.875, -1.25, 0.375])
@@ -77,7 +77,7 @@ class PlacedStations(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Intervals:
-    """Intervals of a road, in each of which everything is given by one piece.
+    """Intervals of a road, each with a single piece of every polynomial.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Intervals:
         )
 
     def sampled(self, *, are_planes: bool) -> Samples:
-        """Return stations by which the surface is measured, in intervals that may be shorter.
+        """Return stations that measure the surface, in intervals that may be shorter.
 
         Of planes two samples in an interval show their steps.
         """
@@ -194,7 +194,7 @@ class Intervals:
 
 
 class SampledSurface(NamedTuple):
-    """A surface along a road at samples of intervals, by which its stations are placed."""
+    """A surface along a road at samples of intervals, which place its stations."""
 
     intervals: Intervals
     points: Floats  # (c, n * m, 3): columns of points, from right to left, at m samples each, m

@@ -18,13 +18,13 @@ class Cubics:
 
     Without any polynomial, the value is 0.
 
-    Before the first start, the value is that of the first start.
+    Before the first start, the value of the first start holds.
 
     Parameters
     ----------
     rows
-        Start and coefficients a, b, c, d of each polynomial a + b x + c x² + d x³, in which x is
-        the distance from the start.
+        Start and coefficients a, b, c, d of each polynomial a + b x + c x² + d x³, where x is the
+        distance from the start.
     """
 
     def __init__(self, rows: Sequence[Sequence[float]] = ()) -> None:

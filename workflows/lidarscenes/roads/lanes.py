@@ -35,11 +35,11 @@ from .cubics import NOTHING, Cubics
 from .elements import MAX_SHOWN, UnreadElements, number
 from .road import Frames, Network, Road
 
-_ACROSS_SHARE = 0.3  # of the tolerance of heights, for cross sections that are curved
+_ACROSS_SHARE = 0.3  # share of the tolerance of heights, for cross sections that are curved
 _KERB_M = 1e-3  # least height of a kerb
-_MIN_COLUMNS = 2  # of points of a section with lanes
+_MIN_COLUMNS = 2  # columns of points of a section with lanes
 _BYTES_PER_POINT = 400  # peak memory of a point of a lane
-_HALVINGS = 30  # of an interval, by which a crossing of two borders is found
+_HALVINGS = 30  # halvings of an interval to find a crossing of two borders
 _KNOWN = (
     "width", "border", "height", "roadMark", "material", "speed", "access", "rule", "visibility",
 )  # fmt: skip
@@ -144,7 +144,7 @@ class LaneSection:
         return self._borders_and_widths(road, stations)[0]
 
     def intervals(self, road: Road, start: float, stop: float) -> Intervals:
-        """Return the intervals between two distances in which all polynomials are single.
+        """Return the intervals between two distances where all polynomials are single.
 
         Borders of lanes that cross each other, or a kink of the road's cross section, end intervals
         as well.
@@ -176,7 +176,7 @@ class LaneSection:
         self, road: Road, stations: Stations
     ) -> tuple[dict[int, Floats], dict[int, Floats]]:
         """Return t (k,) of borders, and widths as the file has them, both by numbers of lanes."""
-        # Where the section starts with a step of the road, lanes are those of the section.
+        # Where the section starts with a step of the road, the lanes of the section count.
         stations = Stations(stations.s, np.maximum(stations.pieces, self.start))
         middle = road.lane_offset.values(stations)
         borders = {0: middle}
@@ -420,7 +420,7 @@ class SectionSurface:
             for strip in self.strips
         ]
         surface._border_points = None
-        for name in ("_t", "_points"):  # of the stations here
+        for name in ("_t", "_points"):  # arrays that belong to these stations
             vars(surface).pop(name, None)
         return surface
 

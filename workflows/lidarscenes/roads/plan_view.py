@@ -24,8 +24,8 @@ from lidarsim.scene.files.scene_graph import MeshFileError
 from .elements import number, positive
 
 _MAX_TURN = 0.5  # rad of a piece of a clothoid
-_CUBIC_PIECES = 16  # of a cubic geometry, in which stations are placed separately
-_CUBIC_SAMPLES = 64  # of each of these pieces, for arc lengths
+_CUBIC_PIECES = 16  # pieces of a cubic geometry, each with separate stations
+_CUBIC_SAMPLES = 64  # samples of each of these pieces, for arc lengths
 _MIN_SPEED = 1e-3  # least ratio of speeds along a cubic's parameter; slower cubics turn back
 _LEAST_M = 1e-9  # geometries that are shorter are left out
 # Gauss and Legendre's quadrature with five points on 0 to 1.
@@ -52,7 +52,7 @@ class _Clothoid(NamedTuple):
     y: float
     heading: float  # rad
     curvature: float  # at the start, 1/m
-    growth: float  # of the curvature, 1/m²
+    growth: float  # growth of the curvature, 1/m²
 
 
 class _Cubic(NamedTuple):
@@ -61,7 +61,7 @@ class _Cubic(NamedTuple):
     start: float  # distance of the table, m
     x: float
     y: float
-    cosine: float  # of the heading at the start
+    cosine: float  # cosine of the heading at the start
     sine: float
     distances: Floats  # (m,): of the samples from the start, m
     parameters: Floats  # (m,): of the samples

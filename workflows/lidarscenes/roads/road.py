@@ -28,7 +28,7 @@ _STEP_M = 1e-4  # smallest step of a lateral shape that gets two points
 MAX_ROAD_M = 1e7  # longest road
 MAX_LINES = 1e5  # across a road, between two kinks of its cross section
 _GAP_M = 1.0  # between roads in the table of reference lines
-_MAX_MISSING = 0.01  # of the length of a road, which its geometry may lack
+_MAX_MISSING = 0.01  # share of the length of a road that its geometry may lack
 _CROSSFALL_SIDES = {"left": (1,), "right": (-1,), "both": (1, -1)}
 _KNOWN = (
     "type", "planView", "elevationProfile", "lateralProfile", "lanes", "objects", "signals",
@@ -70,7 +70,7 @@ class Road:
                 f"has a road {self.name!r} of {self.length:g} m: correct its length"
             )
         self.in_junction = (element.get("junction") or "-1") != "-1"
-        self.offset = 0.0  # of the road in the table of reference lines, m
+        self.offset = 0.0  # offset of the road in the table of reference lines, m
         self.geometry_starts = np.zeros(0)  # (g,), of pieces of geometry, m
         self.elevation = Cubics.read(element.iterfind("elevationProfile/elevation"))
         self.superelevation = Cubics.read(element.iterfind("lateralProfile/superelevation"))

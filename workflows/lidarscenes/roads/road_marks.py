@@ -15,10 +15,10 @@ from .cross_sections import GAP_M
 from .elements import UnreadElements, number, positive
 from .lanes import Lane, SectionSurface
 
-LIFT_M = 0.003  # of marks above the road: thickness of thermoplastic marks
+LIFT_M = 0.003  # height of marks above the road: thickness of thermoplastic marks
 DASH_M = 3.0  # dashes of broken marks that state no lengths
 SPACE_M = 6.0  # gaps between these dashes
-WIDTH_M = 0.12  # of marks that state no width
+WIDTH_M = 0.12  # default width of marks
 _DOT_M = 0.1  # length of Botts' dots
 _DOT_SPACE_M = 1.2
 # Lines of marks from right to left; True for a broken line.
@@ -40,7 +40,7 @@ class _Line(NamedTuple):
 
     starts: Floats  # (d,): of dashes, ascending, m
     stops: Floats  # (d,), m
-    shift: float  # to the left of the border, m
+    shift: float  # distance to the left of the border, m
     width: float  # m
     colour: str
 

@@ -14,14 +14,14 @@ ASPHALT = "asphalt"
 CONCRETE = "concrete"
 EARTH = "earth"
 GRASS = "grass"
-PAINT = "paint"  # with a colour: "paint white"
+PAINT = "paint"  # a colour may follow: "paint white"
 SIGN = "sign face"
 LAMP = "lamp"
 METAL = "metal"
 LEAVES = "leaves"
 WALL = "wall"
 
-# {material: reflectance for red, green and blue light}. Luminances are those of measured spectra at
+# {material: reflectance for red, green and blue light}. Luminances come from measured spectra at
 # 905 nm (`lidarsim.media.materials.reflectances`) where the table has the material.
 _LINEAR = {
     ASPHALT: (0.13, 0.13, 0.13),

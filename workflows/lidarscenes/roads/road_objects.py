@@ -42,14 +42,14 @@ from .solids import (
 )
 
 TUNNEL_HEIGHT_M = 5.0
-TUNNEL_MARGIN_M = 0.5  # from the outermost lanes to the walls
+TUNNEL_MARGIN_M = 0.5  # distance between the outermost lanes and the walls
 STRIPE_M = 0.5  # stripes and gaps of crosswalks that state no markings
 UNTYPED = "object"  # name of objects without a type, whose flat outlines may be lines or decals
 _FLAT = ("crosswalk", "roadMark", "parkingSpace")  # types that are paint if they have no height
 _BYTES_PER_COPY = 4000
 _BYTES_PER_POINT = 400  # peak memory of a point of a rail or tunnel
 _TOP = [3, 2]  # corners of a rail between which it is measured, from the right to the left
-_CEILING = [2, 1]  # of a tunnel, from the right to the left
+_CEILING = [2, 1]  # ceiling of a tunnel, right to left
 _KNOWN_OBJECTS = ("object", "objectReference", "tunnel")
 _KNOWN = ("repeat", "outline", "outlines", "material", "parkingSpace", "markings")
 
@@ -349,12 +349,12 @@ class _Placement(NamedTuple):
     width: float  # m
     height: float  # m
     radius: float  # m; 0 for a box
-    shift: float = 0.0  # of a copy along the road from the object, m
+    shift: float = 0.0  # distance of a copy along the road from the object, m
 
     @classmethod
     def of(cls, element: Element) -> _Placement:
         """Return the placement of an <object>."""
-        # A broken size of one object is no reason to refuse a file: it counts as no size.
+        # A broken size of one object does not make a file unusable: it counts as no size.
         names = ("length", "width", "height", "radius")
         sizes = [max(0.0, number(element, name, 0.0)) for name in names]
         return cls(
@@ -391,7 +391,7 @@ class _ObjectFrame(NamedTuple):
 
     origin: Floats  # (3,), m
     turn: Floats  # (3, 3)
-    shift: float  # of a copy along the road, m
+    shift: float  # distance of a copy along the road, m
 
     @classmethod
     def of(

@@ -114,7 +114,7 @@ class _SignalFrame(NamedTuple):
     """Foot and direction of a signal."""
 
     foot: Floats  # (3,): on the plane of the road, m
-    heading: float  # to which the signal faces, rad
+    heading: float  # direction that the signal faces, rad
 
 
 def _position(element: Element) -> Element | None:

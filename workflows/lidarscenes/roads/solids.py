@@ -15,7 +15,7 @@ from lidarsim.scene.files.scene_graph import Piece
 
 MAX_SEGMENTS = 64
 MIN_SEGMENTS = 8
-MIN_SIZE_M = 0.01  # of boxes whose length or width is zero
+MIN_SIZE_M = 0.01  # size of boxes whose length or width is zero
 # Triangles of a box whose corners are numbered 4 * upper + 2 * left + front.
 _BOX = np.array([
     [0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4],

@@ -40,8 +40,8 @@ from ..files.unit_shapes import SIDES, UNIT_BALL, UNIT_BOX, UNIT_CYLINDER
 from .robot import HELD, MOVING, Joint, Robot
 
 _MAX_LINKS = 1000  # humanoids with hands have 150
-_MAX_FOLDERS_UP = 5  # folders above a robot's file in which its packages are looked for
-_MAX_NUMBER = 1e8  # in a file
+_MAX_FOLDERS_UP = 5  # folders above a robot's file that are searched for its packages
+_MAX_NUMBER = 1e8  # limit for numbers in a file
 _NO_FOLDERS = ("", ".", "..")  # parts of a path that name no folder
 
 
@@ -74,7 +74,7 @@ def load_robot(
         Whether colours and names of materials are read. A material of the URDF applies to shapes,
         and to meshes without colours, or without materials.
     assets
-        A further folder from which mesh files, and the files that these name, may be read: a
+        A further folder whose mesh files, and the files that these name, may be read: a
         package, or a folder of packages.
     tell
         Called with a line on content that is left out.
@@ -270,11 +270,11 @@ class _LinkMeshes:
 
     path: Path
     root: Element
-    size: int  # of the file, bytes
+    size: int  # size of the file, bytes
     opacity: OpacityMode
     colours: bool
     materials: bool
-    assets: tuple[Path, ...]  # resolved folders, from which all files may be read
+    assets: tuple[Path, ...]  # resolved folders; all files come from these folders
     tell: Callable[[str], None]
     _files: dict[Path, list[SceneMesh]] = field(default_factory=dict)
     _collide: list[str] = field(default_factory=list)  # links with collision shapes only
@@ -336,7 +336,7 @@ class _LinkMeshes:
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
         """Return factors (3,) along the axes, which may be zero, and the meshes to be scaled."""
         if shape.tag == "mesh":
-            if len(factors := shape.get("scale", "").split()) == 4:  # as in public files
+            if len(factors := shape.get("scale", "").split()) == 4:  # public files have four
                 shape.set("scale", " ".join(factors[:3]))
             scale = _numbers(shape, "scale", 3, "1 1 1")
             return scale, self._meshes(shape.get("filename", "")) if scale.all() else []
@@ -439,7 +439,7 @@ class _LinkMeshes:
 
 
 def _is_package(folder: Path) -> bool:
-    """Return whether a folder is that of a package of ROS."""
+    """Return whether a folder is a package of ROS."""
     return (folder / "package.xml").is_file()
 
 

@@ -24,7 +24,7 @@ _RAYS_FILE = "rays.npz"
 def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
     """Write a sensor's file as a scenario into a folder: `scenario.yaml`, and its rays.
 
-    The scenario has the scene of `lidarpool demo`, with the sensor in place of its own.
+    The scenario has the scene of `lidarpool demo`, with this sensor in place of the demo's.
 
     Parameters
     ----------

@@ -73,7 +73,7 @@ def read_omnilidar(path: Path) -> ReadSensor:
 class _Prim(NamedTuple):
     """Attributes of a prim."""
 
-    paths: list[str]  # of all OmniLidar prims of the file
+    paths: list[str]  # paths of all OmniLidar prims of the file
     values: dict[str, Any]  # {name: plain value}
     arrays: dict[str, AnyArray]
 

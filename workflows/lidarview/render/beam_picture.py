@@ -15,7 +15,7 @@ from .shot import SIZE
 from .theme import mapped
 
 COLOURS = "viridis"
-MAX_FIRINGS = 8  # of sensors of several channels
+MAX_FIRINGS = 8  # firings of sensors of several channels
 
 
 class _BeamPlot(NamedTuple):
@@ -29,7 +29,7 @@ class _BeamPlot(NamedTuple):
 def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
     """Draw the directions of a sensor's first rays, coloured by time.
 
-    The rays are those of some firings; for sensors of a single channel, those of a frame, or of two
+    The rays come from some firings, but for sensors of a single channel from a frame, or from two
     cycles of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over
     time.
     """

@@ -19,14 +19,14 @@ from .surface import spiral
 _MARGIN_SHARE = 0.35
 _MARGIN_HEIGHTS = 2.0
 _MIN_MARGIN_M = 25.0
-_MAX_SHARE = 0.5  # share of the scene's ground from which all of it is shown
+_MAX_SHARE = 0.5  # share of the scene's ground; larger parts show all of it
 
 _MIN_ROOF_SHARE = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
 _STEEP_DEG = 60.0
 _RAYS = 64
 _MAX_SPREAD = 0.5  # spread of the heights above a sensor, over their median: more is a tree's crown
-_CONTACT = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
-_MAX_POSITIONS = 8  # of sensors, from which rays are cast
+_CONTACT = 1e-3  # share of the scene's diagonal: a sensor on a surface does not stand under it
+_MAX_POSITIONS = 8  # positions of sensors that cast rays
 
 
 def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | None:
@@ -34,7 +34,7 @@ def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | 
 
     The box reaches down to the ground.
 
-    `bounds` (2, 3) are those of the scene; all in metres.
+    `bounds` (2, 3) are the scene's. All values are in metres.
     """
     if not trajectories:
         return None
@@ -112,7 +112,7 @@ class ShownPart:
 
         Objects narrower than the box are included if their middle is inside; wider objects, such as
         the ground, are cut at its sides. All are cut at its top, because towers would hide the
-        trajectory. Objects keep their numbers, also if no triangle is left.
+        trajectory. Objects keep their numbers even if no triangle is left.
         """
         scene = self.scene
         boxes = scene.object_bounds[:, :, :2]

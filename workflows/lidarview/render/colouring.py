@@ -17,7 +17,7 @@ from .theme import mapped, object_colours
 TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
 DIVERGING = mapped("coolwarm", np.linspace(0, 1, 256))  # (256, 3); its middle is pale
 MAX_UNNAMED_LABELS = 12  # labels without names that have a colour each
-MAX_COLOURS = 1 << 16  # of labels
+MAX_COLOURS = 1 << 16  # limit for labels
 
 # Columns that are composed of others, see `values_of`.
 RGB = Column("rgb", "uint32", "", "colours of the surfaces")
@@ -44,16 +44,16 @@ class Colouring:
 
     # Returns colours (n, 3) in 0 to 1 of values (n,).
     paint: Callable[[AnyArray], Floats]
-    name: str  # of the column
-    unit: str  # of the limits
+    name: str  # name of the column
+    unit: str  # unit of the limits
     meaning: str
     limits: tuple[float, float] | None = None  # ends of the scale; None for labels
     logarithmic: bool = False
     # Name and colour of existing labels, in order of their points if there are many.
     labels: tuple[tuple[str, Floats], ...] = ()
-    values: tuple[int, ...] = ()  # of the column, one for each label
+    values: tuple[int, ...] = ()  # values of the column, one for each label
     scale: Floats = field(default_factory=lambda: TURBO)  # (256, 3)
-    divisor: float = 1.0  # of values, to the unit of the limits
+    divisor: float = 1.0  # values over the divisor have the unit of the limits
 
 
 def with_composed(columns: Mapping[str, Column]) -> dict[str, Column]:
@@ -107,7 +107,8 @@ def colours_of(
 ) -> Colouring:
     """Choose colours for the values (n,) of a column.
 
-    `limits` are the ends of a scale of numbers in its unit, in place of those of the values.
+    `limits` are the ends of a scale of numbers in its unit, in place of the lowest and the highest
+    value.
 
     `names` are the words for the values 0, 1, 2, … of a label. Labels have a colour each; labels
     without names and with too many values for a legend are on a scale like numbers. Columns with
@@ -214,7 +215,7 @@ def _scale_painter(
 ) -> Callable[[AnyArray], Floats]:
     """Return the function from values (n,) to colours (n, 3) of a scale (256, 3).
 
-    `limits` are those of values over the divisor.
+    `limits` belong to values over the divisor.
     """
     lower, _, upper = limits
     start, stop = np.log([lower, upper]) if logarithmic else (lower, upper)

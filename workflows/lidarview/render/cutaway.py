@@ -43,7 +43,7 @@ class Cutaway:
         core[:, 1, :2] -= 0.06 * width[:, :2]
         # The roof and things under it: all above the middle between sensors and top.
         core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
-        # Hills are no walls: objects below the sensors that only face up are ground.
+        # Hills are not walls: objects below the sensors that only face up are ground.
         facing = np.full(len(core), np.inf)
         np.minimum.at(facing, surface.scene.face_object, surface.face_normals[:, 2])
         ground = (facing > 0) & (core[:, 0, 2] < sensors[:, 2].min())

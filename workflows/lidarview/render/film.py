@@ -29,18 +29,18 @@ FOCAL_PX = 922.0  # focal length of the camera, pixels: 55 degrees across
 _BEHIND = 1.7
 _ABOVE = 0.95
 _AHEAD = 1.6
-_HEADING_SHARE = 0.12  # of the film, before and after, over which the heading is measured
+_HEADING_SHARE = 0.12  # share of the film, before and after, where the heading is measured
 # of a camera that circles: its distance, times the size, and its rise for a metre of distance
 _CIRCLE_RADIUS = 1.25
 _CIRCLE_SLOPE = 0.62
 # times the focus: closer surfaces are left out, distant surfaces fade
 _MIN_FOCUS = 0.3
 _HAZE_FOCUS = 6.0
-# brightness of old points; frames in which new points fade to it
+# brightness of old points; number of frames until new points have faded to it
 _OLD_BRIGHTNESS = 0.42
 _FADE_FRAMES = 3.0
 _POINT_RADIUS = 2.3  # half pixels
-_NOISE = 0.02  # of the distance, that a point may lie beside its surface
+_NOISE = 0.02  # share of the distance that a point may lie beside its surface
 
 
 class _Shape(NamedTuple):
@@ -173,7 +173,7 @@ def _draw_points(
     shown = (distance <= surface + slack) & (distance >= _MIN_FOCUS * focus)
     shown &= (age == 0) | (distance >= surface - slack) | np.isinf(surface)
     fade = _OLD_BRIGHTNESS + (1 - _OLD_BRIGHTNESS) * np.exp(-age / _FADE_FRAMES)
-    rows = np.flatnonzero(shown)  # of points on one surface, the newest are drawn last
+    rows = np.flatnonzero(shown)  # the newest points on a surface are drawn last
     rows = rows[np.argsort((fade * slack - distance)[rows], kind="stable")]
     colours = BACK + (points.colours[rows] - BACK) * fade[rows, None]
     return splat(image, pixels[rows], colours, _POINT_RADIUS)

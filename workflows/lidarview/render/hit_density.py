@@ -14,9 +14,9 @@ from lidarsim.scene.scene_mesh import triangle_areas
 from .colouring import TURBO
 from .theme import UNSEEN, rgb
 
-HITS_TITLE = "hits per square metre; grey: none"  # of the scale
-_GRID_LEVELS = 24  # of a grid whose cells are half as wide each time
-_MIN_HITS = 12  # hits from which a density is estimated; points in a cell of the grid
+HITS_TITLE = "hits per square metre; grey: none"  # title of the scale
+_GRID_LEVELS = 24  # levels of a grid whose cells are half as wide each time
+_MIN_HITS = 12  # hits that suffice for an estimate of density; points in a cell of the grid
 _MAX_ROUNDS = 12
 _MAX_RATIO = 300.0  # densest to sparsest colour
 
@@ -36,7 +36,7 @@ def hit_colours(
     corners, hits
         (f, 3, 3), metres, and (f,): the drawn triangles of the scene, and the hits of each.
     points
-        (n, 3): an evenly spaced sample of hit points; it may lack those of some places.
+        (n, 3): an evenly spaced sample of hit points, which may lack some places.
     max_pieces
         Largest number of pieces.
 

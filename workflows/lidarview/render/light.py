@@ -36,7 +36,7 @@ class LightMap:
     camera: Camera
     sun: Floats  # (3,) unit vector towards the sun
     openness: Floats32  # (rows, columns) in 0 to 1: the unblocked share of the light
-    position: Floats32  # (rows, columns, 3) metres; NaN where there is no surface
+    position: Floats32  # (rows, columns, 3) metres; NaN without a surface
     normal: Floats32  # (rows, columns, 3)
 
     def brightness(

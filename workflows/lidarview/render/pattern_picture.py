@@ -21,12 +21,12 @@ from .picture_page import Page
 from .theme import mapped
 
 TIMES_S = (0.1, 0.5, 2.0)
-CELL_DEG = 0.28  # of the coverage: the width of a beam of Livox
+CELL_DEG = 0.28  # cell of the coverage: the width of a beam of Livox
 FIELD_S = 4.0  # cells that are met in this time are the field of view
 CONVENTIONS = "azimuth: degrees from x, forward, to y, left; elevation: above the xy plane"
 _COVERED = to_rgb(theme.OBJECT_COLOURS[0])
-_FIRST_FIRINGS = 8  # of sensors of several channels
-_MAX_FRAME_RAYS = 300_000  # of a longer frame, every so many firings
+_FIRST_FIRINGS = 8  # firings of sensors of several channels
+_MAX_FRAME_RAYS = 300_000  # limit for a frame; a longer frame has every n-th firing
 _CHUNK_RAYS = 1_000_000
 _WIDE = 2.0  # charts of fields of view with a greater ratio of sides stand one above the other
 _WIDE_SIZE = (1600, 1150)

@@ -33,11 +33,11 @@ from .shot import SurfaceView
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
 MAX_LARGE_MARKERS = 40  # more sensors than this are small dots
-MAX_PATH_POINTS = 200  # of the drawn trajectory of a sensor
+MAX_PATH_POINTS = 200  # points of the drawn trajectory of a sensor
 # areas of numbered marks, square points of a picture 1600 wide: of 1 to 9, and of more
 _MARK = 62
 _MARK_OF_TWO_DIGITS = 92
-MAX_NAMES = 12  # of actors, beside them
+MAX_NAMES = 12  # limit for names of actors, beside the actors
 # pixels of a picture 1600 wide
 NAME_ABOVE = 26.0
 NAME_SIZE = (150.0, 26.0)
@@ -48,7 +48,7 @@ TICK = 7.0  # length of a tick mark
 LABEL_MARGIN_X = 14.0
 LABEL_MARGIN_Y = 24.0
 LETTER_WIDTH = 12.0  # width of a digit
-TITLE_DISTANCE = 32.0  # from the numbers to the title
+TITLE_DISTANCE = 32.0  # distance between the numbers and the title
 LABEL_SPACING = 34.0  # numbers stand at least this far apart
 MIN_AXIS = 36.0  # a shorter height axis has no room for numbers
 

@@ -20,7 +20,7 @@ from .hit_density import HITS_TITLE, hit_colours
 from .picture_page import LEGEND_ROWS, Page, robot_name
 from .shot import SurfaceView
 
-MAX_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
+MAX_POINTS = 1_000_000  # limit for drawn points of a cloud; a picture has a few more pixels
 # to count, and to colour
 MAX_HITS = 200_000
 MAX_PIECES = 100_000
@@ -224,7 +224,7 @@ def splat(image: Floats32, pixels: Floats, colours: AnyFloats, radius: float) ->
     # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
     height, width, _ = image.shape
     reach = int(radius)
-    margin = reach + 2  # for discs of points beside the edge
+    margin = reach + 2  # room for discs of points beside the edge
     row_length = 2 * (width + margin)
     fine = np.zeros((2 * (height + margin), row_length), np.uint32)
     inner = fine[margin : margin + 2 * height, margin : margin + 2 * width]
@@ -238,8 +238,8 @@ def splat(image: Floats32, pixels: Floats, colours: AnyFloats, radius: float) ->
         for dx in range(-reach, reach + 1)
         if dx * dx + dy * dy <= radius * radius
     ]
-    # The last of several colours for a pixel stays: that of the point with the closest middle, and
-    # of equally close points the point in front.
+    # The last of several colours for a pixel stays: the colour of the point with the closest
+    # middle. Of equally close points, the point in front counts.
     for _, offset in sorted(disc, reverse=True):
         fine.ravel()[middle + offset] = colour
     fine_bytes = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)

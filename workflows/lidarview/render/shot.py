@@ -92,7 +92,7 @@ class SurfaceView:
     part: ShownPart
     uncut: Scene  # the part before it was cut open
     sensors: Floats  # (p, 3) metres, local coordinates
-    paths: tuple[Floats, ...]  # of moving sensors, (k, 3) each
+    paths: tuple[Floats, ...]  # paths of moving sensors, (k, 3) each
     actors: int  # number of actors, the last objects of the scene, which are labelled
     caption: str  # number of sensors, and the time
     models: str  # models of the sensors, for a caption
@@ -268,7 +268,7 @@ class _OpenScene(NamedTuple):
     """The part of a scene that is shown, cut open above sensors in a building."""
 
     part: ShownPart
-    surface: Surface  # of the part
+    surface: Surface  # surface of the part
     uncut: Scene  # the part before it was cut open
     bounds: Floats  # (2, 3) of the part
     box: Floats | None  # (2, 3) around trajectories; None if all of the scene is shown

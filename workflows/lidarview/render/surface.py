@@ -12,7 +12,7 @@ from raybeam import RayCaster
 
 # Faces that meet at a flatter angle than this are shaded as one smooth surface.
 CREASE_COSINE = np.cos(np.radians(35))
-_DEPTH_LEVELS = 5  # of objects that are neighbours
+_DEPTH_LEVELS = 5  # levels for objects that are neighbours
 _MIN_SQUARE = 0.1  # squared length of the mean normal at corners that move no farther
 
 

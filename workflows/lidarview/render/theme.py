@@ -19,14 +19,14 @@ MUTED = "#5d6876"
 CLAY = "#d9dde2"
 UNSEEN = "#c9ccd1"
 SENSOR = "#e0182d"
-VEIL = 0.085  # of MUTED over the page: the ground in a rendered picture
+VEIL = 0.085  # share of MUTED over the page: the ground in a rendered picture
 # In pictures within a page, the style of the page defines these colours.
 STYLED = {
     PAGE: "page", GROUND: "ground", LINE: "line", INK: "ink", MUTED: "muted", UNSEEN: "unseen",
     SENSOR: "sensor",
 }  # fmt: skip
 
-# Distinct also for most colour-blind readers (after Paul Tol's "bright" and "muted" sets, 2021,
+# Distinct even for most colour-blind readers (after Paul Tol's "bright" and "muted" sets, 2021,
 # in an order that keeps neighbours apart).
 OBJECT_COLOURS = (
     "#4477aa", "#ee7733", "#44aa77", "#cc6677", "#66b8d9", "#ccaa33",

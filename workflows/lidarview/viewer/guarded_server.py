@@ -29,10 +29,10 @@ from tornado.web import Application
 
 MAX_BODY_BYTES = 4096  # our pages send no bodies
 MAX_CONNECTIONS = 64  # a browser opens six at a time
-REQUEST_WITHIN_S = 10.0  # from the connection, or from the last answer, to the end of the request
-_MAX_BUFFER_BYTES = 256 << 10  # of what a connection has received: 64 kB of headers, and a body
+REQUEST_WITHIN_S = 10.0  # limit for a request, after the connection or the last answer
+_MAX_BUFFER_BYTES = 256 << 10  # limit for the bytes of a connection: 64 kB of headers, and a body
 _PIECE = 1 << 16  # bytes that are read at a time of a request that is refused
-_MAX_DIGITS = 9  # of a Content-Length
+_MAX_DIGITS = 9  # digits of a Content-Length
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..render.colouring import (
     Colouring,
 )
 
-MAX_LABELS = 1000  # in a legend
+MAX_LABELS = 1000  # limit for a legend
 
 Legend = dict[str, Any]  # JSON for the page: of `legend_of` or `scale_legend`
 
@@ -38,7 +38,7 @@ def legend_of(colouring: Colouring) -> Legend:
     title += f": {colouring.meaning}" if colouring.meaning else ""
     if colouring.logarithmic:
         marks = [f"{number:.2g}" for number in (lower, (lower * upper) ** 0.5, upper)]
-    else:  # as many digits as a bar of this span needs, and never -0
+    else:  # the digits suit a bar of this span, without -0
         digits = int(np.clip(np.ceil(1 - np.log10(upper - lower)), 0, 6)) if upper > lower else 2
         marks = [
             f"{round(number, digits) + 0.0:,.{digits}f}"

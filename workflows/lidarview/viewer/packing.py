@@ -12,10 +12,10 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
 
-_LEVELS = 4095  # of a column of fractions, besides NaN
-_LOGARITHMIC_RATIO = 100.0  # of the largest to the smallest value, from which levels are of logs
-_MAX_CODE = 1 << 31  # of whole numbers that are packed exactly
-_STEPS = 50_000  # of a coordinate, over the length of the points
+_LEVELS = 4095  # levels of a column of fractions, besides NaN
+_LOGARITHMIC_RATIO = 100.0  # ratio of the largest to the smallest value; above, levels are of logs
+_MAX_CODE = 1 << 31  # limit for whole numbers that are packed exactly
+_STEPS = 50_000  # steps of a coordinate, over the length of the points
 
 
 class PackedColumn(NamedTuple):

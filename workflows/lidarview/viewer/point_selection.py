@@ -21,11 +21,11 @@ RESULT = Column("result", "uint8", "", "result that the point is of", kind="labe
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK_ROWS = 1 << 15  # rows that are read at a time
-_SAMPLE_POINTS = 200_000  # points from which the counts of tiles are estimated
+_SAMPLE_POINTS = 200_000  # points for an estimate of the counts of tiles
 _TILE_COLUMNS = 48
 _TILE_ROWS = 27
 TILES = _TILE_COLUMNS * _TILE_ROWS  # parts of a picture
-_KEEP_SHARE = 0.8  # of the points, each time there are too many
+_KEEP_SHARE = 0.8  # share of the points, each time there are too many
 
 
 class HeldPoints:
@@ -166,7 +166,7 @@ def read_scans(text: str) -> ScanRanges:
 
     Ranges that touch are joined.
 
-    ValueError if the text is no such list.
+    ValueError if the text is not such a list.
 
     Examples
     --------
@@ -287,7 +287,7 @@ class PointFinder:
         Abandoned
             If nobody waits for the answer.
         """
-        ranges = [(0, len(self.points))]  # of rows, first and after the last
+        ranges = [(0, len(self.points))]  # ranges of rows, first and after the last
         if scans is not None:
             points = self.points
             parts: Sequence[tuple[int, Any]] = [(0, points)]
@@ -330,7 +330,7 @@ class PointFinder:
     ) -> tuple[Ints, int]:
         """Read blocks in turn, and thin the points out while there are too many.
 
-        Arguments and results are those of `find`, with ranges of rows (start, stop), and the shares
+        Arguments and results are as in `find`, with ranges of rows (start, stop), and the shares
         (tiles,) of the points that are kept in each tile of the eye's picture.
         """
         random = np.random.default_rng(0)

@@ -13,11 +13,11 @@ from ..render.theme import mapped
 
 _IMAGE_WIDTH = 1024  # most columns of a range image
 
-_IMAGE_ROWS = 128  # of a range image, unless its rows are channels
+_IMAGE_ROWS = 128  # rows of a range image, unless its rows are channels
 
 _COLUMN_SHARE = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
 
-_MIN_CHANNELS = 4  # of a sensor whose channels are the rows of a range image
+_MIN_CHANNELS = 4  # least channels of a sensor whose channels are the rows of a range image
 
 _MAX_CHANNELS = 512  # likewise
 

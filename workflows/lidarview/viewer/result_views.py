@@ -61,7 +61,7 @@ def show_view(view: View | GrowingView, *, port: int, browser: bool = True) -> N
 def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> View:
     """Open results of surveys of the same scene as a view of all their points.
 
-    The scene, sensors and actors are those of the first result.
+    The scene, sensors and actors come from the first result.
 
     The view can be played if the sweeps of all results start at the same times. LidarError if a
     result has no cloud, a damaged cloud, or points in the frames of the sensors.
@@ -107,8 +107,7 @@ def join_views(
 def open_result(path: Path, downloads: Downloads | None = None) -> View:
     """Open a cloud or the folder of a result, with its scene and sweeps if they are in the folder.
 
-    A scene or sweeps that cannot be read are noted only. LidarError if there is no cloud, or a
-    damaged cloud.
+    A scene or sweeps that cannot be read are noted only. LidarError for a missing or damaged cloud.
     """
     if not path.exists():
         raise LidarError(f"{path} does not exist: give the folder of a result, or a cloud.")

@@ -71,8 +71,8 @@ Arguments = Mapping[str, str]
 Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # content of the JSON text, and arrays
 
 
-# Answers a question with its arguments: KeyError or ValueError if there is no such question or an
-# argument is wrong; Abandoned once the function (the last argument) says that nobody waits.
+# Answers a question with its arguments: KeyError for an unknown question, ValueError for a wrong
+# argument, Abandoned once the function (the last argument) says that nobody waits.
 Source = Callable[[str, Arguments, Callable[[], bool]], Answer]
 
 
@@ -99,7 +99,7 @@ def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes
 def is_large(question: str, arguments: Arguments) -> bool:
     """Return True if an answer may have millions of points, and hold memory until read.
 
-    ValueError if the number of points is no number.
+    ValueError if the number of points is not a number.
     """
     kind = question.rpartition("/")[2]
     return kind == "export" or (kind == "points" and int(arguments.get("most", 0)) > LARGE_POINTS)
@@ -298,7 +298,7 @@ def page_server(
     """Serve a page while the body runs, in a separate thread, on a port or the next free port.
 
     A `port` of 0 is for any; `stop` is called when a user of the page orders to stop. `index` is
-    the page's file; the viewer of a job is at ``job/NUMBER/``, with which its questions start.
+    the page's file; the viewer of a job is at ``job/NUMBER/``, and its questions start so.
     """
     listener = _open_socket(host, port)
     folder = str(files(__package__) / "page")
@@ -376,7 +376,7 @@ def frame_of(page: PageServer, words: str) -> str:
     """Return HTML for the cell of a notebook: a link of some words, and the page in a frame."""
     url = page.url
     words = escape(words)
-    if hub := os.environ.get(_HUB):  # in a frame, 127.0.0.1 would be the reader's own machine
+    if hub := os.environ.get(_HUB):  # 127.0.0.1 in a frame would be the reader's own machine
         url = f"{hub.rstrip('/')}/proxy/{page.port}/{page.token}/"
         words += (
             " It is shown through jupyter-server-proxy; without that, connect with ssh -L "

@@ -40,15 +40,15 @@ _FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, c
 _MIN_FRAMES = 30
 _FRAME_MS = 100
 FILM_BYTES = 3_000_000  # maximum of a film
-_WIDTHS = range(960, 320, -80)  # of a film, pixels, the widest first
+_WIDTHS = range(960, 320, -80)  # widths of a film, pixels, the widest first
 _FILM_TRIANGLES = 3_000_000
-_FILM_POINTS = 800_000  # that a film shows at a time
-_FRAME_POINTS = 200_000  # that a frame adds
+_FILM_POINTS = 800_000  # points that a film shows at a time
+_FRAME_POINTS = 200_000  # points that a frame adds
 PAGE_BYTES = 25_000_000  # maximum of a page in one file
 _PAGE_POINTS = 4_000_000
 _PAGE_TRIANGLES = 60_000
-_SAMPLE_POINTS = 5_000_000  # points from which a page's points are chosen
-_CELLS = 300  # along the diagonal of the points, in which their density is counted
+_SAMPLE_POINTS = 5_000_000  # sample of points; a page's points are chosen among them
+_CELLS = 300  # cells along the diagonal of the points, where their density is counted
 
 # Statements of modules. `_IMPORT` has the names and the file, `_EXPORT` the name.
 _IMPORT = re.compile(r'^import (\{[^}]*\}|\* as \w+) from "\./([\w.]+)";$', re.MULTILINE)
@@ -70,7 +70,7 @@ def share(
 
     `writing` opens the display of an output's progress, with a caption; none by default.
 
-    LidarError if there are no points, or a file has another suffix or cannot be written.
+    LidarError without points, or if a file has another suffix or cannot be written.
     """
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
@@ -116,7 +116,7 @@ def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) ->
     `quality` is the number of colours of a .gif.
     """
     scaled = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
-    if suffix == ".gif":  # with a palette for each frame, colours would flicker
+    if suffix == ".gif":  # colours would flicker with a palette for each frame
         pixels = np.concatenate([np.asarray(frame)[::2, ::2] for frame in scaled])
         palette = Image.fromarray(pixels).quantize(quality, Image.Quantize.FASTOCTREE)
         scaled = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in scaled]
@@ -289,7 +289,7 @@ def joined_modules(folder: Traversable, name: str) -> str:
             if imported not in modules:
                 add(imported)
         exports = _EXPORT.findall(text)
-        for names in _EXPORT_LIST.findall(text):  # of a minified module, "a as Name"
+        for names in _EXPORT_LIST.findall(text):  # a minified module says "a as Name"
             pairs = (entry.strip().partition(" as ") for entry in names.split(","))
             exports += [f"{exported or local}: {local}" for local, _, exported in pairs]
         text = _IMPORT.sub(r'const \1 = modules["\2"];', text).replace("const * as ", "const ")
@@ -340,7 +340,7 @@ def _thinned(view: View, max_points: int) -> Answer:
 
 
 def _compact_order(columns: Mapping[str, AnyArray], count: int) -> Ints:
-    """Return an order in which neighbours are alike: by sensor and channel, then as they are."""
+    """Return an order with similar neighbours: by sensor and channel, then as they are."""
     keys = [columns[name] for name in ("channel", "sensor") if name in columns]
     return np.lexsort(keys) if keys else np.arange(count)
 

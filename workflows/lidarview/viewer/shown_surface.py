@@ -26,7 +26,7 @@ from .legends import Legend, legend_of, scale_legend
 # smaller: two centimetres.
 _INWARD_SHARE = 1e-4
 _MAX_SIZE_M = 200.0
-HITS_SAMPLE = 500_000  # points from which the density of hits on large triangles is estimated
+HITS_SAMPLE = 500_000  # sample for the density of hits on large triangles
 
 MAX_TRIANGLES = 300_000  # triangles sent to the page, 50 bytes each, at each change of colours
 
@@ -62,7 +62,7 @@ class ShownSurface:
             self._materials = np.full(len(self.coarse.faces), -1)
             is_shown = self._replacements >= 0
             self._materials[self._replacements[is_shown]] = face_materials[is_shown]
-        self._objects = self.coarse.face_object.astype(np.int32)  # as browsers have them
+        self._objects = self.coarse.face_object.astype(np.int32)  # type that browsers have
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = separate_objects(self.coarse, self._objects, _INWARD_SHARE * min(size, _MAX_SIZE_M))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
@@ -75,7 +75,7 @@ class ShownSurface:
         Corners are local, metres; objects are indices of static objects.
 
         `by` is a name of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
-        a sample of the hit points, (n, 3). There are no colours for "grey", which the page defines.
+        a sample of the hit points, (n, 3). The page itself defines the colours of "grey".
         """
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend: Legend | None = None
@@ -133,10 +133,10 @@ class ShownSurface:
 def colours_for(
     scene: Scene, reflectance: Floats | None, face_materials: Ints32 | None = None
 ) -> tuple[str, ...]:
-    """Return the names by which `ShownSurface.coloured` can colour a scene.
+    """Return the names that `ShownSurface.coloured` accepts for a scene.
 
-    "reflectance" needs several values (objects,), "material" those of faces, "colour" a scene with
-    colours.
+    "reflectance" needs several values (objects,), "material" materials of faces, "colour" a scene
+    with colours.
     """
     scene_colours = ("colour",) if scene.coloured else ()
     reflectances = (

@@ -63,9 +63,9 @@ from .range_pictures import are_around, range_image
 from .server import Answer, Arguments
 from .shown_surface import HITS_SAMPLE, MAX_TRIANGLES, ShownSurface, colours_for
 
-MAX_POINTS = 20_000_000  # in an answer, and in a download
+MAX_POINTS = 20_000_000  # points in an answer, and in a download
 MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
-_SAMPLE = 100_000  # points from which colour scales and limits are computed
+_SAMPLE = 100_000  # points for colour scales and limits
 _MAX_COUNTED = 20_000_000  # points whose labels are counted; of more, a sample
 _CORNERS = 1000  # points of a cloud that are in the first picture
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
@@ -77,7 +77,7 @@ CLOUD = "cloud.ply"
 
 @dataclass(frozen=True)
 class Downloads:
-    """Formats in which a page offers points as files, and the function that writes a file."""
+    """Formats of files that a page offers for points, and the function that writes a file."""
 
     formats: Sequence[str]  # suffixes of files without a dot, such as "las"
     save: Callable[[Cloud, Path], object]  # writes points in the format of the path's ending
@@ -102,9 +102,9 @@ class View:
     hits: Callable[[], AnyArray] | None = None
     triangles: int = MAX_TRIANGLES  # largest number of the scene's triangles that are shown
     downloads: Downloads | None = None  # None if points are not offered as files
-    # {column: names of the values 0, 1, 2, …}, beside those of the scene and the sweeps.
+    # {column: names of the values 0, 1, 2, …}, beside the names of the scene and the sweeps.
     names: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    preview: bool = False  # whether the points are those of first sweeps, before a run
+    preview: bool = False  # whether the points come from first sweeps, before a run
     stated_epsg: int | None = None  # EPSG code that the file of a cloud states
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ class View:
         other_columns = {
             column.name: column for column in self.points.table if column not in POSITION
         }
-        self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # to colour and filter by
+        self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # columns to colour and filter by
         self._coloured = with_composed(self.columns)
         self._lock = threading.Lock()
         self._surface: ShownSurface | None = None
@@ -136,7 +136,7 @@ class View:
     def show(self, points: Points, *, keep_scales: bool = False) -> None:
         """Replace the points.
 
-        Colour scales stay those of earlier points with `keep_scales`.
+        With `keep_scales`, the colour scales of earlier points stay.
         """
         self.points = points
         self._finder = PointFinder(points, self.origin)
