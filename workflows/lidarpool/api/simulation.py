@@ -175,8 +175,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         ----------------
         client
             Client of a cluster whose workers declare the resources GPU and LIDAR; without one, a
-            local cluster is started. LIDAR needs a slot more than for a survey, in which jobs are
-            written.
+            local cluster is started. LIDAR needs a slot more than for a survey, to write jobs.
         backend, collectors, queue_capacity, batch_mb
             As for `simulate`; by default as in the scenario.
         gpu_workers
@@ -194,7 +193,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             Resume, and compare every byte of the jobs that are done: jobs with other bytes are
             damaged, and done again.
         overwrite
-            Replace a finished data set, too; with `fresh`, also if some of its jobs have failed.
+            Replace a finished data set, too, and with `fresh` even if some of its jobs have failed.
         live
             Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
             in the cell. "foxglove" and "rerun" show sweeps of jobs in Foxglove and Rerun.

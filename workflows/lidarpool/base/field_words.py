@@ -1,8 +1,7 @@
 """Fields of content in words: which fields of two runs differ, where fingerprints tell only that.
 
 The words are stored with a run, {path of a field: its value}. A long list is its length and a mark
-of its content. Every value counts, except in lists of more than a thousand entries, of which a
-thousand are looked at.
+of its content. Every value counts, except in longer lists: a thousand entries of a list count.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from lidarsim.base.errors import LidarError
 from .fingerprint import fingerprint
 
 _PLAIN = (bool, int, float, str)
-_MAX_ENTRIES = 8  # of a list or mapping whose entries are fields of their own
-_MAX_NUMBERS = 16  # of a list that is written out
+_MAX_ENTRIES = 8  # entries of a list or mapping whose entries are separate fields
+_MAX_NUMBERS = 16  # numbers of a list that is written out
 _MAX_LOOKED_AT = 1000  # entries of a longer list
 _MAX_LETTERS = 80
 _MARK = " #"  # before the mark of content that words do not show
@@ -79,7 +78,7 @@ def _marked(value: Any) -> str:
         value = value[:: 1 + len(value) // _MAX_LOOKED_AT]
     try:
         return f"{size}{_MARK}{fingerprint(value)[:8]}"
-    except LidarError:  # of the user's own, without a fingerprint
+    except LidarError:  # an object of the user without a fingerprint
         return size
 
 

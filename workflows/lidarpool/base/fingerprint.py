@@ -2,7 +2,7 @@
 
 A fingerprint depends on class and fields, and for classes and functions outside the package also on
 their code, so that a subclass with another method has another fingerprint. Fields that do not
-compare (`dataclasses.field(compare=False)`) are no part of it.
+compare (`dataclasses.field(compare=False)`) are not part of it.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _content(array: np.ndarray[Any, Any]) -> bytes:
         return cached[1]
     data = np.ascontiguousarray(array).view(np.uint8).data
     digest = hashlib.sha256(data).digest()
-    if array.nbytes >= _MIN_CACHED_BYTES and not array.flags.writeable:  # as arrays of a Scene
+    if array.nbytes >= _MIN_CACHED_BYTES and not array.flags.writeable:  # so are arrays of a Scene
         key = id(array)
         _hashes[key] = weakref.ref(array, lambda _: _hashes.pop(key, None)), digest
     return digest

@@ -1,4 +1,4 @@
-"""The process from which a local cluster forks its workers.
+"""The process that forks the workers of a local cluster.
 
 A spawned worker imports Dask, NumPy and the packages of lidarpool, which takes a second of a core.
 The fork server imports them once, in parallel to the driver, and forks each worker in 20 ms, also

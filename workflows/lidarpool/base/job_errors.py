@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from lidarsim.base.words import listed
 
-_NUMBER = re.compile(r"\bjob \d+: ")  # of the job, in its error
+_NUMBER = re.compile(r"\bjob \d+: ")  # names the job in its error
 _VALUES = "\nIts values are "  # before the values of the job, in its error
 
 

@@ -1,4 +1,4 @@
-"""JSON files that end with the CRC-32 of their own text, so that damage and edits are noticed."""
+"""JSON files that end with the CRC-32 of their text, so that damage and edits are noticed."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def sealed(content: Mapping[str, Any]) -> bytes:
 def unsealed(data: bytes) -> dict[str, Any]:
     """Return the object that `sealed` or `SealedWriter` has written.
 
-    ValueError if the text is not that of its CRC-32.
+    ValueError if the text does not fit its CRC-32.
     """
     seal = _SEAL.search(data)
     if seal is None:

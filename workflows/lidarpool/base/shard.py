@@ -41,7 +41,7 @@ class Shard:
     def parse(cls, text: str, environment: Mapping[str, str] = os.environ) -> Shard:
         """Read ``3/10``, ``auto`` for the task of a Slurm array, or ``auto/10`` for a pod's index.
 
-        LidarError for any further text, or if there is no such shard, array or index.
+        LidarError for any further text, or without such a shard, array or index.
         """
         if not (match := re.fullmatch(r"(?:(\d+)|auto)/(\d+)|auto", text, re.ASCII)):
             raise LidarError(f"{text!r} is no shard: give 3/10, auto/10 or auto.")

@@ -1,7 +1,7 @@
 """Pickled values, and memory of this process that other processes of this machine map.
 
-A large value that is sent through Dask is copied several times, and each process has a copy of its
-own. Shared memory is a file without a name in any folder (`memfd_create`, Linux), which processes
+A large value that is sent through Dask is copied several times, and each process has a separate
+copy. Shared memory is a file without a name in any folder (`memfd_create`, Linux), which processes
 of the same user open at ``/proc/PID/fd/NUMBER``. The system frees the memory with the last process
 that uses it, however that process ends.
 """
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import cloudpickle
 
-_ALIGNMENT = 64  # of each array, bytes
+_ALIGNMENT = 64  # alignment of each array, bytes
 
 
 class Pickled(NamedTuple):
@@ -48,10 +48,10 @@ class Pickled(NamedTuple):
 
 
 class SharedHandle(NamedTuple):
-    """Location of a `SharedValue`, by which another process loads the value."""
+    """Location of a `SharedValue`, for loading the value in another process."""
 
     path: str
-    name: str  # of the memory, which no other has
+    name: str  # unique name of the memory
     spans: tuple[tuple[int, int], ...]  # start and end of the head and of each buffer
 
     def load(self) -> Any:

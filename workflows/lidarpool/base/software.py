@@ -24,7 +24,7 @@ T = TypeVar("T")
 PACKAGES = ("lidarpool", "lidarscenes", "lidarsim", "lidarview", "poolpart", "raybeam")
 # Files beside a package in a checkout, which an installed package lacks.
 _DISTRIBUTION_FILES = ("pyproject.toml", "README.md", "LICENSE")
-IMPORTED = time.time()  # in a forked worker, the time of the fork server's import
+IMPORTED = time.time()  # a forked worker has the time of the fork server's import
 CLOCK_TOLERANCE_S = 5.0  # largest difference of the clocks of a file server and of this machine
 
 

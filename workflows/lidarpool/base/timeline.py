@@ -78,7 +78,7 @@ def _age_s() -> float:
 
 
 class Timeline:
-    """Steps of this process in the order in which they ended."""
+    """Steps of this process in the order of their ends."""
 
     def __init__(self) -> None:
         self._started = time.time() - _age_s()  # seconds since 1970, in steps of 10 ms

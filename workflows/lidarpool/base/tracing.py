@@ -7,7 +7,7 @@ from typing import Any
 
 Sink = Callable[[str, Mapping[str, Any]], None]
 
-_sink: Sink | None = None  # of this process
+_sink: Sink | None = None  # sink of this process
 
 
 def trace(point: str, /, **fields: Any) -> None:

@@ -52,7 +52,7 @@ def columns(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def colours(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a column by which points are coloured."""
+    """Complete a column that colours points."""
     del ctx, param
     return starting_with(incomplete, (*ALWAYS_COLUMNS, *OPTIONAL_COLUMNS, *COMPOSED_COLUMNS))
 

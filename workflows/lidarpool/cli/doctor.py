@@ -38,7 +38,7 @@ PORTS = {
 }
 _FOR_DEVELOPERS = ("bench", "dev", "docs", "lint")
 _GIB = 2**30
-_MIN_MEMORY_GIB = 2.0  # of a small run with its three processes
+_MIN_MEMORY_GIB = 2.0  # least memory of a small run with its three processes
 _MIN_DISK_GIB = 1.0
 
 

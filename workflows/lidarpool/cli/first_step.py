@@ -12,7 +12,7 @@ import time
 
 import click
 
-_COMPILER = logging.getLogger("raybeam.compiled")  # of a module that is not imported yet
+_COMPILER = logging.getLogger("raybeam.compiled")  # logger of a module that is not imported yet
 
 
 class _Lines(logging.Handler):

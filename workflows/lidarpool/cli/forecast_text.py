@@ -32,7 +32,7 @@ from ..scenario.scenario import Scenario
 from .shared_options import world_lines
 from .terminal import Terminal
 
-FORECAST_JOBS = 5  # of a campaign
+FORECAST_JOBS = 5  # number of jobs of a campaign
 _JOB_COUNTS = ("objects", "triangles", "scans", "sweeps", "rays", "estimate")
 
 

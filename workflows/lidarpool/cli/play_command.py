@@ -19,7 +19,7 @@ from . import shared_options as options
 from .first_step import begin
 
 _PACKETS = "packets"
-_NOW_NS = 2_000_000_000  # from reading the source to the first sweep of --now: time to prepare
+_NOW_NS = 2_000_000_000  # time between reading the source and the first sweep of --now, to prepare
 
 
 @click.command()
@@ -148,7 +148,7 @@ def _play_recording(
 
 @contextmanager
 def _summarized(summary: Callable[[], str]) -> Iterator[None]:
-    """Print a summary once the body has ended, also by Ctrl-C."""
+    """Print a summary once the body has ended, by Ctrl-C too."""
     try:
         yield
     except KeyboardInterrupt as error:

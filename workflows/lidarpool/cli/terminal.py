@@ -34,7 +34,7 @@ class Terminal(Screen):
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
-    warnings: list[str] = field(default_factory=list, init=False)  # that were printed
+    warnings: list[str] = field(default_factory=list, init=False)  # printed warnings
 
     @property
     def _stream(self) -> Any:
@@ -53,7 +53,7 @@ class Terminal(Screen):
             self._stream.write(f"note: {words}\n")
 
     def warn(self, words: str) -> None:
-        """Print a warning once, also in a quiet command, and append the warning to `warnings`."""
+        """Print a warning once, even in a quiet command, and append the warning to `warnings`."""
         if words not in self.warnings:
             self.warnings.append(words)
             click.echo(f"warning: {words}", err=True)

@@ -21,8 +21,8 @@ class Boxes:
     Points are at their own times, so that they lie outside the box of an actor that moves. The size
     of a box is the same in all sweeps: the box of an actor that deforms contains all its poses, in
     the actor's axes. An actor that appears during the sweep has the box that it would have if it
-    had come at the speed with which it appears. If a frozen sensor repeats points of an actor that
-    has left, there is no box.
+    had come at the speed of its appearance. If a frozen sensor repeats points of an actor that
+    has left, the box is missing.
     """
 
     centres: Floats  # (a, 3): metres, world coordinates, or the sensor frame after `inward`

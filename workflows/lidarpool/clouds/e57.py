@@ -32,7 +32,7 @@ from .well_known_text import wkt
 
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _THIN = "thin it first"
-_POINT_BYTES = 24  # of the coordinates of a point, at least
+_POINT_BYTES = 24  # least bytes of the coordinates of a point
 _COLUMNS = {
     "colorRed": "red",
     "colorGreen": "green",
@@ -186,7 +186,7 @@ def open_file(source: RecordingSource) -> Recording:
         system = _system(file)
         if system is not None and file.scan_count:
             points, _, pose = read(0)
-            assert pose is not None  # of every scan
+            assert pose is not None  # every scan has a pose
             notes = tuple(check_metric_format(system, points @ pose[:3, :3].T + pose[:3, 3]))
             # Else the points are in no such system.
             epsg = system.epsg if system.horizontal_m == 1.0 else None

@@ -14,7 +14,7 @@ from lidarsim.scene.files.cloud_scan import CloudScan
 from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut
 from lidarsim.scene.files.stated_system import StatedSystem
 
-MIN_POINTS = 12  # of a scene: a surfel lies in the plane of as many
+MIN_POINTS = 12  # least points of a scene: a surfel lies in the plane of as many
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
 NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 ORIGINS = (("origin_x", "origin_y", "origin_z"),)
@@ -31,9 +31,9 @@ class FilePoints:
     columns: Columns
     scanners: Floats | None = None  # (n, 3): NaN where unknown
     ignored: list[str] = field(default_factory=list)
-    system: StatedSystem | None = None  # that the file states
+    system: StatedSystem | None = None  # system that the file states
     in_metres: bool = False  # whether the format has true metres, whatever the system says
-    units_m: tuple[float, float, float] | None = None  # of x, y and z, if a header names them
+    units_m: tuple[float, float, float] | None = None  # units of x, y and z, if a header names them
     noise_classes: tuple[int, ...] = NOISE_CLASSES
     left_out: LeftOut = field(default_factory=LeftOut)  # withheld points and noise
     no_returns: int = 0  # points at zero that are left out

@@ -19,7 +19,7 @@ _MAX_SOURCE = 65_535  # largest number of a source in the format
 _TURN_DEG = 20.0
 _STEADY_DEG = 5.0
 _STEADY_NS = 1e9
-_MIN_STEP_M = 1e-6  # movement of a carrier in 2 ms, or a sweep, from which on it counts as moving
+_MIN_STEP_M = 1e-6  # a carrier that moves by more in 2 ms, or a sweep, counts as moving
 _LINES = 1 << 40  # numbers reserved for the lines of a station
 
 

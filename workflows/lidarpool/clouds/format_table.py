@@ -88,7 +88,7 @@ class FormatRow:
     actor_boxes
         Whether its files have the boxes of actors.
     raw
-        In data sets: whether a sweep has files of its own, which hold rows of numbers.
+        In data sets: whether each sweep has separate files, which hold rows of numbers.
     plugin
         The plug-in that provides the row; filled in when the plug-in is loaded.
     """
@@ -156,7 +156,7 @@ class FormatRow:
 
         Raises LidarError without a required package.
 
-        `name` is that of the file or folder in the message.
+        `name` is the name of the file or folder in the message.
         """
         for package in self.packages:
             need(package, self.extra, f"{name} is read")
@@ -448,7 +448,7 @@ def row_of(name: str) -> FormatRow:
     Raises
     ------
     LidarError
-        If there is no format of that name, it is only read, or its plug-in cannot be used.
+        If the format is unknown, or is only read, or its plug-in cannot be used.
     """
     row = _TABLE[name]
     if not row.write:
@@ -457,7 +457,7 @@ def row_of(name: str) -> FormatRow:
 
 
 def _rows_of_all() -> Iterator[FormatRow]:
-    """Yield the rows of the table, then those of plug-ins that can be used."""
+    """Yield the rows of the table, then the rows of plug-ins that can be used."""
     yield from (*FORMATS.values(), *_READ_ONLY.values())
     for name in plugins_of(GROUP):
         with suppress(LidarError):
@@ -477,7 +477,7 @@ def reader_of(path: Path, name: str) -> Callable[[Any], Any] | None:
     Raises
     ------
     LidarError
-        If a package that reads it is not installed; `name` is that of the file in messages.
+        If a package that reads it is not installed; `name` is the name of the file in messages.
     """
     if path.is_dir():
         rows = (row for row in _rows_of_all() if any(map(partial(_contains, path), row.folders)))

@@ -25,7 +25,7 @@ from .boxes import Boxes
 from .pieces import Entry
 from .recording import Read, Recording, RecordingSource, SweepFiles
 
-_NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are no images
+_NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are not images
 
 # Columns of points that images have for every ray, or that follow from the pixel.
 _RAY_COLUMNS = ("scan", "ray", "channel", "sensor", "time", "azimuth", "elevation")

@@ -28,7 +28,7 @@ from .file_points import FilePoints, of_scans
 from .pieces import Data, Entry, as_data
 from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
 
-_MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]  # of KITTI
+_MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
 NAMES_FILE = "semantic-kitti.yaml"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
@@ -177,7 +177,7 @@ def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
     The position is the middle of the underside; boxes are turned about the camera's y alone.
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
-    forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # of the actors
+    forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # directions of the actors
     positions = sweeps.pose.inward(sweep, boxes.centres) @ camera.T
     positions[:, 1] += boxes.sizes[:, 2] / 2
     rotation_y = np.arctan2(-forward[:, 2], forward[:, 0])

@@ -48,17 +48,17 @@ _NAMES = {
     "intensity": "energy",
     **{TABLE[name].in_files: f"Normal{name[-1].upper()}" for name in NORMAL},
 }
-_GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06, the start of GPS time
+_GPS_NS = 315_964_800 * 10**9  # time between 1970-01-01 and 1980-01-06, the start of GPS time
 _LEAP_S = 18  # GPS time minus UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # GPS time minus adjusted standard GPS time
 _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
 # Fields of the header: offsets of the waveform packets and of the first such record, their number.
 _WAVES_OFFSET = 227
 _WAVES = Struct("<QQI")
-_MAX_VLR_BYTES = 65_535  # of a variable length record
+_MAX_VLR_BYTES = 65_535  # limit for a variable length record
 _TEXT_AREA = 3  # number of the record with a description in words
 _FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}
-_ON_GRID = 0.1  # share of the precision by which positions in single precision may be beside it
+_ON_GRID = 0.1  # share of the precision that single precision may lie beside the grid
 _MAX_STEPS = 2**31 - 1  # steps of precision from the offset to the farthest point
 
 
@@ -128,7 +128,7 @@ def _header(columns: set[str], sweeps: Sweeps, packets: _Packets | None) -> lasp
     point_format = (6 if packets is None else 9) + int({*COLOURS} <= columns)
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.generating_software = "lidarpool"
-    header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys without a date begin
+    header.creation_date = date(1980, 1, 6)  # GPS time 0, the start of surveys without a date
     if sweeps.start_ns is not None:
         header.creation_date = datetime.fromtimestamp(sweeps.start_ns // 10**9, UTC).date()
         header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
@@ -189,7 +189,7 @@ class _Packets:
     def __init__(self, samples: int, kinds: list[tuple[int, int]]) -> None:
         self._bytes = 2 * samples
         self._index = {kind: number for number, kind in enumerate(kinds, 1)}
-        self._end = _EVLR.size  # of the packets, from the head of their record
+        self._end = _EVLR.size  # end of the packets, after the head of their record
         self.descriptors = []
         for number, (step_ps, exponent) in enumerate(kinds, 1):
             gain = 2.0**exponent

@@ -18,7 +18,7 @@ from lidarsim.scene.files.noise_points import LEGACY_NOISE_CLASSES, NOISE_CLASSE
 from lidarsim.scene.files.stated_system import StatedSystem
 
 # Offsets within the header, by ASPRS LAS 1.4 R15, table 3.
-_HEADER_BYTES = 375  # of LAS 1.4; 1.2 has 227
+_HEADER_BYTES = 375  # bytes of LAS 1.4; 1.2 has 227
 _ENCODING = struct.Struct("<H"), 6
 _LAYOUT = struct.Struct("<HII"), 94  # bytes of the header, offset of the points, number of VLRs
 _EXTENDED = struct.Struct("<QI"), 235  # offset and number of extended VLRs, of LAS 1.4
@@ -27,9 +27,9 @@ _EXTENDED_VLR = struct.Struct("<2x16sHQ32x")
 _PROJECTION = b"LASF_Projection"
 _MAX_EXTENDED = 1_000  # extended records that are searched for a coordinate system
 _MAX_RECORD = 1 << 20  # bytes of a record with a coordinate system
-_WKT_BIT = 16  # of the global encoding: the coordinate system is WKT
+_WKT_BIT = 16  # bit of the global encoding: the coordinate system is WKT
 _SIGNATURE = b"LASF"  # first bytes
-_EARLY_END = "failed to fill whole buffer"  # in the error of lazrs at the end of a file
+_EARLY_END = "failed to fill whole buffer"  # part of the error of lazrs at the end of a file
 _SMALLER = "write it as .las, or thin it first"
 
 
@@ -58,7 +58,7 @@ def open_las(path: Path) -> Iterator[Any]:
             Allowance(size, _SMALLER).take(announced if header.are_points_compressed else 0)
             try:
                 yield reader
-            except Exception as error:  # lazrs has an error of its own, whose text tells its kind
+            except Exception as error:  # the text of the error of lazrs tells its kind
                 if _EARLY_END not in str(error):
                     raise
                 raise CutShortError("its packed points end too early") from error

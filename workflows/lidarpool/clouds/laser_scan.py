@@ -16,7 +16,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = "ray", "range"  # columns that a LaserScan needs, with every return
 _BAGS = frozenset({"mcap", "rosbag2"})
-_MAX_STEP_DIFFERENCE = 1e-6  # radians by which steps between rays may differ
+_MAX_STEP_DIFFERENCE = 1e-6  # largest difference between steps of rays, radians
 
 
 def is_planar(sensor: Sensor) -> bool:

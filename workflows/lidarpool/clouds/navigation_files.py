@@ -26,8 +26,8 @@ _POSITION = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 
 # Largest sizes of a sample.
-_ROW_BYTES = 120  # in its file
-_MESSAGE_BYTES = 500  # in a bag
+_ROW_BYTES = 120  # bytes of a row in its file
+_MESSAGE_BYTES = 500  # bytes of a message in a bag
 
 
 def instrument_bytes(survey: Survey, bags: int) -> int:

@@ -57,7 +57,7 @@ class Pieces(pieces.Pieces):
     Actors are annotated in each sample, at their poses at its time. Classes with names, below 256,
     are labels of nuScenes-lidarseg.
 
-    In a data set each job is a scene with its name, on a day of its own, its files are in folders
+    In a data set each job is a scene with its name, on a separate day, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
 
     Caesar et al., nuScenes, 2020.
@@ -330,7 +330,7 @@ class _Tables:
             )
             chain = self._chain("sample_annotation", annotation_keys)
             for number, beside in zip(samples, chain, strict=True):
-                at_stamp = boxes[number][0]  # of the first sensor, whose sweeps are the samples
+                at_stamp = boxes[number][0]  # the sweeps of the first sensor are the samples
                 x, y, z, w = at_stamp.quaternions[actor].tolist()
                 length, width, height = at_stamp.sizes[actor].tolist()
                 self._add(

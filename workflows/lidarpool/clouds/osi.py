@@ -26,7 +26,7 @@ from lidarsim.sweeps.sweeps import Sweeps, plain_names
 from .boxes import Boxes, SweepBoxes
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
-_GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06: surveys without a date begin there
+_GPS_NS = 315_964_800 * 10**9  # 1980-01-06 after 1970-01-01: the start of surveys without a date
 # Numbers of fields, by osi_sensordata.proto and osi_featuredata.proto of OSI 3.
 _FEATURE_DATA = 26
 _LIDAR_SENSOR = 3
@@ -67,7 +67,7 @@ def write_osi_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 
 def _write(path: Path, suffix: str, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a trace of the kind of a suffix, by which the library chooses the kind."""
+    """Write a trace of the kind that the library chooses by a suffix."""
     osi: Any = import_module("betterosi")  # an extra
     messages = _Messages(osi, sweeps)
     options: dict[str, Any] = {}
@@ -131,7 +131,7 @@ class _EncodedMessage:
         return self.message.desc()
 
     def to_binary(self) -> bytes:
-        """Return all fields in the wire format, in which the order of fields is free."""
+        """Return all fields in the wire format, whose order of fields is free."""
         data: bytes = self.message.to_binary()
         return data + self.encoded_fields
 
@@ -317,7 +317,7 @@ def encoded_detections(positions: Floats, points: Cloud) -> bytes:
         values["intensity"] = 100 * np.clip(columns["intensity"].astype(np.float64), 0, 1)
     if "reflectance" in columns:
         values["reflectivity"] = columns["reflectance"].astype(np.float64)
-    if "radial_velocity" in columns:  # of OSI, towards the sensor
+    if "radial_velocity" in columns:  # OSI's velocity is towards the sensor
         values["radial_velocity"] = -columns["radial_velocity"].astype(np.float64)
     position = _Record()
     position.add_double(1, np.sqrt(across * across + z * z))

@@ -21,7 +21,7 @@ from lidarsim.sweeps.sweeps import Sweeps, plain_names
 from .recording import Read, Recording, RecordingSource, positions_of
 
 _FORMAT = "pcap"
-_HEADER_BYTES = 24  # of a file, and 8 of the stamp of its first packet
+_HEADER_BYTES = 24  # bytes of the header of a file, and 8 of the stamp of its first packet
 
 
 def with_packet_columns(survey: Survey, formats: Collection[str]) -> Survey:

@@ -49,7 +49,7 @@ class Pieces(pieces.Pieces):
                 *((column, np.dtype(column.dtype)) for column in cloud.table),
             )
         ]
-        objects = "\n".join(sweeps.all_names)  # that the column `object` counts
+        objects = "\n".join(sweeps.all_names)  # names that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
         words |= {} if sweeps.epsg is None else {"crs": f"EPSG:{sweeps.epsg}"}
         words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}
@@ -72,7 +72,7 @@ class Pieces(pieces.Pieces):
         return self._file(number, pa.Table.from_arrays(filled, schema=self.schema)), None
 
     def shared_files(self, pieces: Sequence[None]) -> dict[str, bytes]:
-        """Return a file without rows if there are no pieces."""
+        """Return a file without rows for a data set without pieces."""
         return {} if pieces else self._file(0, self.schema.empty_table())
 
     def _file(self, number: int, table: pa.Table) -> dict[str, bytes]:
@@ -156,7 +156,7 @@ def _points(path: Path) -> SweepFiles:
         input_size(path)
     dataset = pa.dataset.dataset(str(path), format="parquet")
     groups = []
-    files = []  # of each group: names of columns of numbers, and size in bytes
+    files = []  # names of columns of numbers, and size in bytes, for each group
     unread = set[str]()  # names of columns
     for file in dataset.get_fragments():
         columns = number_columns(file.physical_schema)

@@ -55,7 +55,7 @@ def read_group(group: Any, columns: Sequence[str], allowance: Allowance) -> pa.T
     Raises LidarError above the allowance.
     """
     allowance.take(_bytes_of(group, columns))
-    # Threads of their own would be many beside those of the workers that load data.
+    # Further threads would be many beside the workers that load data.
     return group.to_table(columns=list(columns), use_threads=False)
 
 

@@ -55,12 +55,12 @@ class Entry:
 class Pieces:
     """Output of a multi-file format: files of each piece, often a sweep, and shared files.
 
-    `folders` are the folders of the files of the pieces. With an `entry` the files are those of a
-    job in a data set.
+    `folders` are the folders of the files of the pieces. With an `entry` the files belong to a job
+    in a data set.
     """
 
     folders: Sequence[str] = ()
-    compensated = False  # by request, where a format also holds points as they were fired
+    compensated = False  # requested where a format also holds points as they were fired
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         self.cloud = cloud

@@ -35,7 +35,7 @@ from .recording import NoiseFilter, Read, Recording, RecordingSource, open_cloud
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
-FILE = "cloud.ply"  # of a result
+FILE = "cloud.ply"  # file of a result
 FIRST_POINTS = 65_536  # points that Open3D writes; it takes five times as long for a point
 _BLOCK_BYTES = 1 << 23  # moved at a time
 
@@ -57,7 +57,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 
 class GrowingPly:
-    """A binary PLY file to which points are appended.
+    """A binary PLY file that grows by appended points.
 
     The file is complete after `finish`.
 
@@ -204,7 +204,7 @@ class GrowingPly:
 
 
 def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
-    """Return the lines of a header that lidarpool adds to those of Open3D."""
+    """Return the lines of a header that lidarpool adds to Open3D's lines."""
     comments = f"comment {AS_FIRED}\n" if sweeps.coordinates == "sensor" else ""
     if sweeps.epsg is not None and sweeps.coordinates == "world":
         comments += f"comment crs: EPSG:{sweeps.epsg}\n"

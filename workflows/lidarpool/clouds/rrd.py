@@ -32,7 +32,7 @@ _POINT_PIXELS = 1.5
 _LINE_PIXELS = 1.5
 _GREY = (150, 150, 150)
 _WHITE = (255, 255, 255)
-_SCENE_ALPHA = 100  # of 255: points on a surface, and behind a wall, can be seen
+_SCENE_ALPHA = 100  # of 255; points on a surface, and behind a wall, can be seen
 _ORANGE = (255, 153, 0)
 _BLUE = (51, 153, 255)
 _GREEN = (26, 204, 77)
@@ -66,8 +66,8 @@ def _recording_to(path: Path) -> Iterator[rr.RecordingStream]:
 
     Raises OSError if the file cannot be written.
 
-    Rerun's own writer logs the error of a full disk, and waits for ever: it writes to a pipe, from
-    which a thread writes to the file.
+    Rerun's own writer logs the error of a full disk, and waits for ever. So it writes to a pipe,
+    and a thread copies the pipe to the file.
     """
     recording = rr.RecordingStream(APPLICATION)
     if not hasattr(os, "mkfifo"):  # Windows
@@ -119,7 +119,7 @@ class RerunLog:
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
         self._origin = np.zeros(3)
-        self._start_ns = START_NS  # of the survey
+        self._start_ns = START_NS  # start of the survey
         self._has_classes = False
         self._log_static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
@@ -161,7 +161,7 @@ class RerunLog:
         paths = {WORLD: WORLD}  # {frame: path of its entity}
         for transform in shown.transforms:
             if transform.parent == WORLD and transform.name not in (CARRIER, shown.frame):
-                continue  # of an actor, whose box has a pose of its own
+                continue  # frame of an actor, whose box has a separate pose
             path = paths[transform.name] = f"{paths[transform.parent]}/{transform.name}"
             in_world = transform.parent == WORLD
             position = transform.position - self._origin if in_world else transform.position

@@ -19,8 +19,8 @@ from lidarview.picture_file import PictureContent
 from .boxes import Boxes
 from .frame_names import CARRIER, WORLD, frame_names, points_topic, survey_start_ns
 
-MAX_TRIANGLES = 200_000  # of the scene in viewers
-MAX_POSITIONS = 10_000  # of a trajectory
+MAX_TRIANGLES = 200_000  # triangles of the scene in viewers
+MAX_POSITIONS = 10_000  # positions of a trajectory
 _ORIGIN_STEP_M = 10_000.0
 # Column types that viewers hold: {kind and size of other columns: the type sent instead}.
 _SENT_TYPES = {"i8": np.float64, "u8": np.float64, "b1": np.uint8, "f2": np.float32}
@@ -68,8 +68,8 @@ class Surroundings:
     trajectories: Mapping[str, Floats] = field(default_factory=dict)
     path: Floats | None = None  # (w, 3): corners of the planned path, metres, world coordinates
     classes: Mapping[int, str] = field(default_factory=dict)  # {number: name}
-    start_ns: int = START_NS  # of the survey, since 1970-01-01 UTC
-    topics: Sequence[str] = ()  # of the points of sweeps that will follow
+    start_ns: int = START_NS  # start of the survey, since 1970-01-01 UTC
+    topics: Sequence[str] = ()  # topics of the points of sweeps that will follow
     has_actors: bool = False  # True if these sweeps have boxes
 
     @property
@@ -154,13 +154,13 @@ class ActorBoxes:
 class ShownSweep:
     """A sweep for viewers: points in the frame of the sensor when the sweep began."""
 
-    start_ns: int  # of the sweep, since 1970-01-01 UTC
+    start_ns: int  # start of the sweep, since 1970-01-01 UTC
     stamp_ns: int  # the same by the sensor's clock, which faults may have moved
     topic: str
     frame: str
     positions: Floats32  # (n, 3), metres
     columns: Mapping[str, AnyArray]  # {name: (n,)}, numbers of at most 32 bits or float64
-    transforms: Sequence[Transform]  # of the frames at the start of the sweep
+    transforms: Sequence[Transform]  # transforms of the frames at the start of the sweep
     boxes: ActorBoxes | None = None  # None without actors
 
 

@@ -27,7 +27,7 @@ from .pieces import Entry, PieceRange, WrittenRange
 from .recording import Read, Recording, RecordingSource, SweepFiles
 
 MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
-_RESERVED = ("points", "pose", "boxes")  # arrays that are no columns
+_RESERVED = ("points", "pose", "boxes")  # arrays that are not columns
 
 
 class Pieces(pieces.Pieces):
@@ -52,7 +52,7 @@ class Pieces(pieces.Pieces):
             raise LidarError(f"WebDataset has other {clash[0]!r}: rename the column.")
 
     def spans(self, parts: int = 1) -> list[PieceRange]:
-        """Divide all sweeps into ranges with tar files of their own, wherever they are written."""
+        """Divide all sweeps into ranges with separate tar files, wherever they are written."""
         return super().spans()
 
     def write(self, storage: Storage, first: int, stop: int) -> WrittenRange:
@@ -126,7 +126,7 @@ class Pieces(pieces.Pieces):
         files["json"] = json.dumps(description).encode()
         key = f"{self.names[sweeps.sensor[number]]}-{sweeps.numbers[number]:06}"
         for name, data in files.items():
-            head = tarfile.TarInfo("/".join([*folder, f"{key}.{name}"]))  # of 1970, and of nobody
+            head = tarfile.TarInfo("/".join([*folder, f"{key}.{name}"]))  # date 1970, no owner
             head.size = len(data)
             yield head.tobuf() + data + bytes(-len(data) % tarfile.BLOCKSIZE)
 

@@ -30,7 +30,7 @@ from .pieces import RangeWorkers, RangeWriter
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)
-_NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # for editors
+_NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # schema for editors
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Format:
     ] = False
 
     def __post_init__(self) -> None:
-        row = self.row  # LidarError if there is no such format
+        row = self.row  # LidarError for an unknown format
         if self.compensated and not row.raw_or_compensated:
             choices = [name for name, row in FORMATS.items() if row.raw_or_compensated]
             raise LidarError(
@@ -311,7 +311,7 @@ def save_cloud(
     """Write points in the format of the path's ending, completely or not at all.
 
     The same points give the same bytes, except in .rrd. About a million points are in memory at a
-    time, or those of the largest sweep.
+    time, or all points of the largest sweep.
 
     Parameters
     ----------
@@ -334,7 +334,7 @@ def save_cloud(
         In mcap and rosbag2, a point for each ray, NaN without a return, in lines as the driver
         of the layout has them: velodyne, ouster, images and robosense.
     precision_m
-        Step of stored positions, metres; by default that of the survey, else 0.001.
+        Step of stored positions, metres; by default the survey's precision, else 0.001.
 
     Returns
     -------
@@ -343,7 +343,7 @@ def save_cloud(
     Raises
     ------
     LidarError
-        If there is no such format, it lacks a column or package, it stores single sweeps and
+        If the format is unknown, it lacks a column or package, it stores single sweeps and
         the cloud is not of a result, or the file cannot be written.
     """
     path = Path(path)

@@ -169,7 +169,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
         with open_input(storage.local(name)) as file, zipfile.ZipFile(file) as archive:
             triangles = read_npy(archive.read(".triangles.npy"), "triangles")
             return triangles, read_npy(archive.read(".hits.npy"), "hits")
-    except Exception as error:  # of many kinds, as in `unpack`
+    except Exception as error:  # `unpack` raises errors of many kinds
         raise LidarError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"
         ) from error
@@ -179,11 +179,11 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 class StoredCloud(CloudDisplay):
     """The points of parts in (scan, ray) order, read in chunks, as a `CloudLike`."""
 
-    storage: Storage  # of the parts
-    names: Sequence[str]  # of the parts, in scan order
+    storage: Storage  # storage of the parts
+    names: Sequence[str]  # names of the parts, in scan order
     firsts: Sequence[int]  # first scan of each part
     rows: Sequence[int]  # number of points of each part
-    columns: Sequence[Column]  # of a part
+    columns: Sequence[Column]  # columns of a part
     cells: Ints | None  # lowest and highest cell, (2, 3); None without points
     precision_m: float  # size of the cells that positions were rounded to
     origin: Floats  # world position of the scene's local origin, (3,), metres

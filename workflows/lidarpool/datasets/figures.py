@@ -192,7 +192,7 @@ class Figures:
             return Varied(name, values)
         numbers = has_value & (np.array(self._labelled[name]) == 0)
         codes = values.copy()
-        for value in np.unique(values[numbers]).tolist():  # as «auto» beside 1 and 2
+        for value in np.unique(values[numbers]).tolist():  # words too: «auto» beside 1 and 2
             codes[numbers & (values == value)] = labels.setdefault(f"{value:g}", len(labels))
         order = sorted(labels)
         codes[has_value] = np.argsort([labels[text] for text in order])[

@@ -1,6 +1,7 @@
 """Casting times of the jobs of a data set, in a file of its report.
 
-Times differ from run to run. The table of jobs, whose bytes are those of any run, has none.
+Times differ from run to run. The table of jobs has no times, since its bytes are the same in any
+run.
 """
 
 from __future__ import annotations

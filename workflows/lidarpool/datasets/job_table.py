@@ -38,8 +38,8 @@ TABLE_FILE = "jobs.csv"
 PARQUET_FILE = "jobs.parquet"
 WRITE_AGAIN = "run the campaign again with --resume, which writes it anew"
 ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
-MAX_JOBS = 100_000_000  # of a campaign: a larger number is not a job's
-MAX_ERROR_LETTERS = 4_000  # of an error in the table: csv.reader refuses cells of 131,072
+MAX_JOBS = 100_000_000  # limit for a campaign: a larger number is not a job's
+MAX_ERROR_LETTERS = 4_000  # limit for an error in the table: csv.reader refuses cells of 131,072
 
 _HEAD = {"number": int, "name": str, "split": str}
 _TAIL = {
@@ -53,9 +53,9 @@ _TAIL = {
 }
 _CLASS = re.compile(r"class_(\d+)", re.ASCII)
 _UTF8 = codecs.getwriter("utf-8")
-_ESCAPED = "backslashreplace"  # for text with parts of names that are no UTF-8
+_ESCAPED = "backslashreplace"  # keeps parts of names that are not UTF-8
 # Text with such a start is a formula for spreadsheets. Leading apostrophes count as well: without
-# that, a cell with an apostrophe of its own would be read back without it.
+# that, a cell that begins with an apostrophe would be read back without it.
 _FORMULA = re.compile(r"'*[=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
 # Before the name of a varied value that would look like another column.
 _VARIED = "varied."
@@ -242,7 +242,7 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
     Raises
     ------
     LidarError
-        If there is no such table, or it is damaged: another checksum, numbers that do not increase,
+        If the table is missing or damaged: another checksum, numbers that do not increase,
         or a row that does not fit the table.
     """
     with ExitStack() as stack:

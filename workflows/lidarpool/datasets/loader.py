@@ -40,7 +40,7 @@ from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import Sweep
 
 _REQUESTS = 8  # sweeps that are read at a time, from a URL or a disk
-_OPEN_JOBS = 16  # jobs of which a thread keeps poses, boxes and opened files
+_OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class SavedSweeps:
     def __getitem__(self, index: int) -> Sweep:
         """Read a sweep.
 
-        LidarError if a file is missing or damaged; IndexError if there is no such sweep.
+        LidarError if a file is missing or damaged; IndexError for an unknown sweep.
         """
         job, number = self._locate(index)
         return job.read(number)
@@ -262,8 +262,8 @@ def sweeps(
     Raises
     ------
     LidarError
-        If there is no data set, it is unfinished or damaged, a package that its format needs is
-        not installed, or there is no such split, job or sensor.
+        If the data set is missing, unfinished or damaged, a package that its format needs is not
+        installed, or the split, job or sensor is unknown.
     """
     storage = replace(Storage.at(location), named="")  # the user's own links may be followed
     head = read_index(storage)

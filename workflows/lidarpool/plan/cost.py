@@ -90,7 +90,7 @@ class _Workspace:
         def singles(*shape: int) -> Floats32:
             return np.empty(shape, np.float32)
 
-        discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # in a block
+        discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # discs in a block
         self._disc_blocks = [slice(i, i + discs) for i in range(0, len(radii), discs or 1)]
         doubled = (2 * centres).astype(np.float32)
         self._x = doubled[:, 0, None, None]
@@ -108,10 +108,10 @@ class _Workspace:
         self._parallel, self._perpendicular, self._scratch = (
             singles(discs, segments, width) for _ in range(3)
         )
-        self._prices = singles(1 + discs, width)  # of all blocks before, and of each disc
+        self._prices = singles(1 + discs, width)  # prices of all blocks before, and of each disc
         self._price = singles(width)
         self._entered = np.empty(width, np.bool_)
-        self._zeros = np.zeros(width, np.float32)  # as an array, see the class
+        self._zeros = np.zeros(width, np.float32)  # zeros as an array (see the class)
 
     def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
         """Write to `cost`, (width,), the costs of paths through `points`, (k + 2, 2, width)."""

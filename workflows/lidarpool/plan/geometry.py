@@ -45,7 +45,7 @@ def clearance(points: Floats, centres: Floats, radii: Floats) -> float:
 
 
 class PathAxes:
-    """Axes in which the path starts at (-½, 0) and ends at (½, 0), two different points.
+    """Axes that let the path start at (-½, 0) and end at (½, 0), two different points.
 
     The swarm computes in single precision and with fixed distances; in these axes neither
     georeferenced coordinates nor the size of the scene matter. Only + - x / and square roots are

@@ -1,4 +1,4 @@
-"""Stations of a terrestrial scan: positions from which a sensor sees most surfaces."""
+"""Stations of a terrestrial scan: positions of a sensor that sees most surfaces."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _CLEARANCE_M = 0.3  # no surface is nearer to the instrument, nor this close abo
 _STEP_M = 0.2  # lower surfaces are stepped on
 _FOOT_M = 0.01  # a ray that starts at this height above the floor does not hit the floor
 _SPHERE_RAYS = 128  # rays in all directions from a candidate
-_SECTORS = 36  # in all of which a sensor that turns has rays
+_SECTORS = 36  # a sensor that turns has rays in all of these
 
 
 class Sight:
@@ -99,7 +99,7 @@ class StationPlan:
     stations: Floats  # (s, 3) world metres
     coverage: Floats  # (s,) share in 0 to 1, after each station
     candidates: Floats  # (c, 3) world metres
-    spacing_m: float  # of the candidates
+    spacing_m: float  # spacing of the candidates
     visible_m2: Floats  # (objects,) area that candidates see
     covered_m2: Floats  # (objects,) area that the stations see
     sight: Sight
@@ -281,7 +281,7 @@ class _Choice(NamedTuple):
     """Chosen rows of `_Visibility`, in order."""
 
     rows: list[int]
-    shares: list[float]  # of the area, covered after each row
+    shares: list[float]  # shares of the area, covered after each row
     covered: Bools  # (n,)
 
 
@@ -326,14 +326,14 @@ def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: floa
     """Return local positions (c, 3), metres, where an instrument can stand, on a grid.
 
     The floor is the lowest surface, or the top of a slab if that is lowest. Floors that are
-    reached only by a climb of more than 45 degrees, such as eaves where there is no ground, are
+    reached only by a climb of more than 45 degrees, such as eaves without ground below, are
     left out; so are positions with a surface within 0.3 m of the instrument, or between the
     instrument and the floor, and positions inside objects.
 
     Raises
     ------
     LidarError
-        If there is no such position, or the grid is too fine.
+        If no position fits, or the grid is too fine.
     """
     positions, shape = _grid_positions(scene, spacing_m)
     floor = _floor_heights(scene, caster, positions)
@@ -396,7 +396,7 @@ def _floor_heights(scene: Scene, caster: RayCaster, positions: Floats) -> Floats
 
 def _largest_level(floor: Floats, spacing_m: float) -> Bools:
     """Return the largest connected part of floors (k, m) on a grid without steep climbs."""
-    # Heights are infinite where there is no floor.
+    # Heights are infinite without a floor.
     group = np.full(floor.shape, -1)
     sizes: list[int] = []
     for first_cell in zip(*np.nonzero(np.isfinite(floor)), strict=True):
@@ -424,7 +424,7 @@ def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
     """Return the indices of positions (c, 3) with room around, and not inside an object.
 
     Inside an object most rays above the horizon meet back faces. A hall that is modelled by its
-    outside is no such object: most positions are inside.
+    outside is not such an object: most positions are inside.
     """
     n = np.arange(_SPHERE_RAYS)
     z = 1 - (2 * n + 1) / _SPHERE_RAYS  # evenly spread over the sphere, by the golden angle

@@ -25,7 +25,7 @@ _STARTS = 1021  # before they repeat
 class Randoms:
     """Single-precision random numbers from a seed.
 
-    NumPy guarantees the raw output of its bit generators, but not that of its `Generator`
+    NumPy guarantees the raw output of its bit generators, but not the output of its `Generator`
     (NEP 19), so the last step is computed here. The seed is below 2**64.
     """
 
@@ -81,9 +81,9 @@ class Swarm:
         spreads = _spreads(self.groups, widest)
         start = _scatter_paths(corners, particles, spreads, randoms)
         self._positions[:] = start.reshape(rows, particles)
-        self._best = self._positions.copy()  # of each particle
+        self._best = self._positions.copy()  # best position of each particle
         self._best_cost = np.full(particles, np.inf, np.float32)
-        self._jump = np.zeros_like(self._best)  # from a particle's best to its position
+        self._jump = np.zeros_like(self._best)  # vector between a particle's best and its position
         self._better = np.empty(particles, np.float32)
         self._leaders = np.empty((rows, self.groups), np.float32)
         self._leader_numbers = np.empty(self.groups, np.intp)

@@ -23,7 +23,7 @@ from .geometry import PathAxes, segment_distances
 # A tangent this close to a disc, as a share of the scene's size, passes it. Three discs with one
 # common tangent are usual in constructed scenes, and rounding must not close the path.
 _TOLERANCE = 1e-10
-_TANGENTS_AT_ONCE = 4096  # of a scene with many discs, to bound the memory of the check
+_TANGENTS_AT_ONCE = 4096  # limit for scenes with many discs, to bound the memory of the check
 
 Graph = dict[int, list[tuple[int, float]]]  # {node: [(neighbour, length of the edge)]}
 

@@ -28,11 +28,11 @@ class Trial:
     """
 
     trial: int  # its number, from 0
-    seed: int  # of its random numbers
-    length: float  # of the path, metres
+    seed: int  # seed of its random numbers
+    length: float  # length of the path, metres
     waypoints: Floats  # (k, 2): corners of the path between its two ends, metres
     collision_free: bool  # whether the path enters no disc, by the exact check
-    seconds: float = field(compare=False)  # that the trial took
+    seconds: float = field(compare=False)  # duration of the trial
 
 
 def run_trial(planning: Planning, trial: int) -> Trial:
@@ -117,7 +117,7 @@ class Plan:
 
     @property
     def excess(self) -> float:
-        """Share by which the path is longer than the shortest possible: 0.01 is 1%."""
+        """Length of the path over the shortest possible length, less 1: 0.01 is 1%."""
         return self.length / self.shortest_possible - 1
 
 
@@ -131,7 +131,7 @@ def best(trials: Iterable[Trial], planning: Planning) -> Plan:
     Raises
     ------
     LidarError
-        If there are no trials.
+        Without trials.
     """
     ranked = []
     for trial in trials:

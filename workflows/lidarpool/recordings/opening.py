@@ -45,7 +45,7 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
 
     A single sensor has the name "".
 
-    Of several sequences with coordinates of their own, the first.
+    Of several sequences in different coordinates, the first is opened.
 
     LidarError as of `open_recording`.
     """
@@ -78,10 +78,10 @@ def open_recording(
     A cloud in memory has sweeps if it belongs to a result.
 
     `sensor` chooses one of several sensors, or the topic of a bag; `intensity` is the column of the
-    intensity, if not one of the usual names; `name` is that of a cloud in memory; `unit` is that of
-    a file of `_UNIT_SUFFIXES`, in place of metres or of the units that a .las states; without
-    `keep_noise`, points that a file withholds or classifies as noise are left out. LidarError if
-    the source is none of these, cannot be opened, or has lengths that are not true.
+    intensity, if not one of the usual names; `name` is the name of a cloud in memory; `unit` is the
+    unit of a file of `_UNIT_SUFFIXES`, in place of metres or of the units that a .las states;
+    without `keep_noise`, points that a file withholds or classifies as noise are left out.
+    LidarError if the source is none of these, cannot be opened, or has lengths that are not true.
     """
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:

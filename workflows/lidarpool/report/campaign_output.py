@@ -106,7 +106,7 @@ class DataSetOutput(Output[CampaignRun]):
             return None
         try:
             self._record = check_same(storage, self.campaign)
-        except DamagedRecordError:  # the manifests say of which campaign the jobs are
+        except DamagedRecordError:  # the manifests name the campaign of the jobs
             self._lost_record = f"{CAMPAIGN_FILE} was damaged, and is made again"
             return None
         self._check_shards(self._record["shards"])

@@ -26,7 +26,7 @@ CARD = "README.md"
 PAGE = "report.html"
 PICTURES = "pictures"
 SPLITS = "splits"
-VALUES_SHOWN = 12  # of a quantity with labels
+VALUES_SHOWN = 12  # shown values of a quantity with labels
 _CAPTIONS = {
     "job": "One of the jobs.",
     "varied": "What was varied: jobs by value, and the points of each job against it.",
@@ -92,7 +92,7 @@ def write_card(
         on_page["times"] = draw_times(figures)
         page = rendered(
             "campaign.html",
-            captions=_PAGE_CAPTIONS,  # for readers of screens
+            captions=_PAGE_CAPTIONS,  # readers of screens need captions
             pictures={name: drawing.svg() for name, drawing in on_page.items() if drawing},
             slowest=figures.slowest,
             description=campaign["description"],

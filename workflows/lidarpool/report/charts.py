@@ -24,7 +24,7 @@ from .page.rendering import NARROW
 
 WIDTH = 1600
 MAX_VARIED = 8  # quantities in a picture
-MAX_COLUMNS = 4  # of them side by side
+MAX_COLUMNS = 4  # columns of charts, side by side
 MAX_DOTS = 5_000
 DOT = "#5b8fd0"
 BAR = "#7aa5d8"
@@ -39,17 +39,17 @@ GAP = 20
 DOTS_HEIGHT = 340
 LABEL_HEIGHT = 60
 SLANTED_HEIGHT = 56  # more below slanted labels
-ROW_GAP = 76  # from one row of charts to the next
+ROW_GAP = 76  # gap between two rows of charts
 PERCENTILES = (10, 50, 90)  # percentiles of the points of jobs with near values
-MAX_COLOURS = 6  # labels that have colours of their own
+MAX_COLOURS = 6  # labels that have separate colours
 # groups of jobs with similar values, whose medians are drawn; jobs of a group
 _MAX_GROUPS = 12
 _MIN_GROUP = 8
 SWEEP_SIZE = (1600, 1000)
 SWEEP_DOTS = 150_000
 SWEEP_FRAME = (90, 60, 1210, 750)  # left, bottom, width, height of the drawing, pixels
-SWEEP_SHARE = 0.97  # of the points that are within the drawing
-MAX_VALUES = 4  # that are named
+SWEEP_SHARE = 0.97  # share of the points that are within the drawing
+MAX_VALUES = 4  # limit for named values
 
 
 def draw_varied(figures: Figures) -> Page | None:
@@ -92,7 +92,7 @@ class _Layout(NamedTuple):
 
     rows: int
     columns: int
-    width: float  # of a chart
+    width: float  # width of a chart
     row_height: int
 
     @classmethod

@@ -18,9 +18,9 @@ from lidarsim.columns.table import AXES, Column
 from ..clouds.pieces import THREADS
 from ..columns.parts import StoredCloud
 
-_CELLS = 64  # along an axis of the grid in which points are counted, a power of two
+_CELLS = 64  # cells along an axis of the grid that counts points, a power of two
 _BLOCK_ROWS = 1 << 15  # rows whose positions are counted at a time, which fit into a cache
-_MIN_POINTS = 12  # points in a cell from which a density is estimated
+_MIN_POINTS = 12  # points in a cell that suffice for an estimate of density
 
 
 class CloudCounts:
@@ -28,7 +28,7 @@ class CloudCounts:
 
     `by_object`, `by_class` and `by_material` are the numbers of points of each object, class and
     material, `no_surface` the points of no object, and `limits` are {column: minimum and maximum}.
-    `bounds`, `above` and `density` are those of `PositionCounts`.
+    `bounds`, `above` and `density` are as in `PositionCounts`.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class PositionCounts:
         cells = self._cells.reshape(3 * (_CELLS,))
         side = self._side
         while (median := float(np.median(cells[cells > 0]))) < _MIN_POINTS and len(cells) > 1:
-            half = len(cells) // 2  # in larger cells, gaps between sparse points count
+            half = len(cells) // 2  # gaps between sparse points count in larger cells
             cells = cells.reshape(half, 2, half, 2, half, 2).sum((1, 3, 5))
             side = 2 * side
         return median / side**2

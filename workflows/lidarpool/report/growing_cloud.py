@@ -26,7 +26,8 @@ from ..run.pipeline.stage_messages import Receipt
 from ..run.store.job_under_way import JobUnderWay
 from .cloud_counts import CloudCounts
 
-# Bytes appended between two flushes: the last flush is short, and no flush delays those of parts.
+# Bytes appended between two flushes: the last flush is short, and no flush delays the flushes of
+# parts.
 _FLUSH_BYTES = 1 << 25
 # Rows in memory at a time. Of a whole part, each axis in float64 took memory from the system, and
 # gave it back: four times the processor time.
@@ -39,7 +40,7 @@ class _Part(NamedTuple):
 
     first: int  # number of its first scan
     stop: int  # number of the scan after its last scan
-    name: str  # in the storage of the parts
+    name: str  # name in the storage of the parts
     rows: int  # number of points
     cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
 
@@ -149,7 +150,7 @@ class GrowingCloud:
         self._sweeps = Sweeps.from_survey(job.survey, job.scene)
         # With the cells of appended parts; only their bounds are used.
         self._points = replace(job.points(), cells=None)
-        self._next_scan = job.scans.start  # of the next part
+        self._next_scan = job.scans.start  # first scan of the next part
         self._waiting: dict[int, _Part] = {}  # {first scan: part}, for earlier parts
         self._appended: list[_Part] = []
         self._appended_rows = 0

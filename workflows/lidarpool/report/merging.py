@@ -82,7 +82,7 @@ class _Part:
         return [
             note
             for note in self.told
-            if not note.startswith(_MISSING) and NO_POINTS not in note  # of an earlier merge
+            if not note.startswith(_MISSING) and NO_POINTS not in note  # notes of an earlier merge
         ]
 
     def numbers(self, shard: Shard) -> range:
@@ -111,7 +111,7 @@ def merge(
 ) -> dict[str, Any]:
     """Merge shards into the data set or result that a single run would have written.
 
-    Every byte is compared with the checksums of its shard. The rows of jobs are those of their
+    Every byte is compared with the checksums of its shard. The rows of jobs come from their
     manifests, which have checksums. After a kill, the same call continues.
 
     Parameters
@@ -301,7 +301,7 @@ def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) 
 
 
 def _missing(parts: Sequence[_Part]) -> list[Shard]:
-    """List the shards that are missing, or lack jobs by which the campaign has grown."""
+    """List the shards that are missing, or lack jobs that the campaign has gained."""
     shard_count = parts[-1].shards[0].total
     parts = sorted(parts, key=lambda part: part.run_size)
     have = {shard.number: len(part.numbers(shard)) for part in parts for shard in part.shards}
@@ -322,7 +322,7 @@ def _merge_dataset(
     record = _merged_record(all_parts, parts[0])
     dataset = DataSet(replace(target, durable=False), **record["campaign"]["keep"])
     dataset.check_installed()
-    if earlier is None:  # from now on the files belong to the campaign
+    if earlier is None:  # the files belong to the campaign now
         write_record(target, record | {"shards": []})
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
         files = [_RowFile(Path(folder, str(index))) for index in range(len(all_parts))]
@@ -353,7 +353,7 @@ def _merge_dataset(
 def _merged_record(parts: Sequence[_Part], fallback: _Part) -> dict[str, Any]:
     """Return the content of CAMPAIGN_FILE for a data set of parts.
 
-    The software is that of a part which has cast rays, else of the fallback.
+    The software is the software of a part with cast rays, else of the fallback.
     """
     sensors = dict[str, str]()
     for part in parts:

@@ -338,13 +338,13 @@ def _known_further(names: Collection[str]) -> list[str]:
 class _Earlier(NamedTuple):
     """The result in a folder."""
 
-    identity: Mapping[str, str] = MappingProxyType({})  # of scene and survey
-    files: frozenset[str] = frozenset()  # that may be removed
-    fields: Mapping[str, str] = MappingProxyType({})  # in words
+    identity: Mapping[str, str] = MappingProxyType({})  # identity of scene and survey
+    files: frozenset[str] = frozenset()  # files that may be removed
+    fields: Mapping[str, str] = MappingProxyType({})  # fields in words
 
 
 def _earlier(storage: Storage) -> _Earlier:
-    """Return the result in a folder, or no text if there is no result, or a damaged result."""
+    """Return the result in a folder, or an empty one if the result is missing or damaged."""
     try:
         report = json.loads(storage.read(REPORT))
         identity = {name: report["identity"][name] for name in _SURVEY}

@@ -68,7 +68,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     """
     scene = result.scene
     survey = result.survey
-    tasks: dict[str, dict[str, int]] = {}  # by the partition where they ran, and by stage
+    tasks: dict[str, dict[str, int]] = {}  # {partition where they ran: {stage: number}}
     for stage in result.stages:
         for name, count in stage.resources.items():
             tasks.setdefault(name, {})[stage.stage] = count
@@ -134,7 +134,7 @@ def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     """Describe the scene, the sensors and the options of a survey."""
     options = declared(survey, CloudOptions) | declared(survey, Weather)
-    del options["columns"]  # which have a table of their own
+    del options["columns"]  # columns have a separate table
     sensors = [
         _sensor(mounted.sensor)
         | {"returns": asdict(returns), "noise": asdict(mounted.noise or survey.noise)}

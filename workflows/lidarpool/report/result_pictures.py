@@ -64,8 +64,8 @@ def draw_pictures(
     """Draw all pictures of a result, or `only` named pictures, into a folder and into its page.
 
     The folder is created. All pictures have the same viewpoint, and the cloud has the colours of
-    the column `colour`. There is no picture of a path without planning, nor of points in the frames
-    of their sensors, which differ from the scene's.
+    the column `colour`. Without planning, the picture of the path is missing. Points in the frames
+    of their sensors, which differ from the scene's, have no picture.
     """
     cloud = result / "cloud.ply"
     page = Path(folder) / "report.html"
@@ -186,7 +186,7 @@ def draw_path(
     limits = _limits(best, drawn_trials, planning, size)
     axes = _path_axes(page, limits, origin)
     pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
-    width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # of the line of the best path
+    width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # width of the line of the best path
     drawn_trials = [trial for trial in drawn_trials if farthest(trial, best) > width_m]
     circles = zip(planning.centres, planning.radii, strict=True)
     discs = PatchCollection(

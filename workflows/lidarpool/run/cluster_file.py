@@ -26,7 +26,7 @@ from .pipeline.stage_names import GPU, LIDAR, OTHER
 # A scheduler that SSH has started outlives a driver that was killed: it ends after this time
 # without tasks.
 _IDLE_TIMEOUT = "1h"
-_CONNECT_TIMEOUT = "30s"  # for a host to answer
+_CONNECT_TIMEOUT = "30s"  # limit for a host to answer
 
 
 class WorkerGroup(BaseModel):
@@ -55,7 +55,7 @@ class WorkerGroup(BaseModel):
         return f"{self.adapt[0]} to {self.worker_limit}" if self.adapt else str(self.worker_limit)
 
     def mistake(self) -> str:
-        """Return a message about a wrong number of workers, or no text if there is no mistake."""
+        """Return a message about a wrong number of workers, or no text without a mistake."""
         if self.adapt is None:
             return "" if self.idle_s is None else "idle_s needs adapt beside it, such as [0, 8]."
         if "workers" in self.model_fields_set:

@@ -55,7 +55,7 @@ SCAN_BYTES = 64  # memory of a scan in the driver
 SUMMARY_BYTES = 28  # disk of a scan in the database
 FORMAT_BYTES = 30  # largest size of a point in an exported file without its columns: LAS
 REPORT_BYTES = 32 << 20  # disk of pictures and report
-TRAJECTORY_POSES = 1000  # for measuring the length of a trajectory
+TRAJECTORY_POSES = 1000  # poses that measure the length of a trajectory
 
 
 def forecast(

@@ -221,7 +221,7 @@ class JobMaker:
     def take(self, *, wait: bool = False) -> Job | JobRow | None:
         """Return the next job, or the row of a job that cannot be made.
 
-        None after the last job; without `wait`, also if no job is ready.
+        None after the last job, or without `wait` while no job is ready.
         """
         try:
             entry = None if self.ended else self._ready.get(block=wait)

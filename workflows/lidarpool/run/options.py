@@ -34,7 +34,7 @@ class RunOptions(TaskOptions):
     describe them; the same are options of commands. The defaults are valid for all.
     """
 
-    out: Path | Storage | None = None  # of the result or data set; None if nothing is written
+    out: Path | Storage | None = None  # output: result or data set; None if nothing is written
     # Folder of the run's store until the result is complete; None for a temporary folder that is
     # deleted with the last user of the points.
     folder: str | Path | Storage | None = None
@@ -47,7 +47,7 @@ class RunOptions(TaskOptions):
     client: Client | None = None
     scheduler: str | None = None  # address, with certificates for it
     files: TlsFiles | None = None
-    cluster: ClusterFile | None = None  # to be started
+    cluster: ClusterFile | None = None  # cluster to be started
     tls: bool = False
     gpu_workers: int | None = None
     other_workers: int | None = None
@@ -107,8 +107,8 @@ def options_of_call(
 ) -> dict[str, Any]:
     """Return the keywords of a call that are not None.
 
-    TypeError, as Python's, for a keyword that is no option, or is meaningless in this call: such
-    keywords are in `without`.
+    TypeError, as Python's, for a keyword that is not an option, or is meaningless in this call:
+    such keywords are in `without`.
     """
     accepted = RunKeywords.__annotations__.keys() - set(without)
     for name in keywords:

@@ -47,7 +47,7 @@ class Progress:
     trials_done: int = 0
     replayed: int = 0  # batches that were sent or cast once more
     waits_for: str = ""  # partition whose slots the survey needs and other runs hold
-    jobs: int = 0  # of a campaign, whose scans are not counted
+    jobs: int = 0  # number of jobs of a campaign, whose scans are not counted
     jobs_done: int = 0
     sweeps: int = 0  # revolutions or frames
     sweeps_done: int = 0  # sweeps whose scans have passed all stages

@@ -50,8 +50,8 @@ EXTRA_JOBS = 64  # jobs under way, at most, in addition to two for each GPU slot
 class Listeners(NamedTuple):
     """Functions that are called in the run's thread with results of the single job of a survey."""
 
-    on_frame: Callable[[ScanFrame], None]  # with each frame
-    on_parts: Callable[[Sequence[Receipt]], None]  # with committed parts
+    on_frame: Callable[[ScanFrame], None]  # called with each frame
+    on_parts: Callable[[Sequence[Receipt]], None]  # called with committed parts
 
 
 class RunLoop:
@@ -64,7 +64,7 @@ class RunLoop:
     store
         Database of the run, and storage of its parts.
     page
-        Page of the run, to which ended jobs are reported.
+        Page of the run, which shows ended jobs.
     maker
         Makes the jobs of a campaign after the first; None for the single job of a survey.
     dataset

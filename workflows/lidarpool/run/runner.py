@@ -10,7 +10,7 @@ gives them to that worker as a task. There `rigs.intersect` casts each batch by 
 stores the columns as a part and sends a `Receipt`; `Pipeline` commits it. Of a survey, stage 3
 returns the `Summaries` of scans in order, and the pipeline hands a `ScanFrame` of each to
 `on_frame`. The parts of a campaign's job whose scans are committed go to the `JobWriter`, and
-`RunLoop` commits the job's row; those of a survey become the points of a `RunResult`.
+`RunLoop` commits the job's row. The parts of a survey become the points of a `RunResult`.
 `Output.finish` makes the result: files of a survey (`report/output.py`) or a campaign
 (`report/campaign_output.py`).
 """

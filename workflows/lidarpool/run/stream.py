@@ -67,7 +67,7 @@ class SweepStream:
     """
 
     campaign: CampaignSpec
-    numbers: Sequence[int]  # of the jobs
+    numbers: Sequence[int]  # numbers of the jobs
     ahead: int  # largest number of sweeps that are being cast or wait to be read
     options: RunOptions
 
@@ -150,7 +150,7 @@ class StreamedJob(PipelineJob):
         positions = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         in_sensor = sweeps.columns_in_sensor(number, cloud)
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
-        if self.data_format == "kitti":  # as in files of this format
+        if self.data_format == "kitti":  # the intensity of files of this format
             columns["intensity"] = intensity_of(cloud)
         boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
@@ -176,7 +176,7 @@ class _Casting:
         self._casting = CastingWorkers(partition, run, workers.backend, workers.software)
         self._dispatcher = Dispatcher(self._casting, self, "")
         self._watch = Watch(client, [GPU], (), options.patience_s)
-        self._orders: list[CollectOrder] = []  # of columns to be fetched
+        self._orders: list[CollectOrder] = []  # orders for columns to be fetched
         columns = stream.campaign.keep.of_jobs.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)
         self._jobs: dict[int, StreamedJob] = {}  # jobs that are being cast

@@ -36,7 +36,7 @@ from .store.run_store import RunStore
 
 TASKS_PER_SLOT = 2  # submitted tasks for each free slot of LIDAR
 MAX_JOBS_PER_TASK = 32
-MAX_POINTS_PER_TASK = 1_000_000  # of all jobs of a task
+MAX_POINTS_PER_TASK = 1_000_000  # points of all jobs of a task
 GATHER_S = 0.25  # time that a job waits for more jobs of its task
 MAX_STALL_S = 10.0  # time without progress, after which the driver writes a job
 

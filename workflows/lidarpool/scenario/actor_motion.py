@@ -242,7 +242,7 @@ class TrajectorySection(Section):
         pieces = follow_surfaces(replace(track, beyond="hold"), standing.of_objects(self.surfaces))
         if len(pieces) == 1 and self.beyond == "absent":
             return replace(pieces[0], beyond="absent")
-        assert track.start_s is not None  # of every track
+        assert track.start_s is not None  # every track has a start
         start = track.start_s
         stop = track.start_s + track.duration_ns / 1e9
         for piece in pieces:

@@ -166,7 +166,7 @@ def _timing_notes(built: Built) -> Iterator[str]:
     survey = built.survey
     if isinstance(survey.path, Track) and survey.start is None:
         start_s = survey.path.start_s
-        assert start_s is not None  # of every track
+        assert start_s is not None  # every track has a start
         if START_FROM.timestamp() <= start_s < _LAST_DATE.timestamp():
             moment = datetime.fromtimestamp(start_s, UTC).isoformat()
             yield (

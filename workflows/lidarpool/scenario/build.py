@@ -128,7 +128,8 @@ class Job:
         survey = self.survey
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
         unseen_objects(scene, survey)  # LidarError for a pattern that fits no object
-        # Largest local coordinate, also of actors; over the precision it must fit 32-bit integers.
+        # Largest local coordinate, of actors too. Divided by the precision it must fit 32-bit
+        # integers.
         reach_m = float(np.abs(scene.bounds).max(initial=0.0))
         if survey.spray_g_m3:  # vehicles on a wet road raise spray
             check_spray(scene.actors)
@@ -185,7 +186,7 @@ def build(
     cache
         Static scenes of other scenarios, which this scenario may share.
     columns
-        Names of columns that the cloud gets beside those of the scenario.
+        Names of columns that the cloud gets beside the scenario's columns.
 
     Raises
     ------
@@ -245,7 +246,7 @@ class Built:
         The scenario that was built.
     scene, survey, planning
         In the scene's local coordinates; the planning is None if the scenario asks for none. The
-        world coordinates of the scene are those of the scenario, without `world.origin`.
+        world coordinates of the scene are the scenario's, without `world.origin`.
     placing
         Poses that `place_sensor` chose in a scene of mesh files; None if the scenario gives poses
         or a trajectory, or has the default objects.
@@ -548,9 +549,9 @@ def _materials(
 
 
 class _ClassedObject(NamedTuple):
-    """An object to which its entry of `scene.copies` or `actors` gives a class."""
+    """An object whose entry of `scene.copies` or `actors` gives it a class."""
 
-    name: str  # of the entry, or of a robot's link
+    name: str  # name of the entry, or of a robot's link
     patterns: list[str]  # fit the names of the object and its numbered copies in the scene
     semantic_class: int
 
@@ -558,7 +559,7 @@ class _ClassedObject(NamedTuple):
 def _classed_objects(scenario: Scenario, scene: Scene) -> list[_ClassedObject]:
     """Return the objects whose entries of copies and actors give a class.
 
-    All copies of an entry are one such object; each link of a robot is an object of its own.
+    All copies of an entry are one such object; each link of a robot is a separate object.
     """
     classed: list[_ClassedObject] = []
     for entry in scenario.placed:
@@ -608,7 +609,8 @@ def _build_survey(
 ) -> Survey:
     """Build the survey along a trajectory or at poses, in local coordinates.
 
-    `columns` are names of columns that the cloud gets beside those of the scenario and formats.
+    `columns` are names of columns that the cloud gets beside the columns of the scenario and of
+    formats.
     """
     scenario = parts.scenario
     sensors = parts.sensors
@@ -653,7 +655,7 @@ def _class_names(
     """Return the names of the classes of a survey, {number: name}.
 
     Names come from `scenario.classes`, and from the classes that files give to objects, unless the
-    scenario uses the number or the name otherwise. `columns` are those of the cloud.
+    scenario uses the number or the name otherwise. `columns` are the columns of the cloud.
     """
     scenario = parts.scenario
     entries = (*scenario.placed, *(scenario.traffic.vehicles if scenario.traffic else ()))

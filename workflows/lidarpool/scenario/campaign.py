@@ -81,7 +81,7 @@ class CampaignSpec:
     title: str
     command: str = ""  # arguments of ``lidarpool run``; empty for a function
     description: str = ""  # text of the campaign file, or empty
-    files: Set[Path]  # that jobs may be made of, existing or not
+    files: Set[Path]  # files that jobs may be made of, existing or not
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
     shard = ALL  # whose jobs a run does
     only_job: None = None  # surveys have one, see `lidarpool.run.job_source.Jobs`
@@ -259,7 +259,7 @@ class CampaignSpec:
             raise LidarError(
                 f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
             )
-        return int(number)  # of NumPy, perhaps
+        return int(number)  # converts a number of NumPy
 
     def check_files(self) -> None:
         """Raise LidarError if a file that jobs may be made of does not exist."""

@@ -45,7 +45,7 @@ from .static_scene import SceneCache
 
 _NOISE = "noise.seed"  # path of the seed that differs from job to job
 _MAX_DESCRIBED = 20  # scenarios whose fields are stored with a run, to name those that differ
-_UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
+_UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # characters to replace in a name of files
 
 
 class JobSource:
@@ -55,7 +55,7 @@ class JobSource:
     names: tuple[str, ...] = ()
     choices: Mapping[str, str] = MappingProxyType({})
     files: Set[Path] = frozenset()
-    folders: Set[Path] = frozenset()  # of the campaign's own files
+    folders: Set[Path] = frozenset()  # folders of the campaign itself
     identity: Mapping[str, str]
 
     def name(self, number: int) -> str:
@@ -345,7 +345,7 @@ class _Base:
     def __init__(
         self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Any]], label: str
     ) -> None:
-        self._label = label  # for messages
+        self._label = label  # label for messages
         self.scenario = Scenario.load(path)
         self.name = path.name
         self._vary = vary
@@ -424,7 +424,7 @@ class _Base:
             try:
                 self.changed({text: value}, "")
             except LidarError as error:
-                in_a_line = str(error).replace("\n  ", " ")  # with a list that has own lines
+                in_a_line = str(error).replace("\n  ", " ")  # joins the lines of a list
                 message = in_a_line.partition("\n")[0].removeprefix(": ")
                 value_line = f"{text} can be {shown(value)}"
                 expected = message.removeprefix(f"{field} is {shown(value)}")

@@ -59,12 +59,12 @@ from ..datasets.job_table import Value
 from .sections import IgnoredColumns, Section, may_be_empty
 
 SIGMAS = 6.0  # a normal number beyond is drawn again, 2 of a billion
-MIN_SHARE = 0.01  # of a normal distribution that lies within limits
+MIN_SHARE = 0.01  # least share of a normal distribution within limits
 
 _CAMPAIGN_SUFFIXES = (".yaml", ".yml")
 _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or a mapping {…}
 _EXACT = Context(prec=40)
-_DIGITS = 12  # that numbers are rounded to, so that tables are readable and hold the exact number
+_DIGITS = 12  # digits of rounded numbers, so that tables are readable and hold the exact number
 
 
 class JobRandom:
@@ -357,7 +357,7 @@ class Choice(Section):
 
 
 def _choice(value: Any) -> Any:
-    """Return an entry of `vary`, or raise an error for an entry that is no choice."""
+    """Return an entry of `vary`, or raise an error for an entry that is not a choice."""
     if not isinstance(value, (dict, Choice)):
         raise must_be("a way of choosing, {uniform: [0, 1]} or {choice: [1, 4]}")
     return value
@@ -380,7 +380,7 @@ def _in_table(value: Any, position: int) -> Value | None:
 class Keep:
     """The format of a data set.
 
-    LidarError if there is no such format or layout.
+    LidarError for an unknown format or layout.
     """
 
     format: Annotated[
@@ -529,7 +529,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     Raises
     ------
     LidarError
-        If the file cannot be read, the field is no list, or a row is not a valid entry; the
+        If the file cannot be read, the field is not a list, or a row is not a valid entry; the
         message has the line.
     """
     entry = next(_entries(kind), None)
@@ -645,7 +645,7 @@ def _nested(values: dict[str, Any]) -> Any:
         for step in outer:
             node = node.setdefault(step, {})
             if not isinstance(node, dict):
-                return result | {name: value}  # refused as a name that is no field
+                return result | {name: value}  # refused as an unknown field
         node[last] = value
     return _lists(result)
 

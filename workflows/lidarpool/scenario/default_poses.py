@@ -28,7 +28,7 @@ _BELOW_M = 0.2
 # Distances from the middle, tried in this order if an object or a building is in the way there.
 _ASIDE_M = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
-# Poses around an object: azimuths from which two sides of a box are seen, elevation above its
+# Poses around an object: azimuths that show two sides of a box, elevation above its
 # middle, and limits of the distance from its middle, in its diagonals.
 _AZIMUTHS_DEG = (45, 135, 225, 315)
 _ABOVE_DEG = 20.0
@@ -53,8 +53,8 @@ _MAX_SHEET_TRIANGLES = 200_000
 class Placing:
     """Poses of a sensor in a scene."""
 
-    poses: tuple[Pose, ...]  # in world coordinates
-    note: str = ""  # for users, on poses that they may not expect
+    poses: tuple[Pose, ...]  # poses in world coordinates
+    note: str = ""  # note for users, on poses that they may not expect
     surrounds_object: bool = False  # whether the poses are around an object
     grid: Mapping[str, Any] = field(default_factory=dict)  # arguments of `Sensor.grid`, if narrowed
 
@@ -278,7 +278,7 @@ def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
 
 
 def _viewing_distance_m(carried: Mounted, diagonal_m: float, field_deg: float) -> float:
-    """Return the distance in metres from which an object with a diagonal fills the view."""
+    """Return the distance in metres where an object with a diagonal fills the view."""
     sensor = carried.sensor
     half = np.radians(max(field_deg, 1e-3) / 2)
     diagonals = float(np.clip(0.5 / np.sin(half), *_DIAGONALS))

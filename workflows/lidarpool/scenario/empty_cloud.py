@@ -17,7 +17,7 @@ from .default_poses import seen_from
 
 EMPTY = "the cloud has no points"
 NO_POINTS = "no points: "  # before the names of jobs
-NAMED_JOBS = 5  # in a warning
+NAMED_JOBS = 5  # jobs in a warning
 
 # Casters of larger scenes take too long for a warning.
 MAX_TRIANGLES = 2_000_000

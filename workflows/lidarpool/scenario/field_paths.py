@@ -37,16 +37,16 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
     steps: list[tuple[str | int, Any]] = []
     key: str | int
     while remaining:
-        path = ".".join(text.split(".")[: -len(remaining)])  # of the node
+        path = ".".join(text.split(".")[: -len(remaining)])  # path of the node
         if node is None and not remaining[0].isdecimal() and (sections := list(sections_in(kind))):
-            model = issubclass(sections[0], BaseModel)  # of defaults
+            model = issubclass(sections[0], BaseModel)  # built with its defaults
             node = sections[0].model_construct() if model else object.__new__(sections[0])
             steps[-1] = (steps[-1][0], node)
         if is_section(type(node)):
             key, node, kind = _field(scenario, node, remaining[0], path)
             part_count = 1
         elif isinstance(node, dict):
-            keys = {str(key): key for key in node}  # of classes, numbers
+            keys = {str(key): key for key in node}  # keys of classes are numbers
             name, part_count = _match_name([*keys], remaining, path)
             node = node[key := keys[name]]
         elif isinstance(node, (tuple, list)):
@@ -81,7 +81,7 @@ def _path_hint(scenario: Scenario, name: str) -> str:
     """Return " Did you mean 'sensor.performance'?" for the field of a name, or empty."""
     for owners in owners_by_level(name, owner_of_file(Scenario)):
         paths = [path for owner in owners if (path := _path_in(scenario, owner.names, name))]
-        # Such as sensors instead of sensor, of which a scenario has one.
+        # A scenario has either sensors or sensor, for example.
         given = [path for path in paths if path.split(".")[0] in scenario.model_fields_set]
         if paths:
             return f" Did you mean {' or '.join(map(repr, (given or paths)[:3]))}?"

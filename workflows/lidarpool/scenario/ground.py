@@ -18,7 +18,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from raybeam import RayCaster, available_backends
 
-STEP_M = 0.5  # of a trajectory that follows a surface
+STEP_M = 0.5  # step of a trajectory that follows a surface
 MAX_STEPS = 1_000_000
 
 
@@ -108,7 +108,7 @@ class StandingSurfaces:
     def heights_below(self, positions: Floats) -> tuple[Floats, Ints32]:
         """Return the heights of the surface below positions (n, 2), and its objects, world metres.
 
-        Both are (n,): nan and -1 where there is no surface.
+        Both are (n,): nan and -1 without a surface.
         """
         heights = np.full(len(positions), np.nan)
         objects = np.full(len(positions), -1, np.int32)
@@ -147,7 +147,7 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
     positions = positions.copy()
     ahead = rotations[:, :2, 0] / np.linalg.norm(rotations[:, :2, 0], axis=1)[:, None]
     heights, axes = _surface_poses(positions[:, :2], ahead, standing)
-    positions[:, 2] += heights  # of the world: the heights they are added to lack the origin
+    positions[:, 2] += heights  # world heights: the heights they are added to lack the origin
     edges = np.flatnonzero(np.diff(np.isfinite(heights), prepend=False, append=False))
     stretches = [
         slice(start, stop) for start, stop in edges.reshape(-1, 2).tolist() if stop - start > 1

@@ -31,7 +31,7 @@ from .traffic import (
 )
 
 OSI_SUFFIXES = (".osi", ".mcap")
-_MAX_SIZE_M = 1e4  # of a moving object: ships and trains are shorter
+_MAX_SIZE_M = 1e4  # limit for a moving object: ships and trains are shorter
 _ROW = 6  # x, y, z of the box's centre, metres; yaw, pitch and roll, radians
 
 
@@ -61,7 +61,7 @@ class ObjectPassage:
         """Return the local trajectory of a mesh, above `section.surfaces` if there are any.
 
         OSI gives the middle of the object's box. The mesh stands on the bottom of the box, its
-        middle under that of the box. Without a mesh, the trajectory is that of OSI's position.
+        middle under the box's. Without a mesh, the trajectory follows OSI's position.
         """
         rows = np.array(self.rows).reshape(-1, _ROW)
         centres = rows[:, :3] + section.translation
@@ -106,7 +106,7 @@ class _PassageCollector:
         time_s = self._clock.seconds(truth.timestamp.seconds + truth.timestamp.nanos / 1e9)
         if time_s < self.time_s:
             raise ValueError(f"the time {time_s:g} comes before {self.time_s:g} s")
-        if time_s == self.time_s:  # of another topic, or of another sensor
+        if time_s == self.time_s:  # message of another topic, or of another sensor
             return
         self.time_s = time_s
         self.message += 1
@@ -270,7 +270,7 @@ def _size_of(moving: Any) -> tuple[float, float, float] | None:
 
 
 def _kind_of(moving: Any) -> str:
-    """Return the type of a moving object in lower case: of vehicles, that of the classification."""
+    """Return the type of a moving object in lower case, of vehicles from the classification."""
     kind = getattr(moving.type, "name", "").lower()
     if kind == "vehicle" and moving.vehicle_classification is not None:
         vehicle = getattr(moving.vehicle_classification.type, "name", "").lower()

@@ -25,11 +25,11 @@ from .default_poses import seen_from, surroundings_of
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
-AIRBORNE_M = 50.0  # height above the ground from which a carrier flies
+AIRBORNE_M = 50.0  # a carrier flies at this height above the ground or higher
 MAX_RATE_DEG_S = 720.0  # two rotations a second
-NOISE_SHARE = 0.1  # of the range
+NOISE_SHARE = 0.1  # share of the range
 
-# Orientation against the direction of travel: angles of this size are no drift of a vehicle, if
+# Orientation against the direction of travel: angles of this size are not drift of a vehicle, if
 # they are constant, which is the length of the mean of unit vectors with these angles.
 _ASKEW_DEG = 30.0
 _CONSTANT = 0.95
@@ -165,7 +165,7 @@ def _surroundings_of_sensors(
 ) -> list[Surroundings | None]:
     """Return the surroundings that each sensor sees, or None if a sensor sees nothing.
 
-    `surroundings` are those of all objects, and `unseen` the masks of the sensors.
+    `surroundings` belong to all objects, and `unseen` the masks of the sensors.
     """
     known: dict[bytes, Surroundings | None] = {b"": surroundings}
     keys = [static_key(scene, mask) for mask in unseen]
@@ -201,7 +201,7 @@ def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
         return inside
     positions, rotations = full_poses(actor.trajectory, 0, times)
     offsets = np.array([sample.position for sample in samples]) - positions
-    local = np.einsum("kji,kj->ki", rotations, offsets)  # in the actor's frame
+    local = np.einsum("kji,kj->ki", rotations, offsets)  # positions in the actor's frame
     lower_m, upper_m = actor.mesh.bounds
     in_bounds = np.flatnonzero(((local > lower_m) & (local < upper_m)).all(axis=1))
     if len(in_bounds):
@@ -249,7 +249,7 @@ def _motion(survey: Survey) -> _Motion:
     path = survey.path
     end_ns = path.duration_ns if np.isfinite(path.duration_ns) else survey.duration_ns
     if isinstance(path, Track):
-        assert path.start_s is not None  # of every track
+        assert path.start_s is not None  # every track has a start
         knots = (path.times_s - path.start_s) * 1e9
         knots = np.unique(np.clip(knots, 0.0, end_ns))
     else:
@@ -359,7 +359,7 @@ class _Facing(NamedTuple):
 
     level: float  # mean cosine between its z axis and up
     angle_deg: float  # mean angle from its direction of travel to its x axis, to the left
-    constancy: float  # of that angle, 0 to 1; 0 if the carrier hardly travels
+    constancy: float  # constancy of that angle, 0 to 1; 0 if the carrier hardly travels
 
     @property
     def askew(self) -> bool:

@@ -64,7 +64,7 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
     """Return the data that a scenario file of mesh files would have.
 
     Names of files start from `folder`, the scenario's. `options` are {name in `MESH_OPTIONS`:
-    value}. Sections without an option are left out, and the scene if there are no files.
+    value}. Sections without an option are left out, and the scene without files.
     """
 
     def relative(file: str | Path) -> str:
@@ -224,8 +224,8 @@ class Scenario(Section):
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
     pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
 
-    _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
-    _source: str = PrivateAttr(default="the default survey")  # for messages
+    _folder: Path = PrivateAttr(default=Path())  # folder that relative file names start from
+    _source: str = PrivateAttr(default="the default survey")  # source for messages
 
     @property
     def title(self) -> str:
@@ -461,7 +461,7 @@ def _field_that_names(section: Any, is_file: Callable[[str], bool]) -> str:
     Parameters
     ----------
     section
-        The section in which fields are searched, also in sections within it.
+        The section that is searched for fields, with sections within it.
     is_file
         Returns True for a text that names the file.
 

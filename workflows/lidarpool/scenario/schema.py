@@ -18,7 +18,7 @@ from .default_poses import on_one_line
 from .scenario import Scenario
 from .sections import Section
 
-SCHEMA_FILE = "scenario.schema.json"  # in the folder of a scenario
+SCHEMA_FILE = "scenario.schema.json"  # name in the folder of a scenario
 
 
 class _Plain(GenerateJsonSchema):
@@ -189,7 +189,7 @@ def _field_lines(name: str, field: FieldInfo, indent: str, values: dict[str, Any
 
 
 def _commented(code: str, comment: str, indent: str) -> Iterator[str]:
-    """Yield code with its comment to the right, or above if there is no room."""
+    """Yield code with its comment to the right, or above without room."""
     line = f"{indent}{code}".ljust(_COMMENT_COLUMN - 1) + f" # {comment}"
     if len(line) <= _WIDTH and len(indent + code) < _COMMENT_COLUMN:
         yield line

@@ -62,8 +62,8 @@ from lidarsim.survey.survey import EpsgCode, Mounted
 from ..clouds.writing import Format
 from ..plan.planning import Search
 
-MAX_COPIES = 1_000_000  # of an entry
-PathOf = Callable[[str], Path]  # of a file that a scenario names
+MAX_COPIES = 1_000_000  # limit for an entry
+PathOf = Callable[[str], Path]  # returns the path of a file that a scenario names
 
 IgnoredColumns = Annotated[
     TextOrTexts, about("names of columns to leave out, with * and ?", "remarks")
@@ -80,7 +80,7 @@ Length = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class Section(BaseModel):
-    """Fields of a scenario: unknown fields are refused, numbers are finite, text is no number."""
+    """Fields of a scenario, without unknown fields, infinite numbers, and numbers as text."""
 
     model_config = STRICT | ConfigDict(frozen=True)
 
@@ -143,7 +143,7 @@ class MeshFile(Section):
             if further:
                 problem = lacking(row, [name for name in value if name in further])
                 raise ValueError(f"{file} {problem}")
-        except LidarError as error:  # of a plug-in
+        except LidarError as error:  # error of a plug-in
             raise ValueError(str(error)) from error
         return handler(value) if kind is MeshFile else kind.model_validate(value)
 
@@ -153,7 +153,7 @@ class MeshFile(Section):
 
     @staticmethod
     def kinds() -> list[type[MeshFile]]:
-        """Return the sections of files of all formats with options, also those of plug-ins."""
+        """Return the sections of files of all formats with options, plug-ins included."""
         options = dict.fromkeys(row.own_options for row in formats_with_plugins())
         return [kind for kind in map(_kind_of_file, options) if kind is not MeshFile]
 
@@ -448,7 +448,7 @@ class WorldSection(Section):
 
 
 class PacketSection(Section):
-    """Packets of the sensor's maker: values in place of those of the sensor's data file."""
+    """Packets of the sensor's maker: values in place of the values of the sensor's data file."""
 
     ports: Annotated[
         dict[str, Annotated[int, Field(ge=1, le=65_535)]],
@@ -561,8 +561,8 @@ class SensorSection(Section):
         Raises LidarError if its files cannot be used.
 
         `path` returns the path of a file in the scenario. Equal sections have the same sensor,
-        unless their files have changed. A sensor with a data sheet has noise and returns of its
-        own: the sheet's, with the fields that the sections give.
+        unless their files have changed. A sensor with a data sheet has its noise and returns: the
+        sheet's, with the fields that the sections give.
         """
         limit_names = {"rate_hz", "min_range_m", "max_range_m"}
         limits = self.model_dump(include=limit_names, exclude_none=True)

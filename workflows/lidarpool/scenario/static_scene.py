@@ -66,7 +66,7 @@ class Findings:
         return Findings(*(values.copy() for values in vars(self).values()))
 
     def named(self, number: int) -> tuple[str, ...]:
-        """Return name patterns of the objects to which files give the class of a number."""
+        """Return name patterns of the objects whose files give them the class of a number."""
         patterns = dict.fromkeys(
             pattern
             for classes in self.classes.values()
@@ -371,7 +371,7 @@ def copies_of(
     Raises
     ------
     LidarError
-        If a table cannot be read, no surface is below a position, or there is no room.
+        If a table cannot be read, no surface is below a position, or the room is too small.
     """
     if entry.scatter is not None:
         poses = _scatter_copies(entry.scatter, entry.name, standing)
@@ -400,7 +400,7 @@ class _CopyPoses(NamedTuple):
     def set_missing_heights(self, standing: StandingSurfaces) -> None:
         """Put copies without z onto the surface below.
 
-        Raises LidarError if there is no surface.
+        Raises LidarError without a surface.
         """
         positions = self.positions
         rows = np.flatnonzero(np.isnan(positions[:, 2]))
@@ -477,7 +477,7 @@ def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> 
 def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSurfaces) -> Floats:
     """Draw positions (n, 3) on surfaces, world metres.
 
-    Raises LidarError if there is no room.
+    Raises LidarError without room.
 
     `standing` are the surfaces of all objects. If none of the first positions is on a surface of
     the scatter, as under a roof, all other surfaces are ignored.

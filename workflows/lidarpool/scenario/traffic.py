@@ -62,11 +62,11 @@ _UNUSED = frozenset((
     "stopDelay", "tag", "timeLoss", "vehicle", "waiting",
 ))  # fmt: skip
 
-_ROW_BYTES = 8 * (1 + len(_ROW))  # of a time and its row
+_ROW_BYTES = 8 * (1 + len(_ROW))  # bytes of a time and its row
 
-_ELEMENT_BYTES = 100  # of an element of a packed file: a short element takes as long as these
+_ELEMENT_BYTES = 100  # bytes of an element of a packed file: a short element takes as long as these
 
-_TRAVELLER_BYTES = 1000  # of a vehicle or person without its rows
+_TRAVELLER_BYTES = 1000  # bytes of a vehicle or person without its rows
 
 _KNOWN = _UNUSED.union(_ROW, ("id", "type"))
 
@@ -177,10 +177,10 @@ class TravellerChoice(NamedTuple):
 class TrafficContent(NamedTuple):
     """Vehicles, persons and objects of a file of traffic between two times."""
 
-    passages: Sequence[TrafficPassage]  # in the order of their starts
+    passages: Sequence[TrafficPassage]  # passages in the order of their starts
     counted: str  # number of vehicles and persons until the end, in words
     left_out: Set[str] = frozenset()  # identities of those that were not to be read
-    notes: Sequence[str] = ()  # on what is left out
+    notes: Sequence[str] = ()  # notes on what is left out
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +287,7 @@ class _PassageCollector:
         self._choice = choice
         self._allowance = allowance
         self._known_attributes = set(_KNOWN)
-        self._vehicle_xy: tuple[str, str] | None = None  # of the time step's last vehicle
+        self._vehicle_xy: tuple[str, str] | None = None  # position of the time step's last vehicle
 
     def collect(self, elements: Iterable[tuple[str, Mapping[str, str]]], last_s: float) -> None:
         """Collect from tags with attributes until a time.
@@ -343,7 +343,7 @@ class _PassageCollector:
             self.left_out.add(attributes["id"])
             return
         passage = self._passage(tag, attributes)
-        if self.time_s <= self._first_s:  # of the rows before the first time the last is needed
+        if self.time_s <= self._first_s:  # of earlier rows, only the last is needed
             del passage.times_s[:], passage.rows[:]
         else:
             self._allowance.take(_ROW_BYTES)
@@ -395,7 +395,7 @@ def read_fcd(
     Raises
     ------
     LidarError
-        If the file cannot be read, is no floating car data, has unknown attributes, or unpacks to
+        If the file cannot be read, is not floating car data, has unknown attributes, or unpacks to
         far more than its size.
     """
     try:
@@ -456,7 +456,7 @@ def carrier_of(
 ) -> Track:
     """Return the local trajectory of the vehicle of the traffic that carries the sensors.
 
-    Its frame is that of the vehicle's mesh. `content` has passages of that vehicle alone; the
+    Its frame is the frame of the vehicle's mesh. `content` has passages of that vehicle alone; the
     other arguments are as for `actors_of`.
 
     Raises

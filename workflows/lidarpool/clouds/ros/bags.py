@@ -47,7 +47,7 @@ _LATCHED = Qos(
     QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
     QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
 )  # fmt: skip
-_MAX_DISTANCE_NS = 2e8  # from a sweep to the nearest pose, before the first and after the last
+_MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
 
 
 def write_rosbag2(
@@ -178,7 +178,7 @@ class Reader(sweep_reader.Reader):
     def _at_start(self, sweep: int, points: Floats32, times: AnyArray) -> Floats32:
         """Return points (n, 3) as fired in the sensor frame at the start of the sweep.
 
-        `times` (n,) are those of the layout.
+        `times` (n,) are the times of the layout.
         """
         since_ns = LAYOUTS[self.layout].since_ns(times, message_stamp_ns(self.sweeps, sweep))
         stamps = np.rint(since_ns + self.sweeps.stamp_ns(sweep)).astype(np.int64)

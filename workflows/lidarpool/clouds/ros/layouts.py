@@ -38,11 +38,11 @@ EXTRA_FIELDS = {
 
 
 class SweepPoints(NamedTuple):
-    """Points of a sweep in the sensor frame, of which layouts make rows."""
+    """Points of a sweep in the sensor frame, for the rows of layouts."""
 
     positions: Floats32  # (n, 3): metres
-    columns: Mapping[str, AnyArray]  # of the cloud
-    traits: LidarTraits  # of the sensor
+    columns: Mapping[str, AnyArray]  # columns of the cloud
+    traits: LidarTraits  # traits of the sensor
 
 
 class PointLayout(ABC):
@@ -70,7 +70,7 @@ class PointLayout(ABC):
     ring_field: ClassVar[str] = "ring"
     full_intensity: ClassVar[float] = 1
     lines: ClassVar[str] = ""
-    no_intensity: ClassVar[float] = 0  # of rays without return, in organized clouds
+    no_intensity: ClassVar[float] = 0  # value of rays without return, in organized clouds
 
     @abstractmethod
     def values(self, points: SweepPoints) -> dict[str, AnyArray]:
@@ -301,7 +301,7 @@ LAYOUTS: dict[str, PointLayout] = {
 class LaidOut:
     """How points of a survey are laid out in messages."""
 
-    name: str  # of the layout, see `LAYOUTS`
+    name: str  # name of the layout in `LAYOUTS`
     compensated: bool = False  # points in the sensor's axes at the start of the sweep, no times
     organized: bool = False  # a point for each ray, NaN without a return
 

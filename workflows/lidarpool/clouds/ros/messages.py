@@ -296,7 +296,7 @@ class _Messages:
         vector, quaternion = self.types_of("geometry_msgs", "Vector3", "Quaternion")
         (imu,) = self.types_of("sensor_msgs", "Imu")
         unknown = np.zeros(9)
-        unknown[0] = -1  # there is no orientation
+        unknown[0] = -1  # the orientation is unknown
         rate, force = (
             np.zeros((2, 9))
             if instruments.imu is None

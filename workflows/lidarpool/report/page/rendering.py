@@ -61,7 +61,7 @@ def write_page(
 ) -> None:
     """Write a report as a single HTML file, which needs no further files and no network.
 
-    Most numbers are those of `report`, from `make_report`. `put_picture` adds pictures. The title
+    Most numbers come from `report`, made by `make_report`. `put_picture` adds pictures. The title
     has the models of the sensors, or the scenario's name if no sensor has a model.
 
     Raises
@@ -123,7 +123,7 @@ def from_above(counts: Ints, marks: Iterable[Sequence[float]] | Floats = ()) -> 
     """
     rows, columns = counts.shape
     shade = np.log1p(counts[::-1])
-    weakest = np.where(counts[::-1] > 0, 40, 0)  # of 255: single points are visible, too
+    weakest = np.where(counts[::-1] > 0, 40, 0)  # least of 255: single points are visible, too
     pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
     pixels[..., 3] = np.maximum(255 * shade / max(shade.max(), 1), weakest)
     data = io.BytesIO()
@@ -281,7 +281,7 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
         drawn[name or "no partition"][record.worker, record.stage].append(record)
     groups = []
     for partition, tasks in sorted(drawn.items()):
-        workers = {worker for worker, _ in tasks}  # of tasks that have a record
+        workers = {worker for worker, _ in tasks}  # workers of tasks that have a record
         workers = workers.union(*(s.workers for s in stages if s.partition == partition))
         count = sum(map(len, tasks.values()))
         total = max(task_counts[partition], count)

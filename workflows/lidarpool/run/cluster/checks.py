@@ -44,7 +44,7 @@ class SurveyWorkers(NamedTuple):
     pool: Pool  # all workers
     casting: list[WorkerInfo]  # workers of partition GPU
     backend: str
-    software: dict[str, str]  # of the casting workers
+    software: dict[str, str]  # software of the casting workers
 
 
 def slots_needed(tasks: TaskOptions, *, planning: bool, writing: bool = False) -> dict[str, int]:
@@ -117,7 +117,7 @@ def check_memory(
 ) -> None:
     """Raise JobError if a worker has too little memory for scans or batches: bytes a slot.
 
-    It is no other LidarError because another job may fit.
+    The class is separate from LidarError because another job may fit.
     """
     peak_bytes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
     if (all_scans := peak_bytes(job.survey.scan_count)) <= available_bytes:

@@ -32,7 +32,7 @@ from .connection import (
 from .tasks import Tasks
 from .watch import Waiting, Watch
 
-LOST_S = 0.5  # for a client to notice that its scheduler is gone
+LOST_S = 0.5  # time until a client notices that its scheduler is gone
 
 # Errors that Dask raises once the scheduler is gone; errors of connections are OSErrors.
 _CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
@@ -59,7 +59,7 @@ def client_of(
     if options.client is not None:
         return nullcontext(options.client)
     if options.scheduler is not None:
-        with suppress(ValueError):  # outside of tasks there is no worker
+        with suppress(ValueError):  # ValueError outside of tasks, without a worker
             if get_worker().scheduler.address == options.scheduler:
                 return nullcontext(own_client())
         return connected(options.scheduler, options.files, waiting)

@@ -83,7 +83,7 @@ def local_cluster(
     Workers of GPU and OTHER have one thread each; their default numbers are `default_workers` of
     this machine, and OTHER may have none. The one LIDAR worker has `lidar_slots` threads and slots;
     with 0 there is none.
-    Further options, and the errors, are those of `poolpart.deploy.local_cluster`.
+    Further options, and the errors, are as in `poolpart.deploy.local_cluster`.
     """
     defaults = default_workers(CPU_COUNT, len(visible_gpus()))
     gpu_workers = defaults[GPU] if gpu_workers is None else gpu_workers
@@ -120,7 +120,7 @@ def local_client(
     """Return a context with a client of a cluster on this machine that ends with the context.
 
     Workers as of `local_cluster`, with the `required_slots` of LIDAR, and by default no worker of
-    OTHER unless it has required slots. `tls` encrypts the traffic, with a certificate of its own;
+    OTHER unless it has required slots. `tls` encrypts the traffic, with a new certificate;
     PoolError if no certificate can be made, or the workers do not start.
     """
     forks = start_fork_server()  # here, for it changes the environment of this process
@@ -245,7 +245,7 @@ def connected(
 
 def _check_address(address: str) -> None:
     """Raise LidarError if an address has no host or no valid port."""
-    with suppress(ValueError):  # for a port that is no number, or out of range
+    with suppress(ValueError):  # ValueError if the port is not a number, or out of range
         parts = urlsplit(f"//{address.rpartition('//')[2]}")
         if parts.hostname and parts.port:
             return

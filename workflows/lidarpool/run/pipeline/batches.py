@@ -13,7 +13,7 @@ from .pipeline_job import PipelineJob
 class BatchState(Enum):
     """State of a batch."""
 
-    WAITING = "waiting"  # to be offered to a GPU worker
+    WAITING = "waiting"  # the next offer goes to a GPU worker
     CASTING = "casting"  # offered to one
     CAST = "cast"  # its columns are on that worker
     COLLECTING = "collecting"  # assigned to a collector
@@ -43,14 +43,14 @@ class Batch:
     order: int = 0  # waiting batches are offered in this order
     state: BatchState = BatchState.WAITING
     since: float = 0.0  # monotonic time of the last change of state
-    key: str = ""  # of the casting task; "" while waiting
+    key: str = ""  # key of the casting task; "" while waiting
     worker: str = ""  # address of the GPU worker
     collector: str = ""  # name of the task of stage 4
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
     single_job: bool = False  # True if it must not be cast with batches of other jobs
 
     def __post_init__(self) -> None:
-        self.share = len(self) / self.job.scans_per_task  # of the memory of a task
+        self.share = len(self) / self.job.scans_per_task  # share of the memory of a task
 
     def __len__(self) -> int:
         return self.stop - self.first

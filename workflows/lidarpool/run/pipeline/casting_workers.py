@@ -37,7 +37,7 @@ _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, Recursion
 LOST_DEVICES = 3  # processes that may lose their GPU in a run, and the last ends it
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
 ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
-RELEASE_S = 3.0  # for workers to drop their rigs
+RELEASE_S = 3.0  # time for workers to drop their rigs
 SPARE_SCENES = 2  # scenes without a survey under way, kept for the next survey
 INLINE_BYTES = 1 << 17  # larger payloads are sent to one worker, and fetched by other workers
 CHECKING = "checking the casting workers"
@@ -52,9 +52,9 @@ class _Payload:
     workers of this machine map; other workers get a future of its bytes.
     """
 
-    name: str  # on the workers
+    name: str  # name on the workers
     make: Callable[[], object]  # returns the value, again if the future is lost
-    small: Pickled | None  # of a small value
+    small: Pickled | None  # pickled small value
     shared: SharedValue | None = None
     future: Future | None = None  # None until a worker needs it
     recipients: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
@@ -125,7 +125,7 @@ class CastingWorkers:
         self._died: list[str] = []  # workers that died while they were checked, in a row
         self._looked_at = float("-inf")
         self.locations = TaskLocations()
-        self._requested_slots = -1  # as the scheduler knows
+        self._requested_slots = -1  # number that the scheduler knows
         self._adapts = True  # False once the partition is known not to adapt to requests
         self.notes: list[str] = []  # notes for the user
         self._lost_devices: set[str] = set()  # processes whose GPU answers no more
@@ -262,7 +262,7 @@ class CastingWorkers:
         ]
         payloads = [self._jobs[first][1], *(self._jobs[job][0] for job in spans)]
         arguments = [self._payload_for(payload, worker) for payload in payloads]
-        # A key of its own for each offer: a task that is released and submitted again under its
+        # Each offer has a separate key. A task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
         self._name_count += 1
         key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._name_count}"

@@ -1,10 +1,10 @@
 """Dispatches batches to casting workers and collectors, and offers lost batches again.
 
-Stage 1 (GENERATE) sends ranges of scans, of which the dispatcher makes batches. Stage 2 (INTERSECT)
-casts batches on GPU workers. Stage 4 (COLLECT) writes them as parts. A batch is WAITING, CASTING,
-CAST or COLLECTING, see `BatchState`. Amounts of work are weights: a task takes `per_task` small
-batches, each of weight 1, and a batch that fills half of a task's memory has the weight of half a
-task, see `policies.weight`.
+Stage 1 (GENERATE) sends ranges of scans. The dispatcher makes batches of the ranges. Stage 2
+(INTERSECT) casts batches on GPU workers. Stage 4 (COLLECT) writes them as parts. A batch is
+WAITING, CASTING, CAST or COLLECTING, see `BatchState`. Amounts of work are weights: a task takes
+`per_task` small batches, each of weight 1, and a batch that fills half of a task's memory has the
+weight of half a task, see `policies.weight`.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Dispatcher:
     def __init__(self, workers: CastingWorkers, stages: Stages, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
         self.failed: dict[PipelineJob, JobError] = {}
-        self.advice = 1  # scans in each range that stage 1 sends: those of a batch
+        self.advice = 1  # scans in each range that stage 1 sends: as many as in a batch
         self._workers = workers
         self._stages = stages
         self._mark = mark
@@ -111,8 +111,8 @@ class Dispatcher:
 
         No batch may be under way if the weight is 0 or less.
 
-        There is no room if many batches of any jobs are younger than the oldest batch of this job:
-        the sorter, and the memory, would have to hold their scans.
+        There is not any room if many batches of any jobs are younger than the oldest batch of this
+        job: the sorter, and the memory, would have to hold their scans.
         """
         span = max((self._batch_count - batch.number for batch in self._batches_of(job)), default=0)
         if span >= policies.MAX_SPAN * self.max_weight:

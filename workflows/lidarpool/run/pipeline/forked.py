@@ -28,7 +28,7 @@ keep_freed_memory()
 # A starting worker removes the folders of ended workers, at the same time as their nannies, and
 # would log each missing folder as an error.
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
-with suppress(ImportError):  # if it cannot be loaded, a check says why
+with suppress(ImportError):  # a check says why the module cannot be loaded
     from lidarsim.base import elementary_loops  # noqa: F401
     from raybeam import moving_loops, tile_casts  # noqa: F401
 

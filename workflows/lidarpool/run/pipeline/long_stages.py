@@ -44,7 +44,7 @@ MAX_DEATHS = 12  # deaths of a stage with nothing committed in between
 ASK_LOCK_S = 0.05  # wait for the lock
 LAST_WORDS_S = 3.0  # time for the stages to end after everything was committed
 
-Order = Description | CollectOrder | Summaries  # to a stage
+Order = Description | CollectOrder | Summaries  # order to a stage
 
 
 @dataclass(eq=False)
@@ -53,7 +53,7 @@ class _StageTask:
 
     future: Future
     worker: str  # address of the only worker that may run the task
-    inlet: Pipe  # from the driver
+    inlet: Pipe  # pipe that the driver fills
     since: float  # time of submission
     dead_since: float | None = None  # time of the worker's death, until the stage is restarted
 
@@ -95,10 +95,11 @@ class LongStages:
         self._names = [GENERATE, SORT, *(f"{COLLECT}-{number}" for number in range(collectors))]
         self._tasks: dict[str, _StageTask] = {}
         self._submitted = 0
-        # A file in the storage, by which collectors find out whether they see the storage.
+        # A file in the storage. Collectors look for the file to find out whether they see the
+        # storage.
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
         self._scans = Pipe(f"lidarpool-{run}-scans", queue_capacity, self.client)
-        self._news = Pipe(f"lidarpool-{run}-news", 64, self.client)  # from stages 3 and 4
+        self._news = Pipe(f"lidarpool-{run}-news", 64, self.client)  # news of stages 3 and 4
         self.inbox: list[Message] = []  # received messages, for the driver to take
         self._outbox: dict[str, list[Order]] = {}  # {name of a pipe: messages}
         self._looked_at = 0.0  # time of the last `look`
@@ -282,7 +283,7 @@ class LongStages:
                 self._check_end(name)
                 continue
             room = max(free.values(), default=0) > 0
-            # A silent worker may wake up: it keeps its stages while there are no other slots.
+            # A silent worker may wake up: it keeps its stages while no other slot is free.
             lost = task.future.status == "error" or task.worker not in locations.members
             if task.dead_since is None and (lost or (task.worker in locations.silent and room)):
                 task.dead_since = now_s
@@ -367,7 +368,7 @@ class LongStages:
         )
         self._tasks[name] = _StageTask(future, worker, inlet, time.monotonic())
         if earlier is not None:
-            earlier.future.cancel()  # if it still runs, its result is dropped
+            earlier.future.cancel()  # the result of a task that still runs is dropped
 
     # -- the end -----------------------------------------------------------------------------
 

@@ -88,7 +88,7 @@ class Pipeline:
         self.scans_to_come = 0  # estimated scans of jobs that are not begun yet; the caller sets it
         # {job: end of its scans}, in the order of stage 1, until stage 1 has described all
         self._announced: dict[int, int] = {}
-        self._ended: list[tuple[PipelineJob, JobError | None]] = []  # for `take_ended`
+        self._ended: list[tuple[PipelineJob, JobError | None]] = []  # jobs for `take_ended`
 
     # -- jobs --------------------------------------------------------------------------------
 
@@ -111,8 +111,8 @@ class Pipeline:
             Scans of the jobs of the run that have not ended, if all are like this job. Batches need
             not be divided among all slots where many jobs follow.
         on_frame
-            Called with each frame, in scan order, in the driver's thread. Without it there are no
-            frames, and the job is complete when all its scans are committed.
+            Called with each frame, in scan order, in the driver's thread. Without `on_frame` the
+            run makes no frames, and the job is complete when all its scans are committed.
         on_parts
             Called with the parts of each commit.
 
@@ -325,7 +325,7 @@ class Pipeline:
         False if stage 1 has no orders. `wait` takes ranges of scans from stage 1 only if True.
         """
         # Stage 1 describes one job after the other, and `_announced` has the same order. While the
-        # first job has no room, its scans and those of later jobs behind it stay in the pipe.
+        # first job has no room, its scans and the scans of later jobs behind it stay in the pipe.
         # After the last scan the pipe is closed, which ends each wait at once: a driver that still
         # asked did so 700 times a second.
         for number in self._announced:

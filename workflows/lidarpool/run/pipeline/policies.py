@@ -108,8 +108,8 @@ def batches_per_task(recent_casts: Sequence[tuple[float, int]], slots: int) -> i
 def weight(batches: Iterable[Batch], per_task: int) -> float:
     """Return the weight of batches, in small batches, if a task has `per_task` small batches.
 
-    All batches of a task are in a worker's memory at a time: a batch of which two fill the memory
-    of a task (`batch.share` is 0.5) counts as half a task, `per_task / 2`. A batch counts as 1 at
+    All batches of a task are in a worker's memory at a time: a batch that fills half the memory of
+    a task (`batch.share` is 0.5) counts as half a task, `per_task / 2`. A batch counts as 1 at
     least.
     """
     return sum(max(1.0, per_task * batch.share) for batch in batches)
@@ -166,8 +166,8 @@ def offers(
     """Group waiting batches into casting tasks, and choose a worker for each task.
 
     The worker with the least work for its slots gets the next task, of up to `per_task` batches of
-    jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. A batch with
-    which a worker has died gets a task for itself, or its neighbours would share the blame for the
+    jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. A batch that was
+    on a worker when it died gets a task for itself, or its neighbours would share the blame for the
     next death. A suspect batch gets a worker for itself, and later batches wait for the suspect:
     they must not occupy all workers. Waiting batches are taken in their order.
 
@@ -219,7 +219,7 @@ class _OfferState:
     per_task: int  # small batches of a task
     load: Counter[str]  # {address: tasks that the worker has}
     reserved: set[str]  # addresses of workers that try a suspect batch
-    free_weight: float  # of batches that may still be offered
+    free_weight: float  # weight of batches that may still be offered
     has_backlog: bool  # True if batches that were cast wait for a collector
 
     @classmethod
@@ -278,8 +278,9 @@ class _OfferState:
 def _group_key(batch: Batch) -> object:
     """Return a key that is equal for batches that may share a task.
 
-    A batch with which a worker died shares with none. A batch of a task that has failed, with
-    several jobs in it, shares only with its own job; all others share with jobs of their scene.
+    A batch that was on a worker when it died shares with none. A batch of a task that has failed,
+    with several jobs in it, shares only with its own job; all others share with jobs of their
+    scene.
     """
     if batch.deaths:
         return batch
@@ -310,9 +311,9 @@ def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[H
 
     Batches of a task stay together.
 
-    Batches with which a collector has died come alone. A collector on the host of the columns is
-    preferred. A suspect batch is collected while no other batch is in stage 4: several collectors
-    may share a process. `collectors` is {name of a collector: address of its worker}.
+    Batches that were on a collector when it died come alone. A collector on the host of the columns
+    is preferred. A suspect batch is collected while no other batch is in stage 4: several
+    collectors may share a process. `collectors` is {name of a collector: address of its worker}.
     """
     ready = [b for b in batches if b.state is BatchState.CAST]
     busy = [b for b in batches if b.state is BatchState.COLLECTING]
@@ -374,7 +375,7 @@ def loss(
         Workers of the partition (`members`), those without a recent heartbeat (`silent`), those
         that are not paused (keys of `free`), and the states of their tasks.
     prepared_workers
-        Workers that can cast. While there is no other worker, a silent or late worker is waited
+        Workers that can cast. Without another worker, a silent or late worker is waited
         for.
     now_s
         Current time, by the clock of `Batch.since`.

@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 Packed = Pickled | SharedHandle  # a plan or a scene, as it comes from the driver
 
-LEAVE_S = 2.0  # from the error of a GPU to the end of its process: the driver knows it by then
+LEAVE_S = 2.0  # a process ends so long after the error of a GPU: the driver knows it by then
 UNUSED_S = 600.0  # rigs unused for longer, as of a killed driver, are dropped when one is built
 
 
@@ -82,7 +82,7 @@ def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None)
     Raises
     ------
     RigMissing
-        If the rig is not cached and there is no plan, or if its scene is not cached either.
+        If the rig is not cached and has no plan, or if its scene is not cached either.
     RigFailed
         If the rig cannot be built.
     """
@@ -162,7 +162,7 @@ class CastWork:
     """Batches of a job that a casting task casts with the job's rig."""
 
     job: int
-    handle: str  # of the rig
+    handle: str  # handle of the rig
     spans: Sequence[BatchRange]  # the first scan and the end of each batch
 
 
@@ -227,7 +227,7 @@ def leaving_with_device(rig: Rig) -> Iterator[None]:
     """Raise DeviceLost for an error after which the rig's GPU does not answer, and end the process.
 
     A nanny starts another process, whose calls the GPU answers. Without a nanny the process stays,
-    since it may be that of the user.
+    since it may be the user's process.
     """
     try:
         yield

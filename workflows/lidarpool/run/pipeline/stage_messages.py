@@ -95,7 +95,7 @@ class ScanRange(Scans):
 class Summaries(Scans):
     """To stage 3, and back in scan order: the summaries of the scans of a committed part."""
 
-    data: bytes  # of an array of `summary_type`
+    data: bytes  # bytes of an array of `summary_type`
     framed: int  # one past the last scan that had been handed out when it was sent
     until: int  # one past the last scan of the job
 
@@ -104,7 +104,7 @@ class Summaries(Scans):
 class CollectOrder:
     """To stage 4: fetch the columns of the batches of a casting task, and write each as a part."""
 
-    key: str  # of the casting task
+    key: str  # key of the casting task
     worker: str  # address of the worker that has its result
     parts: tuple[tuple[int, BatchRange, str], ...]  # job, scans and name of each
 
@@ -120,12 +120,12 @@ class ColumnsLost:
 class Receipt(Scans):
     """From stage 4: a part is whole in storage."""
 
-    name: str  # of the part
+    name: str  # name of the part
     rows: int  # points
     size: int  # bytes
-    hits: int  # of its scans, before thinning out
+    hits: int  # hits of its scans, before thinning out
     cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
-    summaries: bytes  # of its scans, of `summary_type`
+    summaries: bytes  # summaries of its scans, of `summary_type`
     record: TaskRecord | None = None  # the casting task; None for a receipt from the database
     held_at: str = ""  # worker that holds the part because it does not see the storage; else ""
 

@@ -8,4 +8,4 @@ GENERATE = "generate"  # 1, on LIDAR: one long task
 INTERSECT = "intersect"  # 2, on GPU: a short task for each batch
 SORT = "sort"  # 3, on LIDAR: one long task
 COLLECT = "collect"  # 4, on LIDAR: two long tasks
-EXPORT = "export"  # on LIDAR, after the survey: a short task for each range of files
+EXPORT = "export"  # runs on LIDAR, after the survey: a short task for each range of files

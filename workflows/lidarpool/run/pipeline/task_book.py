@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from .task_records import TaskRecord
 
-MAX_RECORDS = 4096  # of a stage; beyond that every second record is dropped, repeatedly
+MAX_RECORDS = 4096  # limit for a stage; beyond that every second record is dropped, repeatedly
 MAX_MISPLACED = 20  # records of a stage; all are counted
 MAX_SPANS = 2048  # busy spans of a stage
 
@@ -21,9 +21,9 @@ class StageTotals:
     partition: str
     tasks: int = 0
     items: int = 0
-    seconds: float = 0.0  # of all tasks
-    start: float = float("inf")  # of the first task, seconds since the epoch
-    stop: float = float("-inf")  # of the last task
+    seconds: float = 0.0  # seconds of all tasks
+    start: float = float("inf")  # start of the first task, seconds since the epoch
+    stop: float = float("-inf")  # end of the last task
     workers: set[str] = field(default_factory=set)  # names
     # {resource: tasks that ran on workers with it}; "none" for workers without.
     resources: Counter[str] = field(default_factory=Counter)

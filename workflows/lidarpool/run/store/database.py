@@ -113,7 +113,7 @@ class RunDatabase:
                 f"it is of format {version}, and this version reads {FORMAT}"
             )
         _checked_location(self.meta)
-        (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # of pages and indices
+        (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # pages, indices
         if state != "ok":
             raise sqlite3.DatabaseError(" ".join(state.split()))
         # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
@@ -354,7 +354,7 @@ def _explained(path: Path) -> Iterator[None]:
         yield
     except (sqlite3.Error, ValueError, LookupError, TypeError, OverflowError) as error:
         words = str(error)
-        # Other operational errors, such as a missing column or text that is no UTF-8, are damage.
+        # Other operational errors, such as a missing column or text that is not UTF-8, are damage.
         of_disk = any(phrase in words.lower() for phrase in _DISK_ERRORS)
         if not isinstance(error, sqlite3.OperationalError) or not of_disk:
             raise DamagedError(
@@ -397,7 +397,7 @@ def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
 def read_parts_location(path: Path) -> tuple[str, str] | None:
     """Return the mark of a run and the location of its parts, "" by default, from a database.
 
-    None if there is no database, or a damaged one; LidarError if a run is using the database, or if
+    None if the database is missing or damaged; LidarError if a run is using the database, or if
     it is another program's.
     """
     if not path.exists():

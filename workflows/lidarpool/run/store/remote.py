@@ -1,4 +1,4 @@
-"""The database of a run in storage that is no disk, such as an object store.
+"""The database of a run in storage that is not a disk, such as an object store.
 
 SQLite writes to disks only, so the database is in a temporary folder of the driver, and a copy is
 put into the storage every few seconds. A survey resumed from a copy finds later commits by its

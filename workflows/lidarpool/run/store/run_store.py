@@ -53,7 +53,7 @@ class _EarlierDatabase(NamedTuple):
     """Database that an earlier run has left."""
 
     db: RunDatabase | None = None  # open; None if no result is committed
-    mark: str = ""  # of a run without committed results
+    mark: str = ""  # mark of a run without committed results
     parts: str = ""  # location of the parts of such a run
     damage: DamagedError | None = None  # why the database cannot be read
 
@@ -74,7 +74,7 @@ class RunStore:
         Folder or URL of the run; None for a temporary folder that is deleted with the last user of
         the points.
     parts
-        Another location for the parts, a path or URL, in which they get their own folder. A resumed
+        Another location for the parts, a path or URL, where they get a separate folder. A resumed
         run uses the earlier location of its parts.
     resume
         Whether to continue an existing run; otherwise there must be none.
@@ -113,7 +113,7 @@ class RunStore:
         self.location = Storage.at(
             tempfile.mkdtemp(prefix="lidarpool-") if location is None else location
         )
-        self._folder = self.location  # of the database
+        self._folder = self.location  # folder of the database
         if not self.location.is_local:
             self._remote = RemoteRun(self.location)
             self._folder = Storage.at(tempfile.mkdtemp(prefix="lidarpool-"))
@@ -384,7 +384,7 @@ class RunStore:
         )
         self.db.read(under_way)
         under_way.resumed = under_way.parts.scans_done
-        under_way.is_identified = is_only  # by the identity of the run
+        under_way.is_identified = is_only  # the identity of the run identifies the job
         self.under_way[job.number] = under_way
         return under_way
 
@@ -473,7 +473,7 @@ class RunStore:
         if not used:
             with suppress(OSError, LidarError):
                 _remove(self.location, self.storage, self.db.meta["mark"])
-            self._folder.remove([FILE])  # also if the storage of the parts has failed
+            self._folder.remove([FILE])  # removed even if the storage of the parts has failed
 
 
 def with_sensors(sensors: Mapping[str, str], added: Iterable[tuple[str, str]]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Formats in which the pages of results offer points."""
+"""Formats of the points that the pages of results offer."""
 
 from __future__ import annotations
 

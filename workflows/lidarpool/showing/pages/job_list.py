@@ -37,7 +37,7 @@ _MAX_VIEWS = 4  # jobs whose points are in memory
 class JobList:
     """Answers the questions of the page of a data set at a folder or URL.
 
-    LidarError if there is no data set, or the data set is unfinished or damaged.
+    LidarError if the data set is missing, unfinished or damaged.
     """
 
     def __init__(self, location: Path | Storage) -> None:
@@ -107,7 +107,7 @@ class JobList:
     def view_of(self, number: int) -> View:
         """Return the view of a job.
 
-        Raises KeyError if there is no such job, or the job has failed.
+        Raises KeyError for an unknown or failed job.
         """
         row = self._rows[number]
         if not row.done:

@@ -17,9 +17,9 @@ from .cpu_share import CpuShare
 from .downloads import downloads
 from .live_job import LiveJob
 
-READING_SHARE = 0.05  # of a core, for points
+READING_SHARE = 0.05  # share of a core, for points
 LOOK_EVERY_S = 5.0  # at most, for the points of another job
-WATCHED_S = 10.0  # after a question, in which the page counts as watched
+WATCHED_S = 10.0  # time after a question while the page counts as watched
 MAX_VIEWS = 4  # jobs whose points are kept: a browser may show, or ask for, an earlier one
 
 

@@ -14,7 +14,7 @@ from ...datasets.job_table import JobRow
 from ...report.charts import draw_results, draw_varied
 from .cpu_share import CpuShare
 
-DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
+DRAWING_SHARE = 0.06  # share of a core, for charts: they take half a second to a second
 
 
 class Charts:

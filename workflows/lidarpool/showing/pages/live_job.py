@@ -28,7 +28,7 @@ from ...run.run_result import RunResult
 from ...run.store.job_under_way import JobUnderWay
 from .downloads import downloads
 
-LIVE_POINTS = 150_000  # in the browser at a time
+LIVE_POINTS = 150_000  # points in the browser at a time
 MAX_WAITING_PARTS = 64  # parts that wait to be read; of more, every second is skipped
 PARTS_PER_READ = 8  # parts read for one drawing
 MAX_FRAMES = 40  # whose rays are shown
@@ -48,13 +48,13 @@ class LiveJob:
         self._under_way = under_way
         self._max_points = max_points
         self._job = under_way.job
-        self._points = under_way.points()  # of the columns of parts
+        self._points = under_way.points()  # points of the columns of parts
         self._waiting: list[str] = []  # names of parts
         self._lock = threading.Lock()
         self._random = np.random.default_rng(0)
-        self._share = 1.0  # of the points of a part that are taken
+        self._share = 1.0  # share of the points of a part that are taken
         self._counts = np.zeros(self._job.scene.counters, np.int64)
-        self._hits = 0  # of the parts that were read
+        self._hits = 0  # hits of the parts that were read
         self.cloud = replace(self._points, names=(), rows=()).load()  # no points, with the columns
         self.frames: deque[ScanFrame] = deque(maxlen=MAX_FRAMES)  # the last frames
         self._view: View | None = None  # None before the first question

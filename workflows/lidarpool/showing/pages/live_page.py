@@ -49,7 +49,7 @@ class LivePage(RunPage):
     page: PageServer
 
     def __init__(self, jobs: int, names: Sequence[str], title: str) -> None:
-        self.stopped = threading.Event()  # by a user of the page; --resume continues
+        self.stopped = threading.Event()  # set by a user of the page; --resume continues
         self._count = jobs
         self._title = title
         self._status = RunStatus()

@@ -26,7 +26,7 @@ from .downloads import downloads
 
 _TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
 _TRAJECTORY_ADVICE = "name it in a scenario, as trajectory: FILE"
-_HEADER_BYTES = 1 << 16  # of a .ply, in which its elements are named
+_HEADER_BYTES = 1 << 16  # bytes of a .ply that name its elements
 
 
 def is_data_set(place: Path | Storage) -> bool:
@@ -42,7 +42,7 @@ def is_data_set(place: Path | Storage) -> bool:
 def open_views(paths: Sequence[Path], **options: Any) -> View:
     """Open files and folders of the same place as a view of all their points.
 
-    The options are those of `open_view`.
+    The options are as in `open_view`.
 
     LidarError if one of them cannot be opened, or has points in the axes of its sensors beside
     others.

@@ -21,8 +21,8 @@ from lidarview.viewer.view import Downloads, View
 
 from ...clouds.recording import Recording
 
-MAX_POINTS = 20_000_000  # of a recording, in memory
-LARGE_POINTS = 2_000_000  # of a cloud, of which a sample is shown while it is read
+MAX_POINTS = 20_000_000  # points of a recording, in memory
+LARGE_POINTS = 2_000_000  # a larger cloud is shown by a sample while it is read
 _SAMPLE_POINTS = 200_000
 _SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
 _RINGS = ("ring", "laser_id", "laser_number", "line", "beam")  # names of the column `channel`
@@ -85,11 +85,11 @@ def _with_known_names(
 ) -> dict[str, AnyArray]:
     """Return columns by the names of lidarpool, without coordinates.
 
-    `all_names` are the names in the recording, also of columns that are left out.
+    `all_names` are the names in the recording, with columns that are left out.
     """
     named: dict[str, AnyArray] = {}
     for name, values in columns.items():
-        if name == "rgb":  # of PCL: bytes in the bits of a float
+        if name == "rgb":  # a column of PCL: bytes in the bits of a float
             bits = values.astype(np.float32).view(np.uint32) if values.dtype.kind == "f" else values
             for colour, shift in (("red", 16), ("green", 8), ("blue", 0)):
                 named[colour] = ((bits >> shift) & 255).astype(np.uint8)
@@ -252,7 +252,7 @@ def _add_sweep(
 ) -> Floats | None:
     """Read a sweep into the world frame, if its pose is known, and return the pose.
 
-    `frame_pose` is the pose of a sweep that has none of its own.
+    `frame_pose` is the pose of a sweep without a pose.
     """
     with reading(recording.name):
         positions, columns, pose = recording.read(number)

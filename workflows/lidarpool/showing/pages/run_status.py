@@ -30,7 +30,7 @@ class RunStatus:
         self._time_left = ""
 
     def update(self, progress: Progress) -> None:
-        """Take a progress, of which rate and remaining time follow."""
+        """Take a progress, and derive rate and remaining time."""
         self.progress = progress
         counts = (progress.collected, progress.scans)
         unit = ""

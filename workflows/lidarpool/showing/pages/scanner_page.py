@@ -45,9 +45,9 @@ from ..viewers.scanner_view import ScannerView, is_present, pose_at
 from ..viewers.viewer import Address
 from .cpu_share import CpuShare
 
-SHARE = 0.02  # of a core, for points; sending them takes as much again
+SHARE = 0.02  # share of a core, for points; sending them takes as much again
 NEWS_MS = 60  # at least, from a question of a page for news to the next
-SCALES_S = 5.0  # for which colour scales stay, so that colours of surfaces do not flicker
+SCALES_S = 5.0  # colour scales stay so long, so that colours of surfaces do not flicker
 MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a sensor
 _RATE_SWEEPS = 20  # over which the rate of sweeps is averaged
 
@@ -151,7 +151,7 @@ class _Sensor:
 
     scanner: Scanner
     cloud: Cloud | None = None  # None before the first sweep
-    pose: Pose = field(default_factory=lambda: Pose((0.0, 0.0, 0.0)))  # of the sensor
+    pose: Pose = field(default_factory=lambda: Pose((0.0, 0.0, 0.0)))  # pose of the sensor
     # (seconds since the page began, x, y, z): local, metres
     trail: deque[tuple[float, ...]] = field(default_factory=lambda: deque(maxlen=MAX_TRAIL))
 
@@ -182,11 +182,11 @@ class SweepFeed:
     def __init__(self, scanners: Sequence[Scanner]) -> None:
         self._sensors = [_Sensor(scanner) for scanner in scanners]
         self._started = time.monotonic()
-        self._lock = threading.Lock()  # of the newest sweeps, held for microseconds
-        self._scene = scanners[0].scene  # with actors as they were moved
-        self._time_ns = 0.0  # of the newest sweep, by the clock of trajectories
+        self._lock = threading.Lock()  # guards the newest sweeps, held for microseconds
+        self._scene = scanners[0].scene  # scene with actors as they were moved
+        self._time_ns = 0.0  # time of the newest sweep, by the clock of trajectories
         self._count = 0  # sweeps
-        self._moments: deque[float] = deque(maxlen=_RATE_SWEEPS)  # of sweeps
+        self._moments: deque[float] = deque(maxlen=_RATE_SWEEPS)  # moments of sweeps
         self._share = CpuShare(SHARE)
         self._shown = 0  # sweeps that had come when the points were replaced
         self._scales_until = 0.0

@@ -43,12 +43,12 @@ from ...run.store.job_under_way import JobUnderWay
 from ..viewers.viewer import Viewer, open_viewer
 from .cpu_share import CpuShare
 
-READING_SHARE = 0.05  # of a core, for surroundings and sweeps
+READING_SHARE = 0.05  # share of a core, for surroundings and sweeps
 MAX_WAITING = 64  # finished sweeps that wait to be read; of more, every second is left out
-LAST_S = 0.3  # to send waiting sweeps at the end of the run
+LAST_S = 0.3  # time to send waiting sweeps at the end of the run
 LOOK_EVERY_S = 5.0  # at most, for another job of a campaign
-JOB_SWEEPS = 10  # of a job of a campaign
-CLOUD_POINTS = 150_000  # of the whole cloud at the end
+JOB_SWEEPS = 10  # sweeps of a job of a campaign
+CLOUD_POINTS = 150_000  # points of the whole cloud at the end
 CLOUD_PARTS = 64
 _WAIT_S = 0.05
 
@@ -58,7 +58,7 @@ class ViewerPage(RunPage):
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
-        self._survey: SurveyFeed | None = None  # of the only job
+        self._survey: SurveyFeed | None = None  # feed of the only job
         self._looking = CpuShare(READING_SHARE)
 
     def begun(self, job: JobUnderWay) -> None:
@@ -130,7 +130,7 @@ class SweepReader:
     def __init__(self, job: JobUnderWay) -> None:
         self._job = job.job
         self.sequence = SweepSequence(job.job.sweeps)
-        self._points = job.points()  # of the columns of parts
+        self._points = job.points()  # points of the columns of parts
         self._parts: dict[int, Receipt] = {}  # {first scan: part}
         self._lock = threading.Lock()
         self._last: tuple[str, Cloud] | None = None  # the part that was read last

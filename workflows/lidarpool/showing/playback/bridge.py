@@ -24,8 +24,8 @@ from .schedule import Schedule
 class BridgeOptions:
     """Options of the command that bridges share, or that some bridges have."""
 
-    to: tuple[str, ...] = ()  # addresses; empty for that of the bridge, on the loopback interface
-    period_ns: int = 0  # of --loop, see `Played.period_ns`; 0 to play once
+    to: tuple[str, ...] = ()  # addresses; empty for the bridge's default, on the loopback interface
+    period_ns: int = 0  # period of --loop (`Played.period_ns`); 0 to play once
     settings: Mapping[str, Any] = field(default_factory=dict)  # {option of some bridges: value}
 
 
@@ -47,7 +47,7 @@ class Bridge(ABC):
         Prints a note for the user.
     """
 
-    format: ClassVar[Format | None] = None  # of clouds that have the columns that the bridge sends
+    format: ClassVar[Format | None] = None  # clouds of it have the columns that are sent
     settings: ClassVar[tuple[str, ...]] = ()  # options of the command beside `to`
     lead_ns: ClassVar[float] = 0.0  # how long before `due_ns` the bridge gets a sweep
 
@@ -128,7 +128,7 @@ class Bridge(ABC):
 def bridge_class(name: str) -> type[Bridge]:
     """Return the class of a bridge.
 
-    LidarError if there is no bridge of that name, or its packages are not installed.
+    LidarError if the bridge is unknown, or its packages are not installed.
     """
     if name not in BRIDGES:
         names = ", ".join(BRIDGES)

@@ -29,7 +29,7 @@ from ...clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 LOOPBACK = "127.0.0.1"
 DOMAIN_VARIABLE = "ROS_DOMAIN_ID"
 _MAX_DOMAIN = 232  # ports of further domains are above 65,535
-_PARTICIPANTS = 32  # of a machine, as ROS 2 takes it
+_PARTICIPANTS = 32  # participants of a machine, as ROS 2 takes it
 # Participants announce themselves once a second: readers that start later soon find the topics.
 _CONFIGURATION = """<CycloneDDS><Domain Id="{domain}">
 <General><Interfaces><NetworkInterface address="{address}"/></Interfaces>
@@ -61,7 +61,7 @@ _DEPTH = 10
 class Network:
     """Where topics are: an interface of this machine, its peers, and a domain."""
 
-    address: str = LOOPBACK  # of the interface
+    address: str = LOOPBACK  # address of the interface
     peers: tuple[str, ...] = ()  # machines that are told of the topics
     domain: int = 0
 
@@ -69,7 +69,7 @@ class Network:
     def to(cls, hosts: Sequence[str], environment: Mapping[str, str] = os.environ) -> Network:
         """Return the network that reaches hosts, of a single interface, or loopback without hosts.
 
-        The domain is that of ROS_DOMAIN_ID.
+        The domain is ROS_DOMAIN_ID.
 
         Raises
         ------
@@ -206,7 +206,7 @@ def _serialised(kind: Any, cdr: bytes) -> Any:
 def message_class(kind: str) -> Any:
     """Return the class of cyclonedds of a message, such as sensor_msgs/msg/PointCloud2.
 
-    Names of type and fields are those of the middleware of ROS 2, with an underscore at the end.
+    Names of type and fields are as in the middleware of ROS 2, with an underscore at the end.
     """
     package, _, name = kind.partition("/msg/")
     _, fields = message_store().fielddefs[kind]

@@ -24,7 +24,7 @@ from .schedule import BEHIND, BEHIND_S, MadeAhead, Schedule, casting_threads
 from .transmitter import Transmitter, sensor_streams
 
 _AHEAD = 16  # sweeps that are cast before they are due, of a trajectory that is known
-_START_NS = 20e6  # from the start of the schedule to the first packet
+_START_NS = 20e6  # time between the start of the schedule and the first packet
 _NumberedSweep = tuple[int, float, Cloud]  # number, start in seconds, points
 Rate = Annotated[float, Field(ge=0.001, le=1000)]
 Seconds = Annotated[float | None, Field(gt=0)]
@@ -61,7 +61,7 @@ def play(
     rate
         Speed: 0.5 takes twice as long.
     duration_s
-        Length of time that is played, seconds of the scanner; by default that of the trajectory,
+        Length of time that is played, seconds of the scanner; by default the trajectory's length,
         else until Ctrl-C.
     start
         Date and time of time 0, as in `Survey`, for the stamps.

@@ -17,7 +17,7 @@ from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule
 from .transmitter import Transmitter, sensor_streams
 
-_LEAD_NS = 0.3e9  # of a sweep before its first packet: the process that sends holds so much
+_LEAD_NS = 0.3e9  # lead of a sweep before its first packet: the process that sends holds so much
 
 
 class PacketsBridge(Bridge):
@@ -110,7 +110,7 @@ class RepeatedInstruments(Instruments):
         return cls(instruments.imu, instruments.gnss, instruments.folder, period_ns)
 
     def rows(self, name: str) -> Iterator[list[str]]:
-        """Yield the rows of a file, those of the IMU again and again, with later times."""
+        """Yield the rows of a file, and rows of the IMU again and again, with later times."""
         if name != IMU_FILE:
             yield from super().rows(name)
             return

@@ -51,14 +51,14 @@ class RecordedDatagram(NamedTuple):
 class PcapRecording:
     """The UDP datagrams of a pcap file, in the order of the file.
 
-    Datagrams in several fragments are joined. LidarError if the file is no pcap file, is cut off
+    Datagrams in several fragments are joined. LidarError if the file is not a pcap file, is cut off
     before its first datagram, or has no datagrams over IPv4.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.sources: list[str] = []  # addresses of sensors, in the order of their first datagrams
-        self.ports: dict[str, list[int]] = {}  # of each sensor
+        self.ports: dict[str, list[int]] = {}  # ports of each sensor
         last_ns = 0
         packet_count = 0
         for datagram in self._datagrams():
@@ -73,7 +73,7 @@ class PcapRecording:
             raise LidarError(
                 f"{path} has no UDP datagrams over IPv4: give a recording of a sensor."
             )
-        self.period_ns = last_ns + last_ns // max(1, packet_count - 1)  # of repeating it
+        self.period_ns = last_ns + last_ns // max(1, packet_count - 1)  # period of repeating it
 
     def batches(self, length_ns: int) -> Iterator[tuple[int, dict[str, list[Datagrams]]]]:
         """Yield start and datagrams of each span of time, {source: datagrams}."""
@@ -112,8 +112,8 @@ class PcapRecording:
             yield from _read_datagrams(file, Struct(f"{order}IIII"), unit_ns, link)
 
 
-_LEAD_NS = 300_000_000  # of datagrams that the process that sends holds
-_START_NS = 50e6  # from the start of the schedule to the first datagram
+_LEAD_NS = 300_000_000  # lead of datagrams that the process that sends holds
+_START_NS = 50e6  # time between the start of the schedule and the first datagram
 
 
 def recorded_streams(

@@ -27,7 +27,7 @@ _CLOCK_NS = 10_000_000  # between messages of the clock, of the survey's time
 class Ros2Bridge(Bridge):
     """Publishes sweeps as drivers do, each at its end, and IMU, GNSS receiver and clock between.
 
-    Topics, types and layouts are those of bags (`write_mcap`). Nodes take the time of the survey
+    Topics, types and layouts are as in bags (`write_mcap`). Nodes take the time of the survey
     from `/clock` (`use_sim_time`), unless it is played at today's time.
     """
 
@@ -44,8 +44,8 @@ class Ros2Bridge(Bridge):
         self._format = self.format_of(options.settings)
         self._laid_out = LaidOut(self._format.layout, organized=self._format.organized)
         self._publisher = RosPublisher(Network.to(options.to))
-        self._messages: SurveyMessages | None = None  # of the sweeps of a lap
-        self._shift_ns = 0  # of the lap
+        self._messages: SurveyMessages | None = None  # messages of the sweeps of a lap
+        self._shift_ns = 0  # shift of the lap
         self._columns: set[str] = set()
         self._between = threading.Thread(target=self._publish_between, daemon=True)
         self._stopped = threading.Event()

@@ -46,10 +46,10 @@ class Played:
     """
 
     sweeps: Sweeps
-    points: Callable[[int], Cloud]  # of the sweep of a number; casts the sweep of a scenario
+    points: Callable[[int], Cloud]  # points of the sweep of a number; casts the sweep of a scenario
     # Returns scene and planned path; None for a result without them.
     content: Callable[[], PictureContent | None] = lambda: None
-    threads: int = 1  # that may ask for points at the same time
+    threads: int = 1  # threads that may ask for points at the same time
 
     def __post_init__(self) -> None:
         if not len(self.sweeps):
@@ -149,8 +149,8 @@ def scenario_job(
 ) -> Job:
     """Return the job of a scenario or mesh file, or the first job of a campaign.
 
-    Its cloud has the columns that the format `needs` holds, in place of those of the formats that
-    the scenario writes. `of_mesh` and `tell` as for `open_source`.
+    Its cloud has the columns that the format `needs` holds, in place of the columns for the formats
+    that the scenario writes. `of_mesh` and `tell` as for `open_source`.
     """
     if path.suffix.lower() in (".yaml", ".yml") and not of_mesh and is_campaign(path):
         campaign = CampaignSpec.load(path)

@@ -26,12 +26,12 @@ class Stream:
 
     name: str
     model: str
-    kinds: Mapping[str, int]  # {kind of datagrams: port}, that of the returns first
+    kinds: Mapping[str, int]  # {kind of datagrams: port}, the returns first
     make_service: MakeService
     told_apart: bool = False  # see `PacketEncoder`
     has_own_address: bool = False
     destination: Destination = field(default_factory=lambda: Destination(LOOPBACK))
-    address: Address = field(default_factory=lambda: Address(LOOPBACK))  # of the interface
+    address: Address = field(default_factory=lambda: Address(LOOPBACK))  # address of the interface
     api_given: bool = False  # whether a user gives the address of the interface
 
     @property
@@ -42,7 +42,7 @@ class Stream:
 
     @property
     def ports(self) -> list[int]:
-        """Ports of the receiver, that of the returns first."""
+        """Ports of the receiver, the port of the returns first."""
         return list(self.destination.ports.values())
 
     def describe(self) -> str:
@@ -56,7 +56,7 @@ class Stream:
 
         Raises LidarError if its datagrams cannot go there.
 
-        A port is that of the returns; other kinds of datagrams move by as much.
+        A port is the port of the returns; other kinds of datagrams move by as much.
         """
         if receiver.port is not None and not self.kinds:
             raise LidarError(
@@ -95,8 +95,8 @@ def sensor_streams(
 def streams_to(streams: Sequence[Stream], to: Sequence[str], api: Sequence[str]) -> list[Stream]:
     """Return streams to the addresses that a user gives, as [NAME=]HOST[:PORT].
 
-    Interfaces listen at 127.0.0.1, 127.0.0.2 and so on by default, those that need an address of
-    their own from 127.0.0.2 on.
+    Interfaces listen at 127.0.0.1, 127.0.0.2 and so on by default, interfaces that need a separate
+    address from 127.0.0.2 on.
 
     LidarError if an address cannot be used, or receivers could not tell two sensors apart.
     """

@@ -1,7 +1,7 @@
 """Runs a command as long as stdin is open: `python attached_child.py COMMAND …`.
 
 The process that started it holds the other end of stdin, which the system closes when that process
-ends, even if it is killed. Then the command and its children, a process group of their own, end.
+ends, even if it is killed. Then the command and its children, a separate process group, end.
 """
 
 from __future__ import annotations

@@ -45,12 +45,12 @@ _BLUE = messages.Color(r=0.2, g=0.6, b=1.0, a=1.0)
 _GREEN = messages.Color(r=0.1, g=0.8, b=0.3, a=1.0)
 _LINE_PIXELS = 2.0
 _TEXT_PIXELS = 12.0
-_COLOUR_BITS = 4  # of each of red, green and blue of the scene
+_COLOUR_BITS = 4  # bits of each of red, green and blue of the scene
 _UNIT = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
 class FoxgloveServer(Viewer):
-    """A WebSocket server to which Foxglove connects, on the loopback interface only.
+    """A WebSocket server for Foxglove, on the loopback interface only.
 
     The SDK's server has no token and checks no `Origin`: every program that can connect reads all
     messages, also the scripts of any website that a browser of this machine has open.
@@ -91,7 +91,7 @@ class FoxgloveServer(Viewer):
         self._latest: dict[str, tuple[Any, int]] = {}  # {topic: message, time in nanoseconds}
         self._frames: dict[str, Any] = {}  # {name: last transform}
         self._sends_time = sends_time
-        self._start_ns = 0  # of the last sweep
+        self._start_ns = 0  # start of the last sweep
         try:
             self._server = foxglove.start_server(
                 name=title,

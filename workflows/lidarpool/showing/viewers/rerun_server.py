@@ -20,7 +20,7 @@ _READY_S = 20.0
 
 
 class RerunServer(Viewer):
-    """A server of Rerun in a process of its own, and the page of its viewer for browsers.
+    """A server of Rerun in a separate process, and the page of its viewer for browsers.
 
     Parameters
     ----------

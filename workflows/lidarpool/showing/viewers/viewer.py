@@ -24,7 +24,7 @@ from .viewer_table import VIEWERS
 
 LOOPBACK = "127.0.0.1"
 _PORTS_TRIED = 20
-_SHOWN_LETTERS = 60  # of an address that is refused
+_SHOWN_LETTERS = 60  # letters of an address that is refused
 
 
 class Viewer(ABC):

@@ -11,7 +11,7 @@ class ViewerRow(NamedTuple):
     target: str  # module and class, which is called with an address and a title
     package: str  # import package
     distribution: str
-    extra: str  # of lidarpool that installs the distribution
+    extra: str  # extra of lidarpool that installs the distribution
 
 
 PAGE = "page"  # the run's own page, in place of a viewer
