@@ -110,11 +110,11 @@ class _Nodes:
             left = loops.merge_pairs(
                 (clusters.lower, clusters.upper, clusters.node),
                 first,
-                second,
-                next_node,
-                (self.lower, self.upper),
-                (self.first_child, self.second_child),
-                self.count,
+                second=second,
+                next_node=next_node,
+                boxes=(self.lower, self.upper),
+                children=(self.first_child, self.second_child),
+                count=self.count,
             )
             clusters.keep_first(left)
             return

@@ -87,13 +87,13 @@ class SweepBoxes:
             )
         actors = rows.tolist()
         return cls(
-            tuple(sweeps.actors[actor] for actor in actors),
-            tuple(sweeps.actor_types[actor] for actor in actors),
-            (len(sweeps.objects) + rows).astype(np.int32),
-            boxes.centres[index][rows],
-            boxes.quaternions[index][rows],
-            boxes.sizes[index][rows],
-            boxes.points[index][rows],
+            names=tuple(sweeps.actors[actor] for actor in actors),
+            types=tuple(sweeps.actor_types[actor] for actor in actors),
+            objects=(len(sweeps.objects) + rows).astype(np.int32),
+            centres=boxes.centres[index][rows],
+            quaternions=boxes.quaternions[index][rows],
+            sizes=boxes.sizes[index][rows],
+            points=boxes.points[index][rows],
         )
 
     def __len__(self) -> int:

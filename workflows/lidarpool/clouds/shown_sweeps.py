@@ -140,13 +140,13 @@ class ActorBoxes:
         """Return the boxes of all actors in a sweep with its points."""
         boxes = Boxes.from_points(sweeps, sweep, points)
         return cls(
-            sweeps.actors,
-            sweeps.actor_types,
-            boxes.centres,
-            boxes.quaternions,
-            boxes.sizes,
-            boxes.points.tolist(),
-            boxes.present.tolist(),
+            names=sweeps.actors,
+            types=sweeps.actor_types,
+            centres=boxes.centres,
+            quaternions=boxes.quaternions,
+            sizes=boxes.sizes,
+            points=boxes.points.tolist(),
+            present=boxes.present.tolist(),
         )
 
 

@@ -244,7 +244,15 @@ def _read_survey(storage: Storage, run: Storage) -> _Part:
                 if job.missing_count:
                     raise LookupError("scans are missing")
                 parts = job.parts.ordered
-                return _Part(storage, record, [shard], scan_count, told, parts, job.trials)
+                return _Part(
+                    storage=storage,
+                    record=record,
+                    shards=[shard],
+                    run_size=scan_count,
+                    told=told,
+                    points=parts,
+                    trials=job.trials,
+                )
         except DamagedError as error:
             raise LidarError(
                 f"{run.path(FILE)} is damaged: run its shard again with --resume, which makes it "

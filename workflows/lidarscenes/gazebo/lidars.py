@@ -115,14 +115,14 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
     if element.get("type") in _COLLISION_LIDARS:
         left_out.append("it meets collision shapes in Gazebo: geometry: collision of scene.files")
     return Lidar(
-        full_name,
-        name,
-        link.path[0],
-        data,
-        _range_m(ranges),
-        matmul(link.matrix, matrix),
-        link.model,
-        tuple(left_out),
+        name=full_name,
+        sensor=name,
+        model=link.path[0],
+        data=data,
+        range_m=_range_m(ranges),
+        matrix=matmul(link.matrix, matrix),
+        model_matrix=link.model,
+        left_out=tuple(left_out),
     )
 
 

@@ -220,7 +220,15 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
     for model in state.inserted:
         element.append(model)
     body = BodyReader(resources, notes, allowance).world(element, resources.world)
-    return World(element, resources.world, body, state, resources, notes, allowance)
+    return World(
+        element=element,
+        source=resources.world,
+        body=body,
+        state=state,
+        resources=resources,
+        notes=notes,
+        allowance=allowance,
+    )
 
 
 def _world_element(root: Element, notes: Notes) -> Element:

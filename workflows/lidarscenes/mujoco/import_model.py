@@ -177,13 +177,13 @@ def _lidar(model: Any, name: str, group: _Group, sites: list[int]) -> Lidar:
         data["performance"] = {"range_m": clean(group.noise_m)}
     root = int(model.body_rootid[group.body])
     return Lidar(
-        name,
-        name,
-        names_of(model, "body")[root],
-        data,
-        (0.0, group.cutoff_m or math.inf),
-        matrix,
-        body_matrix(model, root),
+        name=name,
+        sensor=name,
+        model=names_of(model, "body")[root],
+        data=data,
+        range_m=(0.0, group.cutoff_m or math.inf),
+        matrix=matrix,
+        model_matrix=body_matrix(model, root),
     )
 
 

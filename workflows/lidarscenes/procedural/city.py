@@ -252,7 +252,16 @@ class _CityBlocks:
         slab = np.column_stack([self._size, np.ones(n)])
         objects = np.concatenate(
             [
-                self._rows(PAVEMENT, "pavement", 0, np.arange(n), self._middle, 0.0, slab, z=0.0),
+                self._rows(
+                    PAVEMENT,
+                    "pavement",
+                    kind=0,
+                    block=np.arange(n),
+                    xy=self._middle,
+                    yaw=0.0,
+                    scale=slab,
+                    z=0.0,
+                ),
                 *self._lots(),
                 self._park_trees(),
                 self._along_streets(TREE, inwards=1.6, spacing=9.0, chance=0.55),
@@ -337,7 +346,15 @@ class _CityBlocks:
         )
         y = lots.edge[rows] - lots.side[rows] * (1 + 8.7 * scale[:, 1])
         xy = np.column_stack([lots.x[rows], y])
-        return self._rows(BUILDING, "tower", kind, lots.block[rows], xy, lots.yaw[rows], scale)
+        return self._rows(
+            BUILDING,
+            "tower",
+            kind=kind,
+            block=lots.block[rows],
+            xy=xy,
+            yaw=lots.yaw[rows],
+            scale=scale,
+        )
 
     def _houses(self, lots: _Lots, rows: Ints) -> AnyArray:
         """Return houses on lots, by the rows of the lots (n,)."""
@@ -348,7 +365,15 @@ class _CityBlocks:
         set_back = rng.uniform(10.5, 12.5, n)
         x = lots.x[rows] + rng.uniform(-1.5, 1.5, n)
         xy = np.column_stack([x, lots.edge[rows] - lots.side[rows] * set_back])
-        return self._rows(BUILDING, "house", kind, lots.block[rows], xy, lots.yaw[rows], scale)
+        return self._rows(
+            BUILDING,
+            "house",
+            kind=kind,
+            block=lots.block[rows],
+            xy=xy,
+            yaw=lots.yaw[rows],
+            scale=scale,
+        )
 
     def _yard_trees(self, lots: _Lots, rows: Ints) -> AnyArray:
         """Return trees behind houses, by the rows of the lots (n,)."""
@@ -377,7 +402,15 @@ class _CityBlocks:
         n = len(block)
         kind = rng.integers(self._count["tree"], size=n)
         size = rng.uniform(0.75, 1.3, (n, 1)) * rng.uniform(0.9, 1.1, (n, 3))
-        return self._rows(TREE, "tree", kind, block, xy, rng.uniform(0, 2 * np.pi, n), size)
+        return self._rows(
+            TREE,
+            "tree",
+            kind=kind,
+            block=block,
+            xy=xy,
+            yaw=rng.uniform(0, 2 * np.pi, n),
+            scale=size,
+        )
 
     def _along_streets(
         self, owner: int, *, inwards: float, spacing: float, chance: float
@@ -390,13 +423,15 @@ class _CityBlocks:
         if owner == TREE:
             return self._trees(block, xy)
         if owner == LAMP:
-            return self._rows(LAMP, "lamp", 0, block, xy, positions.yaw, 1.0)
+            return self._rows(
+                LAMP, "lamp", kind=0, block=block, xy=xy, yaw=positions.yaw, scale=1.0
+            )
         n = len(block)
         kind = rng.integers(self._count["car"], size=n)
         yaw = positions.yaw + np.pi * (rng.integers(2, size=n) - 0.5)
         scale = rng.uniform(0.94, 1.06, (n, 3))
         xy = xy + positions.along_edge * rng.uniform(-0.5, 0.5, (n, 1))
-        return self._rows(CAR, "car", kind, block, xy, yaw, scale, z=0.0)
+        return self._rows(CAR, "car", kind=kind, block=block, xy=xy, yaw=yaw, scale=scale, z=0.0)
 
     def _street_positions(self, inwards: float, spacing: float, chance: float) -> _StreetPositions:
         """Return positions along all four edges of each block, each kept with a chance."""

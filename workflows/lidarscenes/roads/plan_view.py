@@ -209,7 +209,19 @@ class PlanTable:
             distances = distances * (length / distances[-1])
         x, y, heading = _origin(geometry)
         sine, cosine = (float(value) for value in sin_cos(heading))
-        self._cubics.append(_Cubic(start, x, y, cosine, sine, distances, parameters, u, v))
+        self._cubics.append(
+            _Cubic(
+                start=start,
+                x=x,
+                y=y,
+                cosine=cosine,
+                sine=sine,
+                distances=distances,
+                parameters=parameters,
+                u=u,
+                v=v,
+            )
+        )
         bends = _curvatures(u, v, parameters)
         for first in range(0, count - 1, _CUBIC_SAMPLES):
             if distances[first] < length:

@@ -120,7 +120,13 @@ def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
         stations, shares, quads = _dashed_knots(line, s, surface.steps)
     middle = border + line.shift
     return _Knots(
-        stations, shares, middle[stations], middle[stations + 1], line.width, quads, line.colour
+        stations=stations,
+        shares=shares,
+        first_t=middle[stations],
+        second_t=middle[stations + 1],
+        width=line.width,
+        quads=quads,
+        colour=line.colour,
     )
 
 

@@ -264,7 +264,15 @@ class _Rail(NamedTuple):
             return None
         intervals = Intervals.between(start, stop, road.breaks)
         material = material_of_object(_kind(element))
-        return cls(road, start, stop, first, last, intervals, material)
+        return cls(
+            road=road,
+            start=start,
+            stop=stop,
+            first=first,
+            last=last,
+            intervals=intervals,
+            material=material,
+        )
 
     def rings(self, stations: Stations, frames: Frames) -> Floats:
         """Return cross sections (k, 4, 3), from the lower right corner to the upper left."""

@@ -93,7 +93,16 @@ def load_robot(
         order = _in_order(list(links), joints)
         _check_mimics(joints)
         folders = () if assets is None else (Path(assets).resolve(),)
-        reader = _LinkMeshes(path, root, size, opacity, colours, materials, folders, tell)
+        reader = _LinkMeshes(
+            path=path,
+            root=root,
+            size=size,
+            opacity=opacity,
+            colours=colours,
+            materials=materials,
+            assets=folders,
+            tell=tell,
+        )
         meshes = {}
         for link in order:
             with prefixed(f"link {link!r}"):
@@ -227,7 +236,15 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
             )
             mimic = (printable(mimicked.get("joint", "")), factor, offset)
     parent, child = end_links
-    return child, Joint(_name(element), kind, parent, _origin(element), axis, limits, mimic)
+    return child, Joint(
+        name=_name(element),
+        kind=kind,
+        parent=parent,
+        origin=_origin(element),
+        axis=axis,
+        limits=limits,
+        mimic=mimic,
+    )
 
 
 def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:

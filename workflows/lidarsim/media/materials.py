@@ -609,19 +609,19 @@ class MaterialTable:
             entries[first[row]].check_leaves(name, bool(has_voxels[row]))
         leaf_area[has_voxels] = 1.0
         return cls(
-            np.array([m.share(wavelength_nm) for m in entries], np.float64)[first],
-            np.array(textured, np.float64)[first],
-            np.array([m.roughness or 0.0 for m in entries])[first],
-            np.array([m.metalness for m in entries])[first],
-            np.array([m.retro for m in entries], np.bool_)[first],
-            np.array([m.transparent == "pass" for m in entries], np.bool_)[first],
-            np.array([m.specular for m in entries], np.float64)[first],
-            np.array([m.semantic_class for m in entries], np.uint16)[first],
-            np.array([m.refractive_index or 0.0 for m in entries])[first],
-            np.array([m.attenuation_per_m for m in entries], np.float64)[first],
-            leaf_area,
-            np.array([angles.index(m.leaf_angle) for m in entries], np.intp)[first],
-            angles,
+            reflectance=np.array([m.share(wavelength_nm) for m in entries], np.float64)[first],
+            scale=np.array(textured, np.float64)[first],
+            roughness=np.array([m.roughness or 0.0 for m in entries])[first],
+            metalness=np.array([m.metalness for m in entries])[first],
+            retro=np.array([m.retro for m in entries], np.bool_)[first],
+            passes=np.array([m.transparent == "pass" for m in entries], np.bool_)[first],
+            specular=np.array([m.specular for m in entries], np.float64)[first],
+            semantic_class=np.array([m.semantic_class for m in entries], np.uint16)[first],
+            refractive_index=np.array([m.refractive_index or 0.0 for m in entries])[first],
+            attenuation=np.array([m.attenuation_per_m for m in entries], np.float64)[first],
+            leaf_area=leaf_area,
+            leaf_angle=np.array([angles.index(m.leaf_angle) for m in entries], np.intp)[first],
+            leaf_angles=angles,
         )
 
     @property

@@ -143,7 +143,15 @@ def load_trajectory(
             raise ValueError(f"origin is of latitudes and longitudes, and it is {kind}")
         seconds, positions, quaternions = poses
         seconds = seconds + offset_s
-        track = Track(seconds, positions, quaternions, smooth, start_s, duration_s, beyond)
+        track = Track(
+            times_s=seconds,
+            positions=positions,
+            quaternions=quaternions,
+            smooth=smooth,
+            start_s=start_s,
+            duration_s=duration_s,
+            beyond=beyond,
+        )
         if camera_axes or (camera_axes is None and kind == "kitti"):
             track = _from_camera(track)
         return track

@@ -81,13 +81,13 @@ class PacketSource:
         sensor = sweeps.fired.sensors[number]
         settings_of(sensor)
         return cls(
-            sensor,
-            sweeps.lidars[number].mode,
-            sweeps.sensors[number],
-            START_NS if sweeps.start_ns is None else sweeps.start_ns,
-            sweeps.start_ns is not None,
-            sweeps.instruments,
-            sweeps.mounts.matrix(number),
+            sensor=sensor,
+            mode=sweeps.lidars[number].mode,
+            name=sweeps.sensors[number],
+            start_ns=START_NS if sweeps.start_ns is None else sweeps.start_ns,
+            dated=sweeps.start_ns is not None,
+            instruments=sweeps.instruments,
+            mount=sweeps.mounts.matrix(number),
         )
 
 

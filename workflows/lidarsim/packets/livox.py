@@ -46,8 +46,24 @@ class Ports:
 _MID360 = 9  # types of devices
 _HAP = 10
 PORTS = {
-    _MID360: Ports(56_300, 56_400, 56_301, 56_401, 56_100, 56_200, 56_201),
-    _HAP: Ports(57_000, 58_000, 57_000, 58_000, 56_000, 0, 0),
+    _MID360: Ports(
+        points=56_300,
+        imu=56_400,
+        host_points=56_301,
+        host_imu=56_401,
+        command=56_100,
+        state=56_200,
+        host_state=56_201,
+    ),
+    _HAP: Ports(
+        points=57_000,
+        imu=58_000,
+        host_points=57_000,
+        host_imu=58_000,
+        command=56_000,
+        state=0,
+        host_state=0,
+    ),
 }
 # Tag of the HAP for the first return. The light that the sensor itself returns is return 0, with
 # which returns nearer than 1.5 m are merged. Other tags, of noise, are 0: high confidence.

@@ -165,7 +165,16 @@ class SceneMesh:
         voxels = self.voxels and self.voxels.moved(linear, offset)
         animation = self.animation and self.animation.moved(linear, offset)
         vertices = turned(self.vertices, linear) + offset
-        return SceneMesh(name, vertices, faces, cutouts, colours, voxels, animation, self.materials)
+        return SceneMesh(
+            name=name,
+            vertices=vertices,
+            faces=faces,
+            cutouts=cutouts,
+            colours=colours,
+            voxels=voxels,
+            animation=animation,
+            materials=self.materials,
+        )
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:

@@ -101,18 +101,18 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
     max_range_m = header.get("max_range_m")
     cycle_ns = header.get("cycle_ns")
     rays = FiredRays(
-        directions,
-        times_ns,
-        channels,
-        origins,
-        None if cycle_ns is None else _positive(header, "cycle_ns"),
-        _positive(header, "rate_hz", FRAME_HZ),
-        (
+        directions=directions,
+        times_ns=times_ns,
+        channels=channels,
+        origins=origins,
+        cycle_ns=None if cycle_ns is None else _positive(header, "cycle_ns"),
+        rate_hz=_positive(header, "rate_hz", FRAME_HZ),
+        range_m=(
             float(header.get("min_range_m") or 0.0),
             inf if max_range_m is None else _positive(header, "max_range_m"),
         ),
-        str(header.get("sensor", "")),
-        bool(header.get("repeats", True)),
+        name=str(header.get("sensor", "")),
+        repeats=bool(header.get("repeats", True)),
     )
     check_times(rays)
     return rays

@@ -106,7 +106,16 @@ class PulseCaster:
 
         def batch(start: int, stop: int) -> PulseBatch:
             keys = Keys(scan, scan_starts)
-            return PulseBatch(keys, start, stop, pattern, first_row, poses, firings, self.emitter)
+            return PulseBatch(
+                keys=keys,
+                start=start,
+                stop=stop,
+                pattern=pattern,
+                first=first_row,
+                poses=poses,
+                firings=firings,
+                emitter=self.emitter,
+            )
 
         all_beams = batch(0, beam_count)
         if self._return_count_varies:
@@ -205,7 +214,13 @@ class PulseCaster:
         colour = velocity = None
         if setup.has_velocities:
             velocity = radial_velocities(
-                surfaces, poses, returns.ray, rays, distance, triangle, times
+                surfaces,
+                poses,
+                ray=returns.ray,
+                rays=rays,
+                distance=distance,
+                triangle=triangle,
+                times=times,
             )
         if surfaces.materials.textured:
             points = directions * distance[:, None]
@@ -214,7 +229,13 @@ class PulseCaster:
             del points  # which takes as much memory as the normals
         light = light_of(setup.survey, setup.sensor)
         lit = surfaces.lit(
-            triangle, directions, distance, light, times, poses.actor_trajectories, colour
+            triangle,
+            directions,
+            distance=distance,
+            light=light,
+            times=times,
+            trajectories=poses.actor_trajectories,
+            colours=colour,
         )
         return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
 
@@ -230,11 +251,11 @@ class PulseCaster:
         count = pulse_loops.thin_out(
             owned(returns.ray, np.int64),
             owned(scan_starts, np.int64),
-            keep_every,
-            hits,
-            rows,
-            number,
-            returns_of_pulse,
+            keep_every=keep_every,
+            counts=hits,
+            rows=rows,
+            number=number,
+            returns=returns_of_pulse,
         )
         thinned = returns if count == size else returns.take(rows[:count])
         thinned = thinned._replace(

@@ -145,15 +145,15 @@ class _FewRays(Sensor):
         # The numbers of firings of scans may differ by one.
         every = max(1, min(every, (stop - first) * sensor.channels // 2))
         return cls(
-            Beams(np.zeros(1)),
-            sensor.head,
-            sensor.min_range_m,
-            sensor.max_range_m,
-            "",
-            sensor.optics,
-            0.0,
-            sensor,
-            every,
+            beams=Beams(np.zeros(1)),
+            head=sensor.head,
+            min_range_m=sensor.min_range_m,
+            max_range_m=sensor.max_range_m,
+            name="",
+            optics=sensor.optics,
+            start_ns=0.0,
+            sampled=sensor,
+            every=every,
         )
 
     def firings(self, step: int) -> tuple[int, int]:

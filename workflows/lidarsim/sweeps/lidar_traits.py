@@ -66,13 +66,13 @@ class LidarTraits:
         if sensor.optics.reflectivity == _OUSTER and len(beams.origin):
             offset_m = float(np.hypot(*beams.origin[0, :2]))
         return cls(
-            sensor.channels,
-            mode,
-            float(head.zero_deg) if isinstance(head, Spin) and spins else 0.0,
-            float(np.ptp(delays)) if len(delays) else 0.0,
-            offset_m,
-            _lines_of(sensor),
-            () if sensor.packets is None else tuple(sensor.packets.lasers.tolist()),
+            channels=sensor.channels,
+            mode=mode,
+            zero_deg=float(head.zero_deg) if isinstance(head, Spin) and spins else 0.0,
+            firing_ns=float(np.ptp(delays)) if len(delays) else 0.0,
+            range_offset_m=offset_m,
+            lines=_lines_of(sensor),
+            lasers=() if sensor.packets is None else tuple(sensor.packets.lasers.tolist()),
         )
 
     def to_json(self) -> dict[str, Any]:

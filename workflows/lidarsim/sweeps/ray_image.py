@@ -66,24 +66,24 @@ class Image:
         max_returns = image_loops.find_pixels(
             owned(points["ray"], np.int64),
             owned(points["scan"] - first_scan, np.int64),
-            (bounds[:, 0] - firings[0]) * sensor.channels,
-            len(firings) * sensor.channels,
-            sensor.channels,
-            plane,
-            row,
-            column,
+            first_rays=(bounds[:, 0] - firings[0]) * sensor.channels,
+            ray_count=len(firings) * sensor.channels,
+            channels=sensor.channels,
+            plane=plane,
+            row=row,
+            column=column,
         )
         if max_returns < 0:
             raise LidarError(MIXED_UP)
         scans = np.arange(first_scan, first_scan + len(steps), dtype=np.int32)
         return cls(
-            sensor,
-            firings,
-            np.repeat(scans, np.diff(bounds, axis=1)[:, 0]),
-            begin_ns,
-            plane,
-            row,
-            column,
+            sensor=sensor,
+            firings=firings,
+            scan=np.repeat(scans, np.diff(bounds, axis=1)[:, 0]),
+            begin_ns=begin_ns,
+            plane=plane,
+            row=row,
+            column=column,
             planes=max(returns, max_returns),
         )
 

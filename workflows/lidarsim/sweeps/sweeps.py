@@ -249,22 +249,22 @@ class Sweeps:
         """Return no sweeps, for points of an unknown survey, in steps of a millimetre."""
         none = SweepPoses(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
-            np.zeros(1, np.int64),
-            np.empty(0),
-            np.empty(0),
-            np.empty(0, np.uint8),
-            none,
-            none,
-            (),
-            (),
-            (),
-            none,
-            np.empty((0, 0, 3)),
-            np.empty((0, 2, 3)),
-            np.empty((0, 0), bool),
-            np.empty((0, 0), bool),
-            "world",
-            0.001,
+            scans=np.zeros(1, np.int64),
+            begins_ns=np.empty(0),
+            ends_ns=np.empty(0),
+            sensor=np.empty(0, np.uint8),
+            pose=none,
+            mounts=none,
+            sensors=(),
+            objects=(),
+            actors=(),
+            actor_poses=none,
+            actor_velocities=np.empty((0, 0, 3)),
+            actor_bounds=np.empty((0, 2, 3)),
+            actor_there=np.empty((0, 0), bool),
+            actor_comes=np.empty((0, 0), bool),
+            coordinates="world",
+            precision_m=0.001,
         )
 
     @classmethod

@@ -44,9 +44,16 @@ from .messages import LATCHED_TOPICS, message_store, survey_messages, sweep_topi
 
 # Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
 _LATCHED = Qos(
-    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
-    QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
-)  # fmt: skip
+    history=QosHistory.KEEP_LAST,
+    depth=1,
+    reliability=QosReliability.RELIABLE,
+    durability=QosDurability.TRANSIENT_LOCAL,
+    deadline=QosTime(0, 0),
+    lifespan=QosTime(0, 0),
+    liveliness=QosLiveliness.AUTOMATIC,
+    liveliness_lease_duration=QosTime(0, 0),
+    avoid_ros_namespace_conventions=False,
+)
 _MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
 
 

@@ -193,15 +193,15 @@ class SurveyMessages:
         height, width = rows.shape
         (message,) = self._make.types_of("sensor_msgs", "PointCloud2")
         return message(
-            header,
-            height,
-            width,
-            self._fields,
-            False,
-            self._row.itemsize,
-            width * self._row.itemsize,
-            rows.reshape(-1).view(np.uint8),
-            not self._laid_out.organized,
+            header=header,
+            height=height,
+            width=width,
+            fields=self._fields,
+            is_bigendian=False,
+            point_step=self._row.itemsize,
+            row_step=width * self._row.itemsize,
+            data=rows.reshape(-1).view(np.uint8),
+            is_dense=not self._laid_out.organized,
         )
 
 
@@ -306,13 +306,13 @@ class _Messages:
             time_ns = start_ns + int(time)
             values = [*map(float, numbers)]
             message = imu(
-                self.header(frame, time_ns),
-                quaternion(0.0, 0.0, 0.0, 1.0),
-                unknown,
-                vector(*values[:3]),
-                rate,
-                vector(*values[3:]),
-                force,
+                header=self.header(frame, time_ns),
+                orientation=quaternion(0.0, 0.0, 0.0, 1.0),
+                orientation_covariance=unknown,
+                angular_velocity=vector(*values[:3]),
+                angular_velocity_covariance=rate,
+                linear_acceleration=vector(*values[3:]),
+                linear_acceleration_covariance=force,
             )
             yield _sent("/imu/data_raw", message, time_ns)
 
@@ -343,16 +343,18 @@ class _Messages:
         first = float(rays.angles[0])
         last = float(rays.angles[-1])
         (scan,) = self.types_of("sensor_msgs", "LaserScan")
+        min_range_m, max_range_m = rays.range_limits_m
         return scan(
-            header,
-            first,
-            last,
-            (last - first) / (len(rays.angles) - 1),
-            rays.time_increment_s,
-            rays.scan_time_s,
-            *rays.range_limits_m,
-            rays.ranges,
-            rays.intensities,
+            header=header,
+            angle_min=first,
+            angle_max=last,
+            angle_increment=(last - first) / (len(rays.angles) - 1),
+            time_increment=rays.time_increment_s,
+            scan_time=rays.scan_time_s,
+            range_min=min_range_m,
+            range_max=max_range_m,
+            ranges=rays.ranges,
+            intensities=rays.intensities,
         )
 
     def image(self, values: Floats32, header: Any) -> Any:
@@ -360,7 +362,15 @@ class _Messages:
         height, width = values.shape
         data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
         image = self._types["sensor_msgs/msg/Image"]
-        return image(header, height, width, "32FC1", 0, 4 * width, data)
+        return image(
+            header=header,
+            height=height,
+            width=width,
+            encoding="32FC1",
+            is_bigendian=0,
+            step=4 * width,
+            data=data,
+        )
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Return the boxes of actors in a sweep as markers, which replace earlier markers."""
@@ -376,28 +386,28 @@ class _Messages:
         return types["visualization_msgs/msg/MarkerArray"](
             [
                 marker(
-                    header,
-                    "actors",
-                    number,
-                    marker.CUBE,
-                    marker.ADD if boxes.present[number] else marker.DELETE,
-                    pose(
+                    header=header,
+                    ns="actors",
+                    id=number,
+                    type=marker.CUBE,
+                    action=marker.ADD if boxes.present[number] else marker.DELETE,
+                    pose=pose(
                         point(*boxes.centres[number].tolist()),
                         quaternion(*boxes.quaternions[number].tolist()),
                     ),
-                    vector(*boxes.sizes[number].tolist()),
-                    orange,
-                    always,
-                    False,
-                    [],
-                    [],
-                    "",
-                    image(header, "", none),
-                    [],
-                    name,
-                    "",
-                    mesh("", none),
-                    False,
+                    scale=vector(*boxes.sizes[number].tolist()),
+                    color=orange,
+                    lifetime=always,
+                    frame_locked=False,
+                    points=[],
+                    colors=[],
+                    texture_resource="",
+                    texture=image(header, "", none),
+                    uv_coordinates=[],
+                    text=name,
+                    mesh_resource="",
+                    mesh_file=mesh("", none),
+                    mesh_use_embedded_materials=False,
                 )
                 for number, name in enumerate(actors)
             ]

@@ -78,14 +78,14 @@ class PipelineJob(CommittedJob):
             samples = summary["samples"]
             spec = survey.scan(scan)
             frame = ScanFrame(
-                scan,
-                survey.carried[spec.sensor].name,
-                spec.ray_count,
-                int(summary["hits"]),
-                int(summary["points"]),
-                samples[~np.isnan(samples[:, 0])],
-                survey,
-                self.points_of_scan,
+                scan=scan,
+                sensor=survey.carried[spec.sensor].name,
+                rays=spec.ray_count,
+                hits=int(summary["hits"]),
+                count=int(summary["points"]),
+                samples=samples[~np.isnan(samples[:, 0])],
+                _survey=survey,
+                _read=self.points_of_scan,
             )
             self.trace("frame", SORT, [scan])
             self.on_frame(frame)

@@ -141,7 +141,18 @@ class Receipt(Scans):
         box = () if (cells := part.cells) is None else tuple(cells.ravel().tolist())
         hits = int(part.scan_hits.sum())
         data = summaries.tobytes()
-        return cls(job, part.first, part.stop, name, len(part), size, hits, box, data, record)
+        return cls(
+            job=job,
+            first=part.first,
+            stop=part.stop,
+            name=name,
+            rows=len(part),
+            size=size,
+            hits=hits,
+            cell_box=box,
+            summaries=data,
+            record=record,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -151,7 +151,19 @@ class RunDatabase:
             name = part_name(self.meta["mark"], number, first, stop)
             box = json.loads(cells)
             rows, size, hits = counts
-            job.parts.add(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
+            job.parts.add(
+                Receipt(
+                    job=number,
+                    first=first,
+                    stop=stop,
+                    name=name,
+                    rows=rows,
+                    size=size,
+                    hits=hits,
+                    cell_box=tuple(box),
+                    summaries=b"",
+                )
+            )
         query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
         for data in (json.loads(text) for (text,) in self._rows(query, number)):
             waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)

@@ -129,14 +129,14 @@ class JobUnderWay(PipelineJob):
         job = self.job
         world = job.survey.coordinates == "world"
         return StoredCloud(
-            self.storage,
-            [part.name for part in parts],
-            [part.first for part in parts],
-            [part.rows for part in parts],
-            job.survey.stored_columns,
-            self.parts.cells,
-            job.survey.precision_m,
-            job.scene.origin if world else np.zeros(3),
+            storage=self.storage,
+            names=[part.name for part in parts],
+            firsts=[part.first for part in parts],
+            rows=[part.rows for part in parts],
+            columns=job.survey.stored_columns,
+            cells=self.parts.cells,
+            precision_m=job.survey.precision_m,
+            origin=job.scene.origin if world else np.zeros(3),
             keeper=self._keeper,
             sweeps=partial(Sweeps.from_survey, job.survey, job.scene),
         )

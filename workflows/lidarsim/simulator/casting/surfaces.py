@@ -213,7 +213,9 @@ class Surfaces:
             film = np.empty(len(cosines), np.bool_)
             water = surface_loops.WaterFilm(LEVEL, light.wet, table.passes | table.leafy)
             shares = table.shares(kinds, bright)
-            surface_loops.soak(normals[2], cosines, kinds, shares, water, film, back)
+            surface_loops.soak(
+                normals[2], cosines, kinds=kinds, shares=shares, water=water, film=film, back=back
+            )
         surface_loops.fade(owned(distance), light.extinction, back)
         return LitHits(normals.T, cosines, kinds, back, film)
 

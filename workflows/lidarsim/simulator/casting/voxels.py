@@ -117,11 +117,11 @@ class Grids:
             self._block_through(
                 instances[block],
                 starts[block],
-                directions[block],
-                projection[block],
-                uniform_density[block],
-                length[block],
-                depth[block],
+                directions=directions[block],
+                projection=projection[block],
+                uniform_density=uniform_density[block],
+                length=length[block],
+                depth=depth[block],
             )
             for block in (
                 slice(k, k + BLOCK_RAYS) for k in range(0, max(len(depth), 1), BLOCK_RAYS)
@@ -146,7 +146,13 @@ class Grids:
             np.full(len(depth), np.inf), np.full(len(depth), -np.inf), np.zeros(instances.shape)
         )
         rays = self._enter(
-            instances, starts, directions, projection, uniform_density, length, depth
+            instances,
+            starts,
+            directions=directions,
+            projection=projection,
+            uniform_density=uniform_density,
+            length=length,
+            depth=depth,
         )
         while len(rays.row):
             density, inside = self._density(rays)

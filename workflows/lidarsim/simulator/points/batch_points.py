@@ -418,11 +418,11 @@ class BatchPoints:
             lit = self._surfaces.lit(
                 self.pulse_returns.triangle[block],
                 self.directions[block],
-                self.pulse_returns.distance[block],
-                light,
-                self._actor_times_ns[block],
-                self._poses.actor_trajectories,
-                None if colours is None else colours[block],
+                distance=self.pulse_returns.distance[block],
+                light=light,
+                times=self._actor_times_ns[block],
+                trajectories=self._poses.actor_trajectories,
+                colours=None if colours is None else colours[block],
             )
             cosines[block] = lit.cosines
             energy[block] = lit.energy
@@ -499,11 +499,11 @@ class BatchPoints:
             velocity = radial_velocities(
                 self._surfaces,
                 self._poses,
-                returns.ray.astype(np.int64),
-                self._rays,
-                returns.distance,
-                returns.triangle,
-                self._actor_times_ns,
+                ray=returns.ray.astype(np.int64),
+                rays=self._rays,
+                distance=returns.distance,
+                triangle=returns.triangle,
+                times=self._actor_times_ns,
             )
             if returns.cause is not None:
                 velocity[np.isin(returns.cause, received_causes())] = np.nan

@@ -214,14 +214,14 @@ class DeviceColumns:
             for column in self.energies:
                 columns[column.name][transfer.actor_rows] = column.make(returns)
         return DevicePoints(
-            self._scene,
-            survey,
-            specs,
-            -(-hits // keep_every),
-            hits,
-            tally,
-            columns,
-            returns if self.needs_all_hits else None,
+            scene=self._scene,
+            survey=survey,
+            specs=specs,
+            counts=-(-hits // keep_every),
+            hits=hits,
+            tally=tally,
+            columns=columns,
+            returns=returns if self.needs_all_hits else None,
         )
 
     def write_ranges(

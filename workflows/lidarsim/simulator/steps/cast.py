@@ -331,11 +331,11 @@ class CastStep(PulseStep):
         normals, cosines, kinds, energy, film = surfaces.lit(
             triangle,
             light.directions,
-            distance,
-            self._sensor_light,
-            light.times,
-            actor_trajectories,
-            colour,
+            distance=distance,
+            light=self._sensor_light,
+            times=light.times,
+            trajectories=actor_trajectories,
+            colours=colour,
         )
         if leaves is not None and len(leaves.rows):
             # Leaves face the light: two leaves behind each other are then never one surface.
@@ -346,17 +346,17 @@ class CastStep(PulseStep):
             light.in_media.advance(step_m)
             energy *= light.in_media.energy_factor(light.directions, distance)
         return SurfaceHits(
-            step_m,
-            triangle,
-            distance,
-            colour,
-            normals,
-            cosines,
-            kinds,
-            energy,
-            film,
-            np.zeros(0, np.intp) if leaves is None else leaves.rows,
-            self._velocities(light, step_m, triangle, actor_trajectories),
+            step_m=step_m,
+            triangle=triangle,
+            distance=distance,
+            colour=colour,
+            normals=normals,
+            cosines=cosines,
+            kinds=kinds,
+            energy=energy,
+            film=film,
+            leaves=np.zeros(0, np.intp) if leaves is None else leaves.rows,
+            velocities=self._velocities(light, step_m, triangle, actor_trajectories),
         )
 
     def _meet_leaves(self, cast: CastLight, batch: PulseBatch) -> tuple[CastLight, Leaves | None]:
@@ -428,13 +428,13 @@ class CastStep(PulseStep):
         if mirrored is not None:
             cause = np.where(mirrored > 0, np.uint8(GHOST), np.uint8(SURFACE))
         hits = PulseReturns(
-            light.ray,
-            surface_hits.distance,
-            surface_hits.triangle,
-            surface_hits.energy,
-            surface_hits.colour,
-            cause,
-            velocity,
+            ray=light.ray,
+            distance=surface_hits.distance,
+            triangle=surface_hits.triangle,
+            energy=surface_hits.energy,
+            colour=surface_hits.colour,
+            cause=cause,
+            velocity=velocity,
         )
         normals = surface_hits.normals
         if light.mirror_matrices is not None:
@@ -481,13 +481,13 @@ class CastStep(PulseStep):
         onward = light.take(rows)
         onward.share = share
         crossings = Crossings(
-            surface_hits.step_m[rows],
-            surface_hits.distance[rows],
-            surface_hits.triangle[rows],
-            surface_hits.normals.T.take(rows, axis=-1).T,  # twice as fast as by rows
-            surface_hits.cosines[rows],
-            reflected,
-            None if light.range_rate is None else surface_hits.velocities[rows],
+            step_m=surface_hits.step_m[rows],
+            distance=surface_hits.distance[rows],
+            triangle=surface_hits.triangle[rows],
+            normals=surface_hits.normals.T.take(rows, axis=-1).T,  # twice as fast as by rows
+            cosines=surface_hits.cosines[rows],
+            reflected=reflected,
+            velocities=None if light.range_rate is None else surface_hits.velocities[rows],
         )
         return self._cross(onward, crossings)
 
@@ -515,24 +515,24 @@ class CastStep(PulseStep):
         count = surface_loops.divide_light(
             rows,
             reflected,
-            surface_loops.OnwardHits(
+            hits=surface_loops.OnwardHits(
                 surface_hits.kinds,
                 surface_hits.cosines,
                 film,
                 light.share,
                 surface_hits.distance,
             ),
-            materials.shares(surface_hits.kinds[rows], bright),
-            surface_loops.OnwardOptics(
+            shares=materials.shares(surface_hits.kinds[rows], bright),
+            optics=surface_loops.OnwardOptics(
                 materials.specular, materials.passes, ~materials.refracts, materials.leafy
             ),
-            surface_loops.OnwardLimits(
+            limits=surface_loops.OnwardLimits(
                 self._sensor_light.wet,
                 self._brightest,
                 self._sensor_light.extinction,
                 self._faintest if drops_faint else -1.0,
             ),
-            share,
+            onward_share=share,
         )
         return OnwardRows(rows[:count], reflected[:count], share[:count])
 
@@ -612,16 +612,16 @@ class CastStep(PulseStep):
         if in_media is not None:
             in_media.advance(clear_m)
         behind = LightPaths(
-            light.ray,
-            light.times,
-            origins,
-            path.directions,
-            deflection.share,
-            crossings.distance + optical_m,
-            mirror_matrices,
-            None if light.mirrored is None else light.mirrored + crossings.reflected,
-            in_media,
-            range_rate,
+            ray=light.ray,
+            times=light.times,
+            origins=origins,
+            directions=path.directions,
+            share=deflection.share,
+            optical_start=crossings.distance + optical_m,
+            mirror_matrices=mirror_matrices,
+            mirrored=None if light.mirrored is None else light.mirrored + crossings.reflected,
+            in_media=in_media,
+            range_rate=range_rate,
         )
         return OnwardLight(behind, -clear_m, path)
 

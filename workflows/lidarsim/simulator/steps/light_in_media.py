@@ -477,11 +477,11 @@ class LightInMedia:
         metres, remaining_depth, grid_density = grids.through(
             np.where(is_grid, self.media.instances(triangles), -1),
             starts[rows],
-            directions[rows],
-            np.take_along_axis(density[rows], grid_layers, axis=1),
-            np.cumsum(media_density, axis=1)[:, -1],
-            length[rows],
-            self.remaining_depth[rows],
+            directions=directions[rows],
+            projection=np.take_along_axis(density[rows], grid_layers, axis=1),
+            uniform_density=np.cumsum(media_density, axis=1)[:, -1],
+            length=length[rows],
+            depth=self.remaining_depth[rows],
         )
         layer_density = np.where(
             is_grid, grid_density, np.take_along_axis(media_density, grid_layers, 1)

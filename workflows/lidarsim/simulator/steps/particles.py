@@ -304,7 +304,9 @@ def _particles(
     beam = 0
     while beam < beams:
         hits = room_for_hits(2 * beams + len(detectable.counts))
-        beam, count = air_loops.sample_particles(beam, beams, subrays, tables, random, reach, hits)
+        beam, count = air_loops.sample_particles(
+            beam, beams, subrays=subrays, tables=tables, keys=random, reach=reach, hits=hits
+        )
         yield hits.first(count)
 
 

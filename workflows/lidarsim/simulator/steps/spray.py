@@ -145,7 +145,13 @@ class SprayStep(PulseStep):
         while row < len(crossings.beam):
             hits = room_for_hits(1024 + len(crossings.beam))
             row, count = spray_loops.sample_clumps(
-                row, crossings, batch.subrays_per_beam, tables, keys, reach_m, hits
+                row,
+                crossings,
+                subrays=batch.subrays_per_beam,
+                tables=tables,
+                keys=keys,
+                reach=reach_m,
+                hits=hits,
             )
             parts.append(returns_without_surface(returns, *hits.first(count), cause=SPRAY))
         clumps = joined(parts)
