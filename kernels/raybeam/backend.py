@@ -63,7 +63,7 @@ class Backend(ABC):
     # on its chunk.
     chunk: ClassVar[int]
 
-    on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device, see `visit`
+    on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device (`visit`)
 
     @classmethod
     @abstractmethod

@@ -41,7 +41,7 @@ class Deforming:
 
     vertices: Floats
     faces: Ints
-    on_device: ClassVar[bool] = False  # see `RayCaster.on_device`
+    on_device: ClassVar[bool] = False  # as `RayCaster.on_device`
 
     @property
     def box(self) -> Floats:

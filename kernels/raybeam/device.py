@@ -31,7 +31,7 @@ class DeviceHits:
     cupy
         The module, for further arrays and kernels.
     make_rays
-        Function of numbers of rays that returns origins and directions, see `rays`.
+        Function of numbers of rays that returns origins and directions (`rays`).
     """
 
     ray: Any

@@ -61,7 +61,7 @@ class Moving:
         metres, and rotations from the body's axes, by rows.
     frames
         Function of numbers of deforming bodies (m,) and times (m,) that returns the frame of each
-        body's shape, float64 (m,): 1.5 is halfway between frames 1 and 2, see `Deforming`. None
+        body's shape, float64 (m,): 1.5 is halfway between frames 1 and 2 (`Deforming`). None
         without deforming bodies.
     """
 

@@ -82,7 +82,7 @@ class _Visit:
     ray
         (m,): number of the ray in the query.
     key
-        int64 (m,): key of triangle 0 of the instance, see `_Best`.
+        int64 (m,): key of triangle 0 of the instance (`_Best`).
     length
         float64 (m,): length of the direction in the mesh's coordinates, before it was made a unit
         vector.

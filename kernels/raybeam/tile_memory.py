@@ -21,7 +21,7 @@ TILE = np.dtype(
         ("axes", "f4", 12),
         ("padding", "f4", 1),  # padding of depths
         ("offset", "f4", 1),  # maximum offset of a ray from the tile's point, as `aim` describes
-        ("spread", "f4", 2),  # factor of errors, see `aim`; and a gap
+        ("spread", "f4", 2),  # factor of errors (`aim`); and a gap
         ("bounds", "f4", 4 * SUBTILES),  # subtiles: lowest and highest su, lowest, highest sv
         ("tile_bounds", "f4", 8),  # bounds of the tile, and a gap
         ("reach", "f4", SUBTILES),  # greatest depth of a subtile's rays
@@ -33,7 +33,7 @@ TILE = np.dtype(
         ("sides", "i8", 15),  # where boxes have the coordinate of the farthest corner, by plane
         ("t_min", "f8", 1),  # closest distance of a hit, local
         ("nested", "i8", 1),  # whether the mesh at hand has a transform
-        ("skips", "i8", 1),  # tiles left that are cast one by one, see `_cast_in_mesh`
+        ("skips", "i8", 1),  # tiles left that are cast one by one (`_cast_in_mesh`)
         ("patience", "i8", 1),  # number of such tiles after the last tile that was not cast as one
         ("sums", "f8", 4),
         ("pairs", "u1", 8 * 8 + 8),  # pairs of a triangle and a subtile

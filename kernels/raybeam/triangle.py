@@ -55,7 +55,7 @@ class PlaneHits(NamedTuple):
     ----------
     a, b, c
         float64 (m,): weights of the three corners times `det`. The ray passes inside if none is
-        negative or none is positive, see `inside`.
+        negative or none is positive (`inside`).
     det
         float64 (m,): ``(a + b) + c``; zero if the ray runs in the triangle's plane.
     t

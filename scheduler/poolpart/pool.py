@@ -247,8 +247,8 @@ class Pool:
         Parameters
         ----------
         rules
-            Rule of each partition, by name; see `per_gpu`, `per_host`, `n_workers`,
-            `named` and `rest`.
+            Rule of each partition, by name: `per_gpu`, `per_host`, `n_workers`,
+            `named` or `rest`.
 
         Returns
         -------

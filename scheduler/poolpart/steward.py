@@ -49,7 +49,7 @@ _ASSIGN_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
 class Seat:
     """Partition and state of a worker, also while the worker's nanny restarts the process."""
 
-    key: Hashable  # identifies the worker, see `seat_key`
+    key: Hashable  # identifies the worker (`seat_key`)
     info: WorkerInfo
     nanny: str | None = None  # its address
     original: Resources = field(default_factory=dict)  # resources that the worker was started with

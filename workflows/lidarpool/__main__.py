@@ -9,7 +9,7 @@ from lidarsim.base.interrupts import end_on_signals
 
 
 def main() -> NoReturn:
-    """Run the command, see `cli.main`."""
+    """Run the command (`cli.main`)."""
     end_on_signals()
     # A second of imports, during which an interrupt would print Python's traceback.
     from .base import rare_collections  # noqa: F401

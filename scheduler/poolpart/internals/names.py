@@ -20,7 +20,7 @@ import distributed
 from ..errors import PoolError
 from .queues import PRIVATE_NAMES as PIPE_NAMES
 
-TESTED = "2025.5.0", "2026.8.0"  # oldest and newest version of distributed; see `make compat`
+TESTED = "2025.5.0", "2026.8.0"  # oldest and newest version of distributed (`make compat`)
 
 NESTED = "keeping nested tasks in their partition"
 REFUSING = "refusing tasks that could never run"

@@ -32,7 +32,7 @@ VARIABLE_SET = "variable_set"  # the request of `Variable.set`
 LOOK_S = 1.0  # a wait looks so often whether it has ended, even if nothing has changed
 
 Record = dict[str, Any]  # an item's record, as Dask's queue extension keeps it
-Packed = bytes | Record  # an item on its way to a client, see `unpack`
+Packed = bytes | Record  # an item on its way to a client (`unpack`)
 # Type of the items that pipes put. Their value is serialized: the scheduler passes it on, and
 # `Queue.get` of a client returns the object. Clients themselves put types "msgpack" and "Future".
 _PICKLED = "pickled"

@@ -69,7 +69,7 @@ def simulate(
         A path to plan on the OTHER partition while the survey runs; None for none.
     on_frame
         Called with each frame, in scan order, while the survey runs; its points are in storage by
-        then, see `ScanFrame.points`. It is called in this thread: a slow callback makes the
+        then (`ScanFrame.points`). It is called in this thread: a slow callback makes the
         pipeline wait, and nothing is lost.
     on_progress
         Called about ten times a second with the progress. Without it there are bars in a notebook

@@ -34,8 +34,8 @@ def software(backend: str = "", plugins: Iterable[Plugin] = ()) -> dict[str, str
     ``lidarpool`` is its version and a hash of the installed sources. For casting with a ray-casting
     `backend`, ``numpy`` and ``backend`` are versions. Each of the used `plugins` has its
     distribution, with version and sources, unless this process lacks the plug-in. Processors do not
-    matter: no byte comes from a function whose last bits depend on them, see `elementary` and
-    `vectors`.
+    matter: no byte comes from a function whose last bits depend on them (`elementary`,
+    `vectors`).
     """
     described = {"lidarpool": f"{__version__} (sources {sources()})"}
     if backend:
@@ -74,7 +74,7 @@ def _package_of(module: str) -> str:
 
 
 def _hash_of(packages: Iterable[str]) -> str:
-    """Return the hash of the files of packages or modules, see `sources`."""
+    """Return the hash of the files of packages or modules (`sources`)."""
     digest = hashlib.sha256()
     newest_s = 0.0
     for package in packages:

@@ -163,7 +163,7 @@ class FormatRow:
         return self.provides(function)
 
 
-_ALL_RAYS = ("ray", "range")  # and every return: see `check_whole`
+_ALL_RAYS = ("ray", "range")  # and every return (`check_whole`)
 LAYOUTS = {
     "velodyne": ("intensity", "time"),
     "autoware": ("intensity", "time", "return_number", "returns"),

@@ -80,7 +80,7 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     extra bytes as well. Of these classes, the lookup has 15 letters of the names, ASCII. Names of
     materials are a record of lidarpool, a list as JSON. Return numbers are 15 at most. A text area
     record names the frame of the points. Recorded waveforms make the point format 9, or 10 with
-    colours; see `_Packets`.
+    colours (`_Packets`).
     """
     packets = _Packets.from_cloud(cloud)
     columns = {column.name for column in cloud.table}

@@ -72,7 +72,7 @@ class GrowingPly:
     table
         Columns beside the positions.
     position_type
-        float32 or float64, see `real_type`.
+        float32 or float64 (`real_type`).
     sweeps
         Sweeps of the points, for comments.
     expected_count

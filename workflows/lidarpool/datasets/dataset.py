@@ -103,7 +103,7 @@ class DataSet:
     format
         kitti, nuscenes, webdataset, mcap, parquet, images or folder.
     layout
-        Layout of points in mcap, see `lidarpool.save_cloud`.
+        Layout of points in mcap (`lidarpool.save_cloud`).
     compensated
         Points in mcap are in the sensor frame at the start of the sweep, and have no times; else at
         their firing. `lidarpool.sweeps` gives both at the start of the sweep.
@@ -275,7 +275,7 @@ class DataSet:
         yield from read_ahead(lambda job: look_at(job.name), (job for job in jobs if job.done))
 
     def _job_checker(self, contents: bool = False) -> Callable[[str], tuple[dict[str, Any], str]]:
-        """Return a function that checks a job by its name, see `look`."""
+        """Return a function that checks a job by its name (`look`)."""
         sizes = lru_cache(_MAX_LISTED_FOLDERS)(lambda folder: self.storage.below(folder).sizes())
 
         def look_at(job: str) -> tuple[dict[str, Any], str]:

@@ -81,9 +81,9 @@ class JobRow:
         Numbers of scans, sweeps, rays, hits and points.
     seconds
         Casting time of all its tasks. The only entry that differs between runs: the table has no
-        such column, see `job_seconds`.
+        such column (`job_seconds`).
     sha256
-        Hash of its points, see `Tally`: the same on any cluster.
+        Hash of its points (`Tally`): the same on any cluster.
     classes
         {class: points}; empty if the points have no column ``class``.
     """

@@ -100,7 +100,7 @@ def _ranks() -> tuple[int, int]:
 
 
 def tensors(sweep: Sweep) -> dict[str, Any]:
-    """Return a sweep as a dict of tensors, see `SavedSweeps.torch`."""
+    """Return a sweep as a dict of tensors (`SavedSweeps.torch`)."""
     boxes = sweep.boxes
     arrays = {
         name: array.astype(np.int64) if array.dtype.kind in "iu" else array

@@ -40,7 +40,7 @@ class Search:
 class Planning(Search):
     """Search for a path in the plane from `start` to `target` that enters no disc.
 
-    The search uses `trials` independent particle swarms; see `run_trial`.
+    The search uses `trials` independent particle swarms (`run_trial`).
 
     Parameters
     ----------

@@ -129,8 +129,8 @@ def plan_stations(
 ) -> StationPlan:
     """Choose stations for a terrestrial scan.
 
-    Candidates stand on a grid, on the lowest floor, where there is room for the instrument; see
-    `candidates`. The candidate that adds most area comes next.
+    Candidates stand on a grid, on the lowest floor, where there is room for the instrument
+    (`candidates`). The candidate that adds most area comes next.
 
     Parameters
     ----------

@@ -57,9 +57,9 @@ class CloudWriter:
     sweeps, scene
         Sweeps and scene of the survey.
     position_type
-        Type of positions in the file, see `real_type`.
+        Type of positions in the file (`real_type`).
     expected_count
-        Expected number of points, see `GrowingPly`.
+        Expected number of points (`GrowingPly`).
     """
 
     def __init__(
@@ -187,8 +187,8 @@ class GrowingCloud:
     def finish(self, path: Path, points: StoredCloud, *, from_above: bool) -> CloudCounts | None:
         """Move the file to a path once it has all `points`, and return their counts.
 
-        None if the file failed, or was never begun. See `CloudCounts.add_positions` for
-        `from_above`.
+        None if the file failed, or was never begun. `from_above` is as in
+        `CloudCounts.add_positions`.
 
         Raises
         ------

@@ -281,7 +281,7 @@ class RunLoop:
     def under_way(self) -> list[dict[str, Any]]:
         """Return the states of the jobs that are being cast, then of the jobs being written.
 
-        See `JobUnderWay.status` for the fields of a state.
+        `JobUnderWay.status` describes the fields of a state.
         """
         writing = {row.number for row in self._writer.jobs} if self._writer else set()
         jobs = [*self._store.under_way.values()]

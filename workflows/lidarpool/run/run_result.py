@@ -109,7 +109,7 @@ class CampaignRun:
     Parameters
     ----------
     failed
-        Jobs that have failed, with `number`, `name`, `values` and `error`; see `jobs.csv`.
+        Jobs that have failed, with `number`, `name`, `values` and `error` (`jobs.csv`).
     done, points, rays
         Jobs in the data set, their points, and the rays that were cast for them.
     casting_seconds

@@ -84,7 +84,7 @@ class CampaignSpec:
     files: Set[Path]  # files that jobs may be made of, existing or not
     choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
     shard = ALL  # whose jobs a run does
-    only_job: None = None  # surveys have one, see `lidarpool.run.job_source.Jobs`
+    only_job: None = None  # surveys have one (`lidarpool.run.job_source.Jobs`)
 
     @checked
     def __init__(

@@ -227,7 +227,7 @@ class Passage:
 class TrafficClock:
     """Converts the times of a file of traffic to seconds, one after the other.
 
-    Raises ValueError for times that must have another unit, see `seconds_of`.
+    Raises ValueError for times that must have another unit (`seconds_of`).
     """
 
     def __init__(self, time_unit: TimeUnit | None) -> None:

@@ -1,7 +1,7 @@
 """Reads an IFC building with ifcopenshell, in a process that `ifc.py` starts: a script.
 
 ifcopenshell ends its process on some broken files; here this process only. The script imports
-nothing of lidarpool. Standard output gets frames, see `child_process.py`: first of the building,
+nothing of lidarpool. Standard output gets frames (`child_process.py`): first of the building,
 then of each shape that elements share, last of the elements.
 """
 

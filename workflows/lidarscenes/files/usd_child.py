@@ -322,7 +322,7 @@ def _poses_up_to(
 ) -> list[_TimedPose]:
     """Return the poses after `start`, up to `stop`, that a path interpolates closely enough.
 
-    `max_offset` is in units of the stage, see `StageNodes._motion`; `depth` is the number of
+    `max_offset` is in units of the stage (`StageNodes._motion`); `depth` is the number of
     halvings that are left.
     """
     step = stop.code - start.code
@@ -352,7 +352,9 @@ class Looks:
         self._names_materials = request["materials"]
         self._folders = tuple(os.path.join(folder, "") for folder in request["folders"])  # noqa: PTH118
         self._images: dict[str, int] = {}  # {path: number}
-        self._materials: dict[Any, tuple[int | None, list[str]]] = {}  # {path: see `_material`}
+        self._materials: dict[
+            Any, tuple[int | None, list[str]]
+        ] = {}  # {path: result of `_material`}
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
     def inherited(self, instance: Any) -> Any:

@@ -88,7 +88,7 @@ class LinkMeshes:
     def _read_link(
         self, body: Body, link: Link, name: str, scale: tuple[float, ...]
     ) -> list[LinkMesh]:
-        """Return the meshes of a link, see `meshes_of`."""
+        """Return the meshes of a link (`meshes_of`)."""
         # {whether each mask sees a shape: the first shape, its flags, and meshes of all shapes}
         groups: dict[tuple[bool, ...], tuple[Element, int, list[SceneMesh]]] = {}
         for shape in self._shapes(link, name):

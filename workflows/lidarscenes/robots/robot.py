@@ -144,7 +144,7 @@ class Robot:
     ) -> Trajectory:
         """Return the trajectory of a link, by the trajectory of the root.
 
-        `joints` are values of joints, see `Robot`; `ignore` are names of columns of a table of
+        `joints` are values of joints (`Robot`); `ignore` are names of columns of a table of
         joints to leave out, with * and ?; `time_unit` is as for `actors`.
 
         Raises
@@ -176,7 +176,7 @@ class Robot:
         trajectory
             Trajectory of the root link.
         joints
-            Values of joints, see `Robot`.
+            Values of joints (`Robot`).
         name
             Name of the robot. Actors are called NAME/LINK, by the first link with triangles.
         without

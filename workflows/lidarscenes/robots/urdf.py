@@ -69,7 +69,7 @@ def load_robot(
     path
         A .urdf file; a .xacro has to be expanded before.
     opacity
-        Use of transparent textures: see `load_meshes`.
+        Use of transparent textures (`load_meshes`).
     colours, materials
         Whether colours and names of materials are read. A material of the URDF applies to shapes,
         and to meshes without colours, or without materials.

@@ -23,8 +23,8 @@ _NUMBERS = 256  # random numbers of one ray
 class Purpose:
     """A use of random numbers, declared by the module that draws the numbers.
 
-    Several instances of a use, such as kinds of particles or instruments, have a seed each: see
-    `named_seed`.
+    Several instances of a use, such as kinds of particles or instruments, have a seed each
+    (`named_seed`).
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ class PartColumns:
         rows
             Rows of the points.
         sweeps
-            Function that returns the sweeps of the survey, see `Cloud`.
+            Function that returns the sweeps of the survey (`Cloud`).
         """
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
         columns = {

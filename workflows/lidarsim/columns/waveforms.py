@@ -43,13 +43,13 @@ def column_type(samples: int) -> str:
 
 
 def records(column: AnyArray) -> Records:
-    """Return a column (n,) as records, see `record`."""
+    """Return a column (n,) as records (`record`)."""
     return column.view(record((column.dtype.itemsize - _RECORD_BYTES) // 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Waveforms:
-    """Waveforms of points in the order of points, see `Cloud.waveforms`.
+    """Waveforms of points in the order of points (`Cloud.waveforms`).
 
     Parameters
     ----------

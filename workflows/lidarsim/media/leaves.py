@@ -69,8 +69,8 @@ class _LightTable(NamedTuple):
     """Projection and brightness of leaves, by the direction of light."""
 
     cosine: Floats  # (361,): of the light's angle from the vertical, ascending from 0 to 1
-    projection: Floats  # (361,): see `projection`
-    brightness: Floats  # (361,): see `brightness`
+    projection: Floats  # (361,), from `projection`
+    brightness: Floats  # (361,), from `brightness`
 
 
 @cache

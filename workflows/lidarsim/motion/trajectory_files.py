@@ -116,11 +116,11 @@ def load_trajectory(
     offset_s
         Added to all times.
     smooth
-        Whether the carrier follows smooth curves; see `Track`.
+        Whether the carrier follows smooth curves (`Track`).
     start_s, duration_s
         Start and duration of the survey within the times of the file; by default all of them.
     beyond
-        Use of the trajectory before its first and after its last time; see `Track`.
+        Use of the trajectory before its first and after its last time (`Track`).
 
     Raises
     ------

@@ -181,7 +181,7 @@ class LivoxEncoder(PacketEncoder):
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service:
-        """Return the sensor's command interface, see `PacketEncoder.service`."""
+        """Return the sensor's command interface (`PacketEncoder.service`)."""
         from .livox_service import LivoxService, LivoxState
 
         ports = PORTS[self.device_type]

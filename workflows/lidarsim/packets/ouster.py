@@ -338,7 +338,7 @@ class OusterEncoder(PacketEncoder):
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service:
-        """Return the sensor's configuration interface, see `PacketEncoder.service`."""
+        """Return the sensor's configuration interface (`PacketEncoder.service`)."""
         from .ouster_api import OusterApi
 
         ports = self.port("lidar", LIDAR_PORT), self.port("imu", IMU_PORT)

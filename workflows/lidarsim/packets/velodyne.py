@@ -93,7 +93,7 @@ class VelodyneEncoder(PacketEncoder):
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> Service:
-        """Return the sensor's web interface, see `PacketEncoder.service`."""
+        """Return the sensor's web interface (`PacketEncoder.service`)."""
         from .velodyne_api import VelodyneApi, VelodyneState
 
         source = self.source

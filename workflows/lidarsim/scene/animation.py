@@ -22,8 +22,8 @@ MAX_PICTURED_VERTICES = 500_000
 class Animation:
     """Poses of a mesh, evenly spaced, between which its vertices move straight.
 
-    Actors of the same mesh share the animation; each plays it by its own clock, see
-    `Actor.played`.
+    Actors of the same mesh share the animation; each plays it by its own clock
+    (`Actor.played`).
 
     Parameters
     ----------

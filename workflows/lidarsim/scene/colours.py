@@ -51,7 +51,7 @@ class Colours:
     image
         int32 (f,): index of each face's image.
     uv
-        float32 (f, 3, 2): texture coordinates of the corners, see `Cutout`; None if there are only
+        float32 (f, 3, 2): texture coordinates of the corners (`Cutout`); None if there are only
         plain colours.
     corners
         uint8 (f, 3, 3): colours of the corners, by which the colours of the images are multiplied

@@ -190,11 +190,11 @@ class Texture:
         self._image = image
 
     def cutout(self, coordinates: AnyArray, corners: Ints) -> Cutout:
-        """Return the texture as the mask of triangles, see `map_to_triangles`."""
+        """Return the texture as the mask of triangles (`map_to_triangles`)."""
         return Cutout(*self.map_to_triangles(coordinates, corners))
 
     def colours(self, coordinates: AnyArray, corners: Ints) -> Colours:
-        """Return the texture as the colours of triangles, see `map_to_triangles`."""
+        """Return the texture as the colours of triangles (`map_to_triangles`)."""
         image, uv = self.map_to_triangles(coordinates, corners)
         return Colours((image,), np.zeros(len(uv), np.int32), uv)
 

@@ -116,7 +116,7 @@ class MeshPart(NamedTuple):
 
     vertices: Floats  # (v, 3), in the frame of the mesh
     faces: Ints32  # (f, 3)
-    mask: Bools | None = None  # (h, w), see `Cutout`
+    mask: Bools | None = None  # (h, w), of a `Cutout`
     uv: Floats32 | None = None  # (f, 3, 2)
     colours: Colours | None = None
     voxels: Voxels | None = None  # leaves within the surface

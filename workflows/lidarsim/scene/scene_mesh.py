@@ -78,7 +78,7 @@ class SceneMesh:
     cutouts
         Cutouts of the last faces, cutout by cutout.
     colours
-        Colours of the faces, see `lidarsim.scene.colours.Colours`, or None.
+        Colours of the faces (`lidarsim.scene.colours.Colours`), or None.
     voxels
         Densities of leaves within the surface of the mesh, which is closed then and has no
         cutouts.
@@ -86,7 +86,7 @@ class SceneMesh:
         Motion of the vertices if an actor has the mesh; elsewhere the mesh is static, as
         `vertices`.
     materials
-        Names of the materials of the faces, see `lidarsim.scene.face_materials.FaceMaterials`, or
+        Names of the materials of the faces (`lidarsim.scene.face_materials.FaceMaterials`), or
         None.
 
     Raises

@@ -31,7 +31,7 @@ class SimplifiedScene:
     scene
         The scene; the original scene if that has no instances.
     counter
-        intp (f,): hit counter of each triangle, see `Scene.counters`.
+        intp (f,): hit counter of each triangle (`Scene.counters`).
     is_original
         Whether `scene` is the original scene.
     """

@@ -429,7 +429,7 @@ def load_sensor(
     calibration
         File of the unit: Velodyne YAML, Ouster metadata, Hesai angle corrections, RoboSense
         angle.csv, Livox list of rays, a table of beams, or rays of a sensor that `export_sensor`
-        wrote; see `read_calibration`.
+        wrote (`read_calibration`).
     columns
         Firings in a revolution, if the model, or a table of beams, leaves a choice.
     rate_hz

@@ -52,9 +52,9 @@ class PulseReturns(NamedTuple):
     ray: Integers
     distance: Floats  # metres, without noise
     triangle: Ints32
-    # Received, see `Surfaces.energy`; None if `BatchPoints` computes it from the reported rays.
+    # Received (`Surfaces.energy`); None if `BatchPoints` computes it from the reported rays.
     energy: Floats | None = None
-    # Packed, see `Surfaces.colours`; None if it is not needed, or `BatchPoints` looks it up at the
+    # Packed (`Surfaces.colours`); None if it is not needed, or `BatchPoints` looks it up at the
     # ends of the rays.
     colour: UInts32 | None = None
     cause: Bytes | None = None  # indices into `CAUSES`; None if all hits are on surfaces
@@ -62,7 +62,7 @@ class PulseReturns(NamedTuple):
     # Full width at half maximum in the waveform, ns, and its height; None without waveforms.
     width: Floats | None = None
     amplitude: Floats | None = None
-    # Recorded, see `columns.waveforms.record`; `BatchPoints` adds `location_ps` and `toward`.
+    # Recorded (`columns.waveforms.record`); `BatchPoints` adds `location_ps` and `toward`.
     waveform: Records | None = None
     number: Bytes | None = None  # among the reported returns of its pulse, from 1
     returns: Bytes | None = None  # number of reported returns of its pulse

@@ -213,7 +213,7 @@ class Rig:
         """Cast scans `first` to `stop` of the survey, and yield the returns of each group of scans.
 
         A group is scans of one sensor and station whose firings follow each other. A frozen sensor
-        casts the older scans that it sends again, see `Survey.sent_scan`.
+        casts the older scans that it sends again (`Survey.sent_scan`).
         """
         specs: list[ScanSpec] = []  # scans of the group
         for spec in map(self.survey.sent_scan, range(first, stop)):

@@ -104,7 +104,7 @@ class ScanSpec:
     scan
         Number in the survey.
     station
-        Station of the trajectory, see `Trajectory`.
+        Station of the trajectory (`Trajectory`).
     firings
         Half-open range of firings, counted from the start of the station.
     start_ns
@@ -666,7 +666,7 @@ class Survey(CloudOptions, Weather):
             source = int(np.searchsorted(starts_ns, active[0].from_s * 1e9)) - 1
         if source == sweep:
             return spec
-        # The last sweep at a pose may have fewer scans: then scans are lost, see `LossStep`.
+        # The last sweep at a pose may have fewer scans: then scans are lost (`LossStep`).
         older = min(int(firsts[source] + index - firsts[sweep]), int(firsts[source + 1]) - 1)
         repeats = int(firsts[source]), int(firsts[sweep])
         return replace(self.scan(older), scan=index, ahead=older - index, repeats=repeats)

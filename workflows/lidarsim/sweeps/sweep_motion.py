@@ -171,7 +171,7 @@ def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats
     Parameters
     ----------
     knots
-        (m, 7): knots of the sweep, see `knots_of`.
+        (m, 7): knots of the sweep (`knots_of`).
     position, rotation
         (3,) and (3, 3): pose of the sensor at the start of the sweep.
     shares

@@ -123,7 +123,7 @@ class Sweeps:
     faults: tuple[Fault, ...] = ()  # faults of all sensors
     materials: tuple[str, ...] = ()  # names that the column `material` counts
     lidars: tuple[LidarTraits, ...] = ()  # traits of each sensor; empty if unknown
-    knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7): see `knots_of`
+    knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7), from `knots_of`
     stations: int = 1  # number in the survey, each with as many sweeps of a sensor
     station_ns: int = 0  # time between the starts of two stations
 

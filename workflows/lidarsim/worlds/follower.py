@@ -175,7 +175,7 @@ class Follower:
         Returns
         -------
         float32 (s, firings, channels)
-            Metres; inf without a return. See `Scanner.ranges`.
+            Metres; inf without a return (`Scanner.ranges`).
 
         Raises
         ------

@@ -19,7 +19,7 @@ DIVERGING = mapped("coolwarm", np.linspace(0, 1, 256))  # (256, 3); its middle i
 MAX_UNNAMED_LABELS = 12  # labels without names that have a colour each
 MAX_COLOURS = 1 << 16  # limit for labels
 
-# Columns that are composed of others, see `values_of`.
+# Columns that are composed of others (`values_of`).
 RGB = Column("rgb", "uint32", "", "colours of the surfaces")
 NORMALS = Column(
     "normals", "uint32", "", "directions of the surfaces: x red, y green, z blue, -1 dark, 1 bright"

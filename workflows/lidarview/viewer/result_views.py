@@ -72,7 +72,7 @@ def open_results(paths: Sequence[Path], downloads: Downloads | None = None) -> V
 def join_views(
     paths: Sequence[Path], views: Sequence[View], downloads: Downloads | None = None
 ) -> View:
-    """Return a view of all points of the views of results, see `open_results`."""
+    """Return a view of all points of the views of results (`open_results`)."""
     first, *other_views = views
     if not other_views:
         return first

@@ -120,7 +120,7 @@ def write_mcap(
     normals, `incidence_deg` and origins of rays, and `material`; each makes points 4 bytes longer,
     up to the 48 bytes of `ouster`.
 
-    Organized clouds have a point for each ray, NaN without a return: see `organized_rows`. Second
+    Organized clouds have a point for each ray, NaN without a return (`organized_rows`). Second
     returns of `ouster` are then on `/NAME/points2`.
     """
     folder = path.with_name(f"{path.name}.bag")

@@ -169,7 +169,7 @@ class Cluster:
         return Tasks(self.partitions[name], self.software["lidarpool"])
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
-        """Watch workers of partitions from now on, see `Watch`."""
+        """Watch workers of partitions from now on (`Watch`)."""
         return Watch(self.client, names, lasting, self.options.patience_s, self._screen.tell)
 
     def check(self, job: Job) -> None:

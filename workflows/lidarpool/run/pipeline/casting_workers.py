@@ -103,7 +103,7 @@ class CastingWorkers:
     so `look` checks every second which workers exist. In return, Dask never fails a task for the
     deaths of its neighbours, and the driver knows which batches a dead worker had.
 
-    `run` is the run's id; `software` is the software that workers must have, see `base.software`.
+    `run` is the run's id; `software` is the software that workers must have (`base.software`).
     """
 
     def __init__(

@@ -2,9 +2,9 @@
 
 Stage 1 (GENERATE) sends ranges of scans. The dispatcher makes batches of the ranges. Stage 2
 (INTERSECT) casts batches on GPU workers. Stage 4 (COLLECT) writes them as parts. A batch is
-WAITING, CASTING, CAST or COLLECTING, see `BatchState`. Amounts of work are weights: a task takes
+WAITING, CASTING, CAST or COLLECTING (`BatchState`). Amounts of work are weights: a task takes
 `per_task` small batches, each of weight 1, and a batch that fills half of a task's memory has the
-weight of half a task, see `policies.weight`.
+weight of half a task (`policies.weight`).
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Dispatcher:
 
     @property
     def max_weight(self) -> int:
-        """Largest permitted weight of the batches under way, see `policies.weight`."""
+        """Largest permitted weight of the batches under way (`policies.weight`)."""
         slots = self._workers.slot_count
         collectors = self._stages.collector_count
         return policies.max_under_way(slots, collectors, self.per_task)
@@ -262,7 +262,7 @@ class Dispatcher:
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
         """Count the death of a worker against its batch, and divide or condemn the batch.
 
-        See `policies.kills_alone` for the rule.
+        `policies.kills_alone` is the rule.
         """
         batch.deaths[stage] += 1
         kills = policies.kills_alone(batch, stage)

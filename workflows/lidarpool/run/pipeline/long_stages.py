@@ -198,7 +198,7 @@ class LongStages:
         """
         lock = Lock(self._lock_name, scheduler_rpc=self.client.scheduler, loop=self.client.loop)
         acquired = False
-        with suppress(RuntimeError):  # another run has just removed it, see `_forget_lock`
+        with suppress(RuntimeError):  # another run has just removed it (`_forget_lock`)
             acquired = lock.acquire(timeout=ASK_LOCK_S)
         if not acquired:
             self.waiting = True

@@ -227,7 +227,7 @@ class Pipeline:
             self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
 
     def _take(self, message: Message) -> None:
-        """Handle a message of a stage, except for receipts, see `_commit`."""
+        """Handle a message of a stage, except for receipts (`_commit`)."""
         if isinstance(message, ColumnsLost):
             self.dispatcher.recast_columns(message)
             return

@@ -151,7 +151,7 @@ class JobUnderWay(PipelineJob):
         return self.points().cloud_of(columns, rows)
 
     def hit_counts(self) -> Ints:
-        """Return the hits for each counter of the scene, see `Scene.counters`."""
+        """Return the hits for each counter of the scene (`Scene.counters`)."""
         counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.parts.ordered:
             triangles, hits = read_tally(self.storage, part.name)

@@ -101,7 +101,7 @@ class PartitionLoads:
         self._loads.clear()
 
     def slots(self) -> list[Any]:
-        """Return the busy slots, see `busy_slots`."""
+        """Return the busy slots (`busy_slots`)."""
         return busy_slots(list(self._loads))
 
 

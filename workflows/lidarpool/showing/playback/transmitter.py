@@ -16,7 +16,7 @@ from lidarsim.packets.encoders import PacketEncoder
 from lidarsim.packets.send import LOOPBACK, Address, Sender, check_reachable
 from lidarsim.packets.service import Destination, Service
 
-# Returns the service of a sensor: see `PacketEncoder.service`.
+# Returns the service of a sensor (`PacketEncoder.service`).
 MakeService = Callable[[str, Destination, Callable[[Destination], None]], Service | None]
 
 
@@ -77,7 +77,7 @@ class Stream:
 def sensor_streams(
     encoders: Sequence[PacketEncoder], to: Sequence[str], api: Sequence[str]
 ) -> list[Stream]:
-    """Return the streams of sensors, see `streams_to`."""
+    """Return the streams of sensors (`streams_to`)."""
     streams = [
         Stream(
             encoder.source.name or "lidar",

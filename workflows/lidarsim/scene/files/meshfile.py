@@ -116,7 +116,7 @@ def load_objects(
         module's logger gets the line, as a warning if the scene seems to lie on its side.
     **options
         Options that all formats share, the fields of `MeshOptions`, and options that the format of
-        the file alone has, see `MeshFormat.options`. Animated meshes have no masks.
+        the file alone has (`MeshFormat.options`). Animated meshes have no masks.
 
     Returns
     -------

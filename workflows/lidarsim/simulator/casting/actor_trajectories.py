@@ -30,7 +30,7 @@ class _StraightTracks(NamedTuple):
 
     actors: Sequence[int]  # (n,): numbers of the actors
     counts: Ints  # (n,): number of segments of each track
-    limits: Floats  # (n, 4): see `TrackTable`
+    limits: Floats  # (n, 4), as in `TrackTable`
     times_s: Floats  # (s,): start of each segment, by the track's clock, seconds
     segments: Sequence[Floats]  # the fields of `trajectory.Segments`; the first four are used
 

@@ -174,7 +174,7 @@ class CastPoses:
 
         Origins are (1, 3) if all rays share one.
 
-        Ray k is row ``start + k`` of the pattern, which repeats, see `raybeam.pattern_rays`.
+        Ray k is row ``start + k`` of the pattern, which repeats (`raybeam.pattern_rays`).
         """
         return pattern_rays(pattern, ray, start=start, **self.caster_arguments)
 
@@ -207,7 +207,7 @@ def poses_of_firings(
 ) -> CastPoses:
     """Return the poses of a sensor's beams in firings `first` to `stop` of a station.
 
-    If a head rotates all beams, see `Sensor.spins`, the poses are of the head, and the rays of one
+    If a head rotates all beams (`Sensor.spins`), the poses are of the head, and the rays of one
     firing serve for all firings. Otherwise the poses are of the carrier. A pose is at the time of
     the first beam of a firing. If all beams start at the same point of a head, the positions are
     those of this point, `Sensor.centre`, else of the head frame's origin.

@@ -1,7 +1,7 @@
 """The ray caster of a whole scene: the static scene, its instances, and moving actors.
 
 Each ray is transformed to the frame of an actor at the time of the ray, so that no tree is ever
-rebuilt: see `raybeam.moving`.
+rebuilt (`raybeam.moving`).
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class _NearestHits(NamedTuple):
 class _ActorShapes(NamedTuple):
     """The s shapes of the a actors of a scene, where actors of the same mesh share a shape.
 
-    A mesh has a part for its opaque triangles, and a part for each mask, see `parts_of`; a part is
+    A mesh has a part for its opaque triangles, and a part for each mask (`parts_of`); a part is
     an instance of the shape's caster.
     """
 
@@ -163,7 +163,7 @@ class SceneCaster:
         """Return the table of hit counters for `RayCaster.visit`, and the number of counters.
 
         The table is int64 (bodies, 2): a hit of triangle t of body i counts in the counter
-        ``table[i, 0] + table[i, 1] * t``, see `Scene.counters`. The bodies are the faces of the
+        ``table[i, 0] + table[i, 1] * t`` (`Scene.counters`). The bodies are the faces of the
         scene, if any, with a counter for each triangle; then each instance, with one counter; and
         last all actors as one body, whose triangles are numbered after the scene's faces alone.
         Bodies that the caster leaves out have no row.

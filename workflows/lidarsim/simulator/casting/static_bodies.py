@@ -1,7 +1,7 @@
 """The ray caster of the static bodies of a scene: of its faces and instances.
 
 Bodies that a sensor does not see are left out. Bodies far beyond the range of all sensors are left
-out as well, and triangles that reach there are cut: see `clipping`. Triangles keep their numbers.
+out as well, and triangles that reach there are cut (`clipping`). Triangles keep their numbers.
 """
 
 from __future__ import annotations

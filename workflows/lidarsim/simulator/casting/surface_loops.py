@@ -46,7 +46,7 @@ class HitSurfaces(NamedTuple):
     """Surfaces of hits: (n,) each."""
 
     row: Ints  # row of the normal in `NormalTables.stored`, or `~row` in `NormalTables.deformed`
-    kind: Ints32  # number of a material of an object, see `Scene.surface_kinds`
+    kind: Ints32  # number of a material of an object (`Scene.surface_kinds`)
     instance: Ints  # or -1
     run: Ints  # column of the actor's pose in `NormalTables.poses`, or -1; empty without actors
 
@@ -139,7 +139,7 @@ class TrackTable(NamedTuple):
     start: Floats  # (3, s): position at the start of each segment, metres
     speed: Floats  # (3, s): velocity, m/s
     # (3, 9, s): a rotation, by rows, is term 0 + sin(a) term 1 + cos(a) term 2, where a is the
-    # angle since the start of the segment: see `Segments`.
+    # angle since the start of the segment (`Segments`).
     rotation: Floats
     rates: Floats  # (s,): growth of the angle a, rad/s
 

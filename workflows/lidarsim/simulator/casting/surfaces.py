@@ -49,7 +49,7 @@ class LitHits(NamedTuple):
     normals: Floats  # (n, 3): unit normals in the scene frame, on either side of the surface
     cosines: Floats  # (n,): cosines of the angles between normals and directions, of either sign
     kinds: Ints32  # (n,): kinds of surfaces, rows of the table of materials
-    energy: Floats  # (n,): see `Surfaces.energy`; less below a film of water
+    energy: Floats  # (n,), as `Surfaces.energy`; less below a film of water
     film: Bools | None = None  # (n,): whether there may be a film of water
 
 

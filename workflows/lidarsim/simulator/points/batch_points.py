@@ -58,7 +58,7 @@ class BatchPoints:
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs = specs
-        # Counters that are not 0, see `StoredTriangles.counter`, and their hits, (k,) each: counts
+        # Counters that are not 0 (`StoredTriangles.counter`), and their hits, (k,) each: counts
         # of all triangles would take much memory, since each station of a batch stores them.
         counter_hits = np.zeros(0, np.int64) if scanned.tally is None else scanned.tally
         counters = np.flatnonzero(counter_hits)

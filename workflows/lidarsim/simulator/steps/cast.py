@@ -82,7 +82,7 @@ class CastLight(NamedTuple):
     # from the surface that the light left, which is at or below 0.
     start_m: Floats
     step_m: Floats  # distance of the hit from the origin, metres
-    triangle: Ints32  # number of the triangle, see `SceneCaster`
+    triangle: Ints32  # number of the triangle (`SceneCaster`)
 
 
 class SurfaceHits(NamedTuple):
@@ -91,7 +91,7 @@ class SurfaceHits(NamedTuple):
     step_m: Floats  # metres from the origin of the last piece of the path
     triangle: Ints32  # triangle of a leaf: where the light entered the crown
     distance: Floats  # optical path from the sensor, metres
-    colour: UInts32 | None  # packed, see `Surfaces.colours`; None if not needed
+    colour: UInts32 | None  # packed (`Surfaces.colours`); None if not needed
     normals: Floats  # unit vectors, scene frame; of a leaf: the direction of the light
     cosines: Floats  # cosines of the angles between normals and directions, of either sign
     kinds: Ints32  # kinds of surfaces: rows of the table of materials
@@ -215,7 +215,7 @@ class CastStep(PulseStep):
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the bytes of sub-rays and hits, more if light continues or is bent.
 
-        The bytes are those while rays are cast and while returns are counted, see `Memory`.
+        The bytes are those while rays are cast and while returns are counted (`Memory`).
         """
         subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
         casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.returns
@@ -285,7 +285,7 @@ class CastStep(PulseStep):
     def _light_of_rays(self, ray: Ints, rays: Floats, batch: PulseBatch) -> LightPaths:
         """Return the light at the sensor of sub-rays `ray` (n,) of a batch that hit a surface.
 
-        `rays` are all sub-rays of the batch, see `_cast_first`.
+        `rays` are all sub-rays of the batch (`_cast_first`).
         """
         setup = self.setup
         poses = batch.subray_poses
@@ -567,7 +567,7 @@ class CastStep(PulseStep):
         """Return the hits of all passes in the order of sub-rays, and set them in the batch.
 
         `parts` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams have
-        several sub-rays. `rays` are all sub-rays, see `_cast_first`; `first_light` is the light of
+        several sub-rays. `rays` are all sub-rays (`_cast_first`); `first_light` is the light of
         those that hit a surface.
         """
         hits = joined([part.hits for part in parts])

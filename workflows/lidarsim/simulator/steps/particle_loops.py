@@ -31,7 +31,7 @@ class FogTables(NamedTuple):
     end_m: float  # range where fog ends
     cell_m: float  # length of a cell
     energies: Floats  # (cells,): received of the fog in a cell
-    peaks: Floats  # ((cells + 1) * cells,): cumulative probabilities, see `air.FogCells.peaks`
+    peaks: Floats  # ((cells + 1) * cells,): cumulative probabilities (`air.FogCells.peaks`)
 
 
 @inlined
@@ -104,7 +104,7 @@ def sample_fog(subrays, tables, keys, reach, hits):
         scan_index = scan_row(keys.scan_starts, keys.first + beam, scan_index)
         scan = keys.scan + scan_index
         number_in_scan = keys.first + beam - keys.scan_starts[scan_index]
-        # Row n of the table is n plus probabilities, see `air.FogCells.peaks`.
+        # Row n of the table is n plus probabilities (`air.FogCells.peaks`).
         probability = fog_cells + uniform(keys.starts[0], scan, number_in_scan, 0)
         cell = 0  # becomes the cell with the highest peak, by binary search
         upper = cells

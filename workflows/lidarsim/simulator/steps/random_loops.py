@@ -28,7 +28,7 @@ _NEXT = np.uint64(1)
 class RandomKeys(NamedTuple):
     """Keys of the random numbers of consecutive beams."""
 
-    starts: AnyArray  # uint64 (purposes,), see `random_numbers.starts`; empty without numbers
+    starts: AnyArray  # uint64 (purposes,), as `random_numbers.starts`; empty without numbers
     scan: int  # number of the first scan
     scan_starts: Ints  # (scans,): number of the first beam of each scan
     first: int  # number of the first beam

@@ -51,7 +51,7 @@ class _Detection(NamedTuple):
     quantiles: Floats  # pointer to the quantiles of the normal distribution
     lowest: float  # first and last of the quantiles
     highest: float
-    loss_start: np.uint64  # starts of hashes, see `random_numbers.starts`
+    loss_start: np.uint64  # starts of hashes (`random_numbers.starts`)
     detection_start: np.uint64
 
 
@@ -373,7 +373,7 @@ def _detected(energy, scan, number_in_scan, return_index, detection):
 def _keep_detected(begin, stop, scan, number_in_scan, detection, output):
     """Keep the detected returns of a beam, rows `begin` to `stop`, and return the next free row.
 
-    `scan` and the beam's `number_in_scan` are keys of random numbers, see `_detected`.
+    `scan` and the beam's `number_in_scan` are keys of random numbers (`_detected`).
     """
     count = begin
     for k in range(begin, stop):

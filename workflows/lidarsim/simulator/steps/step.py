@@ -149,7 +149,7 @@ class Sizes(NamedTuple):
     beams: float  # beams of one `PulseBatch`
     subrays: int  # sub-rays of one `PulseBatch`
     returns: float  # returns of `rays`
-    points: float  # returns that become points: every n-th, see `Survey.keep_every`
+    points: float  # returns that become points: every n-th (`Survey.keep_every`)
 
 
 class Memory(NamedTuple):
@@ -192,8 +192,8 @@ class Emitter:
         pattern
             Rays in the middles of the beams.
         offsets
-            (n, 2): angles that are added to the directions of the n divided beams, radians, see
-            `PulseBatch.deflect`.
+            (n, 2): angles that are added to the directions of the n divided beams, radians
+            (`PulseBatch.deflect`).
         rows
             (n,): rows of `pattern` that are divided; by default all.
         by_head
@@ -222,7 +222,7 @@ class PulseBatch:
     poses: CastPoses  # poses of all beams of the scans
     firings: Firings  # firings of all beams of the scans
     emitter: Emitter
-    # (stop - start, 2): angles added to the directions of beams, radians, see `deflect`
+    # (stop - start, 2): angles added to the directions of beams, radians (`deflect`)
     offsets: Floats | None = None
     # Hits of sub-rays on surfaces, with waveforms also in the air, in the order of sub-rays, which
     # are numbered from 0 at the batch's start.

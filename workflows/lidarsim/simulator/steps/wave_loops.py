@@ -19,8 +19,8 @@ from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
 # In standard deviations of the system waveform:
 # hits within this distance are one Gaussian in closed form, whose position and height err by 1e-3
 NARROW = 0.25
-# two neighbouring hits whose planes meet within this distance are on one surface, see
-# `continue_surfaces`
+# two neighbouring hits whose planes meet within this distance are on one surface
+# (`continue_surfaces`)
 MEET = 1.0
 # Gaussians that are farther apart are fitted separately
 APART = 6.0
@@ -205,7 +205,7 @@ def _vertex(samples, peak):
 def _peaks(wave, stops, peaks):
     """Write the local maxima of a waveform to `stops` and `peaks`, and return their number.
 
-    See `SearchScratch`. Times and heights come from the Gaussian through three samples, energies
+    `scratch` is a `SearchScratch`. Times and heights come from the Gaussian through three samples, energies
     are the areas between the lowest samples to both sides.
     """
     samples = wave.samples
@@ -443,7 +443,7 @@ def _sort_gaussians(scratch, count, faintest):
 def _join_gaussians(wave, scratch, count, stops, peaks):
     """Join close Gaussians to peaks, write `stops` and `peaks`, and return the number of peaks.
 
-    See `SearchScratch`. A peak has the sum, mean and variance of its Gaussians, and ends half-way
+    `scratch` is a `SearchScratch`. A peak has the sum, mean and variance of its Gaussians, and ends half-way
     to the next peak.
     """
     sigma = wave.sigma

@@ -94,7 +94,7 @@ def returns_in(
 ) -> PulseReturns:
     """Return the returns in the waveforms of beams, in the order of beams and distances.
 
-    Hits that lie close together, or on one surface (see `pulse_loops.continue_surfaces`), are one
+    Hits that lie close together, or on one surface (`pulse_loops.continue_surfaces`), are one
     Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle
     and colour of a return come from its strongest hit.
 
