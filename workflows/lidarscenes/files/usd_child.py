@@ -352,9 +352,8 @@ class Looks:
         self._names_materials = request["materials"]
         self._folders = tuple(os.path.join(folder, "") for folder in request["folders"])  # noqa: PTH118
         self._images: dict[str, int] = {}  # {path: number}
-        self._materials: dict[
-            Any, tuple[int | None, list[str]]
-        ] = {}  # {path: result of `_material`}
+        # {path: result of `_material`}
+        self._materials: dict[Any, tuple[int | None, list[str]]] = {}
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
     def inherited(self, instance: Any) -> Any:

@@ -274,7 +274,7 @@ class Material:
         Raises
         ------
         LidarError
-            If the material has leaves of its own and the object has voxels, or the like.
+            If the material has leaves and the object has voxels, or the like.
         """
         if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
             raise LidarError(
@@ -581,7 +581,7 @@ class MaterialTable:
     ) -> MaterialTable:
         """Return the materials of kinds of surfaces: the first that applies to a kind counts.
 
-        `voxels` (objects,) says whether objects have voxels, and so leaves of their own; None if no
+        `voxels` (objects,) says whether objects have voxels, and so separate leaves; None if no
         object has voxels.
 
         Raises

@@ -28,7 +28,7 @@ def _spelled(prefixes: tuple[str, ...], axis: str, *spellings: str) -> tuple[str
 
 
 # Quantity; its spellings (case, spaces, underscores, hyphens and dots do not count); units that a
-# header may state, of which values are returned in the first; the unit of a header without unit.
+# header may state, the first of them for returned values; the unit of a header without unit.
 TIME = Quantity("time_s", ("time", "t", "timestamp", "stamp"), SECONDS, None)
 # World coordinates of the scene: z is up. Of compass directions, x is east and y north.
 POSITION = (

@@ -137,13 +137,13 @@ class PacketEncoder(ABC):
         """Return what answers the maker's software for a live sensor, or None for no service.
 
         `address` is where it listens: HOST for the maker's port, or HOST:PORT. The other parameters
-        are those of `Service`.
+        are as in `Service`.
         """
         return None
 
     @property
     def ports(self) -> Mapping[str, int]:
-        """Ports of all kinds of packets, that of the returns first: {kind: port}."""
+        """Ports of all kinds of packets, the port of the returns first: {kind: port}."""
         return {**self.default_ports, **self.source.settings.ports}
 
     @property
@@ -153,7 +153,7 @@ class PacketEncoder(ABC):
         return int(np.rint(np.diff(self.source.sensor.begins_ns(firings))[0]))
 
     def port(self, kind: str, default: int) -> int:
-        """Return the port of a kind of packets: that of the data file, else the default."""
+        """Return the port of a kind of packets from the data file, else the default."""
         return self.source.settings.ports.get(kind, default)
 
     def unusable(self, reason: str) -> LidarError:
@@ -242,7 +242,7 @@ ENCODERS = {
 }
 
 
-# Classes of decoders, in the order in which they are asked: packets of Ouster have no mark.
+# Classes of decoders, in the order of asking them: packets of Ouster have no mark.
 _DECODERS = (
     "lidarsim.packets.velodyne:VelodyneDecoder",
     "lidarsim.packets.hesai:HesaiDecoder",

@@ -36,7 +36,7 @@ _PERIOD_TOLERANCE_US = 0.02
 class HesaiEncoder(PacketEncoder):
     """Data packets of a model, with sequence numbers, and checksums where the model has them.
 
-    Azimuths are those of the head at the reference time of each block, clockwise from the sensor's
+    Azimuths are the head's at the reference time of each block, clockwise from the sensor's
     y axis. In the mode dual, each block of last returns is followed by a block of strongest
     returns, or of second strongest where the last return is the strongest; an only return is in
     both. The identifier `clock` is gps, the default, for dates, or ptp for seconds since 1970.
@@ -88,7 +88,7 @@ class HesaiEncoder(PacketEncoder):
     def service(
         self, address: str, destination: Destination, send_to: Callable[[Destination], None]
     ) -> PtcService:
-        """Return what answers the commands by which readers get calibration and identity."""
+        """Return the service that gives readers calibration and identity."""
         files = self.files()
         device = PtcDevice(
             name=self.source.name,

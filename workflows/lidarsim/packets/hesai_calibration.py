@@ -67,7 +67,7 @@ class LaserTable(NamedTuple):
 
 
 def _table(heads: list[list[Any]], times: list[str], columns: int) -> str:
-    """Return a table in which each laser has the same time in some columns."""
+    """Return a table with the same time of each laser in some columns."""
     rows = [[laser, *[time] * columns] for laser, time in enumerate(times, 1)]
     return "\n".join([*(",".join(map(str, row)) for row in [*heads, *rows]), ""])
 

@@ -22,7 +22,7 @@ UNIT_MM = 4
 _SEQUENCE_FLAG = 1  # flags of a header: what follows the blocks
 _IMU_FLAG = 2
 _SAFETY_FLAG = 4
-_OT128_STATUS = 128  # version of the status by which readers tell OT128 from Pandar128
+_OT128_STATUS = 128  # version of the status; it tells readers OT128 from Pandar128
 
 _RETURN = [("distance", "<u2"), ("reflectivity", "u1")]
 _RETURN_WITH_BYTE = [*_RETURN, ("reserved", "u1")]
@@ -33,7 +33,7 @@ _SEQUENCE = ("sequence", "<u4")
 class Layout:
     """Packets of a model.
 
-    The reference of a block is the time at which its azimuth is that of the head.
+    The reference of a block is the time when its azimuth is the azimuth of the head.
     """
 
     channels: int
@@ -45,7 +45,7 @@ class Layout:
     reference_us: float  # time between the stamp of a packet and the reference of the stamped block
     epoch: int  # year 0 of dates
     model_code: int  # code of the device information (hesai_ptc.py)
-    header: tuple[int, ...] = ()  # bytes, of which `dual_header` replaces some
+    header: tuple[int, ...] = ()  # bytes; `dual_header` replaces some
     dual_header: Mapping[int, int] | None = None  # {position: byte in the mode dual}
     block_start: int | None = None  # first bytes of each block
     return_byte: int = 0  # fourth byte of a return
@@ -160,7 +160,7 @@ _PACKET_128 = np.dtype(
         ("tail_checksum", "<u4"),
     ]
 )
-STANDARD_STATE = 2  # operational state in which all lasers fire in each block
+STANDARD_STATE = 2  # operational state: all lasers fire in each block
 _FLAGS_128 = _SEQUENCE_FLAG | _IMU_FLAG | _SAFETY_FLAG
 
 LAYOUTS = {

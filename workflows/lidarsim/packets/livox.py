@@ -23,7 +23,7 @@ from .shots import CarryOver, Shots
 
 DOTS = 96  # dots per packet
 IMU_DATA = 0  # type of data
-_CHECKED_FROM = 28  # byte of a packet from which its checksum counts
+_CHECKED_FROM = 28  # byte of a packet where its checksum starts
 _MODES = ("strongest", "first", "last")
 _STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
 _UNSYNCHRONIZED = 0  # sources of the time
@@ -65,8 +65,8 @@ PORTS = {
         host_state=0,
     ),
 }
-# Tag of the HAP for the first return. The light that the sensor itself returns is return 0, with
-# which returns nearer than 1.5 m are merged. Other tags, of noise, are 0: high confidence.
+# Tag of the HAP for the first return. The light that the sensor itself returns is return 0. Returns
+# nearer than 1.5 m are merged with return 0. Other tags, of noise, are 0: high confidence.
 _HAP_FIRST_RETURN = 0x10
 _HAP_MERGED_M = 1.5
 _POSITION = "position_m"  # name of positions among the columns of shots

@@ -473,7 +473,7 @@ class OusterEncoder(PacketEncoder):
 
 
 def _rounded(values: Floats) -> list[float]:
-    """Return values without the last digits, in which radians are not exact, as a list."""
+    """Return values without the last digits, which are not exact in radians, as a list."""
     return [float(value) for value in np.round(values, 9).ravel() + 0.0]
 
 

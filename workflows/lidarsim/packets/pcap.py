@@ -30,7 +30,7 @@ _BROADCAST_MAC = b"\xff" * 6
 class PcapWriter:
     """Writes frames of datagrams into a binary file, in the order of their times in each call.
 
-    `address` is that of the sensor, `destination` of the receiver. `start_ns` is the time 0 of the
+    `address` is the sensor's, `destination` the receiver's. `start_ns` is the time 0 of the
     datagrams, nanoseconds since 1970. Equal datagrams give equal bytes.
     """
 

@@ -31,7 +31,7 @@ class Packets:
     sensor
         The lidar, or the lidar `Mounted` on a carrier.
     name
-        Name of the sensor, of which its serial number is made. A `Mounted` has a name already.
+        Name of the sensor, the source of its serial number. A `Mounted` has a name already.
     returns
         Sub-rays of a beam, and the choice of its reported returns, as of the scanner.
     start
@@ -122,7 +122,8 @@ class Packets:
         sweep
             The cloud that `Scanner.sweep` has returned for this number and start.
         number
-            Number of the revolution, or frame; by default one more than that of the last sweep, or
+            Number of the revolution, or frame; by default one more than the number of the last
+            sweep, or
             0. `Scanner.sweep` needs the same.
         start_s
             Start of the revolution, as in `Scanner.sweep`.

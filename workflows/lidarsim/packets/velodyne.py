@@ -47,7 +47,7 @@ _PACKET = np.dtype(
 class VelodyneEncoder(PacketEncoder):
     """Data packets of 1,206 bytes, and position packets of 512.
 
-    Azimuths are those of the head at the first firing of each block, clockwise from the sensor's
+    Azimuths are the head's at the first firing of each block, clockwise from the sensor's
     x axis. In the mode dual, each block of last returns is followed by a block of strongest
     returns, or of second strongest where the last return is the strongest; an only return is in
     both.

@@ -45,7 +45,7 @@ class Fix(NamedTuple):
 class PositionPackets:
     """Position packets beside the data packets of a sensor, one for every 14.
 
-    The sentence is that of the last full second, with the fix of the carrier's GNSS receiver where
+    The sentence belongs to the last full second, with the fix of the carrier's GNSS receiver where
     its latitudes are known, else without a fix. Of a survey without a start, which no receiver has
     told the time, sentence and state of the pulse per second are empty.
     """

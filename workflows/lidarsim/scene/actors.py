@@ -30,7 +30,7 @@ from .scene_instances import SceneInstance, parts_of
 from .scene_mesh import SceneMesh, stacked
 
 MAX_SAMPLES = 200_000  # poses of all actors
-# Poses and longest duration by which trajectories of unknown classes are measured.
+# Poses and longest duration for measuring trajectories of unknown classes.
 TRAJECTORY_POSES = 10_001
 MAX_DURATION_NS = 1e12
 AT_ZERO = Stations((CENTRE,))
@@ -182,7 +182,7 @@ class Actor:
     def samples(self, duration_ns: float, count: int) -> ActorSamples:
         """Return poses at `count` times, for drawings.
 
-        Times are even over the part of a survey of `duration_ns` in which the actor is present.
+        Times are even over the part of a survey of `duration_ns` while the actor is present.
         """
         appears, leaves = presence_ns(self.trajectory)
         first = max(appears, 0.0)

@@ -54,8 +54,8 @@ class Colours:
         float32 (f, 3, 2): texture coordinates of the corners (`Cutout`); None if there are only
         plain colours.
     corners
-        uint8 (f, 3, 3): colours of the corners, by which the colours of the images are multiplied
-        in linear light; None for white.
+        uint8 (f, 3, 3): colours of the corners, factors of the colours of the images in linear
+        light; None for white.
     """
 
     images: tuple[Bytes, ...]
@@ -124,7 +124,7 @@ class Colours:
     def means(self) -> Bytes:
         """Return the mean colour of each face, in linear light, (f, 3).
 
-        The mean is that of 4 points of the face, or of 100 if there are few faces.
+        The mean is taken over 4 points of the face, or of 100 if there are few faces.
         """
         mean_colours = np.empty((len(self), 3), np.uint8)
         steps = 10 if len(self) <= MAX_DENSE_FACES else 2

@@ -63,7 +63,7 @@ class ObjectMaterials:
         Names of the materials of each object; () for an object without materials.
     index
         int32 (f,) for the scene's faces: row of the names of the face's object; None if all faces
-        have the first name. Parts of instances have an index of their own.
+        have the first name. Parts of instances have a separate index.
     """
 
     names: tuple[tuple[str, ...], ...]

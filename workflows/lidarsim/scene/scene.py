@@ -64,7 +64,7 @@ class Scene:
         float64 (3,), whole metres, plus `world_origin`.
     world_origin
         float64 (3,), metres: what `georeferenced` has added to `origin`. Without it, world
-        coordinates are those of the scene's files.
+        coordinates are as in the scene's files.
     actors
         Moving objects, numbered after the static objects; their meshes are not in `faces`.
     instances
@@ -172,10 +172,10 @@ class Scene:
             With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
             objects of a name are one object.
         **options
-            Options of all formats, see below, and options that the format of the file alone has,
-            by the names of `scene.files` in scenarios: `storeys` of a building (.ifc), `step_m` of
-            a raster. `epsg`, the code of the coordinate system to which a raster is transformed,
-            is `world.epsg` there.
+            Options of all formats, see below, and options that the format of the file alone has, by
+            the names of `scene.files` in scenarios: `storeys` of a building (.ifc), `step_m` of a
+            raster. `epsg`, the code of the coordinate system of a transformed raster, is
+            `world.epsg` there.
 
         Other Parameters
         ----------------
@@ -197,7 +197,7 @@ class Scene:
             .usd).
         materials
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
-            CityJSON, .xodr, .ifc), by which `Material` may choose them.
+            CityJSON, .xodr, .ifc), so that `Material` may choose them.
         assets
             A folder: further files that the scene file names are read from this folder and from
             the folder of the scene file, and from the folders below. Of a world of Gazebo, models
@@ -467,7 +467,7 @@ class Scene:
         )
 
     def solid(self, time_ns: float) -> Scene:
-        """Return a scene in which the actors at a time are static objects, without instances.
+        """Return a scene with the actors at a time as static objects, without instances.
 
         A scene without actors is returned unchanged, with its instances.
 

@@ -291,7 +291,8 @@ class Instances:
         instances = copy(self)
         object.__setattr__(instances, "transforms", transforms)
         earlier_bounds = self._earlier_bounds
-        # Computing bounds takes long: only those of moved instances are computed again, on demand.
+        # Computing bounds takes long: only the bounds of moved instances are computed again, on
+        # demand.
         bounds = vars(instances).pop("bounds", None)
         if bounds is not None:
             earlier_bounds = bounds, np.zeros(len(self), np.bool_)

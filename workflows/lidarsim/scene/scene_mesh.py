@@ -49,7 +49,7 @@ class Voxels:
     density
         float32 (nx, ny, nz): one-sided leaf area, m²/m³, finite and not negative.
     matrix
-        float64 (3, 4): from grid coordinates, in which voxels have the edge 1 and the first voxel
+        float64 (3, 4): from grid coordinates, where voxels have the edge 1 and the first voxel
         starts at zero, to coordinates of the mesh.
     """
 

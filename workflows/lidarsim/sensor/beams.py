@@ -224,7 +224,7 @@ class Mirror(Spin):
 
     motion: MirrorMotion = "triangle"  # "sine" and "triangle" swing, "sawtooth" is a polygon
     width_deg: Width = 60.0  # length of a line
-    # Share of each cycle in which the sensor fires: a polygon's facets sweep more than the line.
+    # Share of each cycle while the sensor fires: a polygon's facets sweep more than the line.
     duty: Duty = 1.0
 
     def times_ns(self, firings: Ints) -> Floats:

@@ -51,7 +51,7 @@ class _Channel:
     height_m
         Height of its start.
     incident
-        Direction (3,) in which light enters prisms; None for other optics.
+        Direction (3,) of light that enters prisms; None for other optics.
     """
 
     rotation: Floats
@@ -249,7 +249,7 @@ def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
 
 
 def _head(head: Spin, pulse_hz: float, pulses_per_firing: int, duration_s: float) -> _Scanner:
-    """Return a scanner without channels whose head turns as that of a sensor."""
+    """Return a scanner without channels whose head turns as a sensor's head."""
     speed = 360 / head.firings_per_turn * pulse_hz / pulses_per_firing
     turned = 360 * head.rate_hz * duration_s
     sign = -1 if head.clockwise else 1

@@ -145,7 +145,7 @@ class Performance(_ModelSection):
     `SensorModel.datasheet` makes settings of them.
 
     The precision of ranges is given either by the fields of `Noise`, with the same names, or for
-    two surfaces, from which its dependence on energy follows.
+    two surfaces, which give its dependence on energy.
     """
 
     range_m: Annotated[float, Field(ge=0)] | None = None

@@ -67,7 +67,7 @@ def rays_of_text(text: str) -> FiredRays:
     if times_s[-1] == times_s[0] or (np.diff(times_s) == 1).all():
         return FiredRays(directions)
     times_ns = np.rint(times_s * _SECOND_NS).astype(np.int64)
-    # The first beam of a firing may leave after its start, and before that of the next firing. A
-    # list that starts later has the times of a clock.
+    # The first beam of a firing may leave after its start, and before the start of the next firing.
+    # A list that starts later has the times of a clock.
     is_clock = times_ns[0] < 0 or times_ns[0] > np.diff(times_ns).max()
     return FiredRays(directions, times_ns - times_ns[0] if is_clock else times_ns)

@@ -1,6 +1,6 @@
 """Angles of rays for MuJoCo-LiDAR: arrays `theta` and `phi`, as its scan patterns are.
 
-An .npz holds the arrays. A Python file (.py) needs NumPy only, and returns those of a frame.
+An .npz holds the arrays. A Python file (.py) needs NumPy only, and returns the arrays of a frame.
 
 `theta` is the azimuth, counter-clockwise from x, and `phi` the elevation above the xy plane, both
 in radians, in the frame of a site: x forward, y left, z up. MuJoCo-LiDAR casts all rays of a call

@@ -1,8 +1,8 @@
 """Rays as an OmniLidar prim of Isaac Sim and Omniverse (.usda).
 
 Attributes by the extension omni.sensors.nv.lidar ("Setting Lidar Attributes") and the schemas
-OmniSensorGenericLidarCoreAPI and OmniSensorGenericLidarCoreEmitterStateAPI. The pattern is that of
-a solid-state lidar: each scan fires one emitter state, a list of azimuths, elevations and times.
+OmniSensorGenericLidarCoreAPI and OmniSensorGenericLidarCoreEmitterStateAPI. The pattern suits a
+solid-state lidar: each scan fires one emitter state, a list of azimuths, elevations and times.
 Several states follow each other scan by scan, so that a pattern need not repeat with each scan. A
 rotary pattern would round times and azimuths to ticks of a whole number of hertz.
 """

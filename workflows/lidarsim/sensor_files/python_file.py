@@ -64,7 +64,7 @@ def python_text(
     rays
         Rays with times.
     title, words
-        The docstring of the file, to which what the file does not hold is added.
+        The docstring of the file, before what the file does not hold.
     left_out
         What the file does not hold, a clause each.
     functions

@@ -69,7 +69,7 @@ def columns_of(rays: FiredRays) -> dict[str, Floats | Ints]:
 def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
     """Return the rays of columns and a header.
 
-    Columns are those of `COLUMNS`: directions or both angles are required.
+    Columns are listed in `COLUMNS`: directions or both angles are required.
 
     Raises
     ------

@@ -1,14 +1,14 @@
 """Returns of the pulses of one sensor: casts the sensor's scans, and applies the steps to the hits.
 
 The way through a worker: `Rig.cast` groups scans, and `Rig.returns` finds the `Firings` of a group
-and the `CastPoses` of its beams. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at
-a time and passes `PulseReturns` through the steps in the order of `step_list.py`: steps that aim
+and the `CastPoses` of its beams. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at a
+time and passes `PulseReturns` through the steps in the order of `step_list.py`: steps that aim
 beams; `CastStep`, which finds the hits of all rays; steps that add light of rain, spray and dirt;
 those that make returns of hits, detect, receive, lose and choose returns. What is kept of them is
 `Scanned`. Steps on reported returns get all beams at once, and returns out of range are removed.
-`BatchPoints` holds it, of which `columns_of` makes columns. If each ray can have one return only
-(`Setup.return_count_varies`), `SceneCaster` itself counts and thins out the hits; on CUDA without
-steps, `DeviceColumns` does all of it.
+`BatchPoints` holds it, and `columns_of` makes columns of `BatchPoints`. If each ray can have one
+return only (`Setup.return_count_varies`), `SceneCaster` itself counts and thins out the hits; on
+CUDA without steps, `DeviceColumns` does all of it.
 """
 
 from __future__ import annotations

@@ -339,8 +339,8 @@ class Rig:
         """Write the ranges of the same firings from several poses into `image` (poses * rays,).
 
         `pattern` are the rays of the firings, in the carrier's frame; `image` has the rays of a
-        pose behind those of the pose before. `first_scan` is added to the number of `specs[0]`, for
-        random numbers.
+        pose behind the rays of the pose before. `first_scan` is added to the number of `specs[0]`,
+        for random numbers.
         """
         rays = len(pattern)
         count = len(image) // rays

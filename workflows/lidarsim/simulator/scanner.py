@@ -232,9 +232,9 @@ class Scanner:
             pose at the time of the beam. In the scene's local coordinates.
         number
             Number of the revolution, or frame, from 0. The number selects the random numbers and
-            the firings, since a revolution starts at the azimuth at which the last revolution has
-            stopped. By default, firings and times are those of revolution 0, and each call has
-            new random numbers.
+            the firings, since a revolution starts at the azimuth where the last revolution has
+            stopped. By default, firings and times belong to revolution 0, and each call has new
+            random numbers.
         start_s
             Start of the revolution, seconds since the start of the trajectories of the sensor and
             the actors. By default as in a survey: `number` times the duration of a revolution.
@@ -482,7 +482,7 @@ class Scanner:
         """Return the scans of a revolution, and the delay of its start, nanoseconds.
 
         The delay is `start_s` less the start of revolution `number` in a survey, 0 without a
-        `start_s`. Without a `number`, the scans are those of revolution 0 with the random numbers
+        `start_s`. Without a `number`, the scans belong to revolution 0, with the random numbers
         of later revolutions, and `count` revolutions of random numbers are used up.
         """
         revolutions_ahead = 0  # so many revolutions are random numbers ahead

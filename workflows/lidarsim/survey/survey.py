@@ -114,7 +114,7 @@ class ScanSpec:
     channels
         Number of the sensor's channels.
     ahead
-        Number of scans by which its random numbers are ahead of its number.
+        Number of scans that its random numbers are ahead of its number.
     repeats
         For a scan of a frozen sensor: the first scan of the sweep that is sent again, and the first
         scan of the sweep that it replaces.

@@ -17,8 +17,8 @@ def named_file(
 
     Names may be escaped, as URIs are by the standard but not by all programs, have backslashes, or
     be of another machine: then their last part counts, if `allow_moved`, in the folder of the mesh
-    file and in those of assets. A pipe does not count as a file, since reading a pipe would wait
-    for ever.
+    file and in the folders of assets. A pipe does not count as a file, since reading a pipe would
+    wait for ever.
 
     Raises
     ------

@@ -33,7 +33,7 @@ _GROUND_STEP_M = 10.0  # step of the differences that a scale is computed by
 _BLOCK_POINTS = 100_000  # reprojected at a time, through lists of Python
 UNNAMED = ("unnamed", "unknown", "")  # names by GDAL and PROJ of systems without a name
 POLAR_EPSG = (5041, 5042)  # universal polar stereographic, of the north and of the south
-_POLAR_DEG = 84.0  # latitude from which the polar stereographic projection stands for UTM
+_POLAR_DEG = 84.0  # from this latitude on, the polar stereographic projection replaces UTM
 _WGS84_ELLIPSOID = (6378137.0, 298.257223563)  # semi-major axis in metres, inverse flattening
 
 # Projections that are made for lengths of countries, by letters of their names.

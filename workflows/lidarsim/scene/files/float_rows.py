@@ -24,7 +24,7 @@ def columns_by_name(path: Path) -> tuple[str, ...]:
 def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
     """Return the columns of a sweep, {name: (n,)}, which are `KITTI` or `NUSCENES`.
 
-    ValueError if the size is not that of whole rows, or the rings are no rings; OSError if the file
+    ValueError for a partial row, or if the rings are not rings; OSError if the file
     cannot be read.
     """
     data = read_input(path)

@@ -25,7 +25,7 @@ GEO_TEXTS = 34737
 _MODEL_TYPE = 1024
 _GEODETIC_CRS = 2048
 PROJECTED_CRS = 3072
-_PROJECTION = 3075  # method of a projection of its own
+_PROJECTION = 3075  # method of a user-defined projection
 _LINEAR_UNIT = 3076
 _LINEAR_UNIT_SIZE = 3077
 _VERTICAL_CRS = 4096
@@ -90,7 +90,7 @@ class CoordinateUnits:
 
     horizontal: CoordinateUnit
     vertical: CoordinateUnit
-    vertical_stated: bool = True  # False if the unit of z is assumed to be that of x and y
+    vertical_stated: bool = True  # False if the unit of z is assumed to be the unit of x and y
 
     @property
     def factors(self) -> tuple[float, float, float]:

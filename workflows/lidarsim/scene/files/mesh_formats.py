@@ -263,7 +263,7 @@ def plugin_endings() -> tuple[str, ...]:
 
 
 def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[MeshOptions, Any]:
-    """Return the options for reading a file: the shared options, and those of its format.
+    """Return the options for reading a file: the shared options, and the options of its format.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def options_of(row: MeshFormat, path: Path, given: Mapping[str, Any]) -> tuple[M
     Returns
     -------
     The shared options, and an instance of the dataclass of the format, or None if the format has
-    no options of its own.
+    no further options.
 
     Raises
     ------
@@ -324,7 +324,7 @@ def option_names(row: MeshFormat | None) -> tuple[str, ...]:
 
 
 def _endings_with(option: str) -> list[str]:
-    """Return the endings of the formats, also of plug-ins, that have an option."""
+    """Return the endings of the formats, plug-ins included, that have an option."""
     return [
         ending
         for row in formats_with_plugins()
@@ -334,7 +334,7 @@ def _endings_with(option: str) -> list[str]:
 
 
 def formats_with_plugins() -> Iterator[MeshFormat]:
-    """Yield the formats that are read, also those of plug-ins that can be used."""
+    """Yield the formats that are read, with the formats of plug-ins that can be used."""
     yield from _formats_read()
     for plugins in plugins_of(GROUP).values():
         for plugin in plugins:

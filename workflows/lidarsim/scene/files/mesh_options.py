@@ -46,7 +46,7 @@ class MeshOptions:
     opacity: Opacity = "mask"
     colours: bool = False  # whether base colours are read
     materials: bool = False  # whether faces keep the names of their materials
-    # Folders from which further files may be read, besides the folder of the file.
+    # Folders whose files may be read, besides the folder of the file.
     assets: str | Path | Sequence[str | Path] | None = None
     # Name or number of the animation to play by the meshes; "" for the first, None for none.
     animation: str | None = None

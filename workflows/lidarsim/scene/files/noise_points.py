@@ -2,7 +2,7 @@
 
 ASPRS LAS 1.4 R15 withholds points that are not to be included in processing, as if they were
 deleted. Its class 7 is low noise; class 18 is high noise in point formats 6 to 10 alone. Programs
-that convert LAS keep these columns under names of their own.
+that convert LAS keep these columns under other names.
 """
 
 from __future__ import annotations

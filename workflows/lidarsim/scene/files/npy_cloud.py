@@ -26,7 +26,7 @@ def read_npy_cloud(path: Path) -> list[CloudScan]:
     Raises
     ------
     ValueError
-        If the array is not that of a cloud, or the file is shorter than the array.
+        If the array is not of a cloud, or the file is shorter than the array.
     LidarError
         If the file is larger than the memory.
     OSError

@@ -33,7 +33,7 @@ _KEYWORDS = (
 )  # fmt: skip
 _DATA = re.compile(rb"^DATA[ \t]+([^\r\n]*?)[ \t]*(?:\r?\n|\Z)", re.MULTILINE)
 _STARTS = (b"# .PCD", b"VERSION", b"FIELDS", b"COLUMNS")  # starts of lines of a header
-_PADDING = "_"  # name of the fields by which PCL fills its rows
+_PADDING = "_"  # name of the fields that fill the rows of PCL
 _KINDS = {
     ("F", 4): "<f4", ("F", 8): "<f8",
     ("I", 1): "<i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
@@ -331,7 +331,7 @@ def _check_length(header: _Header, row_size: int, size: int) -> None:
 
 
 def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[AnyArray]:
-    """Return an array (n, count) for each field of a body in which fields follow each other.
+    """Return an array (n, count) for each field of a body whose fields follow each other.
 
     PCL leaves padding out of what it packs, other programs do not.
     """

@@ -575,7 +575,7 @@ def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
 
 
 def ply_comments(data: bytes) -> list[str]:
-    """Return the comments of a Stanford polygon file, also of its lines obj_info."""
+    """Return the comments of a Stanford polygon file, with its lines obj_info."""
     return _ply_header(data).comments
 
 

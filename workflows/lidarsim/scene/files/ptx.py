@@ -1,8 +1,8 @@
 """Scans of Leica's .ptx: a header of ten lines, then a point for each cell of the scanner's grid.
 
 The header is the number of columns and of rows, the scanner's position and its axes x, y and z, and
-a matrix of four rows by which a point is multiplied from the left: its last row is the position.
-Points without a return are zeros.
+a matrix of four rows. A point is multiplied by the matrix from the left: its last row is the
+position. Points without a return are zeros.
 """
 
 from __future__ import annotations

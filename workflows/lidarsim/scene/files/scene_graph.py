@@ -121,7 +121,7 @@ class Node:
 
 
 class PlacedNode(NamedTuple):
-    """A mesh, and the matrix by which a scene graph places the mesh."""
+    """A mesh, and its matrix in a scene graph."""
 
     mesh: SceneMesh
     matrix: Floats  # (4, 4), from the mesh's coordinates to the file's
@@ -132,7 +132,7 @@ class PlacedNode(NamedTuple):
 def placed_nodes(
     roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str
 ) -> list[PlacedNode]:
-    """Return all placed meshes of a scene graph, in which a node may have several parents.
+    """Return all placed meshes of a scene graph, whose nodes may have several parents.
 
     `roots` are keys of the outermost nodes, and `node_of` returns the node of a key. A placed mesh
     is named by the nearest node with a name, else by the mesh, else by `stem`.
@@ -173,7 +173,7 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
     """Return the content of placed meshes: instances of meshes that many share, and copies.
 
     Meshes with masks that are placed twice become instances too, since each copy would have a part
-    of its own. With `copy_all` all meshes are copied, even meshes scaled to zero.
+    for itself. With `copy_all` all meshes are copied, even meshes scaled to zero.
 
     Raises
     ------

@@ -163,7 +163,7 @@ class StatedSystem:
             return None
         crs = crs_of_text(self.text) if self.text else _crs_of_keys(self.records)
         on_earth = crs is not None and (crs.is_projected or crs.is_geographic or is_geocentric(crs))
-        if not on_earth and self._code:  # codes of Esri are beside those of EPSG in GeoTIFF keys
+        if not on_earth and self._code:  # codes of Esri are beside EPSG codes in GeoTIFF keys
             return crs_of_code(self._code) or crs_of_text(f"ESRI:{self._code}")
         return crs if on_earth else None
 
@@ -364,7 +364,7 @@ def _scale_by_name(system: StatedSystem) -> _Scale:
 class Reprojection:
     """Brings positions from the system that a file states to a system in true metres.
 
-    Heights are converted to metres and stay as in the file, with their vertical datum; those of
+    Heights are converted to metres and stay as in the file, with their vertical datum; heights of
     geocentric coordinates are above the ellipsoid.
 
     Parameters
@@ -479,7 +479,7 @@ def _tiff(records: Mapping[int, bytes]) -> bytes:
             if records.get(number)
         ),
     ]
-    directory = 12  # its offset: after the head, and four bytes of which the first is the pixel
+    directory = 12  # its offset: after the head, and four bytes that begin with the pixel
     body_start = directory + 2 + 12 * len(tags) + 4
     rows = b""
     body = b""

@@ -59,7 +59,7 @@ class _Head(NamedTuple):
     names: list[str] | None  # names of the columns; None without a header
     names_line: int  # number of the header's line
     is_remark: bool  # whether the header is a remark
-    announced: int | None  # points, in a line of their own
+    announced: int | None  # points, in a separate line
     first: str  # first line of the points
     first_line: int
 
@@ -74,7 +74,7 @@ def read_text_cloud(path: Path) -> list[CloudScan]:
     Raises
     ------
     ValueError
-        If a line is wrong, or the columns are not those of a cloud; the message names the line.
+        If a line is wrong, or the columns are not columns of a cloud; the message names the line.
     LidarError
         If the file is larger than the memory.
     OSError
@@ -238,7 +238,7 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
 def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, float, float] | None]:
     """Return the indices of x, y and z, and their units in metres, or None without any.
 
-    ValueError if the columns are those of a trajectory, or have no lengths.
+    ValueError if the columns belong to a trajectory, or have no lengths.
     """
     columns = [column_name(name) for name in names]
     words = [column.words for column in columns]

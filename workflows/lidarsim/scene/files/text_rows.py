@@ -1,6 +1,6 @@
 """Rows of numbers in text: read at once where they are regular, else cell by cell.
 
-NumPy reads ten lines in the time in which Python reads one, but it neither names a line that is
+NumPy reads ten lines while Python reads one, but it neither names a line that is
 wrong, nor reads decimal commas, columns of words and empty cells.
 """
 

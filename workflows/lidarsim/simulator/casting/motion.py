@@ -130,7 +130,7 @@ class CastPoses:
     def part(self, start: int, stop: int, subrays: int) -> CastPoses:
         """Return the poses of the sub-rays of rays `start` to `stop`, `subrays` of each ray.
 
-        Sub-rays are numbered from 0 at ray `start`. The rays are those of complete poses: `start`
+        Sub-rays are numbered from 0 at ray `start`. The rays belong to complete poses: `start`
         is the first ray of a pose, and `stop` follows the last ray of a pose or of all rays.
         """
         rays_per_pose = self.rays_per_pose
@@ -210,7 +210,7 @@ def poses_of_firings(
     If a head rotates all beams (`Sensor.spins`), the poses are of the head, and the rays of one
     firing serve for all firings. Otherwise the poses are of the carrier. A pose is at the time of
     the first beam of a firing. If all beams start at the same point of a head, the positions are
-    those of this point, `Sensor.centre`, else of the head frame's origin.
+    this point's, `Sensor.centre`, else of the head frame's origin.
 
     Later beams of a firing start from the carrier's position at the time of the beam: the carrier
     moves evenly from each firing to the next. A pose for each beam would take as long as casting.

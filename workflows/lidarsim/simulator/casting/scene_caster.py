@@ -108,8 +108,8 @@ class SceneCaster:
         Largest range of the sensors, metres: of a scene of hundreds of kilometres, what is far
         beyond the range is left out. Before scans, `cover` says where sensors are.
     unseen
-        (objects,): True for objects that rays pass through, of which `bodies` lacks the static;
-        None for no object.
+        (objects,): True for objects that rays pass through; `bodies` lacks the static objects among
+        them. None for no object.
     """
 
     def __init__(

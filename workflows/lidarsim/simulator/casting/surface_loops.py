@@ -218,7 +218,7 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
     """Write how rays with directions (3, n) meet surfaces to `output`, `Incidence`.
 
     `hits` are `HitSurfaces`, `tables` `NormalTables`; `reflectance` and `retro` are by kinds of
-    surfaces. The light that is sent back is that of surfaces that are neither textured nor rough.
+    surfaces. The light that is sent back suits surfaces that are neither textured nor rough.
     No view of an array is made: a view would be counted, which takes five times as long as the
     rest of the loop.
     """

@@ -37,7 +37,7 @@ class SprayBoxes(NamedTuple):
     # (b,): when the box is left behind, as a multiple of `Survey.spray_g_m3`.
     density: Floats
     lasts_ns: float  # time after which a box is gone
-    decay_ns: float  # time in which exp(-1) of the density is left
+    decay_ns: float  # time until exp(-1) of the density is left
 
 
 class Crossings(NamedTuple):

@@ -33,7 +33,7 @@ from ..returns import Keys, Planes, PulseReturns
 
 
 class Role(Flag):
-    """Kinds of effects of a step on pulses, of which each step declares a flag or several."""
+    """Kinds of effects of a step on pulses. Each step declares a flag or several."""
 
     AIMS = auto()  # deflects beams before they are cast
     ABOUT_AXIS = auto()  # deflects beams in azimuth and elevation of the head, not across and up
@@ -224,7 +224,7 @@ class PulseBatch:
     emitter: Emitter
     # (stop - start, 2): angles added to the directions of beams, radians (`deflect`)
     offsets: Floats | None = None
-    # Hits of sub-rays on surfaces, with waveforms also in the air, in the order of sub-rays, which
+    # Hits of sub-rays on surfaces, and with waveforms in the air, in the order of sub-rays, which
     # are numbered from 0 at the batch's start.
     hits: PulseReturns | None = None
     planes: Planes | None = None  # planes of `hits`; None if beams have a single sub-ray

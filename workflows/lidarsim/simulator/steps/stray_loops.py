@@ -311,7 +311,8 @@ def receive(pairs, rays, spots, limits, output):
     """Write rays that receive the light of spots to `output`, `ReceivedSpots`, and their number.
 
     `pairs` are `SpotPairs`, `rays` `ReceivingRays`, `spots` `LitSpots`, and `limits`
-    `ReceptionLimits`. The distance of a spot is that of a pulse which the ray would have sent.
+    `ReceptionLimits`. The distance of a spot is the distance of a pulse which the ray would have
+    sent.
     """
     origins = rays.origins
     directions = rays.directions

@@ -205,8 +205,8 @@ def _vertex(samples, peak):
 def _peaks(wave, stops, peaks):
     """Write the local maxima of a waveform to `stops` and `peaks`, and return their number.
 
-    `scratch` is a `SearchScratch`. Times and heights come from the Gaussian through three samples, energies
-    are the areas between the lowest samples to both sides.
+    `SearchScratch` describes the arguments. Times and heights come from the Gaussian through three
+    samples, energies are the areas between the lowest samples to both sides.
     """
     samples = wave.samples
     length = wave.length
@@ -310,7 +310,7 @@ def _step(residual, slopes, sample_count, count, damping, lower, step):
 def _fit(x, y, sample_count, count, scratch):
     """Fit a sum of `count` Gaussians to `sample_count` samples `y` at `x`, by least squares.
 
-    The method is that of Levenberg and Marquardt; the fit stops when a step gains too little, or
+    The method is by Levenberg and Marquardt; the fit stops when a step gains too little, or
     after `STEPS`. Heights are at most `HIGHEST`, positions within `MOVES` of the guess, and widths,
     standard deviations, at least 1. `scratch` is a `FitScratch`, whose `best` holds the guess, and
     receives the fit.
@@ -443,8 +443,8 @@ def _sort_gaussians(scratch, count, faintest):
 def _join_gaussians(wave, scratch, count, stops, peaks):
     """Join close Gaussians to peaks, write `stops` and `peaks`, and return the number of peaks.
 
-    `scratch` is a `SearchScratch`. A peak has the sum, mean and variance of its Gaussians, and ends half-way
-    to the next peak.
+    `SearchScratch` describes the arguments. A peak has the sum, mean and variance of its Gaussians,
+    and ends half-way to the next peak.
     """
     sigma = wave.sigma
     time = scratch.time
@@ -556,11 +556,11 @@ def divide_into_waveforms(hits, sigma_m, neighbours, parts):
     """Mark where waveforms start, write the waveforms to search, and return their number.
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
-    that of the hit before. A waveform is searched if its hits are farther apart than `NARROW`, and
-    not on one surface. `hits` are `WaveHits`, whose marks `starts`, `starts_surface` and `searched`
-    are written. `sigma_m` is the standard deviation of the system waveform in range, and
-    `neighbours` are `pulse_loops.Neighbours`. `parts` (k, 2) receives the first hit, and the hit
-    after the last, of each waveform to search.
+    the Gaussian of the hit before. A waveform is searched if its hits are farther apart than
+    `NARROW`, and not on one surface. `hits` are `WaveHits`, whose marks `starts`, `starts_surface`
+    and `searched` are written. `sigma_m` is the standard deviation of the system waveform in range,
+    and `neighbours` are `pulse_loops.Neighbours`. `parts` (k, 2) receives the first hit, and the
+    hit after the last, of each waveform to search.
     """
     beam = hits.beam
     distance = hits.pulses.distance
