@@ -57,19 +57,21 @@ class Sweep:
         index: int | EllipsisType = ...,
     ) -> Sweep:
         """Return a sweep by its number in the job, with boxes and index of `SweepBoxes.select`."""
+        positions, columns = points
         return cls(
-            job.name,
-            job.number,
-            job.split,
-            job.values,
-            sweeps.sensors[sweeps.sensor[number]],
-            int(sweeps.numbers[number]),
-            round(sweeps.begins_ns[number]),
-            *points,
-            sweeps.pose.matrix(number),
-            sweeps.all_names,
-            sweeps.faults_in(number),
-            (sweeps, boxes, index),
+            job=job.name,
+            job_number=job.number,
+            split=job.split,
+            values=job.values,
+            sensor=sweeps.sensors[sweeps.sensor[number]],
+            number=int(sweeps.numbers[number]),
+            time_ns=round(sweeps.begins_ns[number]),
+            points=positions,
+            columns=columns,
+            pose=sweeps.pose.matrix(number),
+            object_names=sweeps.all_names,
+            faults=sweeps.faults_in(number),
+            _boxes=(sweeps, boxes, index),
         )
 
     def __getstate__(self) -> dict[str, Any]:

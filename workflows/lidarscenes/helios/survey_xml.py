@@ -239,7 +239,9 @@ class _Import:
             self._notes.append("places of channels beside each other: all leave from the first's")
         trajectory.rows[:, 1:4] += min(positions, default=(0, 0, 0))
         for stretch in trajectory.stretches:
-            for channel, mounted in devices[stretch.leg].items() if stretch.active else ():
+            if not stretch.active:
+                continue
+            for channel, mounted in devices[stretch.leg].items():
                 name = f"leg{stretch.leg}" + (f"-{channel}" if channel else "")
                 self._sensors[name] = self._sensor(mounted, stretch, mount_rotation)
 

@@ -189,8 +189,8 @@ class Follower:
     def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
         """Take note of a step of the world, and return the sweeps that ended since the last step.
 
-        The first sweep begins at the first step, and sweeps follow each other. A time before that
-        of the last step, as of a world that was reset, begins anew.
+        The first sweep begins at the first step, and sweeps follow each other. A time before the
+        last step's time, as of a world that was reset, begins anew.
 
         Parameters
         ----------

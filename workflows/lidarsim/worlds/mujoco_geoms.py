@@ -81,7 +81,7 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) 
 
 
 def segments(radius: float, sag_m: float) -> int:
-    """Return the number of sides of a circle, of which the middles are `sag_m` within the circle.
+    """Return the number of sides of a circle whose middles are `sag_m` within the circle.
 
     A multiple of 4.
     """

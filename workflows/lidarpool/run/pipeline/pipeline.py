@@ -3,7 +3,7 @@
 The driver and four stages exchange messages (`stage_messages.py`):
 
 1. GENERATE describes scans: it finds out that the survey defines them, and reports ranges of scans,
-   of which the driver makes batches;
+   and the driver makes batches of the ranges;
 2. INTERSECT casts batches on GPU workers, in short tasks;
 3. SORT, the sorter, puts summaries of committed scans into scan order, for frames;
 4. COLLECT, several collectors, writes the points of each batch as a part into storage.
