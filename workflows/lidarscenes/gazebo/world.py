@@ -154,7 +154,7 @@ def is_in_reach(matrix: Floats) -> bool:
 
 
 def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visuals, or the collision shapes, of all links, and make moving links actors."""
+    """Read the visuals, or the collision shapes, of all links, and the moving actors."""
     world = load_world(data, path, options.folders)
     content = content_of(world, options)[0]
     if not content.meshes and not content.moving:

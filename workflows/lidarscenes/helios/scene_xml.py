@@ -376,7 +376,7 @@ def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
 
 
 def _text(path: Path) -> str:
-    """Return the content of a file, or no text if the file cannot be read."""
+    """Return the content of a file, or empty content if the file cannot be read."""
     try:
         return read_input_text(path, "replace")
     except (OSError, ValueError, LidarError):  # a zero in the name

@@ -451,7 +451,7 @@ class LinkPath:
         """Return velocities (k, 3), m/s, and angular velocities (k, 3), rad/s, at times (k,), ns.
 
         Both are in the scene frame, and exact through all joints; at a time of the joints' values,
-        the values of the following interval count.
+        the velocities of the following interval count.
 
         Raises
         ------

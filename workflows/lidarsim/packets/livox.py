@@ -23,7 +23,7 @@ from .shots import CarryOver, Shots
 
 DOTS = 96  # dots per packet
 IMU_DATA = 0  # type of data
-_CHECKED_FROM = 28  # byte of a packet where its checksum starts
+_CHECKED_FROM = 28  # first byte that the checksum of a packet covers
 _MODES = ("strongest", "first", "last")
 _STANDARD_GRAVITY = 9.80665  # m/s^2: accelerations are in units of it
 _UNSYNCHRONIZED = 0  # sources of the time

@@ -57,7 +57,7 @@ class Service(ABC):
     def __init__(self, destination: Destination, send_to: Callable[[Destination], None]) -> None:
         self.destination = destination
         self.send_to = send_to
-        # Names that clients may ask for, besides the machine's names; set before the start.
+        # Names of this service in requests, besides the machine's names; set before the start.
         self.names: frozenset[str] = frozenset()
 
     @property

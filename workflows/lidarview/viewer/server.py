@@ -71,7 +71,7 @@ Arguments = Mapping[str, str]
 Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # content of the JSON text, and arrays
 
 
-# Answers a question with its arguments: KeyError for an unknown question, ValueError for a wrong
+# Answers a question with its arguments: KeyError or ValueError for an unknown question or a wrong
 # argument, Abandoned once the function (the last argument) says that nobody waits.
 Source = Callable[[str, Arguments, Callable[[], bool]], Answer]
 

@@ -75,7 +75,7 @@ class ShownSurface:
         Corners are local, metres; objects are indices of static objects.
 
         `by` is a name of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
-        a sample of the hit points, (n, 3). The page itself defines the colours of "grey".
+        a sample of the hit points, (n, 3). Colours of "grey" are left out: the page has them.
         """
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend: Legend | None = None

@@ -117,7 +117,7 @@ def check_memory(
 ) -> None:
     """Raise JobError if a worker has too little memory for scans or batches: bytes a slot.
 
-    The class is separate from LidarError because another job may fit.
+    The error is a JobError because another job may fit.
     """
     peak_bytes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
     if (all_scans := peak_bytes(job.survey.scan_count)) <= available_bytes:

@@ -111,7 +111,7 @@ class Dispatcher:
 
         No batch may be under way if the weight is 0 or less.
 
-        There is not any room if many batches of any jobs are younger than the oldest batch of this
+        The job has no room if many batches of any jobs are younger than the oldest batch of this
         job: the sorter, and the memory, would have to hold their scans.
         """
         span = max((self._batch_count - batch.number for batch in self._batches_of(job)), default=0)

@@ -166,9 +166,9 @@ def offers(
     """Group waiting batches into casting tasks, and choose a worker for each task.
 
     The worker with the least work for its slots gets the next task, of up to `per_task` batches of
-    jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. A batch that was
-    on a worker when it died gets a task for itself, or its neighbours would share the blame for the
-    next death. A suspect batch gets a worker for itself, and later batches wait for the suspect:
+    jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. If a worker
+    died with a batch, the batch gets a task for itself, or its neighbours would share the blame for
+    the next death. A suspect batch gets a worker for itself, and later batches wait for the suspect:
     they must not occupy all workers. Waiting batches are taken in their order.
 
     Parameters
@@ -278,7 +278,7 @@ class _OfferState:
 def _group_key(batch: Batch) -> object:
     """Return a key that is equal for batches that may share a task.
 
-    A batch that was on a worker when it died shares with none. A batch of a task that has failed,
+    If a worker died with a batch, the batch shares with none. A batch of a task that has failed,
     with several jobs in it, shares only with its own job; all others share with jobs of their
     scene.
     """
@@ -311,7 +311,7 @@ def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[H
 
     Batches of a task stay together.
 
-    Batches that were on a collector when it died come alone. A collector on the host of the columns
+    If a collector died with batches, these come alone. A collector on the host of the columns
     is preferred. A suspect batch is collected while no other batch is in stage 4: several
     collectors may share a process. `collectors` is {name of a collector: address of its worker}.
     """
