@@ -1,4 +1,4 @@
-"""Stations of a terrestrial scan: positions of a sensor that sees most surfaces."""
+"""Stations of a terrestrial scan: positions that let a sensor see most surfaces."""
 
 from __future__ import annotations
 
