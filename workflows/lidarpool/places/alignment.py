@@ -1,9 +1,9 @@
 """Aligns sweeps to the planes of a place, and calibrates the rings of the sensor by them.
 
 Odometry is exact to centimetres, and the rings of a sensor differ by as much. Both blur a place.
-Here the distances of points to the planes of the map are made small: by the pose of each sweep, by
-an offset of range, elevation and azimuth of each ring, and by the motion within a sweep, where the
-recording is not compensated for that.
+Here the distances of points to the planes of the map are made small: by the pose of each sweep, and
+by an offset of range, elevation and azimuth of each ring. Points have to be compensated for the
+motion within their sweeps.
 
 Arrays have s sweeps, r rings and n points.
 """
@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.base.even_samples import even_indices
 
 from .recorded_sweeps import MIN_RINGS, RecordedSweep, RecordedSweeps, elevations
 from .voxel_planes import VoxelPlanes
@@ -31,21 +30,18 @@ _MAX_VOXEL_M = 0.3
 _ROUNDS = 4  # of a map and an alignment to this map
 _STEPS = 3  # of Gauss and Newton in a round
 _MAX_VOXELS = 1.5  # distance to a plane's centre beyond which a point is not compared
+_MIN_SIGMA_M = 0.005  # of distances: simulated ranges may have no noise
 _TUKEY_SIGMAS = 4.0  # distances beyond which a point does not count (Tukey's biweight)
 # Standard deviations of the offsets of rings, before the points say more.
 _RANGE_PRIOR_M = 0.05
 _ANGLE_PRIOR_RAD = 0.003
 _POINT_SIGMA_M = 0.015  # of a point's distance to its plane, for the weight of these
 _MIN_PLANE_POINTS = 500  # of a sweep on planes: fewer do not fix its pose
-_MIN_MOTION_M = 0.05  # smaller motions within a sweep are not compensated
-_MIN_SHARE = 0.5  # share of the motion that points must show before it is compensated
-
-Turning = Literal["compensated", "anticlockwise", "clockwise"]
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses of the sweeps, and corrections of their points.
+    """Poses of the sweeps, and offsets of their rings.
 
     Attributes
     ----------
@@ -54,11 +50,6 @@ class Alignment:
     ring_offsets
         float64 (r, 3): added to the range (metres), elevation and azimuth (radians) of the points
         of a ring.
-    turning
-        Direction in which the head turned while the points of a sweep were measured, as seen from
-        above; "compensated" if the points need no compensation.
-    motion_share
-        Share of the motion within a sweep that the points show: 0 compensated, 1 not.
     thickness_m
         Median thickness of the planes of the map after each round.
     plane_distance_m
@@ -67,18 +58,12 @@ class Alignment:
 
     poses: Floats
     ring_offsets: Floats
-    turning: Turning = "compensated"
-    motion_share: float = 0.0
     thickness_m: tuple[float, ...] = ()
     plane_distance_m: Floats = field(default_factory=lambda: np.empty(0))
 
-    def corrected(self, sweep: RecordedSweep, number: int) -> Floats:
-        """Return the points (n, 3) of a sweep in the sensor frame: calibrated and compensated."""
-        points = _calibrated(sweep, self.ring_offsets)
-        if self.turning == "compensated":
-            return points
-        fraction = _fraction_of_turn(points, self.turning)
-        return points + fraction[:, None] * _displacements(points, _motion(self.poses, number))
+    def corrected(self, sweep: RecordedSweep) -> Floats:
+        """Return the calibrated points (n, 3) of a sweep in the sensor frame."""
+        return _calibrated(sweep, self.ring_offsets)
 
     def to_world(self, points: Floats, number: int) -> Floats:
         """Return points (n, 3) of the sensor frame of a sweep in the world."""
@@ -117,7 +102,7 @@ class AlignedSweeps:
     def read(self, number: int) -> AlignedSweep:
         """Read a sweep; LidarError if the recording cannot be read."""
         sweep = self.recorded.read(number)
-        points = self.alignment.corrected(sweep, number)
+        points = self.alignment.corrected(sweep)
         world = self.alignment.to_world(points, number)
         origin = self.alignment.poses[number, :3, 3]
         return AlignedSweep(
@@ -145,10 +130,8 @@ def align(sweeps: RecordedSweeps, poses: Floats, mapped: Sequence[int]) -> Align
     samples = [_sample(sweeps.read(number), number) for number in range(sweeps.count)]
     alignment = Alignment(poses.copy(), np.zeros((sweeps.ring_count, 3)))
     voxel_m = _voxel_m(samples)
-    for number in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         planes = _planes(sweeps.recording.name, samples, alignment, mapped, voxel_m)
-        if number == 1:  # poses are good enough to tell the motion within sweeps
-            alignment = _with_turning(alignment, samples, planes, mapped, voxel_m)
         alignment = _aligned(alignment, samples, planes, mapped, voxel_m)
     return alignment
 
@@ -177,7 +160,7 @@ def _planes(
     for number in mapped:
         sample = samples[number]
         assert sample is not None
-        parts.append(alignment.to_world(alignment.corrected(sample, number), number))
+        parts.append(alignment.to_world(alignment.corrected(sample), number))
     planes = VoxelPlanes.of_points(np.concatenate(parts), voxel_m)
     if planes is None:
         raise LidarError(
@@ -201,7 +184,8 @@ class _PlanePoints:
         cls, points: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
     ) -> _PlanePoints:
         distances, plane, rows = planes.distances(_placed(points, pose), _MAX_VOXELS * voxel_m)
-        sigma = 1.4826 * np.median(np.abs(distances)) + 1e-4 if len(distances) else 1.0
+        spread_m = 1.4826 * float(np.median(np.abs(distances))) if len(distances) else 0.0
+        sigma = max(spread_m, _MIN_SIGMA_M)
         weights = np.maximum(1 - (distances / (_TUKEY_SIGMAS * sigma)) ** 2, 0) ** 2
         return cls(rows, points[rows], distances, planes.normals[plane], weights)
 
@@ -212,7 +196,7 @@ def _registered(
     """Return the pose of a sweep that brings its points to planes, and these points."""
     from scipy.spatial.transform import Rotation
 
-    points = alignment.corrected(sample.part(np.arange(min(len(sample), _SWEEP_POINTS))), number)
+    points = alignment.corrected(sample.part(np.arange(min(len(sample), _SWEEP_POINTS))))
     pose = alignment.poses[number].copy()
     for _ in range(_STEPS):
         on_planes = _PlanePoints.of_sweep(points, pose, planes, voxel_m)
@@ -265,8 +249,6 @@ def _aligned(
     return Alignment(
         poses,
         offsets,
-        alignment.turning,
-        alignment.motion_share,
         (*alignment.thickness_m, planes.thickness_m),
         distance_m,
     )
@@ -311,69 +293,3 @@ def _calibrated(sweep: RecordedSweep, ring_offsets: Floats) -> Floats:
 def _placed(points: Floats, pose: Floats) -> Floats:
     """Return points (n, 3) moved by a pose (4, 4)."""
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
-
-
-# -- motion within a sweep ---------------------------------------------------------------------
-
-
-def _fraction_of_turn(points: Floats, turning: Turning) -> Floats:
-    """Return when points (n, 3) were measured, in turns from the middle of the sweep."""
-    turns = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi)  # the seam is behind
-    return np.asarray(turns if turning == "anticlockwise" else -turns)
-
-
-def _motion(poses: Floats, number: int) -> tuple[Floats, Floats]:
-    """Return the shift (3,) and the rotation vector (3,) in a sweep, in its sensor frame."""
-    from scipy.spatial.transform import Rotation
-
-    first = max(number - 1, 0)
-    last = min(number + 1, len(poses) - 1)
-    span = max(last - first, 1)
-    inverse = poses[number, :3, :3].T
-    shift = inverse @ (poses[last, :3, 3] - poses[first, :3, 3]) / span
-    turn = poses[first, :3, :3].T @ poses[last, :3, :3]
-    return shift, Rotation.from_matrix(turn).as_rotvec() / span
-
-
-def _displacements(points: Floats, motion: tuple[Floats, Floats]) -> Floats:
-    """Return how a motion moves points (n, 3) in the sensor frame of the middle of a sweep."""
-    shift, rotation = motion
-    return np.asarray(shift + np.cross(rotation, points))
-
-
-def _with_turning(
-    alignment: Alignment,
-    samples: Sequence[RecordedSweep],
-    planes: VoxelPlanes,
-    mapped: Sequence[int],
-    voxel_m: float,
-) -> Alignment:
-    """Decide whether points have to be compensated for the motion within their sweeps.
-
-    A share of the motion is fitted to the distances of points to planes: near 1 or -1 if the head
-    turned and the recording is not compensated, near 0 if it is.
-    """
-    product = 0.0
-    square = 0.0
-    longest_m = 0.0
-    for number in np.asarray(mapped)[even_indices(len(mapped), 40)].tolist():
-        motion = _motion(alignment.poses, number)
-        longest_m = max(longest_m, float(np.linalg.norm(motion[0])))
-        pose, on_planes = _registered(alignment, samples[number], planes, number, voxel_m)
-        moved = _displacements(on_planes.points, motion)
-        moved *= _fraction_of_turn(on_planes.points, "anticlockwise")[:, None]
-        change = np.einsum("ij,ij->i", moved @ pose[:3, :3].T, on_planes.normals)
-        product -= float((on_planes.weights * change * on_planes.distances).sum())
-        square += float((on_planes.weights * change * change).sum())
-    share = product / square if square > 0 else 0.0
-    turning: Turning = "compensated"
-    if longest_m > _MIN_MOTION_M and abs(share) > _MIN_SHARE:
-        turning = "anticlockwise" if share > 0 else "clockwise"
-    return Alignment(
-        alignment.poses,
-        alignment.ring_offsets,
-        turning,
-        share,
-        alignment.thickness_m,
-        alignment.plane_distance_m,
-    )

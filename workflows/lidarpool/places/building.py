@@ -159,7 +159,8 @@ def twin(
     Parameters
     ----------
     recording
-        Sweeps in any format of `compare`, or a cloud in memory that has sweeps.
+        Sweeps in any format of `compare`, or a cloud in memory that has sweeps. Points are
+        compensated for the motion within their sweep, or the sensor is slow.
     model
         The sensor, by name or file, for its optics and data sheet; needed for a sensor without
         rings. By default a sensor with the recorded rings.
@@ -260,7 +261,7 @@ class _Building:
     ) -> Reflectances | None:
         """Fit the reflectances of a place."""
         seen = place.observations(sweeps, standing)
-        return fit_reflectances(seen, len(place.surfels), self.recorded.ring_count)
+        return fit_reflectances(seen, place.surfels, self.recorded.ring_count)
 
     def _sensor(
         self, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None
@@ -309,8 +310,6 @@ class _Building:
             "surfels": len(place.surfels),
             "voxel_m": self.voxel_m,
             "length_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
-            "turning": alignment.turning,
-            "motion_share": alignment.motion_share,
             "thickness_m": list(alignment.thickness_m),
             "plane_distance_m": float(np.nanmedian(alignment.plane_distance_m)),
             "ring_offset_m": float(np.std(alignment.ring_offsets[:, 0])),

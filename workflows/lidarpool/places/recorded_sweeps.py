@@ -22,7 +22,7 @@ MIN_RINGS = 4  # a sensor with fewer rings is treated as a sensor without rings
 _MAX_RINGS = 512
 _GAP_RAD = np.radians(0.5)  # between the rays of a sensor without rings, in many sweeps
 _REFERENCE_SWEEPS = 5  # sweeps that tell the elevations of the rings
-_WRAP_DEG = 300.0  # a fall of the azimuth that begins a ring
+_BACKWARD_DEG = 15.0  # a step back of the azimuth that begins a ring
 _SHORT_RING = 0.02  # a run of points shorter than this share of the median is no ring
 _MIN_IN_ORDER = 0.95  # share of runs whose elevations go on in one direction
 
@@ -171,10 +171,11 @@ def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyAr
 
 
 def _runs(points: Floats) -> tuple[Ints, Bools]:
-    """Return where runs of rising or falling azimuths start (k,), and which runs are rings."""
+    """Return where runs of rising or of falling azimuths start (k,), and which runs are rings."""
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
-    falls = np.abs(np.diff(azimuth)) > _WRAP_DEG
-    starts = np.append(0, np.flatnonzero(falls) + 1)
+    steps = np.diff(azimuth)
+    direction = np.sign(np.sum(np.sign(steps)))
+    starts = np.append(0, np.flatnonzero(direction * steps < -_BACKWARD_DEG) + 1)
     lengths = np.diff(np.append(starts, len(points)))
     return starts, lengths > _SHORT_RING * np.median(lengths)
 

@@ -17,6 +17,7 @@ from lidarsim.base.arrays import Floats, Ints
 
 from .alignment import AlignedSweep
 from .place import Observations, Seen
+from .surfels import Surfels
 
 _ROUNDS = 12  # of factors and reflectances in turn
 _RANGE_EDGES_M = (0, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 65, 80, 100, 130, 200, np.inf)
@@ -66,16 +67,19 @@ class Reflectances:
         }
 
 
-def fit_reflectances(seen: Observations, surfel_count: int, ring_count: int) -> Reflectances | None:
+def fit_reflectances(seen: Observations, surfels: Surfels, ring_count: int) -> Reflectances | None:
     """Fit reflectances of surfels and the sensor's response; None without intensities.
 
-    Surfels that no ray meets have the median reflectance. Sums, not logarithms, are compared:
-    many sensors report dark surfaces as 0.
+    Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
+    Sums, not logarithms, are compared: many sensors report dark surfaces as 0.
     """
     if not len(seen.intensity) or not np.isfinite(seen.intensity).all():
         return None
     if not (seen.intensity > 0).any():
         return None
+    from scipy.spatial import cKDTree
+
+    surfel_count = len(surfels)
     white = float(np.quantile(seen.intensity, _WHITE_QUANTILE))
     intensity = np.minimum(seen.intensity / white, 1.0)
     rows = (_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring)
@@ -93,8 +97,8 @@ def fit_reflectances(seen: Observations, surfel_count: int, ring_count: int) -> 
             )
             product = others * factors[index][row]
     known = np.isfinite(reflectance)
-    median = float(np.median(reflectance[known])) if known.any() else 0.5
-    reflectance = np.where(known, reflectance, median)
+    _, nearest = cKDTree(surfels.centres[known]).query(surfels.centres[~known])
+    reflectance[~known] = reflectance[known][nearest]
     # Reflectances of 1 are white: the factors take what is above.
     scale = max(float(np.quantile(reflectance, _WHITE_QUANTILE)), 1e-6)
     reflectance = np.clip(reflectance / scale, _MIN_REFLECTANCE, 1.0)

@@ -1,0 +1,176 @@
+"""A place from a recording: what stands, where, how bright; what moved is left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from lidarpool import LidarError, Material, Mounted, Pose, Scene, Sensor, Survey, Track, twin
+from lidarpool.cli.commands import cli
+from lidarpool.clouds.recording import Recording
+from lidarpool.places.recorded_sweeps import RecordedSweeps
+from lidarpool.recordings.opening import open_recording
+from lidarpool.scenario.build import build
+from lidarpool.scenario.scenario import Scenario
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.actors import Actor, box
+from lidarsim.scene.colours import LINEAR
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
+
+pytest.importorskip("scipy")
+
+SWEEPS = 12
+PERIOD_S = 0.1
+SPEED_M_S = 5.0
+FLOOR = 0.2
+WALLS = 0.6
+CAR = (4.0, 1.8, 1.5)
+CAR_Y = 3.0
+
+
+def static_box(name, size, middle):
+    """A box on the ground around a place."""
+    mesh = box(name, size)
+    return SceneMesh(name, mesh.vertices + np.array([*middle, 0.0]), mesh.faces)
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A street of 40 m between walls with posts, and a car that drives past."""
+    corners = np.array([[-30, -8, 0], [30, -8, 0], [30, 8, 0], [-30, 8, 0]], float)
+    meshes = [
+        SceneMesh("floor", corners, np.array([[0, 1, 2], [0, 2, 3]])),
+        static_box("wall left", (60.0, 1.0, 6.0), (0.0, 8.0)),
+        static_box("wall right", (60.0, 1.0, 6.0), (0.0, -8.0)),
+        static_box("wall ahead", (1.0, 16.0, 6.0), (30.0, 0.0)),
+        *(static_box(f"shed {x}", (1.7, 2.2, 2.4), (x, 6.5)) for x in (-11.0, -2.0, 5.0, 16.0)),
+        *(static_box(f"post {x}", (0.4, 0.4, 3.0), (float(x), -5.0)) for x in range(-12, 15, 6)),
+    ]
+    car = Actor(box("car", CAR), Track([0, 3], [[-14, CAR_Y, 0], [26, CAR_Y, 0]]))
+    return Scene.from_meshes(meshes).with_actors([car])
+
+
+@pytest.fixture(scope="module")
+def survey():
+    end_s = SWEEPS * PERIOD_S + 0.2
+    return Survey(
+        sensors=[Mounted(Sensor.grid(480, 24, vertical_fov_deg=40), Pose((0, 0, 1.8)))],
+        trajectory=Track([0, end_s], [[-3, 0, 0], [SPEED_M_S * end_s - 3, 0, 0]]),
+        steps=36 * SWEEPS,
+        columns=["time", "intensity"],
+        materials=[Material("floor", FLOOR), Material("*", WALLS)],
+        precision_m=1e-4,
+    )
+
+
+@pytest.fixture(scope="module")
+def drive(street, survey):
+    """Return the recorded sweeps of the drive: a cloud in memory."""
+    part = columns_of(list(Rig(street, survey, "auto").cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, street.origin)
+    sweeps = Sweeps.from_survey(survey, street)
+    return replace(cloud, sweeps=lambda: sweeps)
+
+
+@pytest.fixture(scope="module")
+def place(drive):
+    return twin(drive)
+
+
+def without_poses(drive, rows=None):
+    """Return a recording of the sweeps in the sensor frame, without poses and times."""
+    opened = open_recording(drive, name="drive")
+
+    def read(number):
+        points, columns, _ = opened.read(number)
+        order = slice(None) if rows is None else rows(points, columns)
+        ring = {} if rows is not None else {"ring": columns["channel"]}
+        return points[order], {"intensity": columns["intensity"][order]} | ring, None
+
+    return Recording("drive", opened.count, read)
+
+
+def test_a_twin_has_the_ranges_of_held_out_sweeps(place):
+    held = place.figures["held_out"]["standing"]
+    assert held["median_size_m"] < 0.01
+    assert held["missed"] < 0.01
+    assert abs(held["intensity_error"]) < 0.1
+    assert "12 sweeps" in repr(place)
+
+
+def test_what_moved_is_no_part_of_the_place(place):
+    middles = place.scene.vertices[place.scene.faces].mean(axis=1)
+    in_lane = np.abs(middles[:, 1] - CAR_Y) < CAR[1] / 2 + 0.1
+    ghosts = in_lane & (middles[:, 2] > 0.15) & (middles[:, 2] < CAR[2] + 0.1)
+    assert ghosts.mean() < 0.005
+    assert (np.abs(middles[:, 1] - CAR_Y) < 1).any()  # the ground stays
+    assert place.figures["moved"] > 0
+
+
+def test_surfaces_are_as_bright_as_they_were(place):
+    scene = place.scene
+    middles = scene.vertices[scene.faces].mean(axis=1)
+    (colours,) = scene.coloured
+    light = LINEAR[colours.means()].mean(axis=1)
+    floor = np.median(light[middles[:, 2] < 0.05])
+    walls = np.median(light[(np.abs(middles[:, 1]) > 7.3) & (middles[:, 2] > 1)])
+    np.testing.assert_allclose(floor / walls, FLOOR / WALLS, rtol=0.3)
+
+
+def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
+    files = place.save(tmp_path / "twin")
+    assert {file.name for file in files} == {
+        "place.glb", "trajectory.csv", "sensor.yaml", "scenario.yaml", "twin.json", "report.html",
+    }  # fmt: skip
+    path = tmp_path / "twin" / "scenario.yaml"
+    job = build(Scenario.load(path))
+    np.testing.assert_allclose(job.survey.path.pose(0).position, place.poses[0, :3, 3], atol=1e-5)
+    other = build(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
+    assert other.survey.carried[0].sensor.channels == 16
+    result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
+    assert "holds scenario.yaml: give another folder, or --overwrite" in str(result.exception)
+
+
+def test_rings_are_found_in_the_order_of_points(drive):
+    def ring_by_ring(points, columns):
+        azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+        return np.lexsort((azimuth, -columns["channel"].astype(int)))
+
+    sweeps = RecordedSweeps.of_recording(without_poses(drive, ring_by_ring))
+    channels = len(np.unique(open_recording(drive, name="drive").read(0)[1]["channel"]))
+    assert sweeps.ring_count == channels
+    assert f"shows {channels} rings" in sweeps.notes[0]
+    rings = sweeps.read(3).ring
+    assert (np.diff(rings) >= 0).all()
+
+
+def test_a_recording_without_a_place_is_refused(drive, tmp_path):
+    recording = without_poses(drive)
+    with pytest.raises(LidarError, match="has 3 sweeps, and a twin needs at least 4"):
+        twin(replace(recording, count=3))
+    shuffled = without_poses(
+        drive, lambda points, _: np.random.default_rng(1).permutation(len(points))
+    )
+    with pytest.raises(LidarError, match="drive has no rings: name its sensor"):
+        twin(shuffled)
+    empty = Recording("drive", 9, lambda _: (np.zeros((0, 3)), {}, None))
+    with pytest.raises(LidarError, match="drive has no points"):
+        twin(empty)
+    trajectory = tmp_path / "poses.csv"
+    trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
+    with pytest.raises(LidarError, match="has 2 poses for 12 sweeps without times"):
+        twin(recording, trajectory=trajectory)
+
+
+def test_another_sensor_is_for_a_scenario_of_one_sensor(tmp_path):
+    path = tmp_path / "s.yaml"
+    path.write_text(yaml.safe_dump({"scene": "seed", "sensors": {"a": "velodyne/vlp16"}}))
+    with pytest.raises(LidarError, match=r"--sensor is for one sensor: in .* change sensors"):
+        Scenario.load(path, {"sensor": "velodyne/vlp32c"})
