@@ -59,6 +59,7 @@ from lidarpool import (
     sweeps,
     to_dask,
     to_open3d,
+    twin,
 )
 from lidarpool.run.options import RunKeywords, RunOptions
 from lidarpool.scenario.sections import PoolSection
@@ -141,6 +142,10 @@ WRONG = {
         ("Car", AT[0], "no actor or instance 'Car'"),
     ],
     fit: [
+        (3, "recording is 3"),
+        ("nowhere", "nowhere does not exist"),
+    ],
+    twin: [
         (3, "recording is 3"),
         ("nowhere", "nowhere does not exist"),
     ],
@@ -277,6 +282,7 @@ def test_nothing_public_is_left_out():
     made = {
         "Comparison",
         "Fit",
+        "Twin",
         "CampaignRun",
         "ScanFrame",
         "Plan",

@@ -51,8 +51,8 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "no scenario": (["run"], "Usage: lidarpool run"),
     "unknown backend": (["run", "good.yaml", "--backend", "gpu"], "'gpu' is not one of 'auto'"),
     "options of a mesh": (
-        ["run", "good.yaml", "--sensor", "vlp16"],
-        "in good.yaml, change sensor.",
+        ["run", "good.yaml", "--pose", "0,0,1"],
+        "in good.yaml, change poses.",
     ),
     "several meshes": (["run", "a.stl", "a.stl", "--pose", "0,0,1"], "are for one mesh"),
     "misspelt model": (["run", "a.stl", "--sensor", "vlp61"], "Did you mean 'vlp16'?"),

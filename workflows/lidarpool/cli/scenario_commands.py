@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from ..base.tls_files import TlsFiles
 
-MAX_COPIED_TRIANGLES = 20_000_000  # of files that cannot share triangles
+MAX_COPIED_TRIANGLES = 20_000_000  # limit for files that cannot share triangles
 _SENSOR_FORMATS = "Format of the file: " + ", ".join(row.name for row in FORMATS) + "."
 
 

@@ -39,10 +39,10 @@ class SweepFiles(NamedTuple):
     sweeps: int  # or parts
     read: Callable[[int], Read]
     times_ns: Floats | None = None  # (sweeps,): start of each sweep; None if unknown
-    point_count: int | None = None  # of a cloud in parts; None of sweeps
+    point_count: int | None = None  # number of points of a cloud in parts; None for sweeps
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
     notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
-    epsg: int | None = None  # of the system that the file states, if that is in metres
+    epsg: int | None = None  # EPSG code of the file's system, if that is in metres
 
 
 class SeveralSensorsError(LidarError):
@@ -114,7 +114,7 @@ class FiredPoints(NamedTuple):
 
     points: Floats  # (n, 3): in the sensor frame at the firing of each, metres
     columns: Columns  # (n,) each
-    poses: FiringPoses  # of the sensor in the world
+    poses: FiringPoses  # poses of the sensor in the world
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,25 +122,25 @@ class Recording:
     """A recording of sweeps; or a cloud without sweeps (`is_cloud`), in parts instead."""
 
     name: str
-    count: int  # of sweeps, or of parts
+    count: int  # number of sweeps or parts
     read: Callable[[int], Read]
-    intensity_column: str | None = None  # if not one of `_INTENSITY_COLUMNS`
+    intensity_column: str | None = None  # a name that is not in `_INTENSITY_COLUMNS`
     is_cloud: bool = False
-    point_count: int | None = None  # if known before the points are read
+    point_count: int | None = None  # None if unknown before the points are read
     times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
     notes: tuple[str, ...] = ()
     thinned: bool = False  # whether hits were left out: gaps are no lost returns
     white: float | None = None  # intensity of a white surface, if it is the same at all ranges
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
-    metres: Metres = METRES  # of the units of x, y and z
-    epsg: int | None = None  # of the system that the file states, if that is in metres
+    metres: Metres = METRES  # lengths of the units of x, y and z
+    epsg: int | None = None  # EPSG code of the file's system, if that is in metres
     sample: Callable[[int], Read] | None = None  # reads about so many points, evenly in the file
     # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
     # None if they are unknown; None if the recording has no frames.
     frame_poses: Callable[[], Floats | None] | None = None
     sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
-    noise_filter: NoiseFilter | None = None  # that `read` applies; None if it leaves out nothing
+    noise_filter: NoiseFilter | None = None  # applied by `read`; None if nothing is left out
     # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
     fired: Callable[[int], FiredPoints] | None = None
 
@@ -227,13 +227,13 @@ class RecordingSource:
     """A file or folder to open, and what the user chose of it."""
 
     path: Path
-    name: str  # in messages
+    name: str  # name in messages
     sensor: str | None = None  # or topic
     intensity: str | None = None  # column, if not one of the usual names
-    unit: str | None = None  # of positions, in place of the unit that the file states
+    unit: str | None = None  # replaces the unit that the file states
 
     def recording(self, count: int, read: Callable[[int], Read], **fields: Any) -> Recording:
-        """Return a recording of `count` sweeps or parts; `fields` are those of `Recording`."""
+        """Return a recording of `count` sweeps or parts; `fields` are fields of `Recording`."""
         return Recording(self.name, count, read, self.intensity, **fields)
 
     def choose(self, kind: str, names: Iterable[str]) -> str:
@@ -266,7 +266,10 @@ class RecordingSource:
         return stated_metres(None, np.zeros((0, 3)), self.unit)[0]
 
     def epsg_in_metres(self, system: StatedSystem | None, metres: Metres) -> int | None:
-        """Return the code of a stated system; None if a unit was chosen instead, or in feet."""
+        """Return the code of a stated system.
+
+        Returns None if a unit was chosen instead, or in feet.
+        """
         if system is None or self.unit is not None or metres != METRES:
             return None
         return system.epsg
@@ -281,7 +284,7 @@ class RecordingSource:
         """Return a recording whose `sweeps()` can be iterated from the first sweep only.
 
         `points` converts a sweep; `count` is the number of sweeps, which are counted if it is None;
-        `fields` are those of `Recording`.
+        `fields` are fields of `Recording`.
         """
         if count is None:
             with reading(self.name):
@@ -327,7 +330,7 @@ def open_cloud(
 ) -> Recording:
     """Open a cloud of lidarpool, in parts or as the sweeps of a sensor.
 
-    `load_sweeps` is None for a cloud without sweeps; `fields` are those of `Recording`.
+    `load_sweeps` is None for a cloud without sweeps; `fields` are fields of `Recording`.
     """
     if load_sweeps is None:
 
@@ -380,7 +383,10 @@ def _ray_keys(columns: Columns) -> Ints:
 
 
 def positions_of(columns: Columns) -> Floats:
-    """Return the positions (n, 3) in columns x, y and z; ValueError without these."""
+    """Return the positions (n, 3) in columns x, y and z.
+
+    Raises ValueError without these.
+    """
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its points have no {', '.join(missing)}")
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
@@ -389,7 +395,7 @@ def positions_of(columns: Columns) -> Floats:
 def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> str:
     """Return the chosen sensor or topic, or the only sensor or topic; else raise LidarError.
 
-    `kind` is the plural, such as "sensors"; `name` is that of the recording.
+    `kind` is the plural, such as "sensors"; `name` is the recording's name.
     """
     available = list(names)
     if chosen is None and len(available) == 1:
@@ -409,7 +415,10 @@ def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> st
 
 
 def take_positions(columns: dict[str, AnyArray]) -> Floats:
-    """Take columns x, y and z out, and return positions (n, 3); ValueError without these."""
+    """Take columns x, y and z out, and return positions (n, 3).
+
+    Raises ValueError without these.
+    """
     positions = positions_of(columns)
     for axis in "xyz":
         del columns[axis]

@@ -28,7 +28,7 @@ from .range_image import RangeImages
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
 CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")  # without a return, or with
 
-WIDTH = 1600  # of charts, pixels
+WIDTH = 1600  # width of charts, pixels
 # of charts, as shares of the width
 LEFT = 0.075
 RIGHT = 0.845
@@ -62,12 +62,12 @@ class Comparison:
 
     __signature__ = ReadableSignature()
 
-    figures: dict[str, Any]  # as in compare.json; lengths in metres, None for unknown
-    images: RangeImages | None  # of the first pair of sweeps that has range images
+    figures: dict[str, Any]  # content of compare.json; lengths in metres, None for unknown
+    images: RangeImages | None  # images of the first pair of sweeps that has any
     residuals: Floats  # (k,): of all cells with a return in both, or of a choice, metres
-    distances: tuple[Floats, Floats]  # of A's points to B, and of B's to A, metres
-    intensities: tuple[Floats, Floats]  # of A and B that are compared
-    measured_points: Sequence[MeasuredPoints]  # of A and of B: of one pair of sweeps, or of all
+    distances: tuple[Floats, Floats]  # distances from A's points to B, and from B's to A, metres
+    intensities: tuple[Floats, Floats]  # intensities in A and B that are compared
+    measured_points: Sequence[MeasuredPoints]  # points of A and of B: one pair of sweeps, or all
 
     def __repr__(self) -> str:
         return rendered("comparison.txt", report=self.figures).rstrip("\n")

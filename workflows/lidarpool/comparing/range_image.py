@@ -143,7 +143,7 @@ class _PolarSweep:
     def image(self, rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
         """Return `RangeImages.images` of a sweep, and the share of points hidden in cells.
 
-        `rows` (r,) are the rows of the sweep's rings; `phases` are those of the method `phases`. Of
+        `rows` (r,) are the rows of the sweep's rings; `phases` come from the method `phases`. Of
         several points in a cell, the point closest to the middle is taken, and of several returns
         of a pulse the nearest.
         """
@@ -248,7 +248,7 @@ def paired_images(
     """Pair the ranges of each ray of two sweeps with the same rays.
 
     Pulses that look into the same cell are often not of the same ray where the sensor moves. The
-    images, and errors, are those of `range_images`.
+    images and errors are as for `range_images`.
     """
     assert a.rays is not None and b.rays is not None and a.rings is not None and b.rings is not None
     polar_a = _PolarSweep.from_points(a, names[0])
@@ -294,8 +294,8 @@ def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _Co
     """Match rings of A and B that look at the same elevation.
 
     Some programs count from below, others from above or from 1: if the numbers of A follow from
-    those of B, rings of which only A or B has returns have a row, too. LidarError if the rings look
-    at other elevations.
+    B's numbers, rings of which only A or B has returns have a row, too. Raises LidarError if the
+    rings look at other elevations.
     """
     numbers, notes = _ring_numbers(a, b)
     if (unmatched := len(np.setxor1d(numbers, b.rings))) > 0:

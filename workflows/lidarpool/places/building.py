@@ -149,7 +149,7 @@ def twin(
     voxel_m: Annotated[float, Field(gt=0, le=10)] = DEFAULT_VOXEL_M,
     sensor: str | None = None,
     intensity: str | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    tell: Callable[[str], None] | None = None,
 ) -> Twin:
     """Rebuild the place of a recording without what moved, to scan it again.
 
@@ -197,7 +197,7 @@ def twin(
         raise LidarError(
             f"{recording.name} has no rings: name its sensor, for example --model livox/mid360."
         )
-    return _Building(sweeps, base, voxel_m, tell).twin(
+    return _Building(sweeps, base, voxel_m, tell or (lambda line: None)).twin(
         None if trajectory is None else Path(trajectory)
     )
 

@@ -87,7 +87,7 @@ def _cells(points: Floats, edges_rad: Floats) -> tuple[Ints, Ints]:
 def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, Bools]:
     """Return a mask of the points of each sweep that stand: {number: (n,)}.
 
-    `numbers` are those of the sweeps that are compared with each other, ascending.
+    `numbers` name the sweeps that are compared with each other, ascending.
     """
     row_elevation_rad = sweeps.recorded.elevation_rad
     if not len(row_elevation_rad):

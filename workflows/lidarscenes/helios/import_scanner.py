@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
 import yaml
@@ -45,7 +45,7 @@ class _Reference(NamedTuple):
 
 def is_scanner(survey: Path) -> bool:
     """Return True if a path is of a file of HELIOS++ with scanners and without a survey."""
-    with suppress(OSError, LidarError, ValueError):
+    with suppress(OSError, LidarError, ValueError, ParseError):
         root = xml_root(read_input(_Reference.of(survey).file))
         has_scanner = root.find("scanner") is not None
         return root.tag == "document" and has_scanner and root.find("survey") is None

@@ -35,7 +35,7 @@ class Estimate(NamedTuple):
     def from_shares(cls, parts: Floats, totals: Ints) -> Estimate:
         """Estimate a share: the sum of parts (n,) over the sum of totals (n,), as of lost pulses.
 
-        The interval is that of Clopper and Pearson for the number of independent pulses whose
+        The interval follows Clopper and Pearson for the number of independent pulses whose
         binomial variance is the variance of the share by the n parts, at most the sum of totals.
         The interval is not empty if the share is 0.
         """

@@ -98,11 +98,11 @@ def fit(
         The sensor, by name or file; the model keeps its figures that the recording does not
         determine. By default a sensor with the recorded beams.
     scene
-        The recorded place as a scene. By default surfaces are those of the recording, and the
+        The recorded place as a scene. By default the recording has the surfaces, and the
         sensor has to stand.
     pose
         Pose of the sensor in the scene: a pose, or a pose for each sweep; also matrices (n, 4, 4).
-        By default poses are those of the recording, and without those the scene's origin. A result
+        By default the recording has the poses; without poses, the scene's origin. A result
         has the poses of all its pulses; other poses hold for a sweep.
     sensor, intensity
         Name of the sensor, or topic of a bag, if the recording has several; column with the

@@ -23,7 +23,7 @@ from ...clouds.recording import FiredPoints, Recording
 from .standstill import Speed, sweep_period_ns
 
 _MAX_SWEEPS = 64  # whose poses are read
-# Poses of a sensor that stands differ by less: exact poses, and those of a localization.
+# Poses of a sensor that stands differ by less: exact poses, and poses of a localization.
 _MIN_SHIFT_M = 0.001
 _MIN_TURN_DEG = 0.01
 _LOCALIZED_SHIFT_M = 0.05
@@ -44,7 +44,7 @@ class KnownPoses:
     def of_recording(
         cls, recording: Recording, pose: Any, scene: Scene | None
     ) -> KnownPoses | None:
-        """Return the poses given as `pose`, else those of the recording; None if unknown.
+        """Return the poses given as `pose`, else the recording's poses; None if unknown.
 
         LidarError if the given poses are neither one nor one for each sweep.
         """
@@ -87,7 +87,7 @@ class KnownPoses:
     def fired(self, recording: Recording) -> Callable[[int], FiredPoints]:
         """Return a function that reads a sweep as fired, with poses in the scene frame.
 
-        A result says where each pulse was fired; otherwise the pose of a sweep is that of all its
+        A result says where each pulse was fired; otherwise the pose of a sweep counts for all its
         pulses. LidarError if the recording has poses of some sweeps alone.
         """
         read = recording.fired

@@ -53,7 +53,7 @@ class Pulses:
     slope: Floats  # growth of the range with the direction, metres in a radian
     residual: Floats  # range less `expected`, metres; NaN of a lost pulse
     intensity: Floats  # mean of the returns beside the pulse; NaN if unknown
-    difference: Floats  # residual less that of the next pulse of the ring; NaN if unknown
+    difference: Floats  # residual less the residual of the next pulse of the ring; NaN if unknown
 
     def rough_sigma(self) -> Floats:
         """Estimate the standard deviations (n,) of ranges, metres, for the choice of outliers."""
@@ -72,7 +72,7 @@ class Pulses:
     def rays(self, sigma: Floats) -> SmoothRays:
         """Return the pulses as rays of one pulse each; ranges have standard deviations (n,).
 
-        The variances are those of differences of neighbouring pulses: errors of poses and of the
+        The variances belong to differences of neighbouring pulses: errors of poses and of the
         scene are alike in both.
         """
         returned = np.isfinite(self.residual)
@@ -137,7 +137,7 @@ class _CellReturns(NamedTuple):
 
     points: Floats  # (r, c, 3): in the sensor frame at their firings, metres
     beside: Floats  # (2, r, c, 3): returns of the ring before and after the cell, like `points`
-    own: Bools  # (r, c): whether the return is that of the cell
+    own: Bools  # (r, c): whether the return belongs to the cell
     known: Bools  # (r, c): whether the pose of the cell's pulse is known
     positions: Floats  # (r c, 3): of the sensor at the firings, scene frame, metres
     rotations: Floats  # (r c, 3, 3): from the sensor frame to the scene frame

@@ -20,7 +20,7 @@ _TAIL_CHANCE = 0.1
 # rings of a patch of rays; patches of a revolution
 _PATCH_ROWS = 4
 _PATCHES = 36
-_FRONTAL_TANGENT = 1.0  # tangent of incidence: below, noise is hardly that of directions
+_FRONTAL_TANGENT = 1.0  # tangent of incidence: below, directions add hardly any noise
 _MIN_FRONTAL_RAYS = 100
 _MIN_FRONTAL_SHARE = 0.05
 _MAX_HALF_INTERVAL = 0.75  # half of the interval of a figure of noise, over its value
@@ -51,8 +51,8 @@ def fit_performance(
 ) -> tuple[dict[str, Estimate], Floats]:
     """Estimate noise and lost pulses of a sensor from rays.
 
-    `energy` (k,) is that of the returns of rays, if known; `all_known` says that rays without any
-    return are known, too, by a scene. Returns estimates by the field names of `Noise`; and the
+    `energy` (k,) is the energy of the returns of rays, if known. `all_known` says that rays without
+    any return are known, too, by a scene. Returns estimates by the field names of `Noise`, and the
     standard deviations of rays (k,), metres, by range or by energy, whichever is likelier.
     """
     threshold, dropout = _fit_detection(rays, energy, all_known)
@@ -102,7 +102,7 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
     """Estimate the share of pulses that chosen rays (k,) lose; None for too few rays.
 
     Without `all_known`, a ray without any return is unknown, so the rays that are known lose fewer
-    pulses than others. For each return of a ray, the share is that of the other `trials - 1`
+    pulses than others. For each return of a ray, the share is taken among the other `trials - 1`
     pulses: the mean of (trials - returns) / (trials - 1) over all returns is unbiased.
     """
     min_trials = 1 if all_known else 2
@@ -242,7 +242,7 @@ def _fit_trimmed(
     """Fit a model to variances, and estimate the covariance (p, p) of its parameters (p,).
 
     Samples whose variance is above a quantile, which a share `chance` of the expected distribution
-    exceeds, are left out; the expected mean of the others is that of the truncated distribution.
+    exceeds, are left out; the others have the mean of the truncated distribution.
     `start` (p,) has initial parameters.
     """
     from scipy.optimize import least_squares
@@ -277,8 +277,8 @@ def fit_threshold(
 ) -> Estimate | None:
     """Estimate the energy of which half of the pulses return, by the curve of `Noise.detected`.
 
-    `energy` (k,) is that of rays; `dropout` is the share that is lost at any energy. Without
-    `all_known`, a ray is known only if a pulse returns: the likelihood is that of a truncated
+    `energy` (k,) is the energy of rays; `dropout` is the share that is lost at any energy. Without
+    `all_known`, a ray is known only if a pulse returns: the likelihood belongs to a truncated
     binomial distribution. None if too few rays lose some of their pulses.
     """
     from scipy.optimize import brute
