@@ -38,6 +38,7 @@ EXCEPTIONS = {
     "lidarscenes/procedural/": "scenes are made once, and read by all",
     "lidarscenes/writers/": "scenes are written once, and read by all",
     "lidarsim/scene/simplified.py": "for pictures and planning",
+    "lidarsim/sensor/helios_scanner.py": "sensors are written once, for another program",
     "lidarsim/sweeps/": "files of sweeps are written by one process for all",
     "lidarscenes/files/ifc_child.py": "ifcopenshell computes places itself; the rest is a note",
     "lidarscenes/files/usd_child.py": "OpenUSD computes places itself; the rest are checks",
