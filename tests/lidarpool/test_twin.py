@@ -131,7 +131,10 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     }  # fmt: skip
     path = tmp_path / "twin" / "scenario.yaml"
     job = build(Scenario.load(path))
-    np.testing.assert_allclose(job.survey.path.pose(0).position, place.poses[0, :3, 3], atol=1e-5)
+    middle = 5
+    pose = job.survey.path.pose(0, 1e9 * place.times_s[middle])
+    np.testing.assert_allclose(pose.position, place.poses[middle, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(pose.rotation_matrix, place.poses[middle, :3, :3], atol=1e-5)
     other = build(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
     assert other.survey.carried[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
@@ -167,6 +170,36 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
     with pytest.raises(LidarError, match="has 2 poses for 12 sweeps without times"):
         twin(recording, trajectory=trajectory)
+
+
+@pytest.mark.extended
+def test_a_drive_far_from_zero_with_an_empty_sweep_and_a_trajectory(drive, place, tmp_path):
+    opened = open_recording(drive, name="drive")
+    far = np.array([400_000.0, 5_600_000.0, 90.0])
+    half = np.sqrt(0.5)  # the world is turned by 90 degrees
+    rows = ["time_s,x,y,z,qx,qy,qz,qw"]
+    for number in range(SWEEPS):
+        x, y, z = place.poses[number, :3, 3]
+        east, north, up = far + np.array([-y, x, z])
+        rows.append(f"{5 + 0.2 * number},{east},{north},{up},0,0,{half},{half}")
+    trajectory = tmp_path / "poses.csv"
+    trajectory.write_text("\n".join(rows) + "\n")
+
+    def read(number):
+        points, columns, _ = opened.read(number)
+        kept = slice(0) if number == 3 else slice(None)
+        return points[kept], {"ring": columns["channel"][kept]}, None
+
+    found = twin(Recording("drive", opened.count, read), trajectory=trajectory)
+    np.testing.assert_allclose(found.times_s, 0.2 * np.arange(SWEEPS), atol=1e-9)
+    steps = np.diff(found.poses[:, :3, 3], axis=0)
+    np.testing.assert_allclose(steps[:, 1], SPEED_M_S * PERIOD_S, atol=0.01)
+    assert found.figures["held_out"]["standing"]["median_size_m"] < 0.01
+    assert not found.scene.has_colours.any()
+    found.save(tmp_path / "twin")
+    scenario = yaml.safe_load((tmp_path / "twin" / "scenario.yaml").read_text())
+    np.testing.assert_allclose(scenario["world"]["origin"], far, atol=10)
+    build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
 
 
 def test_another_sensor_is_for_a_scenario_of_one_sensor(tmp_path):

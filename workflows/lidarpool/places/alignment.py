@@ -63,18 +63,23 @@ class Alignment:
 
     def corrected(self, sweep: RecordedSweep) -> Floats:
         """Return the calibrated points (n, 3) of a sweep in the sensor frame."""
-        return _calibrated(sweep, self.ring_offsets)
-
-    def to_world(self, points: Floats, number: int) -> Floats:
-        """Return points (n, 3) of the sensor frame of a sweep in the world."""
-        return _placed(points, self.poses[number])
+        points = sweep.points
+        if not self.ring_offsets.any():
+            return points
+        range_offset_m, elevation_offset, azimuth_offset = self.ring_offsets[sweep.ring].T
+        range_m = np.linalg.norm(points, axis=1) + range_offset_m
+        elevation = elevations(points) + elevation_offset
+        azimuth = np.arctan2(points[:, 1], points[:, 0]) + azimuth_offset
+        level = range_m * np.cos(elevation)
+        return np.stack(
+            [level * np.cos(azimuth), level * np.sin(azimuth), range_m * np.sin(elevation)], axis=1
+        )
 
 
 class AlignedSweep(NamedTuple):
     """Returns of a sweep; arrays of n points."""
 
-    number: int
-    points: Floats  # (n, 3): in the sensor frame, calibrated and compensated, metres
+    points: Floats  # (n, 3): in the sensor frame, calibrated, metres
     world: Floats  # (n, 3): metres
     origin: Floats  # (3,): of the rays, in the world
     ring: Ints  # (n,)
@@ -103,10 +108,14 @@ class AlignedSweeps:
         """Read a sweep; LidarError if the recording cannot be read."""
         sweep = self.recorded.read(number)
         points = self.alignment.corrected(sweep)
-        world = self.alignment.to_world(points, number)
-        origin = self.alignment.poses[number, :3, 3]
+        pose = self.alignment.poses[number]
         return AlignedSweep(
-            number, points, world, origin, sweep.ring, sweep.intensities, sweep.classes
+            points=points,
+            world=_placed(points, pose),
+            origin=pose[:3, 3],
+            ring=sweep.ring,
+            intensities=sweep.intensities,
+            classes=sweep.classes,
         )
 
 
@@ -144,24 +153,22 @@ def _sample(sweep: RecordedSweep, number: int) -> RecordedSweep:
 
 def _voxel_m(samples: Sequence[RecordedSweep]) -> float:
     """Return the edge of the voxels of the map, metres."""
-    ranges = np.concatenate([np.linalg.norm(sample.points, axis=1) for sample in samples[:5]])
+    ranges = np.concatenate([np.linalg.norm(sample.points, axis=1) for sample in samples])
     return float(np.clip(_VOXEL_SHARE * np.median(ranges), _MIN_VOXEL_M, _MAX_VOXEL_M))
 
 
 def _planes(
     name: str,
-    samples: Sequence[RecordedSweep | None],
+    samples: Sequence[RecordedSweep],
     alignment: Alignment,
     mapped: Sequence[int],
     voxel_m: float,
 ) -> VoxelPlanes:
     """Return the planes of the map of some sweeps; LidarError without planes."""
-    parts = []
-    for number in mapped:
-        sample = samples[number]
-        assert sample is not None
-        parts.append(alignment.to_world(alignment.corrected(sample), number))
-    planes = VoxelPlanes.of_points(np.concatenate(parts), voxel_m)
+    parts = [
+        _placed(alignment.corrected(samples[number]), alignment.poses[number]) for number in mapped
+    ]
+    planes = VoxelPlanes.of_points(name, np.concatenate(parts), voxel_m)
     if planes is None:
         raise LidarError(
             f"{name} shows no planes, such as a floor or walls: a place is rebuilt of surfaces."
@@ -183,6 +190,7 @@ class _PlanePoints:
     def of_sweep(
         cls, points: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
     ) -> _PlanePoints:
+        """Find the points (n, 3) of a sweep, at a pose, that are near planes."""
         distances, plane, rows = planes.distances(_placed(points, pose), _MAX_VOXELS * voxel_m)
         spread_m = 1.4826 * float(np.median(np.abs(distances))) if len(distances) else 0.0
         sigma = max(spread_m, _MIN_SIGMA_M)
@@ -274,20 +282,6 @@ def _axes(points: Floats) -> tuple[Floats, Floats, Floats]:
         [-points[:, 2] * points[:, 0] / safe, -points[:, 2] * points[:, 1] / safe, level], axis=1
     )
     return outward, upward, leftward
-
-
-def _calibrated(sweep: RecordedSweep, ring_offsets: Floats) -> Floats:
-    """Return the points (n, 3) of a sweep with the offsets of their rings."""
-    if not ring_offsets.any():
-        return sweep.points
-    points = sweep.points
-    range_m = np.linalg.norm(points, axis=1) + ring_offsets[sweep.ring, 0]
-    elevation = elevations(points) + ring_offsets[sweep.ring, 1]
-    azimuth = np.arctan2(points[:, 1], points[:, 0]) + ring_offsets[sweep.ring, 2]
-    level = range_m * np.cos(elevation)
-    return np.stack(
-        [level * np.cos(azimuth), level * np.sin(azimuth), range_m * np.sin(elevation)], axis=1
-    )
 
 
 def _placed(points: Floats, pose: Floats) -> Floats:

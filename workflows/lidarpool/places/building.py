@@ -33,6 +33,8 @@ from ..clouds.folder import result_folder, staging
 from ..clouds.recording import Read, Recording
 from ..columns.parts import StoredCloud
 from ..comparing.fit import fit
+from ..comparing.fit.fitting import recorded_sensor
+from ..comparing.fit.stack import SweepStack
 from ..recordings.opening import open_recording
 from ..report.page.rendering import rendered
 from .alignment import AlignedSweeps, align
@@ -69,6 +71,8 @@ class Twin:
         float64 (s, 4, 4): from the sensor frame of each sweep to the scene frame.
     times_s
         float64 (s,): times of the sweeps, seconds from the first.
+    origin
+        float64 (3,): of the scene frame in the world of the recording's poses, metres.
     model
         The sensor of the recording, with the noise that was fitted.
     figures
@@ -80,6 +84,7 @@ class Twin:
     scene: Scene
     poses: Floats
     times_s: Floats
+    origin: Floats
     model: SensorModel
     figures: dict[str, Any]
     pictures: dict[str, Any]
@@ -129,6 +134,8 @@ class Twin:
             "sensor": SENSOR_FILE,
             "trajectory": TRAJECTORY_FILE,
         }
+        if self.origin.any():
+            scenario["world"] = {"origin": self.origin.tolist()}
         if self.scene.has_colours.any():
             scenario["materials"] = [{"objects": "*", "reflectance": "texture"}]
         scenario["cloud"] = {"keep_every": 1, "columns": ["time", "intensity"]}
@@ -242,7 +249,15 @@ class _Building:
         }
         mesh = _coloured(place.surfels.mesh, reflectances)
         scene = Scene.from_meshes([mesh])
-        return Twin(scene, sweeps.alignment.poses, poses.times_s, model, figures, pictures)
+        return Twin(
+            scene=scene,
+            poses=sweeps.alignment.poses,
+            times_s=poses.times_s,
+            origin=poses.origin,
+            model=model,
+            figures=figures,
+            pictures=pictures,
+        )
 
     def _hold_out(
         self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], mapped: list[int]
@@ -283,7 +298,11 @@ class _Building:
         scene = Scene.from_meshes([place.surfels.mesh])
         white = None if reflectances is None else reflectances.white
         poses = sweeps.alignment.poses[chosen]
-        fitted = fit(aligned, scene=scene, pose=poses, white=white).model
+        try:
+            fitted = fit(aligned, scene=scene, pose=poses, white=white).model
+        except LidarError as error:  # the place is there, and a scan of it needs no noise
+            sensor = self.base or recorded_sensor(SweepStack.read(aligned))
+            return sensor, [f"the noise of the sensor is unknown: {error}"]
         if self.base is None or fitted.performance is None:
             return self.base or fitted, []
         source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"

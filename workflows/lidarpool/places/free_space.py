@@ -91,7 +91,7 @@ def standing_points(sweeps: AlignedSweeps, numbers: Sequence[int]) -> dict[int, 
     """
     row_elevation_rad = sweeps.recorded.elevation_rad
     if not len(row_elevation_rad):
-        elevation = elevations(sweeps.read(numbers[0]).points)
+        elevation = np.concatenate([elevations(sweeps.read(number).points) for number in numbers])
         high = float(elevation.max())
         row_elevation_rad = np.arange(high, float(elevation.min()) - _ROW_RAD, -_ROW_RAD)
     images = {

@@ -11,7 +11,6 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import need
 from lidarsim.base.words import plural
-from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory_files import load_trajectory
 
 from .recorded_sweeps import RecordedSweeps
@@ -20,6 +19,7 @@ _VOXELS_OF_REACH = 100  # voxels of the map of KISS-ICP in the range of the sens
 _MIN_VOXEL_M = 0.25
 _MAX_VOXEL_M = 1.0
 _MAX_REACH_M = 100.0  # farther points are too far apart to register sweeps by
+_MAX_LOCAL_M = 10_000.0  # coordinates of a place that single precision holds
 _MAX_STEP_M = 5.0  # from sweep to sweep at 10 Hz: 180 km/h
 DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 Hz
 
@@ -27,9 +27,19 @@ DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 H
 class RecordedPoses(NamedTuple):
     """Poses of the sweeps of a recording."""
 
-    matrices: Floats  # (s, 4, 4): from the sensor frame to the world, metres
+    matrices: Floats  # (s, 4, 4): from the sensor frame to the frame of the place, metres
     times_s: Floats  # (s,): ascending, from 0
     source: str  # a clause, such as "of the recording"
+    origin: Floats  # (3,): of the frame of the place in the world, whole metres
+
+    @classmethod
+    def in_world(cls, matrices: Floats, times_s: Floats, source: str) -> RecordedPoses:
+        """Make poses (s, 4, 4) in the world local, if they are far from zero."""
+        first = matrices[0, :3, 3]
+        origin = np.rint(first) if np.abs(first).max() > _MAX_LOCAL_M else np.zeros(3)
+        local = matrices.copy()
+        local[:, :3, 3] -= origin
+        return cls(local, times_s - times_s[0], source, origin)
 
 
 def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses:
@@ -51,11 +61,12 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     """
     times_s = _times_s(sweeps)
     if trajectory is not None:
-        poses = _of_file(sweeps, trajectory, times_s)
-        return RecordedPoses(poses, times_s - times_s[0], f"of {trajectory.name}")
+        poses, times_s = _of_file(sweeps, trajectory, times_s)
+        return RecordedPoses.in_world(poses, times_s, f"of {trajectory.name}")
     recorded = sweeps.recording.poses(range(sweeps.count))
     # Many files of a sweep each state the pose of none, as VIEWPOINT of PCD does.
-    if recorded is not None and np.ptp(recorded, axis=0).any():
+    is_known = sweeps.recording.fired is not None  # of a result, which may stand
+    if recorded is not None and (is_known or np.ptp(recorded, axis=0).any()):
         poses = recorded
         source = "of the recording"
     else:
@@ -68,7 +79,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
                 f"KISS-ICP moves {steps_m.max():.1f} m from sweep {number - 1} to sweep {number} "
                 f"of {sweeps.recording.name}, which is a failure: give --trajectory."
             )
-    return RecordedPoses(poses, times_s - times_s[0], source)
+    return RecordedPoses.in_world(poses, times_s, source)
 
 
 def _times_s(sweeps: RecordedSweeps) -> Floats:
@@ -82,8 +93,8 @@ def _times_s(sweeps: RecordedSweeps) -> Floats:
     return np.asarray(seconds)
 
 
-def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> Floats:
-    """Return the poses of a file at the times of the sweeps, or one for each sweep."""
+def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple[Floats, Floats]:
+    """Return the poses of a file at the times of the sweeps, or one for each sweep, and times."""
     track = load_trajectory(trajectory)
     if len(track.times_s) != sweeps.count and sweeps.recording.times is None:
         raise LidarError(
@@ -99,11 +110,11 @@ def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> Float
             f"{sweeps.recording.name} from {times_s[0]:.3f} to {times_s[-1]:.3f} s: give the "
             "trajectory of the same drive, in the same time."
         )
-    positions, quaternions = track.poses(0, 1e9 * (times_s - first_s))
+    positions, rotations = track.poses(0, 1e9 * (times_s - first_s))
     poses = np.tile(np.eye(4), (sweeps.count, 1, 1))
-    poses[:, :3, :3] = matrices(quaternions)
+    poses[:, :3, :3] = rotations
     poses[:, :3, 3] = positions
-    return np.asarray(poses)
+    return poses, times_s
 
 
 def _registered(sweeps: RecordedSweeps) -> Floats:

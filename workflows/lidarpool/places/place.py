@@ -20,9 +20,9 @@ from lidarsim.base.even_samples import even_indices
 from raybeam import RayCaster
 
 from ..scenario.point_files import ScannedPoints
+from ..scenario.point_scene import Voxels
 from .alignment import AlignedSweep, AlignedSweeps
 from .surfels import Surfels
-from .voxel_planes import voxel_order
 
 _ROUNDS = 2  # of casting and leaving surfels out
 _VOTING_SWEEPS = 48  # at most, evenly chosen
@@ -159,18 +159,17 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
         np.concatenate(outward),
         np.concatenate(classes) if len(classes) == len(positions) else None,
     )
-    return points.take(_nearest_views(points))
+    return points.take(_nearest_views(sweeps.name, points))
 
 
-def _nearest_views(points: ScannedPoints) -> Ints:
+def _nearest_views(name: str, points: ScannedPoints) -> Ints:
     """Return the indices of points that were not seen from much closer elsewhere.
 
     Rays that come from far away are far apart, and their errors of direction are large.
     """
     assert points.outward is not None
     range_m = np.linalg.norm(points.outward, axis=1)
-    order, starts = voxel_order(points.positions, _VIEW_CELL_M)
-    closest_m = np.minimum.reduceat(range_m[order], starts)
-    lengths = np.diff(starts, append=len(order))
-    kept = range_m[order] <= _MAX_VIEW_FACTOR * closest_m.repeat(lengths)
-    return np.sort(order[kept])
+    cells = Voxels.of_points(Path(name), points.positions, _VIEW_CELL_M)
+    ordered_m = range_m[cells.order]
+    closest_m = np.minimum.reduceat(ordered_m, cells.starts).repeat(cells.counts)
+    return np.sort(cells.order[ordered_m <= _MAX_VIEW_FACTOR * closest_m])

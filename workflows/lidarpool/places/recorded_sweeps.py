@@ -139,7 +139,7 @@ class RecordedSweeps:
     def _rings(self, points: Floats, columns: Columns) -> tuple[Ints, Bools]:
         """Return the rows of the rings of points (n,), and which rings are known."""
         count = len(points)
-        if not len(self.elevation_rad):
+        if not len(self.elevation_rad) or not count:
             return np.zeros(count, np.int64), np.ones(count, bool)
         if self.ring_numbers is not None:
             numbers = np.asarray(rings_of(columns)).astype(np.int64)

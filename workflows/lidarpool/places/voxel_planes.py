@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
+from lidarsim.base.arrays import Bools, Floats, Ints
+
+from ..scenario.point_scene import Voxels
 
 _NEIGHBOURS = 12
 _MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
@@ -24,11 +27,14 @@ class VoxelPlanes:
     thickness_m: float  # median standard deviation of the neighbours along the normals
 
     @classmethod
-    def of_points(cls, points: Floats, voxel_m: float) -> VoxelPlanes | None:
-        """Find planes among points (n, 3); None without any."""
+    def of_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
+        """Find planes among points (n, 3) of a recording; None without any.
+
+        LidarError if the points are too far apart to be sorted into voxels.
+        """
         from scipy.spatial import cKDTree
 
-        means = voxel_means(points, voxel_m)
+        means = Voxels.of_points(Path(name), points, voxel_m).means(points)
         if len(means) < _NEIGHBOURS:
             return None
         _, neighbours = cKDTree(means).query(means, _NEIGHBOURS)
@@ -61,22 +67,3 @@ def _is_plane(variances: Floats) -> Bools:
     """Mark neighbourhoods that are planes by their variances (n, 3), ascending."""
     smallest, middle, largest = variances.T
     return np.asarray((smallest < _MAX_FLAT * middle) & (middle > _MIN_WIDTH * largest))
-
-
-def voxel_means(points: Floats, voxel_m: float) -> Floats:
-    """Return the means (v, 3) of points (n, 3) in the same voxels, in order of the voxels."""
-    order, starts = voxel_order(points, voxel_m)
-    counts = np.diff(starts, append=len(order))
-    return np.asarray(np.add.reduceat(points[order], starts, axis=0) / counts[:, None])
-
-
-def voxel_order(points: Floats, voxel_m: float) -> tuple[Ints, Ints]:
-    """Return indices that sort points (n, 3) by voxel, and where each voxel starts in these."""
-    cells = np.floor(points / voxel_m).astype(np.int64)
-    cells -= cells.min(axis=0)
-    _, ny, nz = (int(size) + 1 for size in cells.max(axis=0))
-    keys: AnyArray = (cells[:, 0] * ny + cells[:, 1]) * nz + cells[:, 2]
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    starts = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
-    return order, starts

@@ -130,7 +130,7 @@ def fit(
         raise LidarError(moving_message(recording.name, speed, "the --scene of its poses"))
     else:
         measured = measure_moving(recording, white, loaded, poses)
-    base = read_model(model) if model else _recorded_sensor(measured.stack)
+    base = read_model(model) if model else recorded_sensor(measured.stack)
     return _fit_of(recording, measured, base)
 
 
@@ -191,7 +191,7 @@ def _with_performance(
     return SensorModel.model_validate(base.model_dump() | changes)
 
 
-def _recorded_sensor(stack: SweepStack) -> SensorModel:
+def recorded_sensor(stack: SweepStack) -> SensorModel:
     """Return a sensor with the beams of a recording."""
     return SensorModel(
         name="Recorded sensor",
