@@ -12,6 +12,8 @@ from click.testing import CliRunner
 from lidarpool import LidarError, Material, Mounted, Pose, Scene, Sensor, Survey, Track, twin
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.recording import Recording
+from lidarpool.places.alignment import AlignedSweep
+from lidarpool.places.lost_pulses import lost_pulses
 from lidarpool.places.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
@@ -43,11 +45,12 @@ def static_box(name, size, middle):
 
 @pytest.fixture(scope="module")
 def street():
-    """A street of 40 m between walls with posts, and a car that drives past."""
+    """A street of 40 m between walls, houses and posts, and a car that drives past."""
     corners = np.array([[-30, -8, 0], [30, -8, 0], [30, 8, 0], [-30, 8, 0]], float)
     meshes = [
         SceneMesh("floor", corners, np.array([[0, 1, 2], [0, 2, 3]])),
-        static_box("wall left", (60.0, 1.0, 6.0), (0.0, 8.0)),
+        static_box("wall left", (60.0, 1.0, 2.5), (0.0, 8.0)),
+        *(static_box(f"house {x}", (7.0, 1.0, 9.0), (x, 8.0)) for x in (-24.0, -7.0, 9.0)),
         static_box("wall right", (60.0, 1.0, 6.0), (0.0, -8.0)),
         static_box("wall ahead", (1.0, 16.0, 6.0), (30.0, 0.0)),
         *(static_box(f"shed {x}", (1.7, 2.2, 2.4), (x, 6.5)) for x in (-11.0, -2.0, 5.0, 16.0)),
@@ -103,6 +106,47 @@ def test_a_twin_has_the_ranges_of_held_out_sweeps(place):
     assert held["missed"] < 0.01
     assert abs(held["intensity_error"]) < 0.1
     assert "12 sweeps" in repr(place)
+
+
+def test_a_twin_has_the_points_and_the_lost_pulses_of_held_out_sweeps(place):
+    held = place.figures["held_out"]
+    assert held["points"] == pytest.approx(1, abs=0.03)
+    assert held["points_by_ring"] < 0.03
+    assert held["no_return"]["recorded"] > 0.02
+    assert held["no_return"]["f1"] > 0.8
+    assert "points    " in repr(place)
+
+
+def test_lost_pulses_are_steps_of_a_ring_without_a_return():
+    elevation = np.radians(np.linspace(15, -15, 16))
+    azimuth = np.radians(np.arange(-179.9, 180, 0.4))
+    ring, column = (index.ravel() for index in np.indices((16, len(azimuth))))
+    level = np.cos(elevation[ring])
+    directions = np.stack(
+        [
+            level * np.cos(azimuth[column]),
+            level * np.sin(azimuth[column]),
+            np.sin(elevation[ring]),
+        ],
+        axis=1,
+    )
+    random = np.random.default_rng(7)
+    returned = random.random(len(ring)) < 0.7
+    returned[ring == 5] = False  # a ring that sees the sky
+    received = (column < 200) | (column >= 300)  # packets of 40 degrees did not come
+    rows = returned & received
+    points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
+    sweep = AlignedSweep(points, points, np.zeros(3), ring[rows], None, None)
+    lost = lost_pulses(sweep, np.eye(4), elevation, 0.0)
+    expected = ~returned & received
+    assert len(lost.ring) == pytest.approx(expected.sum(), rel=0.01)
+    for number in (0, 5, 9):
+        truth = directions[expected & (ring == number)]
+        found = lost.points[lost.ring == number]
+        cosines = found @ truth.T
+        assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
+    unknown = lost_pulses(sweep, np.eye(4), np.empty(0), 0.0)
+    assert not len(unknown.points)
 
 
 def test_what_moved_is_no_part_of_the_place(place):
@@ -163,6 +207,8 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     )
     with pytest.raises(LidarError, match="drive has no rings: name its sensor"):
         twin(shuffled)
+    with pytest.raises(LidarError, match="has no column 'nope' to compare as intensity"):
+        twin(replace(recording, intensity_column="nope"))
     empty = Recording("drive", 9, lambda _: (np.zeros((0, 3)), {}, None))
     with pytest.raises(LidarError, match="drive has no points"):
         twin(empty)

@@ -191,7 +191,7 @@ class Recording:
         """
         with reading(self.name):
             points, columns, pose = self.read(number)
-            self._check_intensity(columns)
+            self.check_intensity(columns)
         positions = np.asarray(points, np.float64)
         # Drivers write NaN or zeros for pulses without a return.
         valid = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
@@ -212,7 +212,7 @@ class Recording:
             _ray_keys(columns)[valid] if self.firing_key and not in_world else None,
         )
 
-    def _check_intensity(self, columns: Columns) -> None:
+    def check_intensity(self, columns: Columns) -> None:
         """Raise LidarError if the recording lacks the column that was chosen as intensity."""
         name = self.intensity_column
         if name is not None and name not in columns:

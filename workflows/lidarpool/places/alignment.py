@@ -61,6 +61,11 @@ class Alignment:
     thickness_m: tuple[float, ...] = ()
     plane_distance_m: Floats = field(default_factory=lambda: np.empty(0))
 
+    def moved_m(self, number: int) -> float:
+        """Return how far the sensor moves from a sweep to the next, or to the last from before."""
+        first = min(number, len(self.poses) - 2)
+        return float(np.linalg.norm(self.poses[first + 1, :3, 3] - self.poses[first, :3, 3]))
+
     def corrected(self, sweep: RecordedSweep) -> Floats:
         """Return the calibrated points (n, 3) of a sweep in the sensor frame."""
         points = sweep.points
@@ -91,6 +96,17 @@ class AlignedSweep(NamedTuple):
         """Ranges (n,), metres."""
         return np.asarray(np.linalg.norm(self.points, axis=1))
 
+    def part(self, rows: Bools) -> AlignedSweep:
+        """Return selected points."""
+        return AlignedSweep(
+            self.points[rows],
+            self.world[rows],
+            self.origin,
+            self.ring[rows],
+            None if self.intensities is None else self.intensities[rows],
+            None if self.classes is None else self.classes[rows],
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class AlignedSweeps:
@@ -111,7 +127,7 @@ class AlignedSweeps:
         pose = self.alignment.poses[number]
         return AlignedSweep(
             points=points,
-            world=_placed(points, pose),
+            world=placed(points, pose),
             origin=pose[:3, 3],
             ring=sweep.ring,
             intensities=sweep.intensities,
@@ -166,7 +182,7 @@ def _planes(
 ) -> VoxelPlanes:
     """Return the planes of the map of some sweeps; LidarError without planes."""
     parts = [
-        _placed(alignment.corrected(samples[number]), alignment.poses[number]) for number in mapped
+        placed(alignment.corrected(samples[number]), alignment.poses[number]) for number in mapped
     ]
     planes = VoxelPlanes.of_points(name, np.concatenate(parts), voxel_m)
     if planes is None:
@@ -191,7 +207,7 @@ class _PlanePoints:
         cls, points: Floats, pose: Floats, planes: VoxelPlanes, voxel_m: float
     ) -> _PlanePoints:
         """Find the points (n, 3) of a sweep, at a pose, that are near planes."""
-        distances, plane, rows = planes.distances(_placed(points, pose), _MAX_VOXELS * voxel_m)
+        distances, plane, rows = planes.distances(placed(points, pose), _MAX_VOXELS * voxel_m)
         spread_m = 1.4826 * float(np.median(np.abs(distances))) if len(distances) else 0.0
         sigma = max(spread_m, _MIN_SIGMA_M)
         weights = np.maximum(1 - (distances / (_TUKEY_SIGMAS * sigma)) ** 2, 0) ** 2
@@ -284,6 +300,6 @@ def _axes(points: Floats) -> tuple[Floats, Floats, Floats]:
     return outward, upward, leftward
 
 
-def _placed(points: Floats, pose: Floats) -> Floats:
+def placed(points: Floats, pose: Floats) -> Floats:
     """Return points (n, 3) moved by a pose (4, 4)."""
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -231,8 +231,7 @@ class _Building:
         self.tell(f"building the place of {plural(len(mapped), 'sweep')}, to compare the others")
         held_out, picture = self._hold_out(sweeps, standing, mapped)
         self.tell("building the place of all sweeps")
-        place = build_place(sweeps, standing, self.voxel_m)
-        reflectances = self._reflectances(sweeps, place, standing)
+        place, reflectances = _place_of(sweeps, standing, self.voxel_m)
         self.tell("fitting the sensor")
         model, notes = self._sensor(sweeps, place, reflectances)
         figures = self._figures(sweeps, standing, place) | {
@@ -263,20 +262,11 @@ class _Building:
         self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], mapped: list[int]
     ) -> tuple[HeldOut, Page]:
         """Compare held-out sweeps with the place of the mapped ones; draw one of these."""
-        by_mapped = standing_points(sweeps, mapped)
-        place = build_place(sweeps, by_mapped, self.voxel_m)
-        reflectances = self._reflectances(sweeps, place, by_mapped)
+        place, reflectances = rebuild(sweeps, mapped, self.voxel_m)
         others = np.setdiff1d(np.arange(self.recorded.count), mapped)
         compared = others[even_indices(len(others), _COMPARED_SWEEPS)].tolist()
         held_out = hold_out(sweeps, place, reflectances, standing, compared)
         return held_out, draw_sweep(sweeps, place, reflectances, compared[len(compared) // 2])
-
-    def _reflectances(
-        self, sweeps: AlignedSweeps, place: Place, standing: Mapping[int, Bools]
-    ) -> Reflectances | None:
-        """Fit the reflectances of a place."""
-        seen = place.observations(sweeps, standing)
-        return fit_reflectances(seen, place.surfels, self.recorded.ring_count)
 
     def _sensor(
         self, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None
@@ -334,6 +324,42 @@ class _Building:
             "ring_offset_m": float(np.std(alignment.ring_offsets[:, 0])),
             "ring_offset_deg": float(np.degrees(np.std(alignment.ring_offsets[:, 1]))),
         }
+
+
+def rebuild(
+    sweeps: AlignedSweeps, numbers: Sequence[int], voxel_m: float
+) -> tuple[Place, Reflectances | None]:
+    """Build the place of some sweeps alone, without what moved.
+
+    Parameters
+    ----------
+    sweeps
+        The sweeps, all at their places.
+    numbers
+        Numbers of the sweeps whose points make the place, ascending.
+    voxel_m
+        Edge of the cubes in each of which all points become their mean.
+
+    Returns
+    -------
+    tuple
+        The place, and its reflectances; None without intensities.
+
+    Raises
+    ------
+    LidarError
+        If too few points stand.
+    """
+    return _place_of(sweeps, standing_points(sweeps, numbers), voxel_m)
+
+
+def _place_of(
+    sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float
+) -> tuple[Place, Reflectances | None]:
+    """Build the place of the points that stand, and fit its reflectances."""
+    place = build_place(sweeps, standing, voxel_m)
+    seen = place.observations(sweeps, standing)
+    return place, fit_reflectances(seen, place.surfels, sweeps.recorded.ring_count)
 
 
 def _coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:

@@ -15,11 +15,15 @@ from typing import Any
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.even_samples import even_indices
 
-from .alignment import AlignedSweeps
+from .alignment import AlignedSweep, AlignedSweeps
+from .lost_pulses import lost_pulses
 from .place import Place
 from .reflectances import Reflectances
 
+_COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
+_ANSWERING_SWEEPS = 100  # that show these cells
 _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # classes of ranges
 
 
@@ -29,47 +33,87 @@ class HeldOut:
 
     Attributes
     ----------
-    sweep
-        Number of the sweep of each ray.
+    sweep, ring
+        Number of the sweep, and row of the ring, of each ray.
     range_m
-        As recorded, metres.
-    difference_m
-        Range in the twin less `range_m`; NaN where the twin has nothing.
+        As recorded, metres; NaN of a lost pulse.
+    simulated_m
+        Range in the twin, metres; NaN where the twin has nothing.
     intensity, simulated_intensity
         As recorded, and in the twin; NaN if unknown.
     standing
-        Whether the recorded point stands, by all sweeps.
+        Whether the recorded point stands, by all sweeps; False for lost pulses.
     """
 
     sweep: Ints
+    ring: Ints
     range_m: Floats
-    difference_m: Floats
+    simulated_m: Floats
     intensity: Floats
     simulated_intensity: Floats
     standing: Bools
 
+    @property
+    def returned(self) -> Bools:
+        """Mask (n,) of the rays that returned in the recording."""
+        return np.isfinite(self.range_m)
+
+    def select(self, rays: Bools) -> HeldOut:
+        """Return selected rays."""
+        return HeldOut(*(getattr(self, column.name)[rays] for column in fields(self)))
+
     def figures(self) -> dict[str, Any]:
-        """Return the figures of all rays, of those that stand, and by class of range."""
-        everything = np.ones(len(self.range_m), bool)
-        bounds = pairwise(_RANGES_M)
+        """Return the figures of all rays, of those whose points stand, and by class of range."""
         classes = [
             {"from_m": low, "to_m": None if np.isinf(high) else high}
             | self._figures((self.range_m >= low) & (self.range_m < high))
-            for low, high in bounds
+            | {"points": self._points(low, high)}
+            for low, high in pairwise(_RANGES_M)
         ]
         return {
-            "all": self._figures(everything),
+            "all": self._figures(self.returned),
             "standing": self._figures(self.standing),
             "by_range": [row for row in classes if row["rays"]],
             "by_sweep": [
-                {"sweep": int(number)} | self._figures(self.sweep == number)
+                {"sweep": int(number)} | self._figures(self.returned & (self.sweep == number))
                 for number in np.unique(self.sweep)
             ],
+            "points": self._points(0, np.inf),
+            "points_by_ring": self._points_by_ring(),
+            "no_return": self._no_return(),
+        }
+
+    def _points(self, low_m: float, high_m: float) -> float | None:
+        """Return the number of points at some ranges in the twin, over the recorded number."""
+        recorded = ((self.range_m >= low_m) & (self.range_m < high_m)).sum()
+        simulated = ((self.simulated_m >= low_m) & (self.simulated_m < high_m)).sum()
+        return float(simulated / recorded) if recorded else None
+
+    def _points_by_ring(self) -> float:
+        """Return the median, over rings, of how far the share of points is from 1."""
+        recorded = np.bincount(self.ring, self.returned)
+        simulated = np.bincount(self.ring, np.isfinite(self.simulated_m))
+        known = recorded > 0
+        return float(np.median(np.abs(simulated[known] / recorded[known] - 1)))
+
+    def _no_return(self) -> dict[str, Any] | None:
+        """Return the shares of rays without a return, and their F1; None if no pulse is lost.
+
+        F1 is the harmonic mean of precision and recall of "no return".
+        """
+        recorded = ~self.returned
+        if not recorded.any():
+            return None
+        simulated = np.isnan(self.simulated_m)
+        return {
+            "recorded": float(recorded.mean()),
+            "simulated": float(simulated.mean()),
+            "f1": float(2 * (recorded & simulated).sum() / (recorded.sum() + simulated.sum())),
         }
 
     def _figures(self, rays: Bools) -> dict[str, Any]:
-        """Return figures of selected rays."""
-        difference_m = self.difference_m[rays]
+        """Return figures of selected rays that returned."""
+        difference_m = self.simulated_m[rays] - self.range_m[rays]
         met = np.isfinite(difference_m)
         size_m = np.abs(difference_m[met])
         recorded = self.intensity[rays]
@@ -112,26 +156,61 @@ def hold_out(
     numbers
         Numbers of the held-out sweeps.
     """
+    elevation_rad = sweeps.recorded.elevation_rad
+    answering = _answering(sweeps, list(standing))
     parts = []
     for number in numbers:
         sweep = sweeps.read(number)
-        seen = place.see(sweep)
-        difference_m = np.full(len(sweep.points), np.nan)
-        difference_m[seen.rays] = seen.distance_m - seen.range_m
-        unknown = np.full(len(sweep.points), np.nan)
-        parts.append(
-            HeldOut(
-                np.full(len(sweep.points), number),
-                sweep.range_m,
-                difference_m,
-                unknown if sweep.intensities is None else sweep.intensities,
-                unknown if reflectances is None else reflectances.intensities(sweep, seen),
-                standing[number],
-            )
-        )
+        moved_m = sweeps.alignment.moved_m(number)
+        lost = lost_pulses(sweep, sweeps.alignment.poses[number], elevation_rad, moved_m)
+        lost = lost.part(answering[_cells(lost)])
+        no_ranges = np.full(len(lost.points), np.nan)
+        no_points = np.zeros(len(lost.points), bool)
+        parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))
+        parts.append(_rays(place, None, lost, number, no_ranges, no_points))
     return HeldOut(
         *(
             np.concatenate([getattr(part, column.name) for part in parts])
             for column in fields(HeldOut)
         )
     )
+
+
+def _rays(
+    place: Place,
+    reflectances: Reflectances | None,
+    sweep: AlignedSweep,
+    number: int,
+    range_m: Floats,
+    standing: Bools,
+) -> HeldOut:
+    """Cast the rays of a sweep, with recorded ranges (n,), at a place."""
+    seen = place.see(sweep)
+    simulated_m = np.full(len(sweep.points), np.nan)
+    simulated_m[seen.rays] = seen.distance_m
+    unknown = np.full(len(sweep.points), np.nan)
+    return HeldOut(
+        sweep=np.full(len(sweep.points), number),
+        ring=sweep.ring,
+        range_m=range_m,
+        simulated_m=simulated_m,
+        intensity=unknown if sweep.intensities is None else sweep.intensities,
+        simulated_intensity=(
+            unknown if reflectances is None else reflectances.intensities(sweep, seen)
+        ),
+        standing=standing,
+    )
+
+
+def _answering(sweeps: AlignedSweeps, numbers: Sequence[int]) -> Bools:
+    """Mark the cells (r, c) in which any sweep has a return: elsewhere the carrier hides all."""
+    answering = np.zeros((sweeps.recorded.ring_count, _COLUMNS), bool)
+    for index in even_indices(len(numbers), _ANSWERING_SWEEPS).tolist():
+        answering[_cells(sweeps.read(numbers[index]))] = True
+    return answering
+
+
+def _cells(sweep: AlignedSweep) -> tuple[Ints, Ints]:
+    """Return the rings and columns (n,) of the rays of a sweep."""
+    turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
+    return sweep.ring, (turns * _COLUMNS).astype(np.int64) % _COLUMNS

@@ -163,6 +163,7 @@ def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyAr
     """Return the points (n, 3) of a sweep in the sensor frame, metres, and their columns."""
     with reading(recording.name):
         points, columns, _ = recording.read(number)
+        recording.check_intensity(columns)
     positions = np.asarray(points, np.float64)
     # Drivers write NaN or zeros for pulses without a return.
     returned = np.isfinite(positions).all(axis=1) & positions.any(axis=1)

@@ -7,7 +7,7 @@ asked, until lines of other rings and sweeps are among these.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +29,7 @@ _EXTENT = 0.85  # half of a side over the standard deviation of the neighbours
 _MAX_HALF_VOXELS = 3  # that half a side is long, beside the gaps between rays
 _MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
 _PLANE_GAPS = 0.55  # half a side, across the rings, over the gap between rays on a plane
-_MAX_RADII = 2.0  # the same over the distance of the farthest neighbour, at most
+_MAX_RADII = 1.0  # the same over the distance of the farthest neighbour, at most
 _MAX_GAPS = 1.0  # half a side over the gap between rays elsewhere, at most
 _MIN_COSINE = 0.1  # of the incidence, by which gaps grow
 _BLOCK = 1 << 16  # surfels at a time
@@ -65,6 +65,11 @@ class Surfels:
         both = np.flatnonzero(rows.repeat(2))
         materials = None if mesh.materials is None else mesh.materials.take(both)
         return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials))
+
+    def moved(self, shifts_m: Floats) -> Surfels:
+        """Return the surfels moved along their normals by shifts (m,), metres."""
+        offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
+        return Surfels(replace(self.mesh, vertices=self.mesh.vertices + offsets))
 
     @classmethod
     def of_points(cls, name: str, points: ScannedPoints, voxel_m: float, gap_rad: float) -> Surfels:

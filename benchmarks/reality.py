@@ -1,0 +1,308 @@
+"""Twins of public recordings, beside sweeps that were held out.
+
+`python -m benchmarks.reality FOLDER [NAME …] [--json FILE]` reads the recordings that FOLDER holds,
+each in the folder of its repository:
+
+| name | repository | sensor |
+|---|---|---|
+| `udacity` | udacity/SFND_Lidar_Obstacle_Detection | HDL-64E |
+| `tram` | FrankMoosmann/FranksVelodyneAlgos | HDL-64E, range images |
+| `kitti360` | heisenberg141/Pointcloud-Segmentation | HDL-64E |
+| `hdl32` | cwchen1102/map_reconstruction | HDL-32E |
+
+Sweeps are held out by two rules: `easy` holds out every second sweep, `hard` blocks of 20. The
+static mask does not come from the twin: a point is static if other sweeps, a second away, have
+points in its neighbourhood. `next` compares each held-out sweep with the following recorded one,
+pulse by pulse: a scale, since the sensor moved between the two.
+
+The recordings are not part of lidarpool, and none states a licence: fetch them yourself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from lidarpool.clouds.recording import Read, Recording
+from lidarpool.places.alignment import AlignedSweeps, align
+from lidarpool.places.building import DEFAULT_VOXEL_M, rebuild
+from lidarpool.places.free_space import standing_points
+from lidarpool.places.held_out import HeldOut, hold_out
+from lidarpool.places.odometry import find_poses
+from lidarpool.places.recorded_sweeps import RecordedSweeps
+from lidarpool.recordings.opening import open_recording
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.even_samples import even_indices
+
+_COMPARED_SWEEPS = 24
+_BLOCK_SWEEPS = 20
+_STATIC_VOXEL_M = 0.4
+_STATIC_SWEEPS = 10  # between sweeps that have points at the same place: a second
+_RESAMPLES = 400  # of sweeps, for intervals
+_IMAGE_COLUMNS = 870  # of the cells in which two recorded sweeps are compared
+_TRAM = Path("exampleData/MuehlburgerTor/velodyne_dist")
+_TRAM_METRES = 0.002  # of a step of the range images
+
+
+class Source(NamedTuple):
+    """A recording in the folder of its repository."""
+
+    repository: str
+    open: Callable[[Path], Recording]
+    parts: dict[str, slice]  # {name: sweeps}
+
+
+def _opened(folder: str) -> Callable[[Path], Recording]:
+    return lambda root: open_recording(root / folder, None, None, name=root.name)
+
+
+def _tram(root: Path) -> Recording:
+    """Open range images: 16-bit PNG files with a row for each ring, and 0 for no return."""
+    files = sorted((root / _TRAM / "data").glob("*.png"))
+    entries = re.split(r"\s*;\s*", (root / _TRAM / "velodyne_config.txt").read_text().strip())
+    numbers = [float(entry.split("\n")[-1]) for entry in entries]
+    column_count, ring_count, start_deg, stop_deg = numbers[:4]
+    elevation = -np.radians(numbers[4 : 4 + int(ring_count)])
+    columns = np.arange(int(column_count))
+    azimuth = np.radians(start_deg + (columns + 0.5) * (stop_deg - start_deg) / column_count)
+    level = np.cos(elevation)[:, None]
+    directions = np.stack(
+        [
+            level * np.cos(azimuth),
+            level * np.sin(azimuth),
+            np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth))),
+        ],
+        axis=2,
+    )
+    ring = np.arange(len(elevation)).repeat(len(azimuth))
+
+    def read(number: int) -> Read:
+        range_m = _TRAM_METRES * np.asarray(Image.open(files[number]), np.float64)
+        return (range_m[..., None] * directions).reshape(-1, 3), {"ring": ring}, None
+
+    return Recording("tram", len(files), read)
+
+
+SOURCES = {
+    "udacity": Source(
+        "SFND_Lidar_Obstacle_Detection",
+        _opened("src/sensors/data/pcd/data_2"),
+        {"drive": slice(None)},
+    ),
+    "tram": Source(
+        "FranksVelodyneAlgos", _tram, {"standing": slice(0, 100), "driving": slice(-160, None)}
+    ),
+    "kitti360": Source(
+        "Pointcloud-Segmentation",
+        _opened("data/velodyne_points/good_data"),
+        {"drive": slice(None)},
+    ),
+    "hdl32": Source("map_reconstruction", _opened("pcd"), {"drive": slice(None)}),
+}
+
+
+def part_of(recording: Recording, chosen: slice) -> Recording:
+    """Return some consecutive sweeps of a recording."""
+    numbers = range(recording.count)[chosen]
+    return replace(
+        recording, count=len(numbers), read=lambda number: recording.read(numbers[number])
+    )
+
+
+def mapped_sweeps(count: int, rule: str) -> Ints:
+    """Return the numbers of the sweeps that make the map."""
+    numbers = np.arange(count)
+    if rule == "easy":
+        return numbers[::2]
+    block = numbers // _BLOCK_SWEEPS
+    held_out = (block % 2 == 1) & ((block + 1) * _BLOCK_SWEEPS < count)
+    return numbers[~held_out]
+
+
+def static_points(sweeps: AlignedSweeps, numbers: Ints) -> dict[int, Bools]:
+    """Return which points of sweeps are static: other sweeps, a second away, saw something there.
+
+    Independent of the twin: points are counted in voxels, and no ray is cast.
+    """
+    keys = []
+    for number in range(sweeps.recorded.count):
+        cells = np.unique(_cells(sweeps.read(number).world), axis=0)
+        keys.append(np.column_stack([cells, np.full(len(cells), number)]))
+    table = np.concatenate(keys)
+    lower = table[:, :3].min(axis=0)
+    spans = np.ptp(table[:, :3], axis=0) + 1
+    code = np.ravel_multi_index(tuple((table[:, :3] - lower).T), tuple(spans))
+    order = np.lexsort((table[:, 3], code))
+    code = code[order]
+    sweep = table[order, 3]
+    starts = np.flatnonzero(np.diff(code, prepend=-1))
+    stops = np.append(starts[1:], len(code)) - 1
+    static_codes = code[starts][sweep[stops] - sweep[starts] >= _STATIC_SWEEPS]
+    masks = {}
+    for number in numbers.tolist():
+        codes = np.ravel_multi_index(
+            tuple((_cells(sweeps.read(number).world) - lower).T), tuple(spans)
+        )
+        masks[number] = np.isin(codes, static_codes)
+    return masks
+
+
+def _cells(world: Floats) -> Ints:
+    """Return the voxels (n, 3) of points (n, 3)."""
+    return np.floor(world / _STATIC_VOXEL_M).astype(np.int64)
+
+
+def to_next(sweeps: RecordedSweeps, numbers: Ints) -> dict[str, float | None]:
+    """Return how far the ranges of sweeps are from the ranges of the next recorded sweep."""
+    differences = []
+    overlaps = []
+    for number in numbers.tolist():
+        if number + 1 == sweeps.count:
+            continue
+        one, following = (_range_image(sweeps, number + k) for k in (0, 1))
+        both = np.isfinite(one) & np.isfinite(following)
+        differences.append(np.abs(one - following)[both])
+        answering = np.isfinite(one) | np.isfinite(following)
+        overlaps.append(both.sum() / answering.sum())
+    if not differences:
+        return {}
+    difference_m = np.concatenate(differences)
+    return {
+        "median_size_m": float(np.median(difference_m)),
+        "p90_size_m": float(np.quantile(difference_m, 0.9)),
+    }
+
+
+def _range_image(sweeps: RecordedSweeps, number: int) -> Floats:
+    """Return the ranges (r, c) of a sweep; NaN without a return."""
+    sweep = sweeps.read(number)
+    image = np.full((sweeps.ring_count, _IMAGE_COLUMNS), np.nan)
+    turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
+    column = (turns * _IMAGE_COLUMNS).astype(np.int64) % _IMAGE_COLUMNS
+    image[sweep.ring, column] = np.linalg.norm(sweep.points, axis=1)
+    return image
+
+
+def interval(rays: HeldOut, figure: Callable[[HeldOut], float | None]) -> list[float] | None:
+    """Return the interval that holds a figure with 95 %, by drawing sweeps again."""
+    random = np.random.default_rng(0)
+    numbers = np.unique(rays.sweep)
+    by_sweep = [figure(rays.select(rays.sweep == number)) for number in numbers]
+    values = np.array([np.nan if value is None else value for value in by_sweep])
+    if not np.isfinite(values).any():
+        return None
+    means = [np.nanmean(random.choice(values, len(values))) for _ in range(_RESAMPLES)]
+    low, high = np.quantile(means, (0.025, 0.975)).tolist()
+    return [low, high]
+
+
+def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Build the twins of a recording by the rules, and return and print a row for each."""
+    source = SOURCES[name]
+    rows = []
+    for part, chosen in source.parts.items():
+        recording = part_of(source.open(root / source.repository), chosen)
+        recorded = RecordedSweeps.of_recording(recording)
+        poses = find_poses(recorded, None)
+        for rule in rules:
+            mapped = mapped_sweeps(recorded.count, rule)
+            if len(mapped) == recorded.count:
+                continue  # too few sweeps for a block between others
+            started = time.perf_counter()
+            row = _row(recorded, poses.matrices, mapped)
+            row |= {
+                "recording": f"{name}, {part}",
+                "rule": rule,
+                "sweeps": recorded.count,
+                "length_m": float(
+                    np.linalg.norm(np.diff(poses.matrices[:, :3, 3], axis=0), axis=1).sum()
+                ),
+                "seconds": time.perf_counter() - started,
+                "gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+            }
+            print(_line(row), flush=True)
+            rows.append(row)
+    return rows
+
+
+def _row(recorded: RecordedSweeps, poses: Floats, mapped: Ints) -> dict[str, Any]:
+    """Return the figures of the held-out sweeps of a recording."""
+    sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped.tolist()))
+    held_out = np.setdiff1d(np.arange(recorded.count), mapped)
+    compared = held_out[even_indices(len(held_out), _COMPARED_SWEEPS)]
+    place, reflectances = rebuild(sweeps, mapped.tolist(), DEFAULT_VOXEL_M)
+    every = np.arange(recorded.count).tolist()
+    standing = standing_points(sweeps, every)
+    rays = hold_out(sweeps, place, reflectances, standing, compared.tolist())
+    static = static_points(sweeps, compared)
+    returned = np.concatenate([static[number] for number in compared.tolist()])
+    is_static = np.zeros(len(rays.range_m), bool)
+    is_static[rays.returned] = returned
+    masked = replace(rays, standing=is_static)
+    plane_m = [sweeps.alignment.plane_distance_m[number] for number in compared.tolist()]
+    return {
+        "twin": rays.figures(),
+        "static": masked.figures()["standing"],
+        "static_share": float(returned.mean()),
+        "interval_m": interval(
+            rays.select(rays.standing), lambda part: part.figures()["all"]["median_size_m"]
+        ),
+        "next": to_next(recorded, compared),
+        "plane_m": float(np.nanmedian(plane_m)),
+        "surfels": len(place.surfels),
+    }
+
+
+def _line(row: dict[str, Any]) -> str:
+    """Return the figures of a row as text."""
+    twin = row["twin"]
+    standing = twin["standing"]
+    no_return = twin["no_return"] or {"f1": float("nan")}
+    correlation = standing["rank_correlation"]
+    return (
+        f"{row['recording']} ({row['rule']}, {row['sweeps']} sweeps, {row['length_m']:.0f} m): "
+        f"half {1000 * standing['median_size_m']:.0f} mm "
+        f"{[round(1000 * edge) for edge in row['interval_m'] or []]}, "
+        f"90 % {1000 * standing['p90_size_m']:.0f}, median {1000 * standing['median_m']:+.0f}, "
+        f"static mask {1000 * row['static']['median_size_m']:.0f} "
+        f"({100 * row['static_share']:.1f} %), next {1000 * row['next']['median_size_m']:.0f}, "
+        f"planes {1000 * row['plane_m']:.1f}; missed {100 * standing['missed']:.2f} %, F1 "
+        f"{no_return['f1']:.3f}, points {twin['points']:.3f}, by ring "
+        f"{twin['points_by_ring']:.3f}; rank "
+        f"{'–' if correlation is None else format(correlation, '.2f')}; {row['seconds']:.0f} s, "
+        f"{row['gib']:.1f} GiB"
+    )
+
+
+def main(arguments: list[str] | None = None) -> list[dict[str, Any]]:
+    """Measure, print and return the rows of the recordings that are there."""
+    parser = argparse.ArgumentParser(prog="benchmarks.reality", description=__doc__)
+    parser.add_argument("folder", type=Path, help="folder with the folders of the repositories")
+    parser.add_argument("names", nargs="*", help=f"of {', '.join(SOURCES)}; all by default")
+    parser.add_argument("--rules", default="easy,hard", help="easy, hard, or both")
+    parser.add_argument("--json", type=Path, help="file for the figures")
+    options = parser.parse_args(arguments)
+    rows = []
+    for name in options.names or SOURCES:
+        root = options.folder / SOURCES[name].repository
+        if not root.is_dir():
+            print(f"{name}: {root} is not there, and is left out")
+            continue
+        rows += measure(name, options.folder, tuple(options.rules.split(",")))
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    return rows
+
+
+if __name__ == "__main__":
+    main()

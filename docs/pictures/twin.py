@@ -1,0 +1,136 @@
+"""A film of a twin: a recorded drive, and the same drive with another sensor in its twin.
+
+`python -m docs.pictures.twin OUT.webp` drives an OS1-64 through the generated city, amid cars that
+move, and rebuilds the place from its sweeps. On the left are the recorded sweeps, on the right
+sweeps of a Pandar128 in the twin, where nothing moves. It prints the figures of the twin.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from benchmarks.odometry import SWEEP_S, left_turn
+from PIL import Image, ImageDraw
+
+from lidarpool import Actor, Mounted, Pose, Scanner, Scene, Survey, Track, load_sensor, twin
+from lidarpool.places.building import Twin
+from lidarscenes.procedural.city import city
+from lidarsim.base.arrays import Floats
+from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.table import SCAN
+from lidarsim.scene.actors import box
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
+from lidarview.render.camera import Camera
+from lidarview.render.colouring import TURBO
+from lidarview.render.pictures import splat
+from lidarview.render.surface import unit
+
+SIZE = (560, 420)  # of each half
+BACK = np.array([14, 17, 22, 255]) / 255
+EYE = np.array([-46.0, -34.0, 34.0])
+TARGET = np.array([-6.0, 2.0, 0.0])
+RAISED_M = 12.0  # height above the ground with the last colour
+HEIGHT_M = 1.9  # of the sensor
+TRIANGLES = 20_000
+# Start and end of the cars that move.
+CARS = (
+    ((24, 3.0), (-34, 3.0)),
+    ((-34, -3.0), (-4, -3.0)),
+    ((3, -34), (3, -8)),
+    ((-16, 3.2), (-60, 3.2)),
+)
+CAPTIONS = ("recorded: OS1-64", "in the twin: Pandar128")
+
+
+def drive(sweeps: int) -> Cloud:
+    """Record a drive through the city, amid cars that move: a cloud in memory."""
+    end_s = (sweeps + 1) * SWEEP_S
+    actors = [
+        Actor(box(f"car {number}", (4.4, 1.8, 1.5)), Track([0, end_s], [(*start, 0), (*stop, 0)]))
+        for number, (start, stop) in enumerate(CARS)
+    ]
+    scene = Scene.from_meshes([city(TRIANGLES)]).with_actors(actors)
+    survey = Survey(
+        sensors=[Mounted(load_sensor("ouster/os1-64"), Pose((0, 0, HEIGHT_M)))],
+        trajectory=left_turn(end_s),
+        steps=36 * sweeps,
+        columns=["time", "intensity"],
+        precision_m=1e-4,
+    )
+    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
+    sweeps_of_survey = Sweeps.from_survey(survey, scene)
+    return replace(cloud, sweeps=lambda: sweeps_of_survey)
+
+
+def camera() -> Camera:
+    """Return the camera of both halves."""
+    ahead = unit((TARGET - EYE)[None])
+    right = unit(np.cross(ahead, [0.0, 0.0, 1.0]))
+    axes = np.concatenate([right, np.cross(right, ahead), ahead])
+    return Camera(EYE, axes, 470.0, np.array(SIZE) / 2, SIZE)
+
+
+def draw(points: Floats, view: Camera, caption: str) -> Image.Image:
+    """Draw the points (n, 3) of a sweep by height."""
+    pixels, distance = view.project(points)
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < SIZE)).all(axis=1))
+    rows = inside[np.argsort(-distance[inside])]
+    share = np.clip(points[rows, 2] / RAISED_M, 0, 1)
+    paint = np.pad(TURBO[(24 + 231 * np.sqrt(share)).astype(int)], ((0, 0), (0, 1)), mode="edge")
+    paint[:, 3] = 1
+    image = splat(np.tile(BACK.astype(np.float32), (*SIZE[::-1], 1)), pixels[rows], paint, 1.5)
+    half = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
+    ImageDraw.Draw(half).text((12, 10), caption, fill=(235, 238, 242), font_size=17)
+    return half
+
+
+def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
+    """Draw the sweeps of the recording beside sweeps of another sensor in the twin."""
+    view = camera()
+    scanner = Scanner(place.scene, load_sensor("hesai/pandar128"))
+    images = []
+    for number in range(sweeps):
+        recorded = cloud.positions[cloud["scan"] // 36 == number]
+        simulated = scanner.sweep(
+            Pose.from_rotation(place.poses[number, :3, 3], place.poses[number, :3, :3])
+        ).positions
+        image = Image.new("RGB", (2 * SIZE[0], SIZE[1]))
+        for index, points in enumerate((recorded, simulated)):
+            image.paste(draw(points, view, CAPTIONS[index]), (index * SIZE[0], 0))
+        images.append(image)
+    return images
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Make the film, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("film", type=Path, help="a .webp file")
+    parser.add_argument("--sweeps", type=int, default=40)
+    options = parser.parse_args(arguments)
+    cloud = drive(options.sweeps)
+    place = twin(cloud)
+    print(repr(place))
+    images = frames(cloud, place, options.sweeps)
+    images[0].save(
+        memory := io.BytesIO(),
+        "webp",
+        save_all=True,
+        append_images=images[1:],
+        duration=round(1e3 * SWEEP_S),
+        loop=0,
+        quality=60,
+        method=4,
+    )
+    options.film.write_bytes(memory.getvalue())
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
