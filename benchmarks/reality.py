@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import resource
 import time
 from collections.abc import Callable
@@ -38,7 +37,8 @@ from lidarpool.places.alignment import AlignedSweeps, align
 from lidarpool.places.building import DEFAULT_VOXEL_M, rebuild
 from lidarpool.places.free_space import standing_points
 from lidarpool.places.held_out import HeldOut, hold_out
-from lidarpool.places.odometry import find_poses
+from lidarpool.places.lost_pulses import answering_cells
+from lidarpool.places.odometry import RecordedPoses, find_poses
 from lidarpool.places.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarsim.base.arrays import Bools, Floats, Ints
@@ -51,7 +51,6 @@ _STATIC_SWEEPS = 10  # between sweeps that have points at the same place: a seco
 _RESAMPLES = 400  # of sweeps, for intervals
 _IMAGE_COLUMNS = 870  # of the cells in which two recorded sweeps are compared
 _TRAM = Path("exampleData/MuehlburgerTor/velodyne_dist")
-_TRAM_METRES = 0.002  # of a step of the range images
 
 
 class Source(NamedTuple):
@@ -69,10 +68,10 @@ def _opened(folder: str) -> Callable[[Path], Recording]:
 def _tram(root: Path) -> Recording:
     """Open range images: 16-bit PNG files with a row for each ring, and 0 for no return."""
     files = sorted((root / _TRAM / "data").glob("*.png"))
-    entries = re.split(r"\s*;\s*", (root / _TRAM / "velodyne_config.txt").read_text().strip())
-    numbers = [float(entry.split("\n")[-1]) for entry in entries]
-    column_count, ring_count, start_deg, stop_deg = numbers[:4]
-    elevation = -np.radians(numbers[4 : 4 + int(ring_count)])
+    entries = (root / _TRAM / "velodyne_config.txt").read_text().splitlines()[-1].split()
+    steps_per_m, column_count, ring_count, start_deg, stop_deg = map(float, entries[:5])
+    elevation = -np.radians(np.array(entries[5:], np.float64))
+    assert len(elevation) == ring_count
     columns = np.arange(int(column_count))
     azimuth = np.radians(start_deg + (columns + 0.5) * (stop_deg - start_deg) / column_count)
     level = np.cos(elevation)[:, None]
@@ -87,7 +86,7 @@ def _tram(root: Path) -> Recording:
     ring = np.arange(len(elevation)).repeat(len(azimuth))
 
     def read(number: int) -> Read:
-        range_m = _TRAM_METRES * np.asarray(Image.open(files[number]), np.float64)
+        range_m = np.asarray(Image.open(files[number]), np.float64) / steps_per_m
         return (range_m[..., None] * directions).reshape(-1, 3), {"ring": ring}, None
 
     return Recording("tram", len(files), read)
@@ -210,8 +209,10 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
     """Build the twins of a recording by the rules, and return and print a row for each."""
     source = SOURCES[name]
     rows = []
+    whole = source.open(root / source.repository)
+    answering = answering_cells(RecordedSweeps.of_recording(whole))
     for part, chosen in source.parts.items():
-        recording = part_of(source.open(root / source.repository), chosen)
+        recording = part_of(whole, chosen)
         recorded = RecordedSweeps.of_recording(recording)
         poses = find_poses(recorded, None)
         for rule in rules:
@@ -219,7 +220,7 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
             if len(mapped) == recorded.count:
                 continue  # too few sweeps for a block between others
             started = time.perf_counter()
-            row = _row(recorded, poses.matrices, mapped)
+            row = _row(recorded, poses, mapped, answering)
             row |= {
                 "recording": f"{name}, {part}",
                 "rule": rule,
@@ -235,7 +236,9 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
     return rows
 
 
-def _row(recorded: RecordedSweeps, poses: Floats, mapped: Ints) -> dict[str, Any]:
+def _row(
+    recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, answering: Bools
+) -> dict[str, Any]:
     """Return the figures of the held-out sweeps of a recording."""
     sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped.tolist()))
     held_out = np.setdiff1d(np.arange(recorded.count), mapped)
@@ -243,7 +246,7 @@ def _row(recorded: RecordedSweeps, poses: Floats, mapped: Ints) -> dict[str, Any
     place, reflectances = rebuild(sweeps, mapped.tolist(), DEFAULT_VOXEL_M)
     every = np.arange(recorded.count).tolist()
     standing = standing_points(sweeps, every)
-    rays = hold_out(sweeps, place, reflectances, standing, compared.tolist())
+    rays = hold_out(sweeps, place, reflectances, standing, answering, compared.tolist())
     static = static_points(sweeps, compared)
     returned = np.concatenate([static[number] for number in compared.tolist()])
     is_static = np.zeros(len(rays.range_m), bool)
@@ -258,6 +261,7 @@ def _row(recorded: RecordedSweeps, poses: Floats, mapped: Ints) -> dict[str, Any
             rays.select(rays.standing), lambda part: part.figures()["all"]["median_size_m"]
         ),
         "next": to_next(recorded, compared),
+        "motion": sweeps.alignment.motion.value,
         "plane_m": float(np.nanmedian(plane_m)),
         "surfels": len(place.surfels),
     }
@@ -270,7 +274,8 @@ def _line(row: dict[str, Any]) -> str:
     no_return = twin["no_return"] or {"f1": float("nan")}
     correlation = standing["rank_correlation"]
     return (
-        f"{row['recording']} ({row['rule']}, {row['sweeps']} sweeps, {row['length_m']:.0f} m): "
+        f"{row['recording']} ({row['rule']}, {row['sweeps']} sweeps, {row['length_m']:.0f} m, "
+        f"{row['motion']}): "
         f"half {1000 * standing['median_size_m']:.0f} mm "
         f"{[round(1000 * edge) for edge in row['interval_m'] or []]}, "
         f"90 % {1000 * standing['p90_size_m']:.0f}, median {1000 * standing['median_m']:+.0f}, "

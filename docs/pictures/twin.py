@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.odometry import SWEEP_S, left_turn
 from PIL import Image, ImageDraw
 
-from lidarpool import Actor, Mounted, Pose, Scanner, Scene, Survey, Track, load_sensor, twin
+from lidarpool import Actor, Mounted, Pose, Scanner, Survey, Track, load_sensor, twin
 from lidarpool.places.building import Twin
 from lidarscenes.procedural.city import city
 from lidarsim.base.arrays import Floats
@@ -55,7 +55,7 @@ def drive(sweeps: int) -> Cloud:
         Actor(box(f"car {number}", (4.4, 1.8, 1.5)), Track([0, end_s], [(*start, 0), (*stop, 0)]))
         for number, (start, stop) in enumerate(CARS)
     ]
-    scene = Scene.from_meshes([city(TRIANGLES)]).with_actors(actors)
+    scene = city(TRIANGLES).with_actors(actors)
     survey = Survey(
         sensors=[Mounted(load_sensor("ouster/os1-64"), Pose((0, 0, HEIGHT_M)))],
         trajectory=left_turn(end_s),

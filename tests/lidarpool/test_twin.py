@@ -12,9 +12,8 @@ from click.testing import CliRunner
 from lidarpool import LidarError, Material, Mounted, Pose, Scene, Sensor, Survey, Track, twin
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.recording import Recording
-from lidarpool.places.alignment import AlignedSweep
 from lidarpool.places.lost_pulses import lost_pulses
-from lidarpool.places.recorded_sweeps import RecordedSweeps
+from lidarpool.places.recorded_sweeps import RecordedSweep, RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -136,8 +135,9 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     received = (column < 200) | (column >= 300)  # packets of 40 degrees did not come
     rows = returned & received
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
-    sweep = AlignedSweep(points, points, np.zeros(3), ring[rows], None, None)
-    lost = lost_pulses(sweep, np.eye(4), elevation, 0.0)
+    sweep = RecordedSweep(points, ring[rows], None, None, None, -np.pi)
+    answering = np.ones((16, 720), bool)
+    lost = lost_pulses(sweep, elevation, answering, 0.0)
     expected = ~returned & received
     assert len(lost.ring) == pytest.approx(expected.sum(), rel=0.01)
     for number in (0, 5, 9):
@@ -145,7 +145,7 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
         found = lost.points[lost.ring == number]
         cosines = found @ truth.T
         assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
-    unknown = lost_pulses(sweep, np.eye(4), np.empty(0), 0.0)
+    unknown = lost_pulses(sweep, np.empty(0), answering, 0.0)
     assert not len(unknown.points)
 
 
@@ -205,7 +205,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     shuffled = without_poses(
         drive, lambda points, _: np.random.default_rng(1).permutation(len(points))
     )
-    with pytest.raises(LidarError, match="drive has no rings: name its sensor"):
+    with pytest.raises(LidarError, match="the order of its points shows none.* Name its sensor"):
         twin(shuffled)
     with pytest.raises(LidarError, match="has no column 'nope' to compare as intensity"):
         twin(replace(recording, intensity_column="nope"))

@@ -2,8 +2,8 @@
 
 Odometry is exact to centimetres, and the rings of a sensor differ by as much. Both blur a place.
 Here the distances of points to the planes of the map are made small: by the pose of each sweep, and
-by an offset of range, elevation and azimuth of each ring. Points have to be compensated for the
-motion within their sweeps.
+by an offset of range, elevation and azimuth of each ring. Points as they were fired are compensated
+by the motion from their sweep to the next.
 
 Arrays have s sweeps, r rings and n points.
 """
@@ -11,7 +11,7 @@ Arrays have s sweeps, r rings and n points.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,9 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 
+from .lost_pulses import lost_pulses
+from .motion import Motion, Step
+from .odometry import RecordedPoses
 from .recorded_sweeps import MIN_RINGS, RecordedSweep, RecordedSweeps, elevations
 from .voxel_planes import VoxelPlanes
 
@@ -28,6 +31,11 @@ _VOXEL_SHARE = 0.012  # edge of the map's voxels over the median range
 _MIN_VOXEL_M = 0.05
 _MAX_VOXEL_M = 0.3
 _ROUNDS = 4  # of a map and an alignment to this map
+_TRIAL_ROUNDS = 2  # of each way in which points may be stored
+_TRIAL_SWEEPS = 24  # consecutive
+_TURN_M = 10.0  # motion that blurs as much as a turn by a radian
+_NEAR_VOXELS = 160  # twice the median range
+_MAX_SHARE_OF_VOXELS = 0.99  # of those of the usual way, filled in another way that is right
 _STEPS = 3  # of Gauss and Newton in a round
 _MAX_VOXELS = 1.5  # distance to a plane's centre beyond which a point is not compared
 _MIN_SIGMA_M = 0.005  # of distances: simulated ranges may have no noise
@@ -41,12 +49,16 @@ _MIN_PLANE_POINTS = 500  # of a sweep on planes: fewer do not fix its pose
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses of the sweeps, and offsets of their rings.
+    """Poses of the sweeps, motion within them, and offsets of their rings.
 
     Attributes
     ----------
     poses
-        float64 (s, 4, 4): from the sensor frame of each sweep to the world.
+        float64 (s, 4, 4): from the sensor frame at the start of each sweep to the world.
+    times_s
+        float64 (s,): starts of the sweeps.
+    motion
+        How the points of a sweep are compensated.
     ring_offsets
         float64 (r, 3): added to the range (metres), elevation and azimuth (radians) of the points
         of a ring.
@@ -57,17 +69,37 @@ class Alignment:
     """
 
     poses: Floats
+    times_s: Floats
+    motion: Motion
     ring_offsets: Floats
     thickness_m: tuple[float, ...] = ()
     plane_distance_m: Floats = field(default_factory=lambda: np.empty(0))
 
-    def moved_m(self, number: int) -> float:
-        """Return how far the sensor moves from a sweep to the next, or to the last from before."""
-        first = min(number, len(self.poses) - 2)
-        return float(np.linalg.norm(self.poses[first + 1, :3, 3] - self.poses[first, :3, 3]))
+    @classmethod
+    def unaligned(cls, poses: RecordedPoses, motion: Motion, ring_count: int) -> Alignment:
+        """Return the alignment of poses without corrections."""
+        return cls(poses.matrices.copy(), poses.times_s, motion, np.zeros((ring_count, 3)))
 
-    def corrected(self, sweep: RecordedSweep) -> Floats:
-        """Return the calibrated points (n, 3) of a sweep in the sensor frame."""
+    def step(self, number: int) -> tuple[Step, float]:
+        """Return the motion from a sweep to the next, and its seconds; of the last, from before."""
+        first = min(number, len(self.poses) - 2)
+        period_s = float(self.times_s[first + 1] - self.times_s[first])
+        return Step.between(self.poses[first], self.poses[first + 1]), period_s
+
+    def compensated(self, sweep: RecordedSweep, number: int) -> tuple[Floats, Floats]:
+        """Return the points (n, 3) of a sweep in the sensor frame of its start, calibrated.
+
+        The second array (n, 3) has the positions of the sensor when it fired, in the same frame.
+        """
+        points = self._calibrated(sweep)
+        step, period_s = self.step(number)
+        shares = self.motion.shares(sweep, period_s)
+        if shares is None:
+            return points, np.zeros_like(points)
+        return step.compensated(points, shares), shares[:, None] * step.translation
+
+    def _calibrated(self, sweep: RecordedSweep) -> Floats:
+        """Return the points (n, 3) of a sweep with the offsets of their rings."""
         points = sweep.points
         if not self.ring_offsets.any():
             return points
@@ -84,28 +116,17 @@ class Alignment:
 class AlignedSweep(NamedTuple):
     """Returns of a sweep; arrays of n points."""
 
-    points: Floats  # (n, 3): in the sensor frame, calibrated, metres
+    points: Floats  # (n, 3): in the sensor frame of the start, calibrated, metres
     world: Floats  # (n, 3): metres
-    origin: Floats  # (3,): of the rays, in the world
+    origins: Floats  # (n, 3): of the rays, in the world
     ring: Ints  # (n,)
     intensities: Floats | None  # (n,)
     classes: Ints | None  # (n,)
 
     @property
     def range_m(self) -> Floats:
-        """Ranges (n,), metres."""
-        return np.asarray(np.linalg.norm(self.points, axis=1))
-
-    def part(self, rows: Bools) -> AlignedSweep:
-        """Return selected points."""
-        return AlignedSweep(
-            self.points[rows],
-            self.world[rows],
-            self.origin,
-            self.ring[rows],
-            None if self.intensities is None else self.intensities[rows],
-            None if self.classes is None else self.classes[rows],
-        )
+        """Ranges (n,) along the rays, metres."""
+        return np.asarray(np.linalg.norm(self.world - self.origins, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,20 +143,33 @@ class AlignedSweeps:
 
     def read(self, number: int) -> AlignedSweep:
         """Read a sweep; LidarError if the recording cannot be read."""
+        return self.aligned(self.recorded.read(number), number)
+
+    def lost(self, number: int, answering: Bools) -> AlignedSweep:
+        """Read a sweep and return its lost pulses in answering cells, as points a metre away."""
+        step, _ = self.alignment.step(number)
+        # Points as fired have no gaps by motion.
+        is_compensated = self.alignment.motion is Motion.COMPENSATED
+        moved_m = float(np.linalg.norm(step.translation)) if is_compensated else 0.0
         sweep = self.recorded.read(number)
-        points = self.alignment.corrected(sweep)
+        lost = lost_pulses(sweep, self.recorded.elevation_rad, answering, moved_m)
+        return self.aligned(lost, number)
+
+    def aligned(self, sweep: RecordedSweep, number: int) -> AlignedSweep:
+        """Return points of a sweep at their places."""
+        points, origins = self.alignment.compensated(sweep, number)
         pose = self.alignment.poses[number]
         return AlignedSweep(
             points=points,
             world=placed(points, pose),
-            origin=pose[:3, 3],
+            origins=placed(origins, pose),
             ring=sweep.ring,
             intensities=sweep.intensities,
             classes=sweep.classes,
         )
 
 
-def align(sweeps: RecordedSweeps, poses: Floats, mapped: Sequence[int]) -> Alignment:
+def align(sweeps: RecordedSweeps, poses: RecordedPoses, mapped: Sequence[int]) -> Alignment:
     """Align all sweeps to a map of some.
 
     Parameters
@@ -143,7 +177,7 @@ def align(sweeps: RecordedSweeps, poses: Floats, mapped: Sequence[int]) -> Align
     sweeps
         The sweeps.
     poses
-        (s, 4, 4): first estimates of the poses.
+        First estimates of the poses.
     mapped
         Numbers of the sweeps whose points make the map, and calibrate the rings.
 
@@ -153,10 +187,77 @@ def align(sweeps: RecordedSweeps, poses: Floats, mapped: Sequence[int]) -> Align
         If the recording shows hardly any planes.
     """
     samples = [_sample(sweeps.read(number), number) for number in range(sweeps.count)]
-    alignment = Alignment(poses.copy(), np.zeros((sweeps.ring_count, 3)))
     voxel_m = _voxel_m(samples)
-    for _ in range(_ROUNDS):
-        planes = _planes(sweeps.recording.name, samples, alignment, mapped, voxel_m)
+    motion = _motion(sweeps, samples, poses, voxel_m)
+    alignment = Alignment.unaligned(poses, motion, sweeps.ring_count)
+    return _rounds(sweeps.recording.name, samples, alignment, mapped, voxel_m, _ROUNDS)
+
+
+def _motion(
+    sweeps: RecordedSweeps, samples: list[RecordedSweep], poses: RecordedPoses, voxel_m: float
+) -> Motion:
+    """Return how points are stored: the way in which some consecutive sweeps fill few voxels.
+
+    Surfaces that several sweeps saw at the same place share voxels. The thickness of planes does
+    not tell: of a blurred wall no plane is found, and a level road stays thin.
+    """
+    if sweeps.is_compensated:
+        return Motion.COMPENSATED
+    is_timed = all(sample.time_s is not None for sample in samples)
+    if is_timed:
+        candidates = [Motion.TIMED, Motion.COMPENSATED]
+    elif len(sweeps.elevation_rad):
+        candidates = [Motion.COMPENSATED, Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE]
+    else:
+        return Motion.COMPENSATED
+    window = _fastest(poses)
+    chosen = samples[window]
+    local = poses.part(window)
+    filled = {}
+    for motion in candidates:
+        alignment = Alignment.unaligned(local, motion, sweeps.ring_count)
+        numbers = range(len(chosen))
+        alignment = _rounds(
+            sweeps.recording.name, chosen, alignment, numbers, voxel_m, _TRIAL_ROUNDS
+        )
+        filled[motion] = _filled_voxels(chosen, alignment, voxel_m)
+    best = min(candidates, key=filled.__getitem__)
+    is_clear = filled[best] < _MAX_SHARE_OF_VOXELS * filled[candidates[0]]
+    return best if is_clear else candidates[0]
+
+
+def _filled_voxels(samples: Sequence[RecordedSweep], alignment: Alignment, voxel_m: float) -> int:
+    """Return the number of voxels that hold points: far points, which are alone, do not count."""
+    parts = []
+    for number, sample in enumerate(samples):
+        points, _ = alignment.compensated(sample, number)
+        near = np.linalg.norm(sample.points, axis=1) < _NEAR_VOXELS * voxel_m
+        parts.append(placed(points[near], alignment.poses[number]))
+    return len(np.unique(np.floor(np.concatenate(parts) / voxel_m).astype(np.int64), axis=0))
+
+
+def _fastest(poses: RecordedPoses) -> slice:
+    """Return consecutive sweeps in which the sensor moves and turns most."""
+    steps = np.diff(poses.matrices, axis=0)
+    size = np.linalg.norm(steps[:, :3, 3], axis=1)
+    size += _TURN_M * np.linalg.norm(steps[:, :3, :3], axis=(1, 2))
+    count = min(_TRIAL_SWEEPS, len(poses.matrices))
+    total = np.convolve(size, np.ones(count - 1), "valid")
+    start = int(total.argmax())
+    return slice(start, start + count)
+
+
+def _rounds(
+    name: str,
+    samples: Sequence[RecordedSweep],
+    alignment: Alignment,
+    mapped: Sequence[int],
+    voxel_m: float,
+    rounds: int,
+) -> Alignment:
+    """Make a map and align all sweeps to it, several times; LidarError without planes."""
+    for _ in range(rounds):
+        planes = _planes(name, samples, alignment, mapped, voxel_m)
         alignment = _aligned(alignment, samples, planes, mapped, voxel_m)
     return alignment
 
@@ -182,7 +283,8 @@ def _planes(
 ) -> VoxelPlanes:
     """Return the planes of the map of some sweeps; LidarError without planes."""
     parts = [
-        placed(alignment.corrected(samples[number]), alignment.poses[number]) for number in mapped
+        placed(alignment.compensated(samples[number], number)[0], alignment.poses[number])
+        for number in mapped
     ]
     planes = VoxelPlanes.of_points(name, np.concatenate(parts), voxel_m)
     if planes is None:
@@ -220,7 +322,8 @@ def _registered(
     """Return the pose of a sweep that brings its points to planes, and these points."""
     from scipy.spatial.transform import Rotation
 
-    points = alignment.corrected(sample.part(np.arange(min(len(sample), _SWEEP_POINTS))))
+    some = sample.part(np.arange(min(len(sample), _SWEEP_POINTS)))
+    points, _ = alignment.compensated(some, number)
     pose = alignment.poses[number].copy()
     for _ in range(_STEPS):
         on_planes = _PlanePoints.of_sweep(points, pose, planes, voxel_m)
@@ -270,11 +373,12 @@ def _aligned(
         prior = _POINT_SIGMA_M / np.array([_RANGE_PRIOR_M, _ANGLE_PRIOR_RAD, _ANGLE_PRIOR_RAD])
         normal += np.diag(prior**2)
         offsets = offsets + np.linalg.solve(normal, side[..., None])[..., 0]
-    return Alignment(
-        poses,
-        offsets,
-        (*alignment.thickness_m, planes.thickness_m),
-        distance_m,
+    return replace(
+        alignment,
+        poses=poses,
+        ring_offsets=offsets,
+        thickness_m=(*alignment.thickness_m, planes.thickness_m),
+        plane_distance_m=distance_m,
     )
 
 

@@ -41,6 +41,7 @@ from .alignment import AlignedSweeps, align
 from .charts import draw_above, draw_errors, draw_sweep
 from .free_space import standing_points
 from .held_out import HeldOut, hold_out
+from .lost_pulses import answering_cells
 from .odometry import find_poses
 from .place import Place, build_place
 from .recorded_sweeps import RecordedSweeps
@@ -202,7 +203,8 @@ def twin(
     base = None if model is None else read_model(model)
     if base is None and not len(sweeps.elevation_rad):
         raise LidarError(
-            f"{recording.name} has no rings: name its sensor, for example --model livox/mid360."
+            f"{' '.join(sweeps.notes) or f'{recording.name} has no rings.'} Name its sensor, for "
+            "example --model livox/mid360."
         )
     return _Building(sweeps, base, voxel_m, tell or (lambda line: None)).twin(
         None if trajectory is None else Path(trajectory)
@@ -225,7 +227,7 @@ class _Building:
         poses = find_poses(recorded, trajectory)
         mapped = list(range(0, recorded.count, 2))
         self.tell(f"poses {poses.source}; aligning the sweeps")
-        sweeps = AlignedSweeps(recorded, align(recorded, poses.matrices, mapped))
+        sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped))
         self.tell("finding what stands")
         standing = standing_points(sweeps, range(recorded.count))
         self.tell(f"building the place of {plural(len(mapped), 'sweep')}, to compare the others")
@@ -236,6 +238,7 @@ class _Building:
         model, notes = self._sensor(sweeps, place, reflectances)
         figures = self._figures(sweeps, standing, place) | {
             "poses": poses.source,
+            "motion": sweeps.alignment.motion.value,
             "held_out": held_out.figures(),
             "response": None if reflectances is None else reflectances.figures(),
             "model": model.name,
@@ -265,7 +268,8 @@ class _Building:
         place, reflectances = rebuild(sweeps, mapped, self.voxel_m)
         others = np.setdiff1d(np.arange(self.recorded.count), mapped)
         compared = others[even_indices(len(others), _COMPARED_SWEEPS)].tolist()
-        held_out = hold_out(sweeps, place, reflectances, standing, compared)
+        answering = answering_cells(self.recorded)
+        held_out = hold_out(sweeps, place, reflectances, standing, answering, compared)
         return held_out, draw_sweep(sweeps, place, reflectances, compared[len(compared) // 2])
 
     def _sensor(
@@ -320,7 +324,7 @@ class _Building:
             "voxel_m": self.voxel_m,
             "length_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
             "thickness_m": list(alignment.thickness_m),
-            "plane_distance_m": float(np.nanmedian(alignment.plane_distance_m)),
+            "plane_distance_m": _median(alignment.plane_distance_m),
             "ring_offset_m": float(np.std(alignment.ring_offsets[:, 0])),
             "ring_offset_deg": float(np.degrees(np.std(alignment.ring_offsets[:, 1]))),
         }
@@ -360,6 +364,12 @@ def _place_of(
     place = build_place(sweeps, standing, voxel_m)
     seen = place.observations(sweeps, standing)
     return place, fit_reflectances(seen, place.surfels, sweeps.recorded.ring_count)
+
+
+def _median(values: Floats) -> float | None:
+    """Return the median of the values that are known, or None."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else None
 
 
 def _coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:

@@ -15,15 +15,11 @@ from typing import Any
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.base.even_samples import even_indices
 
 from .alignment import AlignedSweep, AlignedSweeps
-from .lost_pulses import lost_pulses
 from .place import Place
 from .reflectances import Reflectances
 
-_COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
-_ANSWERING_SWEEPS = 100  # that show these cells
 _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # classes of ranges
 
 
@@ -128,7 +124,7 @@ class HeldOut:
             "rank_correlation": None,
             "intensity_error": None,
         }
-        if both.sum() > 2 and recorded[both].std() > 0 and simulated[both].std() > 0:
+        if both.sum() > 2 and np.ptp(recorded[both]) > 0 and np.ptp(simulated[both]) > 0:
             from scipy.stats import spearmanr
 
             figures["rank_correlation"] = float(spearmanr(recorded[both], simulated[both])[0])
@@ -141,6 +137,7 @@ def hold_out(
     place: Place,
     reflectances: Reflectances | None,
     standing: Mapping[int, Bools],
+    answering: Bools,
     numbers: Sequence[int],
 ) -> HeldOut:
     """Cast the rays of held-out sweeps at a place that other sweeps made.
@@ -153,17 +150,15 @@ def hold_out(
         The place, and its reflectances; None without intensities.
     standing
         Which points of the held-out sweeps stand, by all sweeps: {number: (n,)}.
+    answering
+        (r, c): cells that any sweep has a return in, of `answering_cells`.
     numbers
         Numbers of the held-out sweeps.
     """
-    elevation_rad = sweeps.recorded.elevation_rad
-    answering = _answering(sweeps, list(standing))
     parts = []
     for number in numbers:
         sweep = sweeps.read(number)
-        moved_m = sweeps.alignment.moved_m(number)
-        lost = lost_pulses(sweep, sweeps.alignment.poses[number], elevation_rad, moved_m)
-        lost = lost.part(answering[_cells(lost)])
+        lost = sweeps.lost(number, answering)
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)
         parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))
@@ -200,17 +195,3 @@ def _rays(
         ),
         standing=standing,
     )
-
-
-def _answering(sweeps: AlignedSweeps, numbers: Sequence[int]) -> Bools:
-    """Mark the cells (r, c) in which any sweep has a return: elsewhere the carrier hides all."""
-    answering = np.zeros((sweeps.recorded.ring_count, _COLUMNS), bool)
-    for index in even_indices(len(numbers), _ANSWERING_SWEEPS).tolist():
-        answering[_cells(sweeps.read(numbers[index]))] = True
-    return answering
-
-
-def _cells(sweep: AlignedSweep) -> tuple[Ints, Ints]:
-    """Return the rings and columns (n,) of the rays of a sweep."""
-    turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
-    return sweep.ring, (turns * _COLUMNS).astype(np.int64) % _COLUMNS

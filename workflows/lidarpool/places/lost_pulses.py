@@ -13,54 +13,70 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.even_samples import even_indices
 
-from .alignment import AlignedSweep, placed
-from .recorded_sweeps import elevations
+from .recorded_sweeps import RecordedSweep, RecordedSweeps, elevations
 
 _MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep stretches steps
 _MIN_RETURNS = 8  # of a ring whose steps are known
+_COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
+_ANSWERING_SWEEPS = 100  # that show these cells
 _SECTORS = 360  # of azimuth, in which all rings may be empty
 _MIN_RINGS = 0.05  # share of the rings that return in a sector; with less, no packet came
 
 
 def lost_pulses(
-    sweep: AlignedSweep, pose: Floats, elevation_rad: Floats, moved_m: float
-) -> AlignedSweep:
+    sweep: RecordedSweep, elevation_rad: Floats, answering: Bools, moved_m: float
+) -> RecordedSweep:
     """Return the lost pulses of a sweep, as points a metre away without intensities.
 
     Parameters
     ----------
-    sweep, pose
-        The returns, and the pose (4, 4) of the sensor.
+    sweep
+        The returns.
     elevation_rad
         (r,): of the rings, radians; empty for a sensor without rings, whose lost pulses are
         unknown.
+    answering
+        (r, c): cells that any sweep has a return in, of `answering_cells`.
     moved_m
-        How far the sensor moves during the sweep.
+        How far the sensor moved during the sweep, if points are compensated; else 0.
     """
-    directions = np.empty((0, 3))
-    ring = np.empty(0, np.int64)
-    if len(elevation_rad) and len(sweep.points) >= _MIN_RETURNS:
-        directions, ring = _lost(sweep, elevation_rad, moved_m)
-    world = placed(directions, pose)
-    return AlignedSweep(directions, world, sweep.origin, ring, None, None)
-
-
-def _lost(sweep: AlignedSweep, elevation_rad: Floats, moved_m: float) -> tuple[Floats, Ints]:
-    """Return the directions (k, 3) of lost pulses in the sensor frame, and their rings (k,)."""
+    if not len(elevation_rad) or len(sweep) < _MIN_RETURNS:
+        return sweep.part(np.zeros(len(sweep), bool))
     gaps = _Gaps.of_sweep(sweep)
-    azimuth, elevation, ring = gaps.between(moved_m)
+    lost = gaps.between(moved_m)
     silent = np.setdiff1d(np.arange(len(elevation_rad)), gaps.ring)
     circle = np.arange(-np.pi, np.pi, gaps.step_rad)
-    azimuth = np.append(azimuth, np.tile(circle, len(silent)))
-    elevation = np.append(elevation, elevation_rad[silent].repeat(len(circle)))
-    ring = np.append(ring, silent.repeat(len(circle)))
+    azimuth = np.append(lost.azimuth, np.tile(circle, len(silent)))
+    elevation = np.append(lost.elevation, elevation_rad[silent].repeat(len(circle)))
+    ring = np.append(lost.ring, silent.repeat(len(circle)))
     level = np.cos(elevation)
     directions = np.stack(
         [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1
     )
-    known = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
-    return directions[known], ring[known]
+    time_s = None if sweep.time_s is None else _times_s(sweep, azimuth)
+    pulses = RecordedSweep(directions, ring, None, None, time_s, sweep.start_rad)
+    received = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
+    return pulses.part(received & answering[_cells(pulses)])
+
+
+def _times_s(sweep: RecordedSweep, azimuth: Floats) -> Floats:
+    """Return the times (k,) of pulses of azimuths (k,): of the returns nearest in azimuth."""
+    assert sweep.time_s is not None
+    azimuths = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+    order = np.argsort(azimuths)
+    turned = (azimuth + np.pi) % (2 * np.pi) - np.pi
+    index = np.searchsorted(azimuths[order], turned).clip(max=len(order) - 1)
+    return np.asarray(sweep.time_s[order[index]])
+
+
+class _Lost(NamedTuple):
+    """Lost pulses (k,): azimuths and elevations, radians, and rings."""
+
+    azimuth: Floats
+    elevation: Floats
+    ring: Ints
 
 
 class _Gaps(NamedTuple):
@@ -75,7 +91,7 @@ class _Gaps(NamedTuple):
     step_rad: float  # of the azimuths of neighbouring pulses
 
     @classmethod
-    def of_sweep(cls, sweep: AlignedSweep) -> _Gaps:
+    def of_sweep(cls, sweep: RecordedSweep) -> _Gaps:
         """Sort the returns of a sweep."""
         azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
         order = np.lexsort((azimuth, sweep.ring))
@@ -92,11 +108,11 @@ class _Gaps(NamedTuple):
         filled = (counts >= counts.max() / 2).repeat(counts) & (gap_rad > 0)
         step_rad = float(np.median(gap_rad[filled])) if filled.any() else 2 * np.pi
         elevation = elevations(sweep.points)[order]
-        range_m = sweep.range_m[order]
+        range_m = np.linalg.norm(sweep.points, axis=1)[order]
         return cls(azimuth, elevation, range_m, ring, following, gap_rad, step_rad)
 
-    def between(self, moved_m: float) -> tuple[Floats, Floats, Ints]:
-        """Return the azimuths, elevations and rings (k,) of the steps within gaps."""
+    def between(self, moved_m: float) -> _Lost:
+        """Return the pulses at the steps within gaps."""
         parallax_rad = moved_m * np.abs(1 / self.range_m - 1 / self.range_m[self.following])
         steps = np.rint(self.gap_rad / self.step_rad).astype(np.int64)
         is_gap = self.gap_rad > _MIN_STEPS * self.step_rad + parallax_rad
@@ -107,7 +123,7 @@ class _Gaps(NamedTuple):
         azimuth = self.azimuth[before] + share * self.gap_rad[before]
         elevation = self.elevation[before]
         elevation = elevation + share * (self.elevation[self.following[before]] - elevation)
-        return azimuth, elevation, self.ring[before]
+        return _Lost(azimuth, elevation, self.ring[before])
 
 
 def _received(gaps: _Gaps, ring_count: int) -> Bools:
@@ -120,3 +136,17 @@ def _received(gaps: _Gaps, ring_count: int) -> Bools:
 def _sectors(azimuth: Floats) -> Ints:
     """Return the sectors of azimuths, radians."""
     return np.asarray(np.floor(azimuth / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS)
+
+
+def answering_cells(sweeps: RecordedSweeps) -> Bools:
+    """Mark the cells (r, c) in which any sweep has a return: elsewhere the carrier hides all."""
+    answering = np.zeros((sweeps.ring_count, _COLUMNS), bool)
+    for number in even_indices(sweeps.count, _ANSWERING_SWEEPS).tolist():
+        answering[_cells(sweeps.read(number))] = True
+    return answering
+
+
+def _cells(sweep: RecordedSweep) -> tuple[Ints, Ints]:
+    """Return the rings and columns (n,) of the rays of a sweep."""
+    turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
+    return sweep.ring, (turns * _COLUMNS).astype(np.int64) % _COLUMNS

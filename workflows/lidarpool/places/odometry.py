@@ -32,6 +32,10 @@ class RecordedPoses(NamedTuple):
     source: str  # a clause, such as "of the recording"
     origin: Floats  # (3,): of the frame of the place in the world, whole metres
 
+    def part(self, window: slice) -> RecordedPoses:
+        """Return the poses of some consecutive sweeps."""
+        return self._replace(matrices=self.matrices[window], times_s=self.times_s[window])
+
     @classmethod
     def in_world(cls, matrices: Floats, times_s: Floats, source: str) -> RecordedPoses:
         """Make poses (s, 4, 4) in the world local, if they are far from zero."""

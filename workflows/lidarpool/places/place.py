@@ -80,8 +80,8 @@ class Place:
     def see(self, sweep: AlignedSweep, chosen: Bools | None = None) -> Seen:
         """Cast the rays of a sweep; `chosen` (n,) are some of its points."""
         rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
-        directions = sweep.world[rows] - sweep.origin
-        hits = self.caster.cast(sweep.origin, directions)
+        directions = sweep.world[rows] - sweep.origins[rows]
+        hits = self.caster.cast(sweep.origins[rows], directions)
         met = np.flatnonzero(hits.hit)
         surfel = hits.triangle[met].astype(np.int64) // 2
         range_m = np.linalg.norm(directions[met], axis=1)
@@ -181,7 +181,7 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
     for number, mask in standing.items():
         sweep = sweeps.read(number)
         positions.append(sweep.world[mask])
-        outward.append(sweep.origin - sweep.world[mask])
+        outward.append(sweep.origins[mask] - sweep.world[mask])
         if sweep.classes is not None:
             classes.append(sweep.classes[mask])
     points = ScannedPoints(

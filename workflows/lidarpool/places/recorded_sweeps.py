@@ -24,6 +24,11 @@ _GAP_RAD = np.radians(0.5)  # between the rays of a sensor without rings, in man
 _REFERENCE_SWEEPS = 5  # sweeps that tell the elevations of the rings
 _BACKWARD_DEG = 15.0  # a step back of the azimuth that begins a ring
 _SHORT_RING = 0.02  # a run of points shorter than this share of the median is no ring
+_TIME_COLUMNS = ("t", "time", "time_s", "timestamp", "offset_time", "time_offset", "time_stamp")
+_TIME_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+_MIN_SWEEP_S = 0.01
+_MAX_SWEEP_S = 2.0
+_MAX_CONE_SPREAD = 0.25  # of a ring, over all elevations: lines of a Livox are no cones
 _MIN_IN_ORDER = 0.95  # share of runs whose elevations go on in one direction
 
 
@@ -35,9 +40,17 @@ class RecordedSweep:
     ring: Ints  # (n,): row in `RecordedSweeps.elevation_rad`; 0 for a sensor without rings
     intensities: Floats | None  # (n,): in the scale of the recording
     classes: Ints | None  # (n,)
+    time_s: Floats | None  # (n,): since the first of its points
+    start_rad: float  # azimuth at which the sweep starts
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def turn(self) -> Floats:
+        """Share of a counter-clockwise revolution from the start of the sweep to points (n,)."""
+        azimuth = np.arctan2(self.points[:, 1], self.points[:, 0])
+        return np.asarray(((azimuth - self.start_rad) / (2 * np.pi)) % 1)
 
     def part(self, rows: Bools | Ints) -> RecordedSweep:
         """Return selected points."""
@@ -46,6 +59,8 @@ class RecordedSweep:
             self.ring[rows],
             None if self.intensities is None else self.intensities[rows],
             None if self.classes is None else self.classes[rows],
+            None if self.time_s is None else self.time_s[rows],
+            self.start_rad,
         )
 
 
@@ -84,12 +99,13 @@ class RecordedSweeps:
         if all(rings_of(columns) is not None for _, columns in references):
             rings = np.concatenate([np.asarray(rings_of(columns)) for _, columns in references])
             elevation = np.concatenate([elevations(points) for points, _ in references])
-            numbers, index = np.unique(rings.astype(np.int64), return_inverse=True)
-            medians = np.array([np.median(elevation[index == k]) for k in range(len(numbers))])
-            order = np.argsort(-medians, kind="stable")
-            if len(order) >= MIN_RINGS:
-                return cls(recording, medians[order], numbers[order], ())
-            return cls(recording, np.empty(0), None, ())
+            numbers, medians, spread_rad = _cones(rings.astype(np.int64), elevation)
+            if len(numbers) < MIN_RINGS:
+                return cls(recording, np.empty(0), None, ())
+            if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
+                note = f"The rings of {recording.name} are no cones: its rays are not calibrated."
+                return cls(recording, np.empty(0), None, (note,))
+            return cls(recording, medians, numbers, ())
         found = [_runs_in_order(points) for points, _ in references]
         runs = [run for run in found if run is not None]
         if not runs:
@@ -122,6 +138,11 @@ class RecordedSweeps:
             return _GAP_RAD
         return float(np.median(-np.diff(self.elevation_rad)))
 
+    @property
+    def is_compensated(self) -> bool:
+        """Whether points are known to be compensated for the motion, as in results."""
+        return self.recording.fired is not None
+
     def read(self, number: int) -> RecordedSweep:
         """Read a sweep; LidarError if the recording cannot be read."""
         points, columns = _returns(self.recording, number)
@@ -133,6 +154,8 @@ class RecordedSweeps:
             ring,
             None if intensities is None else np.asarray(intensities, np.float64),
             None if classes is None else np.asarray(classes).astype(np.int64),
+            None if self.is_compensated else _times_s(columns),
+            _start_rad(points, ring),
         )
         return sweep if known.all() else sweep.part(known)
 
@@ -157,6 +180,46 @@ class RecordedSweeps:
 def elevations(points: Floats) -> Floats:
     """Return the elevations (n,) of points (n, 3) in the sensor frame, radians."""
     return np.asarray(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+
+
+def _times_s(columns: Columns) -> Floats | None:
+    """Return the times (n,) of points since the first, seconds; None without a column of times.
+
+    Sweeps last 0.01 to 2 s, so the span of the column tells its unit: s, ms, µs or ns.
+    """
+    values = next((columns[name] for name in _TIME_COLUMNS if name in columns), None)
+    if values is None or not len(values):
+        return None
+    times = np.asarray(values)
+    if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+        return None
+    since = (times - times.min()).astype(np.float64)
+    span = float(since.max())
+    for unit_s in _TIME_UNITS_S:
+        if _MIN_SWEEP_S <= span * unit_s <= _MAX_SWEEP_S:
+            return since * unit_s
+    return None
+
+
+def _start_rad(points: Floats, ring: Ints) -> float:
+    """Return the azimuth at which a sweep starts: the mean of the first points of all rings."""
+    _, firsts = np.unique(ring, return_index=True)
+    x, y = points[firsts, :2].T
+    azimuth = np.arctan2(y, x)
+    return float(np.arctan2(np.sin(azimuth).sum(), np.cos(azimuth).sum()))
+
+
+def _cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
+    """Return the numbers and median elevations (r,) of rings, and how far a ring is from a cone.
+
+    The highest ring is first. The last value is the median, over rings, of the range that half of
+    the elevations of a ring are in, radians.
+    """
+    numbers, index = np.unique(rings, return_inverse=True)
+    parts = [elevation[index == row] for row in range(len(numbers))]
+    low, medians, high = np.array([np.quantile(part, (0.25, 0.5, 0.75)) for part in parts]).T
+    order = np.argsort(-medians, kind="stable")
+    return numbers[order], medians[order], float(np.median(high - low))
 
 
 def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyArray]]:

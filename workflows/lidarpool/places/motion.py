@@ -1,0 +1,60 @@
+"""Motion of the sensor within a sweep: what the points of a recording need to be compensated by.
+
+Points are stored as they were fired, each in the sensor frame of its own time, or compensated: all
+in the sensor frame of the start of the sweep. Files do not say which. As fired, a point has a share
+of the motion from its sweep to the next: by its time or, without times, by its azimuth.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+
+from .recorded_sweeps import RecordedSweep
+
+
+class Motion(StrEnum):
+    """How the points of a recording were stored."""
+
+    COMPENSATED = "compensated"
+    TIMED = "as fired, at the times of the points"
+    COUNTERCLOCKWISE = "as fired, counter-clockwise"
+    CLOCKWISE = "as fired, clockwise"
+
+    def shares(self, sweep: RecordedSweep, period_s: float) -> Floats | None:
+        """Return the shares (n,) of the motion of a sweep of `period_s`; None if compensated."""
+        if self is Motion.TIMED:
+            return None if sweep.time_s is None else sweep.time_s / period_s
+        if self is Motion.COMPENSATED:
+            return None
+        turn = sweep.turn
+        return turn if self is Motion.COUNTERCLOCKWISE else 1 - turn
+
+
+class Step(NamedTuple):
+    """Motion of the sensor from the start of a sweep to the start of the next, sensor frame."""
+
+    rotation: Floats  # (3,): rotation vector, radians
+    translation: Floats  # (3,): metres
+
+    @classmethod
+    def between(cls, pose: Floats, following: Floats) -> Step:
+        """Return the step from a pose (4, 4) to another."""
+        from scipy.spatial.transform import Rotation
+
+        turned = pose[:3, :3].T @ following[:3, :3]
+        return cls(
+            Rotation.from_matrix(turned).as_rotvec(),
+            pose[:3, :3].T @ (following[:3, 3] - pose[:3, 3]),
+        )
+
+    def compensated(self, points: Floats, shares: Floats) -> Floats:
+        """Return points (n, 3), fired at shares (n,) of the step, in the frame of its start."""
+        from scipy.spatial.transform import Rotation
+
+        turned = Rotation.from_rotvec(shares[:, None] * self.rotation).apply(points)
+        return np.asarray(turned + shares[:, None] * self.translation)
