@@ -205,7 +205,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     shuffled = without_poses(
         drive, lambda points, _: np.random.default_rng(1).permutation(len(points))
     )
-    with pytest.raises(LidarError, match="the order of its points shows none.* Name its sensor"):
+    with pytest.raises(LidarError, match=r"the order of its points shows none.* Name its sensor"):
         twin(shuffled)
     with pytest.raises(LidarError, match="has no column 'nope' to compare as intensity"):
         twin(replace(recording, intensity_column="nope"))
