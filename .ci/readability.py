@@ -30,6 +30,7 @@ MAX_PACKED_PER_1000_LINES = 2.0
 PLAIN_PACKAGES = (
     "kernels/raybeam",
     "scheduler/poolpart",
+    "workflows/lidarpool",
     "workflows/lidarscenes",
     "workflows/lidarsim",
     "workflows/lidarview",

@@ -216,7 +216,7 @@ def test_what_has_no_range_image_says_why():
     plain = Cloud(cloud().positions, {})
     for a, b, says in (
         (plain, cloud(), "cloud A has no rings: the range image needs a column ring or channel"),
-        (cloud(), Cloud(cloud().positions + 30, cloud().columns), "no cones around zero"),
+        (cloud(), Cloud(cloud().positions + 30, cloud().columns), "not cones around zero"),
         (cloud(), Cloud(cloud().positions * [1, 1, 9], cloud().columns), "not of the same sensor"),
     ):
         found = compare(a, b).figures
@@ -365,7 +365,7 @@ def test_sweeps_of_data_sets(tmp_path, kind):
     found = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="front").figures
     assert found["pairs"] == found["a"]["sweeps"] == 15  # of five jobs
     assert found["distances"]["a_to_b"]["max_m"] == 0
-    assert "pairs of which one has no points are left out" in found["notes"]
+    assert "pairs with an empty sweep are left out" in found["notes"]
     other = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="rear/left", sweeps=[3]).figures
     assert other["pairs"] == 1 and other["distances"]["a_to_b"]["median_m"] > 1
 

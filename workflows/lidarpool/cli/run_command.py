@@ -90,7 +90,10 @@ def _run_survey(
     extent: str | None,
     note_on: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
-    """Run a job, and write the result of a survey; `note_on` returns a note on the result."""
+    """Run a job, and write the result of a survey.
+
+    `note_on` returns a note on the result.
+    """
     assert options.out is not None, "commands write"
     for note in advice(built):
         terminal.tell(note)
@@ -110,7 +113,10 @@ def _run_survey(
 def run_campaign(
     campaign: CampaignSpec, terminal: Terminal, options: RunOptions, backend: str | None
 ) -> None:
-    """Run a campaign, and print a summary; LidarError if the run or a job fails."""
+    """Run a campaign, and print a summary.
+
+    LidarError if the run or a job fails.
+    """
     options = options.with_pool(campaign.pool, {"backend": backend})
     assert options.out is not None, "commands write"
     for warning in _first_job_warnings(campaign, terminal):

@@ -58,7 +58,7 @@ class MeasuredPoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Result of `compare`; printed as a table."""
+    """Result of `compare`, printed as a table."""
 
     __signature__ = ReadableSignature()
 

@@ -77,7 +77,7 @@ class Alignment:
 
 
 class AlignedSweep(NamedTuple):
-    """Returns of a sweep; arrays of n points."""
+    """Returns of a sweep, as arrays of n points."""
 
     points: Floats  # (n, 3): in the sensor frame, calibrated, metres
     world: Floats  # (n, 3): metres
@@ -105,7 +105,7 @@ class AlignedSweeps:
         return self.recorded.recording.name
 
     def read(self, number: int) -> AlignedSweep:
-        """Read a sweep; LidarError if the recording cannot be read."""
+        """Read a sweep, or raise LidarError if the recording cannot be read."""
         sweep = self.recorded.read(number)
         points = self.alignment.corrected(sweep)
         pose = self.alignment.poses[number]
@@ -164,7 +164,7 @@ def _planes(
     mapped: Sequence[int],
     voxel_m: float,
 ) -> VoxelPlanes:
-    """Return the planes of the map of some sweeps; LidarError without planes."""
+    """Return the planes of the map of some sweeps, or raise LidarError without planes."""
     parts = [
         _placed(alignment.corrected(samples[number]), alignment.poses[number]) for number in mapped
     ]

@@ -262,7 +262,7 @@ class _Building:
     def _hold_out(
         self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], mapped: list[int]
     ) -> tuple[HeldOut, Page]:
-        """Compare held-out sweeps with the place of the mapped ones; draw one of these."""
+        """Compare held-out sweeps with the place of the mapped sweeps, and draw a sweep."""
         by_mapped = standing_points(sweeps, mapped)
         place = build_place(sweeps, by_mapped, self.voxel_m)
         reflectances = self._reflectances(sweeps, place, by_mapped)

@@ -60,7 +60,7 @@ class Estimate(NamedTuple):
         return self.high - self.low <= 2 * share * abs(self.value)
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
-        """Return the estimate of `scale` times a power; negative numbers count as 0."""
+        """Return the estimate of `scale` times a power, where negative numbers count as 0."""
         value, *limits = (round(float(scale * max(number, 0.0) ** exponent), 9) for number in self)
         return Estimate(value, min(limits), max(limits))
 

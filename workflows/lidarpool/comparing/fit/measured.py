@@ -48,7 +48,7 @@ class Measured:
     energy: Floats | None  # (k,): as of `_pulse_energies`; None if unknown
     estimates: dict[str, Estimate]  # {field of `Noise`: estimate}; empty for a single sweep
     bias: dict[int, Estimate]  # {row: metres}
-    lost_by_range: Curve | None = None  # by the range of the scene; None without a scene
+    lost_by_range: Curve | None = None  # share by the range of the scene; None without a scene
     moves: bool = False  # whether the sensor moves
 
     def curves(self) -> dict[str, Curve]:
@@ -71,7 +71,10 @@ class Measured:
         return curves
 
     def _range_variances(self) -> Floats:
-        """Return variances (k,) of ranges, m², less those by directions; NaN of single returns."""
+        """Return variances (k,) of ranges, m², less the variances that noise of directions causes.
+
+        The variance of a single return is NaN.
+        """
         rays = self.rays
         estimate = self.estimates.get("angle_deg")
         direction_noise_rad = 0.0 if estimate is None else np.radians(estimate.value)
@@ -165,7 +168,10 @@ def _check_rays(count: int, name: str) -> None:
 
 
 def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> Floats:
-    """Cast a ray into each cell; return ranges of the scene (r, c), metres, NaN without a hit."""
+    """Cast a ray into each cell, and return ranges of the scene (r, c), metres.
+
+    The range of a ray that meets nothing is NaN.
+    """
     rays = stack.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
     pose = np.eye(4) if poses is None else poses.matrices[0]
@@ -231,7 +237,7 @@ def _mean_by_row(row: Ints, errors: Floats) -> dict[int, Estimate]:
 
 
 def _root_mean(variances: Floats) -> dict[str, float] | None:
-    """Estimate the root of the mean of finite variances (n,); None for too few variances."""
+    """Estimate the root of the mean of finite variances (n,), or None for too few variances."""
     finite = variances[np.isfinite(variances)]
     if len(finite) < MIN_RAYS:
         return None

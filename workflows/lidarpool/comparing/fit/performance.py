@@ -32,9 +32,9 @@ _MIN_TILT_TANGENT = 0.3
 
 # Lost pulses and false alarms
 _MIN_WEAK_RAYS = 30  # rays with losses that a threshold needs
-_LOG_STEP = 1e-3  # of logarithms, for derivatives
-# Rings and degrees of azimuth around a ray into the sky of which no ray returns twice: in smaller
-# gaps between leaves, leaves return once.
+_LOG_STEP = 1e-3  # step of logarithms, for derivatives
+# Around a ray into the sky, no ray within these rings and degrees of azimuth returns twice: in
+# smaller gaps between leaves, leaves return once.
 _SKY_RINGS = 7
 _SKY_DEG = 36.0
 _MIN_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
@@ -78,7 +78,7 @@ def fit_performance(
 def _fit_detection(
     rays: SmoothRays, energy: Floats | None, all_known: bool
 ) -> tuple[Estimate | None, Estimate | None]:
-    """Estimate the energy of which half of the pulses return, and the share lost at any energy.
+    """Estimate the energy at which half of the pulses return, and the share lost at any energy.
 
     Either is None if undetermined; `energy` (k,) is None if unknown.
     """
@@ -99,7 +99,7 @@ def _fit_detection(
 
 
 def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> Estimate | None:
-    """Estimate the share of pulses that chosen rays (k,) lose; None for too few rays.
+    """Estimate the share of pulses that chosen rays (k,) lose, or None for too few rays.
 
     Without `all_known`, a ray without any return is unknown, so the rays that are known lose fewer
     pulses than others. For each return of a ray, the share is taken among the other `trials - 1`
@@ -121,7 +121,7 @@ class ScatterFit(NamedTuple):
 
     estimates: dict[str, Estimate]  # {field of `Noise`: estimate}
     sigma: Floats  # (k,): fitted standard deviation of the range of each ray, metres
-    deviance: float  # of the fit to all rays; a smaller deviance is likelier
+    deviance: float  # deviance of the fit to all rays; a smaller deviance is likelier
 
 
 class _VarianceSamples(NamedTuple):
@@ -129,7 +129,7 @@ class _VarianceSamples(NamedTuple):
 
     variance: Floats  # square metres
     freedom: Ints  # degrees of freedom of the variance
-    growth: Floats  # the quantity with which noise of ranges grows, such as the range
+    growth: Floats  # a quantity that noise of ranges grows with, such as the range
     slope: Floats  # metres in a radian
     distance: Floats  # metres
     patch: Ints  # number of the patch of neighbouring rays, whose errors may be alike
@@ -145,7 +145,7 @@ class _VarianceModel:
     marks; the others are 0.
     """
 
-    power: int  # of σ and the growth: 1 if noise adds, 2 if variances add
+    power: int  # power of σ and of the growth: 1 if noise adds, 2 if variances add
     fitted: Bools  # (3,): which parameters are fitted
     variance_scale: float  # usual variance v, square metres
     growth_scale: float  # usual growth, in its unit
@@ -202,7 +202,7 @@ def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int
 
 
 def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
-    """Choose the rays whose variances are fitted; `growth` (k,) is of all rays.
+    """Choose the rays whose variances are fitted, among all rays with `growth` (k,).
 
     Rays that lose many pulses are left out: only their nearer or brighter pulses return.
     """
@@ -275,7 +275,7 @@ def _fit_trimmed(
 def fit_threshold(
     energy: Floats, rays: SmoothRays, dropout: float, *, all_known: bool = False
 ) -> Estimate | None:
-    """Estimate the energy of which half of the pulses return, by the curve of `Noise.detected`.
+    """Estimate the energy at which half of the pulses return, by the curve of `Noise.detected`.
 
     `energy` (k,) is the energy of rays; `dropout` is the share that is lost at any energy. Without
     `all_known`, a ray is known only if a pulse returns: the likelihood belongs to a truncated

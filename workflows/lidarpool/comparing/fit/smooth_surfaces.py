@@ -118,7 +118,7 @@ class SmoothRays(NamedTuple):
     intensity: Floats  # mean; NaN if unknown
     returns: Ints  # number of sweeps with a return
     trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
-    variance: Floats  # of the range over the sweeps, square metres
+    variance: Floats  # variance of the range over the sweeps, square metres
     freedom: Ints  # degrees of freedom of the variance: its returns, less 1
 
     def select(self, chosen: Bools | Indices) -> SmoothRays:
@@ -131,7 +131,7 @@ class _RayStatistics(NamedTuple):
 
     mean_range: Floats  # metres
     mean_intensity: Floats
-    variance: Floats  # of the range, square metres
+    variance: Floats  # variance of the range, square metres
     return_count: Ints
 
 
@@ -142,7 +142,7 @@ def select_smooth_rays(
 
     A return is an outlier if the range is more than `MAX_SIGMAS` standard deviations from the
     median of the ray, by the noise of ranges `sigma` (r, c), metres, and of directions. Outliers
-    are left out, and rays with many outliers. Slopes are those of a scene's ranges `expected`
+    are left out, and rays with many outliers. Slopes are taken from a scene's ranges `expected`
     (r, c), metres, if known.
     """
     median = finite_median(stack.ranges, 0)

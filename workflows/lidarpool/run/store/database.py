@@ -85,7 +85,7 @@ class RunDatabase:
         self.meta: dict[str, str] = {}
         self.begun: set[int] = set()  # jobs under way with committed parts, trials or frames
         self.ended_count = 0  # jobs that have ended
-        self._ended = bytearray()  # for each job: 1 if it has ended
+        self._ended = bytearray()  # a byte for each job: 1 if the job has ended
         with _explained(self.path):
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
