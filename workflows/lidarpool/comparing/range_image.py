@@ -100,7 +100,15 @@ class _PolarSweep:
             )
         ranges = np.linalg.norm(sweep.points, axis=1)
         azimuth = np.degrees(np.arctan2(y, x)) % 360
-        return cls(azimuth, elevation, ranges, index, sweep.intensities, rings, middle)
+        return cls(
+            azimuth=azimuth,
+            elevation=elevation,
+            ranges=ranges,
+            ring_index=index,
+            intensities=sweep.intensities,
+            rings=rings,
+            ring_elevation=middle,
+        )
 
     def step(self) -> float:
         """Return the typical step from a pulse to the next pulse of its ring, degrees."""

@@ -335,14 +335,14 @@ def _detection_of(receiver, starts):
     loses = len(starts) > 0
     count = len(receiver.quantiles)
     return _Detection(
-        receiver.dropout,
-        receiver.threshold,
-        receiver.threshold_sigmas,
-        float64s(receiver.quantiles.ctypes.data),
-        receiver.quantiles[0] if count else 0.0,
-        receiver.quantiles[count - 1] if count else 0.0,
-        starts[0] if loses else np.uint64(0),
-        starts[1] if loses else np.uint64(0),
+        dropout=receiver.dropout,
+        threshold=receiver.threshold,
+        threshold_sigmas=receiver.threshold_sigmas,
+        quantiles=float64s(receiver.quantiles.ctypes.data),
+        lowest=receiver.quantiles[0] if count else 0.0,
+        highest=receiver.quantiles[count - 1] if count else 0.0,
+        loss_start=starts[0] if loses else np.uint64(0),
+        detection_start=starts[1] if loses else np.uint64(0),
     )
 
 
@@ -480,7 +480,15 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, P
             exceeds_gap = extent_m > receiver.gap_m
             if exceeds_gap:  # few beams hit an edge or graze a surface
                 _sort_by_distance(scratch.hits, collected)
-            _mark_returns(hits, air, collected, exceeds_gap, receiver, neighbours, scratch)
+            _mark_returns(
+                hits,
+                air,
+                count=collected,
+                exceeds_gap=exceeds_gap,
+                receiver=receiver,
+                neighbours=neighbours,
+                scratch=scratch,
+            )
             count = _write_returns(collected, beam, receiver, scratch, count, output)
         if loses and count > begin:
             number = keys.first + beam
