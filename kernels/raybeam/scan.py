@@ -232,14 +232,14 @@ class Collector(Groups):
         if len(first_kept) == 1:
             return np.arange(first_kept[0], len(ray), self.keep_every)
         offset = cuts[:-1] + first_kept - self.keep_every * (np.cumsum(kept_counts) - kept_counts)
-        rows: Indices = np.repeat(offset, kept_counts)
-        rows += self.keep_every * np.arange(len(rows))
-        return rows
+        row_indices: Indices = np.repeat(offset, kept_counts)
+        row_indices += self.keep_every * np.arange(len(row_indices))
+        return row_indices
 
-    def tally(self, rows: Integers) -> None:
+    def tally(self, tally_indices: Integers) -> None:
         """Count the hits of a chunk by their rows (m,) in the tally, if there is a tally."""
         if self._tally is not None:
-            np.add.at(self._tally, rows.astype(np.intp), 1)
+            np.add.at(self._tally, tally_indices.astype(np.intp), 1)
 
     def add(
         self,

@@ -65,12 +65,12 @@ class RecordedPoints:
     def __len__(self) -> int:
         return len(self.points)
 
-    def part(self, rows: Indices) -> RecordedPoints:
+    def part(self, row_indices: Indices) -> RecordedPoints:
         """Select points, without the keys of their rays."""
         return RecordedPoints(
-            self.points[rows],
-            None if self.rings is None else self.rings[rows],
-            None if self.intensities is None else self.intensities[rows],
+            self.points[row_indices],
+            None if self.rings is None else self.rings[row_indices],
+            None if self.intensities is None else self.intensities[row_indices],
         )
 
     @classmethod

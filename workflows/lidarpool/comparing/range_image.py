@@ -131,13 +131,13 @@ class _PolarSweep:
             step = similar_steps(step).mean()
         return float(step)
 
-    def phases(self, rows: Ints, cells: _Cells) -> Floats:
+    def phases(self, ring_rows: Ints, cells: _Cells) -> Floats:
         """Return where pulses are within a step, in steps: (rows, blocks), NaN without pulses.
 
-        `rows` (r,) are the rows of the sweep's rings in the cells.
+        `ring_rows` (r,) are the rows of the sweep's rings in the cells.
         """
         row_count, _ = cells.shape
-        bins = rows[self.ring_index] * _BLOCKS + self._block
+        bins = ring_rows[self.ring_index] * _BLOCKS + self._block
         phasors = np.exp(2j * np.pi * self.azimuth / cells.step_deg)
         real, imaginary = (
             np.bincount(bins, part, row_count * _BLOCKS) for part in (phasors.real, phasors.imag)
@@ -151,18 +151,18 @@ class _PolarSweep:
         """Index (n,) of the block of each point."""
         return (self.azimuth * (_BLOCKS / 360)).astype(np.int64).clip(0, _BLOCKS - 1)
 
-    def image(self, rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
+    def image(self, ring_rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
         """Return `RangeImages.images` of a sweep, and the share of points hidden in cells.
 
-        `rows` (r,) are the rows of the sweep's rings; `phases` come from the method `phases`. Of
-        several points in a cell, the point closest to the middle is taken, and of several returns
-        of a pulse the nearest.
+        `ring_rows` (r,) are the rows of the sweep's rings; `phases` come from the method `phases`.
+        Of several points in a cell, the point closest to the middle is taken, and of several
+        returns of a pulse the nearest.
         """
         row_count, column_count = cells.shape
-        position = self.azimuth / cells.step_deg - phases[rows[self.ring_index], self._block]
+        position = self.azimuth / cells.step_deg - phases[ring_rows[self.ring_index], self._block]
         column = np.round(position)
         offset = np.round(np.abs(position - column), 3)
-        cell = rows[self.ring_index] * column_count + column.astype(np.int64) % column_count
+        cell = ring_rows[self.ring_index] * column_count + column.astype(np.int64) % column_count
         order = np.lexsort((self.ranges, offset, cell))
         chosen = order[np.diff(cell[order], prepend=-1) > 0]
         image = np.full((4, row_count * column_count), np.nan)

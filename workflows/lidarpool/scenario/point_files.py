@@ -64,14 +64,14 @@ class ScannedPoints:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def take(self, rows: Indices) -> ScannedPoints:
+    def take(self, row_indices: Indices) -> ScannedPoints:
         """Return selected points."""
         return ScannedPoints(
-            self.positions[rows],
-            None if self.outward is None else self.outward[rows],
-            None if self.classes is None else self.classes[rows],
-            None if self.intensities is None else self.intensities[rows],
-            None if self.colours is None else self.colours[rows],
+            self.positions[row_indices],
+            None if self.outward is None else self.outward[row_indices],
+            None if self.classes is None else self.classes[row_indices],
+            None if self.intensities is None else self.intensities[row_indices],
+            None if self.colours is None else self.colours[row_indices],
         )
 
 

@@ -45,9 +45,9 @@ class Frames(NamedTuple):
     up: Floats  # (k, 3): unit vectors, upright on both
     level_side: Floats  # (k, 3): horizontal unit vectors to the left
 
-    def take(self, rows: slice | Ints) -> Frames:
+    def take(self, station_selection: slice | Ints) -> Frames:
         """Return the frames of selected stations."""
-        return Frames(*(array[rows] for array in self))
+        return Frames(*(array[station_selection] for array in self))
 
 
 class Road:
@@ -247,11 +247,13 @@ class LateralShapes:
         count = len(self.stations)
         return slice(min(max(first, 0), count - 1), min(max(last, 1), count))
 
-    def _profiles(self, rows: Ints, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights of the stations `rows` (k,) at t (..., k), m."""
-        cubics = np.maximum((self._starts[rows] <= pieces[..., None]).sum(axis=-1) - 1, 0)
-        a, b, c, d = self._coefficients[:, rows, cubics]
-        x = np.maximum(t - self._starts[rows, cubics], 0)
+    def _profiles(self, station_indices: Ints, t: Floats, pieces: Floats) -> Floats:
+        """Return the heights of stations, by their indices (k,), at t (..., k), m."""
+        cubics = np.maximum(
+            (self._starts[station_indices] <= pieces[..., None]).sum(axis=-1) - 1, 0
+        )
+        a, b, c, d = self._coefficients[:, station_indices, cubics]
+        x = np.maximum(t - self._starts[station_indices, cubics], 0)
         return np.asarray(((d * x + c) * x + b) * x + a)
 
 

@@ -155,10 +155,10 @@ class _Writer:
         return primitives
 
     def _corners(
-        self, mesh: SceneMesh, rows: Indices, uv: AnyArray | None, tints: Bytes | None
+        self, mesh: SceneMesh, face_indices: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
         """Return the attributes of triangles (k,) with separate corners (k, 3, …)."""
-        corners = turned(mesh.vertices[mesh.faces[rows]].reshape(-1, 3), UP_AXES["y"].T)
+        corners = turned(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
             attributes["TEXCOORD_0"] = self._array(uv.reshape(-1, 2).astype("<f4"), "VEC2")
@@ -167,16 +167,16 @@ class _Writer:
             attributes["COLOR_0"] = self._array(light, "VEC3")
         return attributes
 
-    def _array(self, rows: AnyArray, kind: str) -> int:
+    def _array(self, values: AnyArray, kind: str) -> int:
         """Add an accessor of attributes, or of indices (scalars), and return its number."""
-        view = self._view(rows.tobytes(), target=34963 if kind == "SCALAR" else 34962)
-        limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        view = self._view(values.tobytes(), target=34963 if kind == "SCALAR" else 34962)
+        limits = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         return self._put(
             "accessors",
             {
                 "bufferView": view,
-                "componentType": _TYPES[rows.dtype.kind],
-                "count": len(rows),
+                "componentType": _TYPES[values.dtype.kind],
+                "count": len(values),
                 "type": kind,
                 **limits,
             },

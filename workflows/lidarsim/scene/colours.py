@@ -81,19 +81,19 @@ class Colours:
         """Return a plain colour for each face, from colours (f, 3)."""
         return cls.of_corners(colours[:, None].repeat(3, axis=1))
 
-    def take(self, rows: Integers | slice) -> Colours:
+    def take(self, face_selection: Integers | slice) -> Colours:
         """Return the colours of selected faces."""
-        uv = None if self.uv is None else self.uv[rows]
-        corners = None if self.corners is None else self.corners[rows]
-        return Colours(self.images, self.image[rows], uv, corners)
+        uv = None if self.uv is None else self.uv[face_selection]
+        corners = None if self.corners is None else self.corners[face_selection]
+        return Colours(self.images, self.image[face_selection], uv, corners)
 
-    def divided(self, rows: Integers, weights: Floats) -> Colours:
-        """Return the colours of pieces of the faces `rows` (k,).
+    def divided(self, face_indices: Integers, weights: Floats) -> Colours:
+        """Return the colours of pieces of faces, by the indices of the faces (k,).
 
         `weights` (k, 3, 3) are the barycentric coordinates of the corners of each piece in its
         face.
         """
-        faces = self.take(rows)
+        faces = self.take(face_indices)
         uv = None if faces.uv is None else matmul(weights, faces.uv).astype(np.float32)
         corners = None if faces.corners is None else matmul(weights, faces.corners).astype(np.uint8)
         return replace(faces, uv=uv, corners=corners)
@@ -193,20 +193,20 @@ class Lookup:
         self._texture = _Planes.joined(textured, textures)
         self._light = _Planes.joined(tinted, lights)
 
-    def colours_at(self, rows: Integers, points: Floats) -> UInts32:
+    def colours_at(self, face_indices: Integers, points: Floats) -> UInts32:
         """Return the packed colours (n,) of points (n, 3) on faces (n,), the texel of an image."""
-        image = self._image.take(rows)
+        image = self._image.take(face_indices)
         texel = self._first.take(image)
         positions = np.ascontiguousarray(points.T)
         if self._texture is not None:
-            selected, (u, v) = self._texture.values_at(rows, positions)
+            selected, (u, v) = self._texture.values_at(face_indices, positions)
             image = image[selected]
             width = self._width.take(image)
             row = _element(v, self._height.take(image))
             texel[selected] += row * width + _element(u, width)
         colours = self._texels.take(texel)
         if self._light is not None:
-            selected, light = self._light.values_at(rows, positions)
+            selected, light = self._light.values_at(face_indices, positions)
             tinted = LINEAR[unpacked(colours[selected])] * np.clip(light.T, 0, 1)
             colours[selected] = packed(as_srgb(tinted))
         return colours
@@ -227,13 +227,13 @@ class _Planes(NamedTuple):
         slope_rows = np.where(has_values, np.cumsum(has_values) - 1, -1).astype(np.int32)
         return cls(slope_rows, np.concatenate(blocks), bool(has_values.all()))
 
-    def values_at(self, rows: Integers, points: Floats) -> tuple[Any, Floats]:
+    def values_at(self, face_indices: Integers, points: Floats) -> tuple[Any, Floats]:
         """Return the selection of the faces (n,) with values, and the values at points (3, n).
 
         The selection is a slice of all, or indices (m,); the values are (w, m).
         """
         selected: Any = slice(None)
-        slope_rows = self.rows.take(rows)
+        slope_rows = self.rows.take(face_indices)
         if not self.everywhere:
             selected = np.flatnonzero(slope_rows >= 0)
             slope_rows = slope_rows[selected]

@@ -32,9 +32,9 @@ class FaceMaterials:
         """Return the same material for all faces, or None without a name."""
         return cls((name,)) if name else None
 
-    def take(self, rows: Integers | slice) -> FaceMaterials:
+    def take(self, face_selection: Integers | slice) -> FaceMaterials:
         """Return the materials of selected faces, with the same names."""
-        return self if self.index is None else FaceMaterials(self.names, self.index[rows])
+        return self if self.index is None else FaceMaterials(self.names, self.index[face_selection])
 
     def check(self, name: str, faces: int) -> None:
         """Check that names are distinct, and rows fit a number of faces.

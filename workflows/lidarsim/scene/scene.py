@@ -328,8 +328,8 @@ class Scene:
         object.__setattr__(scene, "world_origin", added)
         return scene
 
-    def moved(self, rows: Indices, positions: Floats, rotations: Floats) -> Scene:
-        """Return the same scene with instances `rows` (m,) at other poses.
+    def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Scene:
+        """Return the same scene with instances, by their indices (m,), at other poses.
 
         A pose is the pose of the mesh's frame in local coordinates: positions (m, 3), metres, and
         rotations (m, 3, 3). The instances keep their scales.
@@ -338,7 +338,7 @@ class Scene:
         scene = copy(self)
         for cached in ("bounds", "object_bounds", "footprints"):
             vars(scene).pop(cached, None)
-        moved = self.instances.moved(rows, positions, rotations)
+        moved = self.instances.moved(instance_indices, positions, rotations)
         object.__setattr__(scene, "instances", moved)
         return scene
 
@@ -517,15 +517,17 @@ class Scene:
                 by_object[owner].append(instance)
         return tuple(item for items in by_object for item in items)
 
-    def _mesh_of_faces(self, owner: int, rows: Indices) -> SceneMesh:
-        """Return the faces `rows` (k,) of an object as a mesh in world coordinates."""
-        points, faces = compacted(self.vertices, self.faces[rows])
+    def _mesh_of_faces(self, owner: int, face_indices: Indices) -> SceneMesh:
+        """Return faces of an object, by their indices (k,), as a mesh in world coordinates."""
+        points, faces = compacted(self.vertices, self.faces[face_indices])
         return SceneMesh(
             self.names[owner],
             points + self.origin,
             faces,
-            colours=self.colours and self.colours.take(rows),
-            materials=None if self.materials is None else self.materials.of_object(owner, rows),
+            colours=self.colours and self.colours.take(face_indices),
+            materials=None
+            if self.materials is None
+            else self.materials.of_object(owner, face_indices),
         )
 
     def _mesh_of_shared_part(self, instances: Instances, index: int) -> SceneMesh:

@@ -29,13 +29,13 @@ NO_SURFACE = -1  # triangle and object of returns that are not from a surface
 SURFACE = CAUSES.index("surface")
 
 
-def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
+def selected(columns: Iterable[Any], row_selection: Any) -> Iterator[Any]:
     """Yield the selected rows of each column, or None for a column that is None."""
     for column in columns:
         if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
-            yield column.T.take(rows, axis=-1).T
+            yield column.T.take(row_selection, axis=-1).T
         else:
-            yield None if column is None else column[rows]
+            yield None if column is None else column[row_selection]
 
 
 # Columns of every hit and return.
@@ -79,11 +79,11 @@ class PulseReturns(NamedTuple):
         single = np.ones(len(ray), np.uint8)
         return cls(ray, distance, triangle, number=single, returns=single, reported=distance)
 
-    def take(self, rows: Bools | Indices) -> PulseReturns:
+    def take(self, row_selection: Bools | Indices) -> PulseReturns:
         """Return the selected rows of all columns."""
-        if rows.dtype == np.bool_:  # a mask would be counted again for each column
-            rows = np.flatnonzero(rows)
-        return PulseReturns(*selected(self, rows))
+        if row_selection.dtype == np.bool_:  # a mask would be counted again for each column
+            row_selection = np.flatnonzero(row_selection)
+        return PulseReturns(*selected(self, row_selection))
 
     @property
     def height(self) -> Floats:

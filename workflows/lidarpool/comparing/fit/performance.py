@@ -261,10 +261,13 @@ def _fit_trimmed(
         weight = np.sqrt(freedom / 2) / expected
 
         def residuals(
-            parameters: Floats, rows: Bools = inliers, weight: Floats = weight, scale: Any = scale
+            parameters: Floats,
+            row_mask: Bools = inliers,
+            weight: Floats = weight,
+            scale: Any = scale,
         ) -> Any:
             variance = scale * model.expected(parameters, samples)
-            return ((samples.variance - variance) * weight)[rows]
+            return ((samples.variance - variance) * weight)[row_mask]
 
         x_scale = np.maximum(theta, 0.01)
         solved = least_squares(residuals, theta, bounds=(0, np.inf), x_scale=x_scale)

@@ -403,9 +403,12 @@ def casters_of_sensors(
 
 
 def move_instances(
-    casters: Sequence[SceneCaster], surfaces: Surfaces, instances: Instances, rows: Indices
+    casters: Sequence[SceneCaster],
+    surfaces: Surfaces,
+    instances: Instances,
+    instance_indices: Indices,
 ) -> None:
-    """Move instances `rows` to their transforms in `instances`, while no scan is under way.
+    """Move instances to their transforms in `instances`, while no scan is under way.
 
     Parameters
     ----------
@@ -413,11 +416,11 @@ def move_instances(
         Casters of the sensors of a survey.
     surfaces, instances
         Of the scene with the moved instances.
-    rows
+    instance_indices
         (m,): rows of the instances that have moved.
     """
     for static in dict.fromkeys(caster.bodies.static for caster in casters):
-        static.move(instances, rows)
+        static.move(instances, instance_indices)
     for caster in dict.fromkeys(casters):
         caster.with_moved_instances(surfaces, instances)
 

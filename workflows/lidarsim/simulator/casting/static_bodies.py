@@ -187,19 +187,19 @@ class StaticBodies:
                 region = np.stack([lower, np.maximum(region[1], trees.region[1])])
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
-    def move(self, instances: Instances, rows: Indices) -> None:
-        """Move instances `rows` (m,) to their transforms in `instances`. No cast may run.
+    def move(self, instances: Instances, instance_indices: Indices) -> None:
+        """Move instances by their indices (m,) to their transforms in `instances`. No cast may run.
 
         Trees are built again if an instance leaves for where no sensor reaches, such as a body that
         falls for ever, if it comes from there, or if it was cut.
         """
         self._instances = instances
         if self._instance_is_seen is not None:
-            rows = rows[self._instance_is_seen[rows]]
+            instance_indices = instance_indices[self._instance_is_seen[instance_indices]]
         trees = self._trees
-        if trees is None or not len(rows):
+        if trees is None or not len(instance_indices):
             return
-        offsets = instances.transforms[rows, :, 3] - self._centre
+        offsets = instances.transforms[instance_indices, :, 3] - self._centre
         is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
         if trees.region is None and is_remote.any() and self._can_cut:
             self._may_cut = True
@@ -207,19 +207,19 @@ class StaticBodies:
             return
         first = trees.face_bodies
         if trees.region is None and self._instance_is_seen is None:  # all instances have a tree
-            trees.caster.move(first + rows, instances.transforms[rows])
+            trees.caster.move(first + instance_indices, instances.transforms[instance_indices])
             return
-        numbers = first + np.searchsorted(trees.rows, rows)
+        numbers = first + np.searchsorted(trees.rows, instance_indices)
         if trees.region is None:
-            trees.caster.move(numbers, instances.transforms[rows])
+            trees.caster.move(numbers, instances.transforms[instance_indices])
             return
-        has_tree = np.isin(rows, trees.rows)
+        has_tree = np.isin(instance_indices, trees.rows)
         is_cut = has_tree & np.isin(numbers, list(trees.origins))
-        comes = ~has_tree & _is_near(instances, trees.region)[rows]
+        comes = ~has_tree & _is_near(instances, trees.region)[instance_indices]
         if (is_cut | comes | (has_tree & is_remote)).any():
             self._trees = self._build(trees.region)
             return
-        trees.caster.move(numbers[has_tree], instances.transforms[rows[has_tree]])
+        trees.caster.move(numbers[has_tree], instances.transforms[instance_indices[has_tree]])
 
     def _build(self, region: Floats | None) -> _Trees:
         """Build the trees of the bodies within a region (2, 3), or of all bodies.

@@ -41,14 +41,14 @@ class TriangleKinds:
         rows, objects, _ = self._triangles.locate(triangle)
         return self.of_rows(rows, objects)
 
-    def of_rows(self, rows: Indices, objects: Ints32) -> Ints32:
+    def of_rows(self, triangle_indices: Indices, objects: Ints32) -> Ints32:
         """Return the kinds of surfaces, from rows of stored triangles (n,) and objects (n,): (n,).
 
         Objects are an argument because instances that share stored triangles may differ in object.
         """
         if self._kind_in_object is None:
             return objects
-        kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[rows]
+        kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[triangle_indices]
         return np.where(objects < 0, np.int32(-1), self._material_kind[kinds])
 
     @cached_property

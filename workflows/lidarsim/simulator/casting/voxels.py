@@ -45,9 +45,9 @@ class _GridRays(NamedTuple):
     # the leaves; 0 without a grid.
     projection: Floats
 
-    def take(self, rows: Indices) -> _GridRays:
+    def take(self, row_indices: Indices) -> _GridRays:
         """Return the light of selected rows."""
-        return _GridRays._make(array[..., rows] for array in self)
+        return _GridRays._make(array[..., row_indices] for array in self)
 
 
 class Grids:

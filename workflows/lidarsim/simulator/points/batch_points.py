@@ -78,9 +78,9 @@ class BatchPoints:
         """Values of a column."""
         return column.make(self)
 
-    def positions_of(self, rows: Ints) -> Floats:
-        """Return the positions of the returns `rows` (k,), as `positions`: (k, 3)."""
-        return self.positions[rows]
+    def positions_of(self, row_indices: Ints) -> Floats:
+        """Return the positions of returns by their rows (k,), as `positions`: (k, 3)."""
+        return self.positions[row_indices]
 
     # -- the ray -----------------------------------------------------------------------------
 

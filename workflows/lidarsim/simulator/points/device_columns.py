@@ -99,14 +99,14 @@ class DevicePoints:
         value = {"sensor": self.specs[0].sensor, "cause": SURFACE}.get(column.name, 1)
         return np.full(len(self), value, column.dtype)
 
-    def positions_of(self, rows: Ints) -> Floats:
-        """Return the positions of points `rows` (k,), metres: (k, 3).
+    def positions_of(self, row_indices: Ints) -> Floats:
+        """Return the positions of points by their rows (k,), metres: (k, 3).
 
         Positions are rounded to the precision unless NumPy computes columns.
         """
         if self.returns is not None:
-            return self.returns.positions_of(rows)
-        cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
+            return self.returns.positions_of(row_indices)
+        cells = np.stack([self.columns[axis.name][row_indices] for axis in AXES], axis=1)
         return cells * self.survey.precision_m
 
 

@@ -58,9 +58,9 @@ class LightPaths:
     # if the next surface stood still; None if no column stores velocities.
     range_rate: Floats | None = None
 
-    def take(self, rows: Integers) -> LightPaths:
+    def take(self, row_indices: Integers) -> LightPaths:
         """Return the light of selected rows."""
-        return LightPaths(*selected(vars(self).values(), rows))
+        return LightPaths(*selected(vars(self).values(), row_indices))
 
     def optical_end(self, step_m: Floats) -> Floats:
         """Return the optical paths from the sensor to distances (n,) from the origins, metres."""
@@ -492,11 +492,11 @@ class CastStep(PulseStep):
         return self._cross(onward, crossings)
 
     def _divide(
-        self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
+        self, light: LightPaths, surface_hits: SurfaceHits, row_indices: Indices, reflected: Bools
     ) -> OnwardRows:
         """Compute the share of light that surfaces transmit or mirror, and drop faint light.
 
-        `rows` are rows of the light; `reflected` says which of them are mirrored. Both are
+        `row_indices` are rows of the light; `reflected` says which of them are mirrored. Both are
         overwritten. Light is dropped only if there are mirrors, and if no medium refracts: where
         light is refracted, its energy may exceed the limit that is computed here.
         """
@@ -505,15 +505,15 @@ class CastStep(PulseStep):
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
         if materials.textured and surface_hits.colour is not None:
-            bright = luminance(surface_hits.colour[rows])
+            bright = luminance(surface_hits.colour[row_indices])
         in_media = light.in_media
         drops_faint = light.mirrored is not None and not (
             in_media is not None and in_media.differentials
         )
-        share = np.empty(len(rows))
+        share = np.empty(len(row_indices))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
         count = surface_loops.divide_light(
-            rows,
+            row_indices,
             reflected,
             hits=surface_loops.OnwardHits(
                 surface_hits.kinds,
@@ -522,7 +522,7 @@ class CastStep(PulseStep):
                 light.share,
                 surface_hits.distance,
             ),
-            shares=materials.shares(surface_hits.kinds[rows], bright),
+            shares=materials.shares(surface_hits.kinds[row_indices], bright),
             optics=surface_loops.OnwardOptics(
                 materials.specular, materials.passes, ~materials.refracts, materials.leafy
             ),
@@ -534,7 +534,7 @@ class CastStep(PulseStep):
             ),
             onward_share=share,
         )
-        return OnwardRows(rows[:count], reflected[:count], share[:count])
+        return OnwardRows(row_indices[:count], reflected[:count], share[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
         """Cast the light behind surfaces, and return the light that hits a surface in range.

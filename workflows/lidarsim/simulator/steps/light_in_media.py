@@ -63,37 +63,37 @@ class MediaStack:
         """Return the stacks of light in the air."""
         return cls(*(np.full((count, MAX_MEDIA), -1, np.int32) for _ in range(2)))
 
-    def __getitem__(self, rows: Integers) -> MediaStack:
+    def __getitem__(self, row_indices: Integers) -> MediaStack:
         """Return the stacks of selected sub-rays."""
-        return MediaStack(self.kinds[rows], self.triangles[rows])
+        return MediaStack(self.kinds[row_indices], self.triangles[row_indices])
 
-    def enter(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium within the media around light: a medium for each of `rows`.
+    def enter(self, row_indices: Indices, kinds: Ints32, triangles: Ints32) -> None:
+        """Add a medium within the media around light: a medium for each selected row.
 
         A full stack loses its outermost medium.
         """
         for table, values in ((self.kinds, kinds), (self.triangles, triangles)):
-            table[rows, 1:] = table[rows, :-1]
-            table[rows, 0] = values
+            table[row_indices, 1:] = table[row_indices, :-1]
+            table[row_indices, 0] = values
 
-    def surround(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium around the media of each of `rows`, while full stacks stay as they are."""
-        depth = (self.kinds[rows] >= 0).sum(axis=1)
+    def surround(self, row_indices: Indices, kinds: Ints32, triangles: Ints32) -> None:
+        """Add a medium around the media of selected rows, while full stacks stay as they are."""
+        depth = (self.kinds[row_indices] >= 0).sum(axis=1)
         free = depth < MAX_MEDIA
-        self.kinds[rows[free], depth[free]] = kinds[free]
-        self.triangles[rows[free], depth[free]] = triangles[free]
+        self.kinds[row_indices[free], depth[free]] = kinds[free]
+        self.triangles[row_indices[free], depth[free]] = triangles[free]
 
-    def leave(self, rows: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stacks of `rows`, and return False for rows without it."""
-        matches = self.kinds[rows] == kinds[:, None]
+    def leave(self, row_indices: Indices, kinds: Ints32) -> Bools:
+        """Remove a medium from the stacks of rows, and return False for rows without it."""
+        matches = self.kinds[row_indices] == kinds[:, None]
         in_stack = matches.any(axis=1)
-        rows = rows[in_stack]
+        row_indices = row_indices[in_stack]
         depth = matches[in_stack].argmax(axis=1)
         column = np.arange(MAX_MEDIA)
         column = column + (column >= depth[:, None])
         for table in (self.kinds, self.triangles):
-            padded = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
-            table[rows] = np.take_along_axis(padded, column, axis=1)
+            padded = np.pad(table[row_indices], ((0, 0), (0, 1)), constant_values=-1)
+            table[row_indices] = np.take_along_axis(padded, column, axis=1)
         return in_stack
 
 
@@ -114,9 +114,9 @@ class RayDifferentials:
         zeros = np.zeros(len(derivatives))
         return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
 
-    def __getitem__(self, rows: Integers) -> RayDifferentials:
+    def __getitem__(self, row_indices: Integers) -> RayDifferentials:
         """Return the differentials of selected sub-rays."""
-        return RayDifferentials(*selected(vars(self).values(), rows))
+        return RayDifferentials(*selected(vars(self).values(), row_indices))
 
     def advance(self, step: Floats, attenuation: Floats) -> None:
         """Move the light straight on by steps (n,), metres, through an attenuation (n,), 1/m."""
@@ -278,19 +278,19 @@ class Media:
         self,
         entered: MediaStack,
         surrounding: MediaStack,
-        rows: Indices,
+        probe_indices: Indices,
         triangles: Ints32,
         cosines: Floats,
     ) -> None:
-        """Update the stacks of a search for probes `rows` that cross triangles."""
+        """Update the stacks of a search for the probes that cross triangles, by their indices."""
         kinds = self._surfaces.kinds(triangles)
         at_medium = self.filled[kinds]
         entering = self.enters(kinds, cosines) & at_medium
-        entered.enter(rows[entering], kinds[entering], triangles[entering])
+        entered.enter(probe_indices[entering], kinds[entering], triangles[entering])
         leaving = np.flatnonzero(at_medium & ~entering)
-        was_entered = entered.leave(rows[leaving], kinds[leaving])
+        was_entered = entered.leave(probe_indices[leaving], kinds[leaving])
         leaving = leaving[~was_entered]
-        surrounding.surround(rows[leaving], kinds[leaving], triangles[leaving])
+        surrounding.surround(probe_indices[leaving], kinds[leaving], triangles[leaving])
 
     def initial_state(
         self, caster: SceneCaster, light: Rays, depths: Floats | None
@@ -387,10 +387,11 @@ class LightInMedia:
     differentials: RayDifferentials | None  # None if no medium refracts
     remaining_depth: Floats | None  # (n,): optical depth to a leaf; None without leaves
 
-    def __getitem__(self, rows: Integers) -> LightInMedia:
+    def __getitem__(self, row_indices: Integers) -> LightInMedia:
         """Return the state of selected sub-rays."""
         return LightInMedia(
-            self.media, *selected((self.stack, self.differentials, self.remaining_depth), rows)
+            self.media,
+            *selected((self.stack, self.differentials, self.remaining_depth), row_indices),
         )
 
     @property
