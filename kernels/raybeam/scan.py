@@ -150,7 +150,7 @@ class Groups:
     def __init__(self, starts: Ints, keep_every: int) -> None:
         self._starts = starts
         self.keep_every = keep_every
-        self.hits = np.zeros(len(starts), np.int64)  # hits of each group so far
+        self.hit_counts = np.zeros(len(starts), np.int64)  # hits of each group so far
 
     def spans(self, start: int, stop: int) -> tuple[slice, Ints]:
         """Find the groups that rays `start` to `stop` belong to.
@@ -181,8 +181,8 @@ class Groups:
             the number of hits to keep.
         """
         # Hits in the chunks before: not 0 for the first group.
-        earlier_hits = self.hits[groups].copy()
-        self.hits[groups] += counts
+        earlier_hits = self.hit_counts[groups].copy()
+        self.hit_counts[groups] += counts
         first_kept = -earlier_hits % self.keep_every
         return first_kept, np.maximum(-((first_kept - counts) // self.keep_every), 0)
 
@@ -257,4 +257,4 @@ class Collector(Groups):
     def result(self) -> ScanReturns:
         """Return the result of all chunks."""
         ray, distance, triangle, instance = join_hits(self._parts)
-        return ScanReturns(ray, distance, triangle, self.hits, self._tally, instance)
+        return ScanReturns(ray, distance, triangle, self.hit_counts, self._tally, instance)

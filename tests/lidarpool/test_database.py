@@ -82,7 +82,7 @@ def test_what_is_committed_is_there_once(db, job):
     for found in (job, read(again)):
         parts = found.parts
         assert [p.name for p in parts.ordered] == [one.name, two.name]
-        assert (parts.scans_done, parts.point_count, parts.hits) == (7, 9, 27)
+        assert (parts.scans_done, parts.point_count, parts.hit_count) == (7, 9, 27)
         assert parts.missing(0, SCANS) == [(5, 10), (12, SCANS)]
         assert found.missing_count == SCANS - 7 and not found.scans_complete
     again.close()
@@ -144,7 +144,7 @@ def test_parts_that_are_dropped_are_missing_again(db, job):
     again = reopened(db)
     for found in (job, read(again)):
         assert found.parts.missing(0, SCANS) == [(4, 8)]
-        counts = found.parts.scans_done, found.parts.point_count, found.parts.hits
+        counts = found.parts.scans_done, found.parts.point_count, found.parts.hit_count
         assert counts == (16, 14, 42)
     two = receipt(4, 6), receipt(6, 8)
     assert commit(again, found, *two) == [*two]

@@ -258,7 +258,7 @@ def test_weak_returns_are_lost_by_the_model(distance):
     sigma = math.sqrt(MANY * share * (1 - share))
     assert abs(len(found["range"]) - MANY * share) < 3 * sigma + 2
     batch = found["batch"]
-    assert len(found["range"]) == batch.hits.sum() == tally_of([batch]).sum()
+    assert len(found["range"]) == batch.hit_counts.sum() == tally_of([batch]).sum()
 
 
 # -- the same bits however it is batched ----------------------------------------------------------
@@ -312,8 +312,8 @@ def test_returns_are_thinned_out_scan_by_scan():
     assert every["returns"].max() > 1
     for name in COLUMNS:
         assert np.array_equal(every[name][::3], third[name])
-    assert every["batch"].hits.tolist() == third["batch"].hits.tolist()
-    assert every["batch"].hits.sum() == len(every["ray"])
+    assert every["batch"].hit_counts.tolist() == third["batch"].hit_counts.tolist()
+    assert every["batch"].hit_counts.sum() == len(every["ray"])
 
 
 def test_one_subray_without_noise_is_the_plain_ray():

@@ -58,7 +58,7 @@ def test_what_is_near_the_sensors_has_more_triangles(avenue):
 def test_hits_are_shared_by_area(avenue):
     drawn = SimplifiedScene.from_scene(avenue, 40_000, [np.zeros((1, 3))])
     counts = np.arange(40.0)
-    hits = drawn.hits(counts)
+    hits = drawn.triangle_hit_counts(counts)
     assert np.bincount(drawn.scene.face_object, hits) == pytest.approx(counts)
 
 
@@ -84,8 +84,8 @@ def test_what_masks_leave_is_drawn(repeats):
     if repeats == 1:
         assert np.mean((middle[:, 0] < 1.01) & (middle[:, 1] < 0.76)) == 1
     counts = np.array([3.0, 4, 5])
-    shared = np.bincount(drawn.counter, drawn.hits(counts))
-    assert np.allclose(shared, np.bincount(before.counter, before.hits(counts)))
+    shared = np.bincount(drawn.counter, drawn.triangle_hit_counts(counts))
+    assert np.allclose(shared, np.bincount(before.counter, before.triangle_hit_counts(counts)))
     assert cut_masks(Scene.from_meshes([wall])).faces.shape == (2, 3)
 
 

@@ -219,7 +219,7 @@ def _result_lines(
         f"{scans_in_words(job.survey.scan_count, job.survey.sweep_count)}, "
         f"{plural(result.rays, 'ray')}, "
         f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
-        f"{f' and {result.hits - surface_hits:,} on none' if result.hits > surface_hits else ''}, "
+        f"{f' and {result.hit_count - surface_hits:,} on none' if result.hit_count > surface_hits else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )

@@ -265,7 +265,7 @@ class Run(Generic[R]):
             trials=trials,
             backend=self.store.backend,
             rays=job.survey.ray_count,
-            hits=only_job.parts.hits,
+            hit_count=only_job.parts.hit_count,
             stages=loop.stages if loop else (),
             resumed=only_job.resumed,
             notes=tuple(self.store.notes),

@@ -61,7 +61,7 @@ class SimplifiedScene:
                 copies.add(part, shared, int(row))
         return cls(copies.scene(), np.concatenate(copies.counters))
 
-    def hits(self, counts: AnyArray) -> AnyArray:
+    def triangle_hit_counts(self, counts: AnyArray) -> AnyArray:
         """Return the hits of each triangle, and of the actors' triangles, from hit counters."""
         if self.is_original:
             return counts

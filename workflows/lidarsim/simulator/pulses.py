@@ -39,7 +39,7 @@ class Scanned(NamedTuple):
     """Kept returns of scans, and counts of all returns."""
 
     returns: PulseReturns
-    hits: Ints  # (scans,): returns of each scan, kept or not
+    hit_counts: Ints  # (scans,): returns of each scan, kept or not
     tally: Ints | None  # (counters,): hits by `StoredTriangles.counter`, kept or not, on request
 
 
@@ -152,7 +152,7 @@ class PulseCaster:
             return scanned
         removed = np.flatnonzero(~in_range)
         removed_scan = np.searchsorted(scan_starts, returns.ray[removed], "right") - 1
-        hits = scanned.hits - np.bincount(removed_scan, minlength=len(scan_starts))
+        hit_counts = scanned.hit_counts - np.bincount(removed_scan, minlength=len(scan_starts))
         tally = scanned.tally
         if tally is not None:
             triangle = returns.triangle[removed]
@@ -162,11 +162,11 @@ class PulseCaster:
         stop = np.searchsorted(returns.ray, returns.ray, "right")
         removed_before = np.append(0, np.cumsum(~in_range))  # removed returns before each row
         number = required(returns.number) - (removed_before[:-1] - removed_before[start])
-        count = required(returns.returns) - (removed_before[stop] - removed_before[start])
+        count = required(returns.return_counts) - (removed_before[stop] - removed_before[start])
         renumbered = returns._replace(
-            number=number.astype(np.uint8), returns=count.astype(np.uint8)
+            number=number.astype(np.uint8), return_counts=count.astype(np.uint8)
         )
-        return Scanned(renumbered.take(in_range), hits, tally)
+        return Scanned(renumbered.take(in_range), hit_counts, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch after all steps that act before returns are thinned out."""
@@ -200,7 +200,7 @@ class PulseCaster:
         returns = PulseReturns.single_returns(hits.ray, hits.distance, hits.triangle)
         if batch.offsets is not None:
             returns = self._with_light(returns, batch)
-        return Scanned(returns, hits.hits, hits.tally)
+        return Scanned(returns, hits.hit_counts, hits.tally)
 
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add energy, colour and velocity to returns of deflected beams, by cast directions."""
@@ -245,14 +245,14 @@ class PulseCaster:
 
         keep_every = self.setup.survey.keep_every
         size = len(returns.ray)
-        hits = np.zeros(len(scan_starts), np.int64)
+        hit_counts = np.zeros(len(scan_starts), np.int64)
         rows = np.empty(size, np.int64)
         number, returns_of_pulse = np.empty((2, size), np.uint8)
         count = pulse_loops.thin_out(
             owned(returns.ray, np.int64),
             owned(scan_starts, np.int64),
             keep_every=keep_every,
-            counts=hits,
+            counts=hit_counts,
             rows=rows,
             number=number,
             returns=returns_of_pulse,
@@ -261,10 +261,10 @@ class PulseCaster:
         thinned = thinned._replace(
             ray=thinned.ray.astype(np.uint32),
             number=number[:count],
-            returns=returns_of_pulse[:count],
+            return_counts=returns_of_pulse[:count],
             reported=thinned.distance,
         )
         if not tally:
-            return Scanned(thinned, hits, None)
+            return Scanned(thinned, hit_counts, None)
         triangle = returns.triangle[returns.triangle != NO_SURFACE]
-        return Scanned(thinned, hits, self._surfaces.triangles.count(triangle))
+        return Scanned(thinned, hit_counts, self._surfaces.triangles.count(triangle))

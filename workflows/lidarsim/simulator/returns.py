@@ -65,7 +65,7 @@ class PulseReturns(NamedTuple):
     # Recorded (`columns.waveforms.record`); `BatchPoints` adds `location_ps` and `toward`.
     waveform: Records | None = None
     number: Bytes | None = None  # among the reported returns of its pulse, from 1
-    returns: Bytes | None = None  # number of reported returns of its pulse
+    return_counts: Bytes | None = None  # number of reported returns of its pulse
     reported: Floats | None = None  # distance with noise, metres
 
     @classmethod
@@ -77,7 +77,7 @@ class PulseReturns(NamedTuple):
     def single_returns(cls, ray: Integers, distance: Floats, triangle: Ints32) -> PulseReturns:
         """Return a table where each ray (n,) has a single return, without noise."""
         single = np.ones(len(ray), np.uint8)
-        return cls(ray, distance, triangle, number=single, returns=single, reported=distance)
+        return cls(ray, distance, triangle, number=single, return_counts=single, reported=distance)
 
     def take(self, row_selection: Bools | Indices) -> PulseReturns:
         """Return the selected rows of all columns."""

@@ -65,7 +65,7 @@ class Measured:
             "light_by_range": _curve(rays.distance, rays.intensity),
         }
         if self.stack.sweep_count > 1:
-            curves["returned_by_light"] = _curve(light, rays.returns / rays.trials)
+            curves["returned_by_light"] = _curve(light, rays.return_counts / rays.trials)
         if self.lost_by_range is not None:
             curves["lost_by_range"] = self.lost_by_range
         return curves
@@ -153,7 +153,7 @@ def measure_moving(
         rays = pulses.rays(sigma)
         energy = _pulse_energies(rays, white or recording.white, recording.energies)
         estimates, sigma = fit_performance(rays, energy, all_known=True)
-    lost = 1 - rays.returns.astype(np.float64)
+    lost = 1 - rays.return_counts.astype(np.float64)
     bias = _pulse_bias(pulses)
     return Measured(stack, rays, energy, estimates, bias, _curve(rays.distance, lost), moves=True)
 
@@ -221,7 +221,7 @@ def _bias(
     cell = flat.row, flat.column
     if expected is not None:
         return _mean_by_row(flat.row, flat.distance - expected[cell])
-    error_m = sigma[cell] / np.sqrt(flat.returns) + _MIN_RANGE_ERROR_M
+    error_m = sigma[cell] / np.sqrt(flat.return_counts) + _MIN_RANGE_ERROR_M
     return ring_bias(flat, stack.directions[cell], error_m)
 
 

@@ -85,7 +85,7 @@ class Pulses:
             distance=self.expected,
             slope=self.slope,
             intensity=self.intensity,
-            returns=returned.astype(np.int64),
+            return_counts=returned.astype(np.int64),
             trials=np.ones(len(self.row), np.int64),
             variance=np.where(paired, self.difference**2 / 2, 0.0),
             freedom=paired.astype(np.int64),

@@ -103,17 +103,17 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
 
     Without `all_known`, a ray without any return is unknown, so the rays that are known lose fewer
     pulses than others. For each return of a ray, the share is taken among the other `trials - 1`
-    pulses: the mean of (trials - returns) / (trials - 1) over all returns is unbiased.
+    pulses: the mean of (trials - return_counts) / (trials - 1) over all return_counts is unbiased.
     """
     min_trials = 1 if all_known else 2
     chosen = chosen & (rays.trials >= min_trials)
     if chosen.sum() < MIN_RAYS:
         return None
-    returns = rays.returns[chosen]
+    return_counts = rays.return_counts[chosen]
     trials = rays.trials[chosen]
     if all_known:
-        return Estimate.from_shares((trials - returns).astype(np.float64), trials)
-    return Estimate.from_shares((trials - returns) * returns / (trials - 1), returns)
+        return Estimate.from_shares((trials - return_counts).astype(np.float64), trials)
+    return Estimate.from_shares((trials - return_counts) * return_counts / (trials - 1), return_counts)
 
 
 class ScatterFit(NamedTuple):
@@ -206,7 +206,7 @@ def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
 
     Rays that lose many pulses are left out: only their nearer or brighter pulses return.
     """
-    repeated = (rays.freedom > 0) & (rays.returns >= MIN_RETURN_SHARE * rays.trials)
+    repeated = (rays.freedom > 0) & (rays.return_counts >= MIN_RETURN_SHARE * rays.trials)
     patch_columns = max(int(rays.column.max()) // _PATCHES, 1)
     patch = rays.row // _PATCH_ROWS * (_PATCHES + 2) + rays.column // patch_columns
     return _VarianceSamples(
@@ -294,7 +294,7 @@ def fit_threshold(
 
     def deviance(log_threshold: Any) -> Floats:
         p: Floats = detection(log_threshold)
-        likelihood = binom.logpmf(rays.returns, rays.trials, p)
+        likelihood = binom.logpmf(rays.return_counts, rays.trials, p)
         return (0 if all_known else np.log1p(-((1 - p) ** rays.trials))) - likelihood
 
     lower, upper = np.log(np.quantile(energy, (0.001, 0.999)))

@@ -116,7 +116,7 @@ class SmoothRays(NamedTuple):
     distance: Floats  # mean of the ranges, metres
     slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, metres in a radian
     intensity: Floats  # mean; NaN if unknown
-    returns: Ints  # number of sweeps with a return
+    return_counts: Ints  # number of sweeps with a return
     trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
     variance: Floats  # variance of the range over the sweeps, square metres
     freedom: Ints  # degrees of freedom of the variance: its returns, less 1
@@ -156,9 +156,9 @@ def select_smooth_rays(
         smooth &= np.abs(median - expected) < SCENE_TOLERANCE_M
     cell = np.nonzero(among_smooth(smooth))
     slope = slopes[cell]
-    returns = return_count[cell]
+    return_counts = return_count[cell]
     limit_m = MAX_SIGMAS * np.hypot(sigma[cell], direction_noise_rad * slope)
-    limit_m = np.where(returns > 1, limit_m, np.inf)
+    limit_m = np.where(return_counts > 1, limit_m, np.inf)
     statistics = _ray_statistics(stack, cell, surfaces.azimuth_slope[cell], median[cell], limit_m)
     rays = SmoothRays(
         row=cell[0],
@@ -166,13 +166,13 @@ def select_smooth_rays(
         distance=statistics.mean_range,
         slope=slope,
         intensity=statistics.mean_intensity,
-        returns=returns,
+        return_counts=return_counts,
         trials=stack.trials[cell],
         variance=statistics.variance,
         freedom=statistics.return_count - 1,
     )
     count = statistics.return_count
-    return rays.select(np.flatnonzero((count > 0) & (count >= MIN_RETURN_SHARE * returns)))
+    return rays.select(np.flatnonzero((count > 0) & (count >= MIN_RETURN_SHARE * return_counts)))
 
 
 def among_smooth(smooth: Bools) -> Bools:

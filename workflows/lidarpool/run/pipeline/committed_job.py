@@ -23,7 +23,7 @@ class CommittedParts:
         self.ordered: list[Receipt] = []  # without summaries
         self.scans_done = 0
         self.point_count = 0
-        self.hits = 0
+        self.hit_count = 0
 
     @property
     def cells(self) -> Ints | None:
@@ -77,8 +77,8 @@ class CommittedParts:
 
     def _count(self, part: Receipt, sign: int) -> None:
         self.scans_done += sign * len(part.scans)
-        self.point_count += sign * part.rows
-        self.hits += sign * part.hits
+        self.point_count += sign * part.point_count
+        self.hit_count += sign * part.hit_count
 
 
 class CommittedJob:

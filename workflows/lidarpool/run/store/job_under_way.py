@@ -132,7 +132,7 @@ class JobUnderWay(PipelineJob):
             storage=self.storage,
             names=[part.name for part in parts],
             firsts=[part.first for part in parts],
-            rows=[part.rows for part in parts],
+            rows=[part.point_count for part in parts],
             columns=job.survey.stored_columns,
             cells=self.parts.cells,
             precision_m=job.survey.precision_m,

@@ -64,7 +64,7 @@ class BatchPoints:
         counters = np.flatnonzero(counter_hits)
         self.tally = counters, counter_hits[counters]
         self.pulse_returns = scanned.returns
-        self.hits = scanned.hits  # (scans,): returns of each scan, kept or not
+        self.hit_counts = scanned.hit_counts  # (scans,): returns of each scan, kept or not
         self._surfaces = surfaces
         self._pattern = pattern
         self._start = start
@@ -549,7 +549,7 @@ class BatchPoints:
     @property
     def returns(self) -> Bytes:
         """Number of reported returns of its pulse."""
-        return required(self.pulse_returns.returns)
+        return required(self.pulse_returns.return_counts)
 
     @property
     def cause(self) -> Bytes:

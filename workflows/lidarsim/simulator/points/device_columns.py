@@ -82,7 +82,7 @@ class DevicePoints:
     survey: Survey
     specs: list[ScanSpec]
     counts: Ints  # (scans,): number of points of each scan
-    hits: Ints  # (scans,): number of hits of each scan, reported or not
+    hit_counts: Ints  # (scans,): number of hits of each scan, reported or not
     tally: tuple[Indices, Ints]  # numbers of hit counters that are not 0, and their hits
     columns: dict[str, AnyArray]  # {column name: values}
     returns: BatchPoints | None  # returns on the host, if NumPy computes columns
@@ -195,11 +195,13 @@ class DeviceColumns:
             self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
         )
         try:
-            hits, tally = seen.caster.caster.visit(scan, transfer.make, seen.counters, actor_hits)
+            hit_counts, tally = seen.caster.caster.visit(
+                scan, transfer.make, seen.counters, actor_hits
+            )
         finally:  # else the device would write to memory that goes back to the pool
             columns, (ray, distance, triangle) = transfer.finish()
         assert tally is not None
-        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hits, None)
+        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hit_counts, None)
         returns = BatchPoints(
             self._scene,
             survey,
@@ -217,8 +219,8 @@ class DeviceColumns:
             scene=self._scene,
             survey=survey,
             specs=specs,
-            counts=-(-hits // keep_every),
-            hits=hits,
+            counts=-(-hit_counts // keep_every),
+            hit_counts=hit_counts,
             tally=tally,
             columns=columns,
             returns=returns if self.needs_all_hits else None,

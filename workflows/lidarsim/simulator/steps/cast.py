@@ -218,8 +218,8 @@ class CastStep(PulseStep):
         The bytes are those while rays are cast and while returns are counted (`Memory`).
         """
         subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
-        casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.returns
-        return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
+        casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.return_count
+        return Memory(casting=casting, counting=75 * sizes.return_count + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the hits of the sub-rays of a batch, without using `returns`."""

@@ -148,7 +148,7 @@ class Sizes(NamedTuple):
     rays: int  # rays of all scans whose memory is estimated
     beams: float  # beams of one `PulseBatch`
     subrays: int  # sub-rays of one `PulseBatch`
-    returns: float  # returns of `rays`
+    return_count: float  # returns of `rays`
     points: float  # returns that become points: every n-th (`Survey.keep_every`)
 
 

@@ -55,7 +55,7 @@ class StrayLightStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of the causes of returns, and of central rays, in bytes."""
-        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch with the returns of stray light.

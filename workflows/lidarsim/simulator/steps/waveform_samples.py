@@ -52,7 +52,7 @@ class RecordingStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of a block of samples, and of all records, in bytes."""
-        recorded = record(setup.waveform_samples).itemsize * sizes.returns
+        recorded = record(setup.waveform_samples).itemsize * sizes.return_count
         sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
         return Memory(casting=sampled + recorded, counting=2.3 * recorded)
 
