@@ -34,7 +34,7 @@ def test_fewer_triangles_cover_about_as_much(avenue, most):
     assert 0.9 * most < len(drawn.scene.faces) <= most
     assert np.ptp(sizes(drawn)) == 0
     area = triangle_areas(drawn.scene.vertices[drawn.scene.faces]).sum()
-    part = avenue.instances.parts[0]
+    part = avenue.instances.mesh_parts[0]
     whole = 40 * triangle_areas(part.vertices[part.faces]).sum()
     assert 0.6 * whole < area < 1.5 * whole
     # No branch that was made larger sticks out.
@@ -48,7 +48,7 @@ def test_what_is_near_the_sensors_has_more_triangles(avenue):
     place = np.array([[200.0, 3, 2], [205, 3, 2]])
     drawn = SimplifiedScene.from_scene(avenue, 40_000, [place])
     some = sizes(drawn)
-    assert some[20] == len(avenue.instances.parts[0].faces)
+    assert some[20] == len(avenue.instances.mesh_parts[0].faces)
     assert (np.diff(some[:20]) >= 0).all() and (np.diff(some[21:]) <= 0).all()
     assert some.min() == 500 and some.sum() <= 40_000 < 2 * some.sum()
     assert SimplifiedScene.from_scene(avenue, 40_000, [np.zeros((0, 3))]).scene.triangles <= 40_000

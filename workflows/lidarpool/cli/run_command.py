@@ -215,11 +215,12 @@ def _result_lines(
     """Yield the outcome of a survey as lines of text."""
     yield from terminal.notes(report["notes"])
     surface_hits = report["hits_on_surfaces"]
+    hits_on_none = result.hit_count - surface_hits
     yield (
         f"{scans_in_words(job.survey.scan_count, job.survey.sweep_count)}, "
         f"{plural(result.rays, 'ray')}, "
         f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
-        f"{f' and {result.hit_count - surface_hits:,} on none' if result.hit_count > surface_hits else ''}, "
+        f"{f' and {hits_on_none:,} on none' if hits_on_none > 0 else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )

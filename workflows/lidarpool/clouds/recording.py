@@ -74,14 +74,14 @@ class RecordedPoints:
         )
 
     @classmethod
-    def joined(cls, parts: list[RecordedPoints]) -> RecordedPoints:
+    def joined(cls, recorded: list[RecordedPoints]) -> RecordedPoints:
         """Concatenate parts of the same recording, which have the same columns."""
-        if not parts:
+        if not recorded:
             return cls(np.empty((0, 3)))
-        rings = [part.rings for part in parts if part.rings is not None]
-        intensities = [part.intensities for part in parts if part.intensities is not None]
+        rings = [part.rings for part in recorded if part.rings is not None]
+        intensities = [part.intensities for part in recorded if part.intensities is not None]
         return cls(
-            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.points for part in recorded]),
             np.concatenate(rings) if rings else None,
             np.concatenate(intensities) if intensities else None,
         )

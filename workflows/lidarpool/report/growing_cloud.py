@@ -174,13 +174,15 @@ class GrowingCloud:
             self._thread.join()
         self._discard()
 
-    def add(self, parts: Sequence[Receipt]) -> None:
+    def add(self, receipts: Sequence[Receipt]) -> None:
         """Append committed parts once all earlier scans are appended, and return at once."""
-        if not parts:
+        if not receipts:
             return
-        self._committed_scans += sum(part.stop - part.first for part in parts)
-        self._committed_bytes += sum(part.size for part in parts)
-        self._queue.put([_Part(p.first, p.stop, p.name, p.point_count, p.cell_box) for p in parts])
+        self._committed_scans += sum(part.stop - part.first for part in receipts)
+        self._committed_bytes += sum(part.size for part in receipts)
+        self._queue.put(
+            [_Part(p.first, p.stop, p.name, p.point_count, p.cell_box) for p in receipts]
+        )
         if self._thread.ident is None:
             self._thread.start()
 

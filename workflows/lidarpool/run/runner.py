@@ -70,7 +70,7 @@ class Output(Generic[R]):
     def look(self, run: Run[R]) -> None:
         """Compare the output with the results of an earlier run in the store."""
 
-    def on_parts(self, parts: Sequence[Receipt]) -> None:
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Note that parts of the only job were committed, and return at once."""
 
     def finish(self, run: Run[R]) -> R:
@@ -239,9 +239,9 @@ class Run(Generic[R]):
         if self._on_frame is not None:
             self._on_frame(frame)
 
-    def _parts(self, parts: Sequence[Receipt]) -> None:
-        self.page.on_parts(parts)
-        self.output.on_parts(parts)
+    def _parts(self, receipts: Sequence[Receipt]) -> None:
+        self.page.on_parts(receipts)
+        self.output.on_parts(receipts)
 
     # -- for outputs -------------------------------------------------------------------------
 

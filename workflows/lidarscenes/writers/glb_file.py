@@ -74,11 +74,11 @@ class _Writer:
         parts.append(part)
         return len(parts) - 1
 
-    def add(self, name: str, parts: list[SceneMesh | SceneInstance]) -> None:
+    def add(self, name: str, object_parts: list[SceneMesh | SceneInstance]) -> None:
         """Add an object, whose parts have a common matrix, as a node."""
-        meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in parts]
+        meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in object_parts]
         key = tuple(id(mesh) for mesh in meshes)
-        translated = self._origin.any() and not isinstance(parts[0], SceneInstance)
+        translated = self._origin.any() and not isinstance(object_parts[0], SceneInstance)
         if key not in self._meshes:
             self._referenced += meshes
             if translated:
@@ -86,9 +86,11 @@ class _Writer:
             primitives = [primitive for mesh in meshes for primitive in self._primitives(mesh)]
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}
-        if isinstance(parts[0], SceneInstance):
+        if isinstance(object_parts[0], SceneInstance):
             to_y_up = affine(UP_AXES["y"].T, np.zeros(3))
-            node["matrix"] = matmul(matmul(to_y_up, parts[0].matrix), to_y_up.T).T.ravel().tolist()
+            node["matrix"] = (
+                matmul(matmul(to_y_up, object_parts[0].matrix), to_y_up.T).T.ravel().tolist()
+            )
         elif translated:
             node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))

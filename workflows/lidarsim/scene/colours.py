@@ -301,16 +301,16 @@ def luminance(colours: UInts32) -> Floats:
 _SHARES = WEIGHTS[:, None] * LINEAR
 
 
-def join_colours(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
+def join_colours(mesh_colours: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
     """Join the colours of meshes in order, or return None if no mesh has colours.
 
     `sizes` are the numbers of faces of the meshes; a mesh without colours becomes grey.
     """
-    if not any(part is not None for part in parts):
+    if not any(part is not None for part in mesh_colours):
         return None
     coloured = [
         Colours.plain(GREY, size) if part is None else part
-        for part, size in zip(parts, sizes, strict=True)
+        for part, size in zip(mesh_colours, sizes, strict=True)
     ]
     image_numbers: dict[int, int] = {}  # {id of an image: its number}
     images: list[Bytes] = []
@@ -338,9 +338,9 @@ def join_colours(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colou
     return Colours(tuple(images), np.concatenate(image_indices), uv, corners)
 
 
-def colours_summary(parts: Iterable[Colours | None]) -> str:
+def colours_summary(mesh_colours: Iterable[Colours | None]) -> str:
     """Return a summary of colours: «2 textures, 1 plain colour, colours of vertices»."""
-    coloured = [part for part in parts if part is not None]
+    coloured = [part for part in mesh_colours if part is not None]
     kinds = {
         id(part.images[number]): "texture" if part.images[number].size > 3 else "plain colour"
         for part in coloured

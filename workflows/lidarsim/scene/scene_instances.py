@@ -157,7 +157,7 @@ class Instances:
 
     Attributes
     ----------
-    parts
+    mesh_parts
         Parts, each once.
     part
         intp (n,): index of each instance's part.
@@ -167,7 +167,7 @@ class Instances:
         int32 (n,): index of each instance's object.
     """
 
-    parts: tuple[MeshPart, ...]
+    mesh_parts: tuple[MeshPart, ...]
     part: Indices
     transforms: Floats
     owner: Ints32
@@ -198,7 +198,7 @@ class Instances:
     @cached_property
     def sizes(self) -> Ints:
         """Number of triangles of each instance, (n,)."""
-        return np.array([len(part.faces) for part in self.parts], np.int64)[self.part]
+        return np.array([len(part.faces) for part in self.mesh_parts], np.int64)[self.part]
 
     @property
     def triangles(self) -> int:
@@ -207,13 +207,13 @@ class Instances:
 
     def owners(self, condition: Callable[[MeshPart], bool]) -> Ints32:
         """Return the objects of the instances whose part fulfils a condition."""
-        fulfilled = np.array([condition(part) for part in self.parts], np.bool_)
+        fulfilled = np.array([condition(part) for part in self.mesh_parts], np.bool_)
         return self.owner[fulfilled[self.part]]
 
     def placed(self) -> Iterator[tuple[Indices, Floats]]:
         """Yield blocks of instances (k,) of the same part, and their vertices: (k, 3, v), local."""
         for number in np.unique(self.part):
-            part = self.parts[number]
+            part = self.mesh_parts[number]
             rows = np.flatnonzero(self.part == number)
             step = max(1, BLOCK_POINTS // len(part.vertices))
             for start in range(0, len(rows), step):

@@ -56,7 +56,7 @@ class SimplifiedScene:
         shares = _triangle_shares(shared, max_triangles, near_positions)
         copies = _CopiedInstances(scene)
         for index, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
-            part = _drawn_part(shared.parts[index], share)
+            part = _drawn_part(shared.mesh_parts[index], share)
             for row in np.flatnonzero((shared.part == index) & (shares == share)):
                 copies.add(part, shared, int(row))
         return cls(copies.scene(), np.concatenate(copies.counters))
@@ -148,15 +148,15 @@ def cut_masks(scene: Scene) -> Scene:
     The hit counters stay the same.
     """
     shared = scene.instances
-    masked = sum(part.mask is not None for part in shared.parts) if shared else 0
+    masked = sum(part.mask is not None for part in shared.mesh_parts) if shared else 0
     if shared is None or not masked:
         return scene
-    instance_counts = np.bincount(shared.part, minlength=len(shared.parts))
+    instance_counts = np.bincount(shared.part, minlength=len(shared.mesh_parts))
     parts = tuple(
         _cut_part(part, min(CUT_TRIANGLES, DRAWN_TRIANGLES / (masked * count)))
-        for part, count in zip(shared.parts, instance_counts.tolist(), strict=True)
+        for part, count in zip(shared.mesh_parts, instance_counts.tolist(), strict=True)
     )
-    return replace(scene, instances=replace(shared, parts=parts))
+    return replace(scene, instances=replace(shared, mesh_parts=parts))
 
 
 def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:

@@ -106,22 +106,22 @@ def required(column: T | None) -> T:
 _LACKING: dict[str, Any] = {"cause": np.uint8(SURFACE), "velocity": np.nan, "width": 0.0}
 
 
-def joined(parts: list[PulseReturns]) -> PulseReturns:
+def joined(tables: list[PulseReturns]) -> PulseReturns:
     """Concatenate tables of hits. Columns outside `_LACKING` are in all tables, or in none."""
-    if len(parts) == 1:
-        return parts[0]
-    return PulseReturns._make(_column(name, parts) for name in PulseReturns._fields)
+    if len(tables) == 1:
+        return tables[0]
+    return PulseReturns._make(_column(name, tables) for name in PulseReturns._fields)
 
 
-def _column(name: str, parts: list[PulseReturns]) -> AnyArray | None:
+def _column(name: str, tables: list[PulseReturns]) -> AnyArray | None:
     """Concatenate a column of several tables, or return None if all tables lack the column."""
-    columns = [getattr(part, name) for part in parts]
+    columns = [getattr(part, name) for part in tables]
     if all(column is None for column in columns):
         return None
     return np.concatenate(
         [
             np.full(len(part.ray), _LACKING[name]) if column is None else column
-            for part, column in zip(parts, columns, strict=True)
+            for part, column in zip(tables, columns, strict=True)
         ]
     )
 

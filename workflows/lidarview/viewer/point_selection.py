@@ -70,11 +70,12 @@ class JoinedPoints:
 
     table: tuple[Column, ...]
 
-    def __init__(self, parts: Sequence[Points]) -> None:
-        self._firsts = np.cumsum([0, *map(len, parts)])  # rows; the last is one past all
-        self.parts = [*zip(self._firsts[:-1].tolist(), parts, strict=True)]
-        shared = set.intersection(*({column.name for column in part.table} for part in parts))
-        self.table = (*(entry for entry in parts[0].table if entry.name in shared), RESULT)
+    def __init__(self, results: Sequence[Points]) -> None:
+        self._firsts = np.cumsum([0, *map(len, results)])  # rows; the last is one past all
+        # [(row of the first point, points of a result)]
+        self.results = [*zip(self._firsts[:-1].tolist(), results, strict=True)]
+        shared = set.intersection(*({column.name for column in result.table} for result in results))
+        self.table = (*(entry for entry in results[0].table if entry.name in shared), RESULT)
 
     def __len__(self) -> int:
         return int(self._firsts[-1])
@@ -88,8 +89,8 @@ class JoinedPoints:
             row_selection = np.arange(*row_selection.indices(len(self)))
         bounds = np.searchsorted(row_selection, self._firsts)
         if name == RESULT.name:
-            return np.repeat(np.arange(len(self.parts), dtype=np.uint8), np.diff(bounds))
-        pieces = zip(self.parts, itertools.pairwise(bounds), strict=True)
+            return np.repeat(np.arange(len(self.results), dtype=np.uint8), np.diff(bounds))
+        pieces = zip(self.results, itertools.pairwise(bounds), strict=True)
         return np.concatenate(
             [part.values(name, row_selection[a:b] - first) for (first, part), (a, b) in pieces]
         )
@@ -290,11 +291,13 @@ class PointFinder:
         ranges = [(0, len(self.points))]  # ranges of rows, first and after the last
         if scans is not None:
             points = self.points
-            parts: Sequence[tuple[int, Any]] = [(0, points)]
+            results: Sequence[tuple[int, Any]] = [(0, points)]
             if isinstance(points, JoinedPoints):
-                parts = points.parts
+                results = points.results
             row_ranges = (
-                (first, part.rows_of(scan_range)) for first, part in parts for scan_range in scans
+                (first, result.rows_of(scan_range))
+                for first, result in results
+                for scan_range in scans
             )
             ranges = sorted((first + start, first + stop) for first, (start, stop) in row_ranges)
         total = sum(stop - start for start, stop in ranges)

@@ -156,7 +156,9 @@ class _FilmSource:
         colours = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]  # darker colours are lost
         return local, np.pad(colours, ((0, 0), (0, 1)), constant_values=1)
 
-    def parts(self, box: Floats, spans: Sequence[ScanRanges]) -> Iterator[tuple[Floats, Floats]]:
+    def new_points(
+        self, box: Floats, spans: Sequence[ScanRanges]
+    ) -> Iterator[tuple[Floats, Floats]]:
         """Yield the points and colours of each frame's scans."""
         for scans in spans:
             yield self.points(box, _FRAME_POINTS, scans)
@@ -175,7 +177,7 @@ def _film(view: View, max_frames: int) -> Film:
     frames = int(np.clip(view.duration_ns / (1e6 * _FRAME_MS), _MIN_FRAMES, max_frames))
     film = Film(
         moments_ns=np.linspace(0, view.duration_ns, frames + 1)[1:],
-        parts=repeat(source.points(box, _FILM_POINTS), frames),
+        new_points=repeat(source.points(box, _FILM_POINTS), frames),
         keep_share=0.0,
         scene_triangles=triangles,
         top=top,
@@ -188,7 +190,9 @@ def _film(view: View, max_frames: int) -> Film:
     intervals = pairwise([-np.inf, *film.moments_ns[:-1], np.inf])
     spans = [_scans_between(view.sweeps, *interval) for interval in intervals]
     all_points = max(_FILM_POINTS, min(len(view.points), _FRAME_POINTS * frames))
-    film = replace(film, parts=source.parts(box, spans), keep_share=_FILM_POINTS / all_points)
+    film = replace(
+        film, new_points=source.new_points(box, spans), keep_share=_FILM_POINTS / all_points
+    )
     return _follow(film, moving[0], source, spans) if moving else film
 
 

@@ -32,7 +32,7 @@ class Estimate(NamedTuple):
         return cls.from_variance(values.mean(), values.var() / len(values))
 
     @classmethod
-    def from_shares(cls, parts: Floats, totals: Ints) -> Estimate:
+    def from_shares(cls, counts: Floats, totals: Ints) -> Estimate:
         """Estimate a share: the sum of parts (n,) over the sum of totals (n,), as of lost pulses.
 
         The interval follows Clopper and Pearson for the number of independent pulses whose
@@ -42,8 +42,8 @@ class Estimate(NamedTuple):
         from scipy.stats import beta
 
         total = float(totals.sum())
-        share = float(parts.sum()) / total
-        share_variance = float(((parts - share * totals) ** 2).sum()) / total**2
+        share = float(counts.sum()) / total
+        share_variance = float(((counts - share * totals) ** 2).sum()) / total**2
         binomial_variance = share * (1 - share) / total
         pulses = (
             total * binomial_variance / share_variance

@@ -103,7 +103,7 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
 
     Without `all_known`, a ray without any return is unknown, so the rays that are known lose fewer
     pulses than others. For each return of a ray, the share is taken among the other `trials - 1`
-    pulses: the mean of (trials - return_counts) / (trials - 1) over all return_counts is unbiased.
+    pulses: the mean of (trials - returns) / (trials - 1) over all returns is unbiased.
     """
     min_trials = 1 if all_known else 2
     chosen = chosen & (rays.trials >= min_trials)
@@ -113,7 +113,9 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
     trials = rays.trials[chosen]
     if all_known:
         return Estimate.from_shares((trials - return_counts).astype(np.float64), trials)
-    return Estimate.from_shares((trials - return_counts) * return_counts / (trials - 1), return_counts)
+    return Estimate.from_shares(
+        (trials - return_counts) * return_counts / (trials - 1), return_counts
+    )
 
 
 class ScatterFit(NamedTuple):

@@ -278,7 +278,7 @@ class StaticBodies:
             index = int(instances.part[row])
             if cut_part is None:
                 if index not in meshes:
-                    meshes[index] = mesh_of(instances.parts[index])
+                    meshes[index] = mesh_of(instances.mesh_parts[index])
                 mesh = meshes[index]
             else:
                 origins[len(bodies)] = cut_part.origin
@@ -314,7 +314,7 @@ def _parts_in(
         is_near &= is_seen
     for row in np.flatnonzero(is_near).tolist():
         cut_part = None
-        part = instances.parts[instances.part[row]]
+        part = instances.mesh_parts[instances.part[row]]
         if not is_whole[row] and part.mask is None:
             planes = box_planes(region, instances.transforms[row])
             cut_part = cut(part.vertices, part.faces, planes)

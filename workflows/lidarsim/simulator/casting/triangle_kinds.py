@@ -60,7 +60,7 @@ class TriangleKinds:
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
         scene = self._scene
-        parts = () if scene.instances is None else scene.instances.parts
+        parts = () if scene.instances is None else scene.instances.mesh_parts
         meshes = [(len(mesh.faces), mesh.materials) for mesh in self._triangles.meshes]
         meshes += [(len(part.faces), part.materials) for part in parts]
         face_materials = None if scene.materials is None else scene.materials.index

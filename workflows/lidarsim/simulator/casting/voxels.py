@@ -54,7 +54,7 @@ class Grids:
     """The grids of the instances of a scene, with the densities of each part stored once."""
 
     def __init__(self, shared: Instances) -> None:
-        voxels = [part.voxels for part in shared.parts]
+        voxels = [part.voxels for part in shared.mesh_parts]
         sizes = [(0, 0, 0) if grid is None else grid.density.shape for grid in voxels]
         self._sizes = np.array(sizes, np.float64)
         self._starts = np.cumsum([0, *(int(np.prod(size)) for size in sizes[:-1])])
@@ -68,7 +68,7 @@ class Grids:
     @classmethod
     def from_instances(cls, shared: Instances | None) -> Grids | None:
         """Return the grids of instances, or None without grids."""
-        if shared is None or all(part.voxels is None for part in shared.parts):
+        if shared is None or all(part.voxels is None for part in shared.mesh_parts):
             return None
         return cls(shared)
 

@@ -562,26 +562,30 @@ class CastStep(PulseStep):
         )
 
     def _join(
-        self, batch: PulseBatch, parts: list[VisibleHits], rays: Floats, first_light: LightPaths
+        self,
+        batch: PulseBatch,
+        hits_by_pass: list[VisibleHits],
+        rays: Floats,
+        first_light: LightPaths,
     ) -> PulseReturns:
         """Return the hits of all passes in the order of sub-rays, and set them in the batch.
 
-        `parts` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams have
-        several sub-rays. `rays` are all sub-rays (`_cast_first`); `first_light` is the light of
-        those that hit a surface.
+        `hits_by_pass` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams
+        have several sub-rays. `rays` are all sub-rays (`_cast_first`); `first_light` is the light
+        of the sub-rays that hit a surface.
         """
-        hits = joined([part.hits for part in parts])
-        normals = parts[0].normals
-        if parts[1:]:
+        hits = joined([part.hits for part in hits_by_pass])
+        normals = hits_by_pass[0].normals
+        if hits_by_pass[1:]:
             order = np.argsort(hits.ray, kind="stable")
             hits = hits.take(order)
             if batch.subrays_per_beam > 1:
-                normals = np.concatenate([part.normals for part in parts])[order]
+                normals = np.concatenate([part.normals for part in hits_by_pass])[order]
         batch.hits = hits
         if batch.subrays_per_beam > 1:
             directions = first_light.directions
             # The rows differ from `first_light` after several passes, or if hits were left out.
-            if parts[1:] or len(hits.ray) != len(first_light.ray):
+            if hits_by_pass[1:] or len(hits.ray) != len(first_light.ray):
                 directions = rays[-3:].take(hits.ray, axis=1).T
             batch.planes = normals, directions
         return hits

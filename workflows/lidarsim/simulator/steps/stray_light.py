@@ -215,7 +215,7 @@ def _retro_clusters(
     shared = scene.instances
     if shared is not None:
         for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
-            mesh = shared.parts[part]
+            mesh = shared.mesh_parts[part]
             if has_retro[owner]:
                 vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
                 yield from clusters_of(mesh.faces, vertices, first)

@@ -658,7 +658,7 @@ def _peak_of_hit(time, wave, stops, count):
 
 
 @compiled()
-def search_waveforms(light, parts, sampling, starts, peaks, scratch):
+def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
     """Sample waveforms, and write the peak that each of their hits belongs to.
 
     Waveform k has the hits `parts[k, 0]` to `parts[k, 1]` of `light`, a `WaveLight`.
@@ -669,9 +669,9 @@ def search_waveforms(light, parts, sampling, starts, peaks, scratch):
     time = light.time
     first_number = 0
     pulse_samples = np.int64(2 * CUT * sigma) + 1
-    for part in range(len(parts)):
-        begin = parts[part, 0]
-        stop = parts[part, 1]
+    for part in range(len(hit_ranges)):
+        begin = hit_ranges[part, 0]
+        stop = hit_ranges[part, 1]
         first = np.int64(math.ceil(time[begin] - CUT * sigma)) - 1
         last_first = np.int64(math.ceil(time[stop - 1] - CUT * sigma))
         length = last_first + pulse_samples - first + 1
