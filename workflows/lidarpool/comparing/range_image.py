@@ -40,8 +40,10 @@ class RangeImages:
     images: Floats
     hidden_shares: tuple[float, float]  # shares of points behind others in their cells
     notes: tuple[str, ...]
-    rows: Ints  # (k,): of all cells, or of all rays that have a return
-    compared: Floats  # (2, 2, k): range and intensity at `rows` in A and in B, NaN where unknown
+    cell_rows: Ints  # (k,): of all cells, or of all rays that have a return
+    compared: (
+        Floats  # (2, 2, k): range and intensity at `cell_rows` in A and in B, NaN where unknown
+    )
     paired_by: str = "cells"  # or "rays"
 
     @property
@@ -205,7 +207,7 @@ def range_images(
         images=images,
         hidden_shares=(hidden_a, hidden_b),
         notes=common.notes,
-        rows=np.repeat(np.arange(row_count), len(columns)),
+        cell_rows=np.repeat(np.arange(row_count), len(columns)),
         compared=images[:, :2].reshape(2, 2, -1),
     )
 
@@ -279,7 +281,7 @@ def paired_images(
     return replace(
         images,
         images=values[..., ray_of_cell],
-        rows=(rings[:, None] == images.rings).argmax(axis=1),
+        cell_rows=(rings[:, None] == images.rings).argmax(axis=1),
         compared=values[:, :2, :-1],
         paired_by="rays",
     )

@@ -273,7 +273,7 @@ class _Comparing:
         in_both = np.flatnonzero(in_a & in_b)
         in_both = in_both[even_indices(len(in_both), budget)]
         (range_a, intensity_a), (range_b, intensity_b) = images.compared[..., in_both]
-        ring = images.rings[images.rows[in_both]]
+        ring = images.rings[images.cell_rows[in_both]]
         self.cells.append(_CellPairs(range_a - range_b, ring, intensity_a, intensity_b))
 
     def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
@@ -281,7 +281,7 @@ class _Comparing:
 
         `in_a` and `in_b` (k,) mark returns.
         """
-        rows = images.rows
+        rows = images.cell_rows
         returned_a, returned_b = images.returned
         rows_of_neither, _ = np.nonzero(~returned_a & ~returned_b)
         rows_of_states = (

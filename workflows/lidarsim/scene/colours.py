@@ -215,7 +215,7 @@ class Lookup:
 class _Planes(NamedTuple):
     """Values on faces that are linear in the position."""
 
-    rows: Ints32  # (f,): row of `slopes` of each face; -1 for faces without values
+    slope_rows: Ints32  # (f,): row of `slopes` of each face; -1 for faces without values
     slopes: Floats  # (k, 4 w): for each of w values, slopes along x, y and z, and value at zero
     everywhere: bool  # all faces have values
 
@@ -233,7 +233,7 @@ class _Planes(NamedTuple):
         The selection is a slice of all, or indices (m,); the values are (w, m).
         """
         selected: Any = slice(None)
-        slope_rows = self.rows.take(face_indices)
+        slope_rows = self.slope_rows.take(face_indices)
         if not self.everywhere:
             selected = np.flatnonzero(slope_rows >= 0)
             slope_rows = slope_rows[selected]

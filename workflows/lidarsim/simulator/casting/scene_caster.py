@@ -184,7 +184,9 @@ class SceneCaster:
         trees = self._static.trees
         first_instance = min(1, self._face_count)
         last = first_instance + (0 if self._instances is None else len(self._instances))
-        return np.concatenate([np.arange(trees.face_bodies), first_instance + trees.rows, [last]])
+        return np.concatenate(
+            [np.arange(trees.face_bodies), first_instance + trees.instance_indices, [last]]
+        )
 
     @property
     def backend(self) -> str:

@@ -70,15 +70,15 @@ class _Trees(NamedTuple):
     region: Floats | None  # (2, 3), metres; None for the whole scene
     # (b,): first triangle of each instance of the caster; None for a caster of faces alone
     first_triangles: Ints32 | None
-    # (r,): rows in the scene's instances of the last r instances of the caster, ascending
-    rows: Ints
+    # (r,): indices in the scene's instances of the last r instances of the caster, ascending
+    instance_indices: Ints
     # {instance of the caster: the triangle of its mesh that each triangle is a part of}
     origins: dict[int, Indices]
 
     @property
     def face_bodies(self) -> int:
         """Number of instances of the caster that are the scene's faces: 0 or 1."""
-        return self.caster.instance_count - len(self.rows)
+        return self.caster.instance_count - len(self.instance_indices)
 
     def numbered(self, hits: ScanReturns) -> Ints32:
         """Return the triangles of hits (k,), by the numbers of the scene."""
@@ -209,11 +209,11 @@ class StaticBodies:
         if trees.region is None and self._instance_is_seen is None:  # all instances have a tree
             trees.caster.move(first + instance_indices, instances.transforms[instance_indices])
             return
-        numbers = first + np.searchsorted(trees.rows, instance_indices)
+        numbers = first + np.searchsorted(trees.instance_indices, instance_indices)
         if trees.region is None:
             trees.caster.move(numbers, instances.transforms[instance_indices])
             return
-        has_tree = np.isin(instance_indices, trees.rows)
+        has_tree = np.isin(instance_indices, trees.instance_indices)
         is_cut = has_tree & np.isin(numbers, list(trees.origins))
         comes = ~has_tree & _is_near(instances, trees.region)[instance_indices]
         if (is_cut | comes | (has_tree & is_remote)).any():

@@ -115,8 +115,8 @@ class SeenBodies:
 
     def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
         self.caster = caster
-        self.rows = caster.body_rows  # rows in `StoredTriangles.bodies`
-        self.table = bodies[self.rows]  # all actors are the last body
+        self.body_rows = caster.body_rows  # rows in `StoredTriangles.bodies`
+        self.table = bodies[self.body_rows]  # all actors are the last body
         self.counters = caster.counters()
         self.device_table: Any = None
         self.device_normal_matrices: Any = None
@@ -271,7 +271,7 @@ class DeviceColumns:
         if seen.device_table is None:
             seen.device_table = to_device(cupy, seen.table)
         if seen.device_normal_matrices is None:
-            normal_matrices = self._surfaces.triangles.bodies()[1][seen.rows]
+            normal_matrices = self._surfaces.triangles.bodies()[1][seen.body_rows]
             seen.device_normal_matrices = to_device(cupy, normal_matrices)
         return seen.device_table, *self._surface_tables, seen.device_normal_matrices
 

@@ -129,7 +129,7 @@ class Crossings(NamedTuple):
 class OnwardRows(NamedTuple):
     """Rows of light that continues: arrays (k,), with a row twice where the light divides."""
 
-    rows: Indices
+    row_indices: Indices
     reflected: Bools  # whether the light of the row is mirrored, else transmitted
     share: Floats  # share behind the surface, like `LightPaths.share`
 
@@ -337,10 +337,10 @@ class CastStep(PulseStep):
             trajectories=actor_trajectories,
             colours=colour,
         )
-        if leaves is not None and len(leaves.rows):
+        if leaves is not None and len(leaves.row_indices):
             # Leaves face the light: two leaves behind each other are then never one surface.
-            normals[leaves.rows] = light.directions[leaves.rows]
-            energy[leaves.rows] = self._leaf_energy(leaves, triangle, distance, colour)
+            normals[leaves.row_indices] = light.directions[leaves.row_indices]
+            energy[leaves.row_indices] = self._leaf_energy(leaves, triangle, distance, colour)
         energy *= light.share
         if light.in_media is not None:
             light.in_media.advance(step_m)
@@ -355,7 +355,7 @@ class CastStep(PulseStep):
             kinds=kinds,
             energy=energy,
             film=film,
-            leaves=np.zeros(0, np.intp) if leaves is None else leaves.rows,
+            leaves=np.zeros(0, np.intp) if leaves is None else leaves.row_indices,
             velocities=self._velocities(light, step_m, triangle, actor_trajectories),
         )
 
@@ -376,9 +376,9 @@ class CastStep(PulseStep):
             self._draw(batch),
         )
         step_m = cast.step_m.copy()
-        step_m[leaves.rows] = cast.start_m[leaves.rows] + leaves.metres
+        step_m[leaves.row_indices] = cast.start_m[leaves.row_indices] + leaves.metres
         triangle = cast.triangle.copy()
-        triangle[leaves.rows] = leaves.triangles
+        triangle[leaves.row_indices] = leaves.triangles
         return cast._replace(step_m=step_m, triangle=triangle), leaves
 
     def _leaf_energy(
@@ -388,7 +388,7 @@ class CastStep(PulseStep):
 
         `triangle`, `distance` (metres) and `colour` are of all hits (n,), with those on leaves.
         """
-        rows = leaves.rows
+        rows = leaves.row_indices
         leaf_colour = None if colour is None else colour[rows]
         return self.surfaces.energy(
             triangle[rows], leaves.cosines, distance[rows], self._sensor_light, leaf_colour

@@ -355,7 +355,7 @@ class Media:
 class LightInGrids(NamedTuple):
     """Light among all that passes grids of voxels: arrays (k,)."""
 
-    rows: Indices  # rows of the light
+    row_indices: Indices  # rows of the light
     metres: Floats  # metres to the leaf that the light meets; inf without a leaf
     remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
 
@@ -372,7 +372,7 @@ class Refraction(NamedTuple):
 class Leaves(NamedTuple):
     """Leaves that light meets: arrays (k,)."""
 
-    rows: Indices  # rows of the light
+    row_indices: Indices  # rows of the light
     metres: Floats  # metres from the start of the span to the leaf
     triangles: Ints32  # through which the light entered the crown
     cosines: Floats  # mean cosine between light and leaves
@@ -443,13 +443,13 @@ class LightInMedia:
         assert self.remaining_depth is not None
         depth = density * length
         if passage is not None:
-            in_grids = passage.rows
+            in_grids = passage.row_indices
             depth[in_grids] = self.remaining_depth[in_grids] - passage.remaining_depth
         rows = np.flatnonzero(depth > self.remaining_depth)
         metres = self.remaining_depth[rows] / density[rows]
         if passage is not None:
             metres_in_grids = np.full(len(depth), np.nan)
-            metres_in_grids[passage.rows] = passage.metres
+            metres_in_grids[passage.row_indices] = passage.metres
             metres = np.where(np.isnan(metres_in_grids[rows]), metres, metres_in_grids[rows])
         self.remaining_depth = self.remaining_depth - depth
         return rows, metres

@@ -265,7 +265,7 @@ class PulseBatch:
         )
 
     @property
-    def rows(self) -> slice:
+    def row_range(self) -> slice:
         """Rows of the batch's firings in `firings`, in complete firings."""
         channels = self.firings.sensor.channels
         return slice(self.start // channels, self.stop // channels)
