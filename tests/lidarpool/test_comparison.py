@@ -233,7 +233,7 @@ def test_of_many_points_and_cells_some_are_compared(monkeypatch):
     assert found["range_image"]["residual"]["rmse_m"] == pytest.approx(0.02, rel=0.07)
     assert "2,000 points and cells" in found["notes"][0]
     thin = compare(cloud(), cloud(), most_points=3000).figures
-    assert thin["a"]["points"] == 3000 and "11,520 points, of which 26 %" in thin["notes"][0]
+    assert thin["a"]["points"] == 3000 and "11,520 points; 26 % are compared" in thin["notes"][0]
 
 
 # -- formats --------------------------------------------------------------------------------------

@@ -1,14 +1,28 @@
 """Returns of the pulses of one sensor: casts the sensor's scans, and applies the steps to the hits.
 
-The way through a worker: `Rig.cast` groups scans, and `Rig.returns` finds the `Firings` of a group
-and the `CastPoses` of its beams. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at a
-time and passes `PulseReturns` through the steps in the order of `step_list.py`: steps that aim
-beams; `CastStep`, which finds the hits of all rays; steps that add light of rain, spray and dirt;
-those that make returns of hits, detect, receive, lose and choose returns. What is kept of them is
-`Scanned`. Steps on reported returns get all beams at once, and returns out of range are removed.
-`BatchPoints` holds it, and `columns_of` makes columns of `BatchPoints`. If each ray can have one
-return only (`Setup.return_count_varies`), `SceneCaster` itself counts and thins out the hits; on
-CUDA without steps, `DeviceColumns` does all of it.
+The way through a worker, from `intersect` of a casting task to a part's columns:
+
+1. `Rig.cast` groups scans of one sensor and station whose firings follow each other.
+2. `Rig.returns` finds the `Firings` of a group and the `CastPoses` of its beams.
+3. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at a time, and passes
+   `PulseReturns` through the steps in the order of `step_list.py`:
+
+   a. Steps aim the beams.
+   b. `CastStep` finds the hits of all sub-rays; `CastStep.apply` lists its passes. From here on,
+      `PulseReturns` has a row for each hit.
+   c. Steps add the light of rain, spray and dirt, as further hits.
+   d. `SeparationStep` or `WaveformStep` makes returns of hits; `_mark_returns` of
+      `separation_loops.py` follows five hits of a beam. From here on, `PulseReturns` has a row for
+      each return.
+   e. Steps detect, receive, lose and choose returns.
+
+4. `PulseCaster` counts the returns of each scan, and keeps every n-th: `Scanned`.
+5. Steps on reported returns get all beams at once, and returns out of range are removed.
+6. `BatchPoints` holds the returns that are left, and `columns_of` makes their columns.
+
+If each ray can have one return only (`Setup.return_count_varies`), `SceneCaster` itself counts and
+thins out the hits, in place of 3 and 4; of the steps of 3, only steps that aim beams act. On CUDA
+without steps, `DeviceColumns` does 3 to 6.
 """
 
 from __future__ import annotations

@@ -257,6 +257,16 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbours, scratch):
     `count` is the number of hits. `exceeds_gap` is False if no hit of the beam is farther from
     another hit than the receiver's gap. A surface that continues from sub-ray to sub-ray is in a
     single return.
+
+    In the example of `continue_surfaces`, with a gap of 0.3 m, `_collect_hits` has written the
+    drop, then the hits of sub-rays 0 to 3, and `_sort_by_distance` has moved the post before the
+    ground of sub-rays 1 and 2. `row[k, 0]` is -1, 0, 3, 1 and 2: the drop is row 0 of the table of
+    the air. Each hit is farther than the gap from the hit before, so `starts_return` is True for
+    all five. Hits on surfaces are in several returns, so `continue_surfaces` looks for surfaces
+    that continue, and clears `starts_return` of hits 2, 3 and 4. `_write_returns` then writes two
+    returns: the drop at 8.0 m, and hits 1 to 4 at their mean distance, weighted by energy. If the
+    post returns twice the energy of a ground hit, the mean is 10.88 m, and the return has the row
+    of the post, 3.
     """
     row = scratch.hits.row
     distance = scratch.hits.distance
