@@ -178,11 +178,11 @@ def test_frames_that_were_handed_out_are_kept_with_the_next_commit(db, job):
 
 
 def test_the_cells_of_all_parts(db, job):
-    assert job.parts.cells is None
+    assert job.parts.cell_box is None
     commit(db, job, receipt(0, 1, cells=()), receipt(1, 2, cells=(-5, 0, 3, 0, 9, 4)))
-    assert job.parts.cells.tolist() == [[-5, 0, 3], [0, 9, 4]]
+    assert job.parts.cell_box.tolist() == [[-5, 0, 3], [0, 9, 4]]
     commit(db, job, receipt(2, 3, cells=(0, -7, 3, 1, 1, 2**40)))
-    assert read(reopened(db)).parts.cells.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
+    assert read(reopened(db)).parts.cell_box.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
 
 
 def test_values_and_trials_come_back(db, job):

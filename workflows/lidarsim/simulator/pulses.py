@@ -40,7 +40,7 @@ from ..scene.scene import Scene
 from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
-from .casting.surfaces import Surfaces, light_of
+from .casting.surfaces import Surfaces, sensor_light_of
 from .returns import NO_SURFACE, Keys, PulseReturns, joined, required
 from .steps.doppler import radial_velocities
 from .steps.step import Emitter, PulseBatch, PulseStep, Role
@@ -241,12 +241,12 @@ class PulseCaster:
             points += origins
             colour = surfaces.colours(triangle, points, times, poses.actor_trajectories)
             del points  # which takes as much memory as the normals
-        light = light_of(setup.survey, setup.sensor)
+        sensor_light = sensor_light_of(setup.survey, setup.sensor)
         lit = surfaces.lit(
             triangle,
             directions,
             distance=distance,
-            light=light,
+            sensor_light=sensor_light,
             times=times,
             trajectories=poses.actor_trajectories,
             colours=colour,

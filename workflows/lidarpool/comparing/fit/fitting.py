@@ -173,8 +173,7 @@ def _with_performance(
 ) -> SensorModel:
     """Return a sensor with estimates in its performance.
 
-    Figures without estimates stay.
-    The figures of range noise go together: an estimate of one replaces all of these, and
+    `estimates` is `Measured.estimates`. Figures without estimates stay. The figures of range noise go together: an estimate of one replaces all of these, and
     `precision`.
     """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}

@@ -46,7 +46,9 @@ class Measured:
     stack: SweepStack
     rays: SmoothRays
     energy: Floats | None  # (k,): as of `_pulse_energies`; None if unknown
-    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}; empty for a single sweep
+    # {figure: estimate}: fields of `Noise` (`fit_performance`), and for a sensor that stands also
+    # `false_alarms`, a field of `Performance`; empty for a single sweep of such a sensor
+    estimates: dict[str, Estimate]
     bias: dict[int, Estimate]  # {row: metres}
     lost_by_range: Curve | None = None  # share by the range of the scene; None without a scene
     moves: bool = False  # whether the sensor moves

@@ -52,8 +52,16 @@ def fit_performance(
     """Estimate noise and lost pulses of a sensor from rays.
 
     `energy` (k,) is the energy of the returns of rays, if known. `all_known` says that rays without
-    any return are known, too, by a scene. Returns estimates by the field names of `Noise`, and the
-    standard deviations of rays (k,), metres, by range or by energy, whichever is likelier.
+    any return are known, too, by a scene.
+
+    Returns
+    -------
+    estimates
+        {field of `Noise`: estimate}: `range_m`, `angle_deg`, and `range_per_m` or, if likelier,
+        `range_at_threshold_m`; `detection_range_m` and `dropout`. Without a field that the rays do
+        not determine.
+    sigma
+        Standard deviations of the ranges of rays (k,), metres, by the likelier of range and energy.
     """
     threshold, dropout = _fit_detection(rays, energy, all_known)
     scatter = fit_scatter(rays, "range_per_m", rays.distance, 1)
@@ -121,7 +129,8 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
 class ScatterFit(NamedTuple):
     """Noise of ranges and directions that was fitted to the variances of rays."""
 
-    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}
+    # {`range_m`, `angle_deg` or the name of the increase, fields of `Noise`: estimate}
+    estimates: dict[str, Estimate]
     sigma: Floats  # (k,): fitted standard deviation of the range of each ray, metres
     deviance: float  # deviance of the fit to all rays; a smaller deviance is likelier
 

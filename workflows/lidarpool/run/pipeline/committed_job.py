@@ -26,12 +26,12 @@ class CommittedParts:
         self.hit_count = 0
 
     @property
-    def cells(self) -> Ints | None:
+    def cell_box(self) -> Ints | None:
         """Lowest and highest cell of all points, (2, 3), or None without points."""
-        cells = [part.cell_box for part in self.ordered if part.cell_box]
-        if not cells:
+        boxes = [part.cell_box for part in self.ordered if part.cell_box]
+        if not boxes:
             return None
-        table = np.array(cells, np.int64).reshape(-1, 2, 3)
+        table = np.array(boxes, np.int64).reshape(-1, 2, 3)
         return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
 
     def reaching_past(self, scan: int) -> list[Receipt]:

@@ -138,7 +138,7 @@ class Receipt(Scans):
         summaries["hits"] = part.scan_hits
         summaries["points"] = part.counts
         summaries["samples"] = part.samples
-        box = () if (cells := part.cells) is None else tuple(cells.ravel().tolist())
+        box = () if part.cell_box is None else tuple(part.cell_box.ravel().tolist())
         data = summaries.tobytes()
         return cls(
             job=job,

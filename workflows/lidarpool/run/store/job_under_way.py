@@ -134,7 +134,7 @@ class JobUnderWay(PipelineJob):
             firsts=[part.first for part in parts],
             rows=[part.point_count for part in parts],
             columns=job.survey.stored_columns,
-            cells=self.parts.cells,
+            cells=self.parts.cell_box,
             precision_m=job.survey.precision_m,
             origin=job.scene.origin if world else np.zeros(3),
             keeper=self._keeper,

@@ -23,7 +23,7 @@ from ...sensor.optics import LIGHT_M_NS
 from ...sensor.reflectivity import COUNTS, SCALES
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
-from ..casting.surfaces import Surfaces, light_of
+from ..casting.surfaces import Surfaces, sensor_light_of
 from ..pulses import Scanned
 from ..returns import required
 from ..steps.cast import GHOST
@@ -410,7 +410,7 @@ class BatchPoints:
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
         """Cosines of incidence, of either sign, and energies, in blocks to save memory."""
-        light = light_of(self.survey, self.sensor)
+        sensor_light = sensor_light_of(self.survey, self.sensor)
         cosines, energy = np.empty((2, len(self)))
         colours = self._colours if self._surfaces.materials.textured else None
         for begin in range(0, len(self), BLOCK_HITS):
@@ -419,7 +419,7 @@ class BatchPoints:
                 self.pulse_returns.triangle[block],
                 self.directions[block],
                 distance=self.pulse_returns.distance[block],
-                light=light,
+                sensor_light=sensor_light,
                 times=self._actor_times_ns[block],
                 trajectories=self._poses.actor_trajectories,
                 colours=None if colours is None else colours[block],

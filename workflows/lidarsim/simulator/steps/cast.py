@@ -22,10 +22,10 @@ from ...scene.colours import luminance
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, Clock, along_rings
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, light_of
+from ..casting.surfaces import Surfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
 from .doppler import range_rates_of_origins, velocities_of_ends
-from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
+from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, depths
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")
@@ -148,7 +148,7 @@ class OnwardLight(NamedTuple):
 
     light: LightPaths
     start_m: Floats  # positions of those surfaces along the light, metres, at or below 0
-    path: Pattern  # the rays to cast: origins and directions of `light`
+    pattern: Pattern  # the rays to cast: origins and directions of `light`
 
 
 class CastStep(PulseStep):
@@ -174,7 +174,7 @@ class CastStep(PulseStep):
         super().__init__(setup, caster, surfaces)
         survey = setup.survey
         sensor = setup.sensor
-        self._sensor_light = light_of(survey, sensor)
+        self._sensor_light = sensor_light_of(survey, sensor)
         self._seed = setup.noise.seed
         table = surfaces.at_wavelength(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
@@ -327,7 +327,7 @@ class CastStep(PulseStep):
             light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
         if media is not None:
             leaf_depths = depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
-            media_rays = Rays(origins, directions, times, poses.actor_trajectories)
+            media_rays = MediaRays(origins, directions, times, poses.actor_trajectories)
             light.in_media = media.initial_state(self.caster, media_rays, leaf_depths)
         return light
 
@@ -353,7 +353,7 @@ class CastStep(PulseStep):
             triangle,
             light.directions,
             distance=distance,
-            light=self._sensor_light,
+            sensor_light=self._sensor_light,
             times=light.times,
             trajectories=actor_trajectories,
             colours=colour,
@@ -562,12 +562,12 @@ class CastStep(PulseStep):
 
         With crowns, hits beyond the range are returned too: there may be leaves before them.
         """
-        light, start_m, path = onward
+        light, start_m, pattern = onward
         max_range_m = self.setup.sensor.max_range_m
         # Light takes no time: it travels 300 m in a microsecond.
         clock = Clock(light.times, np.zeros(1), actor_trajectories)
         poses = CastPoses(np.zeros(3), clock=clock)
-        hits = self.caster.scan(path, poses, t_max=self._reach_m)
+        hits = self.caster.scan(pattern, poses, t_max=self._reach_m)
         rows = hits.ray
         cast = CastLight(light.take(rows), start_m[rows], hits.distance, hits.triangle)
         if self._leafy or max_range_m == np.inf:
@@ -632,7 +632,7 @@ class CastStep(PulseStep):
             cosines = np.abs(products(normals.T, outgoing.T))
         range_rate = _range_rate_behind(light, incoming_index, crossings.velocities, outgoing)
         clear_m = self.caster.clear_m / np.maximum(cosines, 1e-3)
-        path, origins = _path_behind(light, crossings.step_m, clear_m, outgoing)
+        pattern, origins = _pattern_behind(light, crossings.step_m, clear_m, outgoing)
         optical_m = clear_m if in_media is None else in_media.optical(clear_m)
         if in_media is not None:
             in_media.advance(clear_m)
@@ -640,7 +640,7 @@ class CastStep(PulseStep):
             ray=light.ray,
             times=light.times,
             origins=origins,
-            directions=path.directions,
+            directions=pattern.directions,
             share=deflection.share,
             optical_start=crossings.distance + optical_m,
             mirror_matrices=mirror_matrices,
@@ -648,7 +648,7 @@ class CastStep(PulseStep):
             in_media=in_media,
             range_rate=range_rate,
         )
-        return OnwardLight(behind, -clear_m, path)
+        return OnwardLight(behind, -clear_m, pattern)
 
     def _deflect(self, light: LightPaths, crossings: Crossings) -> Deflection:
         """Return the directions and shares of light behind surfaces that refract or mirror.
@@ -694,7 +694,7 @@ def _range_rate_behind(
     return light.range_rate + incoming_index * incoming_speed - light.index * outgoing_speed
 
 
-def _path_behind(
+def _pattern_behind(
     light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
 ) -> tuple[Pattern, Floats]:
     """Return rays that start `clear_m` (n,) behind the ends of light, and their origins (n, 3).

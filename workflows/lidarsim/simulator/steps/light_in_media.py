@@ -42,7 +42,7 @@ UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # direction of search, unlike edge
 Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 
 
-class Rays(NamedTuple):
+class MediaRays(NamedTuple):
     """Light of sub-rays at its origin, and the trajectories of actors."""
 
     origins: Floats  # (n, 3): metres, scene frame
@@ -217,27 +217,27 @@ class Media:
         """Return whether light enters bodies: (n,), by `cosines` between normals and light."""
         return np.asarray((cosines < 0) != self._inwards[kinds])
 
-    def stack_at(self, caster: SceneCaster, light: Rays) -> MediaStack:
+    def stack_at(self, caster: SceneCaster, rays: MediaRays) -> MediaStack:
         """Return the media around the origins of light."""
-        stack = MediaStack.none(len(light.origins))
-        in_bounds = np.zeros(len(light.origins), np.bool_)
+        stack = MediaStack.none(len(rays.origins))
+        in_bounds = np.zeros(len(rays.origins), np.bool_)
         if not len(in_bounds):
             return stack
-        lower = light.origins.min(axis=0)
-        upper = light.origins.max(axis=0)
+        lower = rays.origins.min(axis=0)
+        upper = rays.origins.max(axis=0)
         overlapping = ((self._bounds[:, 0] <= upper) & (self._bounds[:, 1] >= lower)).all(axis=1)
         for box_min, box_max in self._bounds[overlapping]:
-            in_bounds |= ((light.origins >= box_min) & (light.origins <= box_max)).all(axis=1)
+            in_bounds |= ((rays.origins >= box_min) & (rays.origins <= box_max)).all(axis=1)
         rows = np.flatnonzero(in_bounds)
         if not len(rows):
             return stack
         # Most rays start at the same position and time as the ray before.
-        origins = light.origins[rows]
-        times = light.times[rows]
+        origins = rays.origins[rows]
+        times = rays.times[rows]
         first_of_run = np.ones(len(rows), np.bool_)
         first_of_run[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
         searched = self._search(
-            caster, origins[first_of_run], times[first_of_run], light.actor_trajectories
+            caster, origins[first_of_run], times[first_of_run], rays.actor_trajectories
         )
         search_rows = np.cumsum(first_of_run) - 1
         stack.kinds[rows] = searched.kinds[search_rows]
@@ -293,12 +293,12 @@ class Media:
         surrounding.surround(probe_indices[leaving], kinds[leaving], triangles[leaving])
 
     def initial_state(
-        self, caster: SceneCaster, light: Rays, depths: Floats | None
+        self, caster: SceneCaster, rays: MediaRays, depths: Floats | None
     ) -> LightInMedia:
         """Return the state of light at its origin, with optical depths to a leaf `depths` (n,)."""
-        stack = self.stack_at(caster, light)
+        stack = self.stack_at(caster, rays)
         differentials = (
-            RayDifferentials.from_directions(light.directions, self.index(stack))
+            RayDifferentials.from_directions(rays.directions, self.index(stack))
             if self.refracts
             else None
         )
@@ -353,11 +353,13 @@ class Media:
 
 
 class LightInGrids(NamedTuple):
-    """Light among all that passes grids of voxels: arrays (k,)."""
+    """Light among all light that passes grids of voxels: arrays (k,)."""
 
     row_indices: Indices  # rows of the light
     metres: Floats  # metres to the leaf that the light meets; inf without a leaf
     remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
+    # (k, MAX_MEDIA): optical depth per metre; of a grid in the voxel where light meets a leaf, or 0
+    density: Floats
 
 
 class Refraction(NamedTuple):
@@ -427,6 +429,7 @@ class LightInMedia:
         if self.media.grids is not None:
             starts = origins + starts_m[:, None] * directions
             passage = self._pass_grids(starts, directions, length, density)
+            density[passage.row_indices] = passage.density
         cumulative = np.cumsum(density, axis=1)
         rows, metres = self._advance_to_leaves(cumulative[:, -1], length, passage)
         layer = _crown_layers(draw(CROWN, ray[rows]), cumulative[rows])
@@ -457,11 +460,10 @@ class LightInMedia:
     def _pass_grids(
         self, starts: Floats, directions: Floats, length: Floats, density: Floats
     ) -> LightInGrids:
-        """Follow light through grids of voxels, and write their densities into `density`.
+        """Follow light through grids of voxels, and return the passage with new densities.
 
-        Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. Before, `density`
-        (n, MAX_MEDIA) has the optical depth per metre of grids for a leaf area density of 1 m²/m³;
-        afterwards, for the voxel where light meets a leaf, or 0. Other media keep their values.
+        Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. `density`
+        (n, MAX_MEDIA) is the optical depth per metre; of a grid for a leaf area density of 1 m²/m³.
         """
         grids = self.media.grids
         stack = self.stack
@@ -488,8 +490,7 @@ class LightInMedia:
             is_grid, grid_density, np.take_along_axis(media_density, grid_layers, 1)
         )
         np.put_along_axis(media_density, grid_layers, layer_density, 1)
-        density[rows] = media_density
-        return LightInGrids(rows, metres, remaining_depth)
+        return LightInGrids(rows, metres, remaining_depth, media_density)
 
     def advance(self, step: Floats) -> None:
         """Move the light straight on by steps (n,), metres."""

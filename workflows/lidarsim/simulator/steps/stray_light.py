@@ -17,7 +17,7 @@ from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...scene.scene import Scene
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, light_of
+from ..casting.surfaces import Surfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
 from .detection import passes
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -44,7 +44,7 @@ class StrayLightStep(PulseStep):
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        self._sensor_light = light_of(setup.survey, setup.sensor)
+        self._sensor_light = sensor_light_of(setup.survey, setup.sensor)
         self._clusters = [*_retro_clusters(setup.scene, surfaces, caster.unseen)]
 
     @staticmethod
