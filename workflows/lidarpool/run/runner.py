@@ -229,7 +229,7 @@ class Run(Generic[R]):
         self.cluster = Cluster(first, store, options, self.screen, enter, self._local)
         dataset = self.output.dataset
         self.page.follow(self.cluster.partitions, dataset)
-        listeners = Listeners(self._frame, self._parts)
+        listeners = Listeners(self._frame, self._on_parts)
         self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, listeners)
         with self.screen.progress() as show:
             self.loop.run(first, show)
@@ -239,7 +239,7 @@ class Run(Generic[R]):
         if self._on_frame is not None:
             self._on_frame(frame)
 
-    def _parts(self, receipts: Sequence[Receipt]) -> None:
+    def _on_parts(self, receipts: Sequence[Receipt]) -> None:
         self.page.on_parts(receipts)
         self.output.on_parts(receipts)
 

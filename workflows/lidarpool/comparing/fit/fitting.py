@@ -173,8 +173,8 @@ def _with_performance(
 ) -> SensorModel:
     """Return a sensor with estimates in its performance.
 
-    `estimates` is `Measured.estimates`. Figures without estimates stay. The figures of range noise go together: an estimate of one replaces all of these, and
-    `precision`.
+    `estimates` is `Measured.estimates`. Figures without estimates stay. The figures of range noise
+    go together: an estimate of one replaces all of these, and `precision`.
     """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()

@@ -54,7 +54,7 @@ class _EarlierDatabase(NamedTuple):
 
     db: RunDatabase | None = None  # open; None if no result is committed
     mark: str = ""  # mark of a run without committed results
-    parts: str = ""  # location of the parts of such a run
+    parts_location: str = ""  # location of its parts; empty for the folder of the run
     damage: DamagedError | None = None  # why the database cannot be read
 
 
@@ -174,7 +174,7 @@ class RunStore:
             if db.used:
                 return _EarlierDatabase(db)
             db.close()
-            return _EarlierDatabase(mark=db.meta["mark"], parts=db.meta.get("parts", ""))
+            return _EarlierDatabase(mark=db.meta["mark"], parts_location=db.meta.get("parts", ""))
         except DamagedError as error:
             return _EarlierDatabase(damage=error)
         except LidarError as error:  # the user does not know the local copy of a database
@@ -207,7 +207,7 @@ class RunStore:
             reason = str(earlier.damage).replace(self._folder.url, self.location.url)
             raise LidarError(reason) from earlier.damage
         if self.lasting:
-            _remove(self.location, parts_of(self.location, earlier.parts), earlier.mark)
+            _remove(self.location, parts_of(self.location, earlier.parts_location), earlier.mark)
 
     def _read_mark(self, parts_location: str | Path | Storage | None) -> dict[str, str] | None:
         """Return the first values of this run's database, from the folder of its parts."""

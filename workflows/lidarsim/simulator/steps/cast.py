@@ -246,15 +246,17 @@ class CastStep(PulseStep):
         """
         cast, rays = self._cast_first(batch)
         first_light = cast.light
-        parts: list[VisibleHits] = []
+        hits_by_pass: list[VisibleHits] = []
         for _ in range(MAX_LEAFY_PASSES if self._leafy else MAX_PASSES):
             surface_hits = self._surface_hits(cast, batch)
-            parts.append(self._visible_hits(cast.light, surface_hits))
-            onward = self._continue(cast.light, surface_hits, parts[-1], batch.subrays_per_beam)
+            hits_by_pass.append(self._visible_hits(cast.light, surface_hits))
+            onward = self._continue(
+                cast.light, surface_hits, hits_by_pass[-1], batch.subrays_per_beam
+            )
             if onward is None:
                 break
             cast = self._cast_again(onward, batch.subray_poses.actor_trajectories)
-        return self._join(batch, parts, rays, first_light)
+        return self._join(batch, hits_by_pass, rays, first_light)
 
     @property
     def _leafy(self) -> bool:
