@@ -2,7 +2,9 @@
 
 Three things make a reader search: a name that does not say what its value is (`found`, `own`), a
 docstring whose first line has a pronoun where a noun belongs, and several assignments on one line.
-Each source root has limits for their shares, which well-kept projects stay below.
+Each source root has limits for their shares, which well-kept projects stay below. A call with seven
+or more arguments by position makes a reader count; all source roots together may have a few, such
+as launches of CUDA kernels, signatures of compiled loops, and packed headers of packets.
 
 Sentences with more than one fact cost time, too. `HABITS` are wordings of such sentences. A comment
 behind code that begins with `FRAGMENT` makes the reader find the noun in the code. Packages in
@@ -25,11 +27,14 @@ SOURCE_ROOTS = ("kernels", "scheduler", "workflows")
 MAX_VAGUE_PERCENT = 3.0  # of all names that are assigned or defined
 MAX_PRONOUN_PERCENT = 12.0  # of all docstrings
 MAX_PACKED_PER_1000_LINES = 2.0
+MANY_POSITIONAL = 7  # arguments by position that a reader must count
+MAX_POSITIONAL_CALLS = 20  # calls with so many arguments by position, in all source roots
 
 # Packages whose docstrings and comments say one fact a sentence.
 PLAIN_PACKAGES = (
     "kernels/raybeam",
     "scheduler/poolpart",
+    "workflows/lidarpool",
     "workflows/lidarscenes",
     "workflows/lidarsim",
     "workflows/lidarview",
@@ -97,6 +102,29 @@ def packed_assignments(tree: ast.Module) -> Iterator[int]:
             names = {ast.unparse(target) for target in targets.elts}
             if names != {ast.unparse(value) for value in node.value.elts}:
                 yield node.lineno
+
+
+def positional_calls(tree: ast.Module) -> Iterator[int]:
+    """Yield lines of calls with `MANY_POSITIONAL` or more arguments by position."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            positional = [part for part in node.args if not isinstance(part, ast.Starred)]
+            if len(positional) >= MANY_POSITIONAL:
+                yield node.lineno
+
+
+def check_calls(listing: bool) -> bool:
+    """Print the number of calls with many positional arguments; return True if few."""
+    findings = [
+        f"{path.relative_to(ROOT).as_posix()}:{line}: call with many arguments by position"
+        for root in SOURCE_ROOTS
+        for path in sorted((ROOT / root).rglob("*.py"))
+        for line in positional_calls(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    print(f"{len(findings)} calls with {MANY_POSITIONAL} or more arguments by position")
+    if listing:
+        print("\n".join(findings))
+    return len(findings) <= MAX_POSITIONAL_CALLS
 
 
 def check(root: str, listing: bool) -> bool:
@@ -212,10 +240,11 @@ def check_sentences(package: str, listing: bool) -> bool:
 
 
 def main() -> None:
-    """Check each source root and package, and exit with 1 if a measure is above its limit."""
+    """Check source roots, packages and calls, and exit with 1 if a measure is above its limit."""
     listing = "--list" in sys.argv[1:]
     passed = [check(root, listing) for root in SOURCE_ROOTS]
     are_plain = [check_sentences(package, listing) for package in PLAIN_PACKAGES]
+    has_few_calls = check_calls(listing)
     if not all(passed):
         sys.exit(
             f"limits: {MAX_VAGUE_PERCENT:g} % vague names, {MAX_PRONOUN_PERCENT:g} % docstrings "
@@ -224,6 +253,11 @@ def main() -> None:
         )
     if not all(are_plain):
         sys.exit("say one fact a sentence; `python .ci/readability.py --list` prints where")
+    if not has_few_calls:
+        sys.exit(
+            f"at most {MAX_POSITIONAL_CALLS} calls may have so many arguments by position: name "
+            "arguments; `python .ci/readability.py --list` prints where"
+        )
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def compare_halves(recording: Recording, model: str | None, white: float | None)
     steps = np.abs(np.diff(light, axis=0)) / np.sqrt(2) / np.maximum(rays.intensity, 1)
     spread = {"recorded": float(np.nanmedian(steps) / 0.6745)}
     lost = {name: float(np.isnan(values).mean()) for name, values in ranges.items()}
-    lost["recorded"] = 1 - rays.returns.sum() / rays.trials.sum()  # without gaps
+    lost["recorded"] = 1 - rays.return_counts.sum() / rays.trials.sum()  # without gaps
     return Comparison({name: deviations(v) for name, v in ranges.items()}, lost, spread)
 
 

@@ -247,7 +247,7 @@ def large(session: Session) -> Rows:
         rays_per_pose=len(directions),
         keep_every=keep_every,
     )
-    hits_per_revolution = int(caster.scan(Pattern(directions), MIDDLE).hits.sum())
+    hits_per_revolution = int(caster.scan(Pattern(directions), MIDDLE).hit_counts.sum())
     last = []
     start = time.perf_counter()
     hits, _ = caster.visit(scan, lambda hits: last.append(hits.ray[-1:]))

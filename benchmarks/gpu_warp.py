@@ -61,7 +61,7 @@ def mujoco(session: Session, device: str = "cuda:0") -> Rows:
     caster = RayCaster(vertices, faces, backend="cuda")
     casts = {
         "MuJoCo-LiDAR": mujoco_cast,
-        "raybeam": lambda: int(caster.engine.scan(scan).hits.sum()),
+        "raybeam": lambda: int(caster.engine.scan(scan).hit_counts.sum()),
     }
     for name, cast in casts.items():
         hits = cast()

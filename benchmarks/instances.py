@@ -111,7 +111,7 @@ def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> d
     hits = 0
     for position in (positions[0], *positions):  # the first twice: to warm up
         start = time.process_time()
-        hits += int(caster.scan(pattern, position).hits.sum())
+        hits += int(caster.scan(pattern, position).hit_counts.sum())
         seconds.append(time.process_time() - start)
     return {
         "triangles": trees * leaves + 2,

@@ -27,7 +27,7 @@ CAST = np.dtype(
         ("delays", "i8"),  # float64 (rays_per_pose,), seconds after the pose's time
         ("velocities", "i8"),  # float64 (3, poses), metres a second
         ("rates", "i8"),  # float64 (3, poses): angular rates, radians a second
-        ("rows", "i8"),  # number of beams
+        ("beam_count", "i8"),  # number of beams
         ("poses", "i8"),  # number of poses
         ("rays_per_pose", "i8"),
         ("first", "i8"),  # row of ray 0 in the pattern, counted in sub-rays
@@ -154,7 +154,7 @@ class Cast:
             record["delays"] = self.address_of(motion.delays)
             record["velocities"] = self.address_of(motion.velocities.T)
             record["rates"] = self.address_of(motion.rates.T)
-        record["rows"] = len(directions)
+        record["beam_count"] = len(directions)
         record["poses"] = len(poses)
         record["rays_per_pose"] = poses.rays_per_pose
         record["first"] = first

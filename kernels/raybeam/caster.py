@@ -322,7 +322,7 @@ class RayCaster:
         >>> down = Pattern([[0, 0, -1], [0.1, 0, -1]])
         >>> track = [[1, 1, 3], [2, 1, 3], [3, 1, 3]]
         >>> hits = caster.scan(down, track, window=(0, 6), rays_per_pose=2, keep_every=2)
-        >>> hits.ray.tolist(), hits.hits.tolist()
+        >>> hits.ray.tolist(), hits.hit_counts.tolist()
         ([0, 2, 4], [6])
         """
         return self.engine.scan(

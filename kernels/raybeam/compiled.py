@@ -232,6 +232,7 @@ def part(signature: Any) -> Callable[[Any], Any]:
     """Compile a function that compiled code calls by its address.
 
     As a stage it would be compiled again with each of its callers, and with the callers of these.
+    Callers pass all arguments by position, since an address does not come with names.
     """
 
     def make(function: Any) -> Any:
@@ -276,6 +277,6 @@ def _inner(function: Any, **options: Any) -> Any:
     dispatcher = njit(error_model="numpy", **wrappers, **options)(function)
     get_template = dispatcher.get_call_template
     dispatcher.get_call_template = lambda args, keywords: get_template(
-        tuple(map(unliteral, args)), keywords
+        tuple(map(unliteral, args)), {name: unliteral(kind) for name, kind in keywords.items()}
     )
     return dispatcher

@@ -215,14 +215,14 @@ class CudaBackend(Backend):
             max_hits = -(-len(scan) // scan.keep_every) + len(scan.groups)
             transfer = HitTransfer(self._cupy, max_hits, nested=self._scene.nested)
             try:
-                hits, counted = self.visit(scan, transfer.send)
+                hit_counts, counted = self.visit(scan, transfer.send)
             finally:  # else the device would write to memory that goes back to the pool
                 ray, distance, triangle, instance = transfer.finish()
         tally = None
         if counted is not None:
             tally = np.zeros(self._scene.face_count, np.int64)
             tally[counted[0]] = counted[1]
-        return ScanReturns(ray, distance, triangle, hits, tally, instance)
+        return ScanReturns(ray, distance, triangle, hit_counts, tally, instance)
 
     def visit(
         self,
@@ -251,7 +251,7 @@ class CudaBackend(Backend):
             except BaseException:  # the device still writes to the counts of the next chunk
                 cp.cuda.get_current_stream().synchronize()
                 raise
-            return groups.hits, self._nonzero_counters(counting[2]) if scan.tally else None
+            return groups.hit_counts, self._nonzero_counters(counting[2]) if scan.tally else None
 
     def device_nearest(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float

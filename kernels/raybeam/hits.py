@@ -61,7 +61,7 @@ class ScanReturns:
         float64 (k,): as in `Hits`, metres.
     triangle
         int32 (k,): as in `Hits`.
-    hits
+    hit_counts
         int64 (g,): number of hits of each group, kept or not.
     tally
         int64 (face_count,): hits of each triangle, kept or not, whichever instance shows it: the
@@ -74,7 +74,7 @@ class ScanReturns:
     ray: UInts32
     distance: Floats
     triangle: Ints32
-    hits: Ints
+    hit_counts: Ints
     tally: Ints | None
     instance: Ints32
 

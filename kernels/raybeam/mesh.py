@@ -91,11 +91,8 @@ class LocalMesh:
     ----------
     frame
         Local coordinates of the mesh.
-    points, rows
-        Vertices, float64 (v, 3), local; and the rows of the three vertices of each triangle,
-        int64 (k, 3), without triangles that have no area.
     corners
-        float64 (k, 3, 3), local: triangle, corner, coordinate.
+        float64 (k, 3, 3), local: triangle, corner, coordinate, without triangles that have no area.
     index
         int32 (k,): row of each triangle in the `faces` of the caller.
     face_count
@@ -105,8 +102,6 @@ class LocalMesh:
     """
 
     frame: Frame
-    points: Floats
-    rows: Ints
     corners: Floats
     index: Ints32
     face_count: int
@@ -144,7 +139,6 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
         raise ValueError("No triangle of the mesh has an area: there is nothing to hit.")
     face_count = len(rows)
     if len(index) < face_count:
-        rows = rows[has_area]
         corners = corners[has_area]
     by_triangle = corners.reshape(-1, 9)
     lower = by_triangle.min(axis=0).reshape(3, 3).min(axis=0) - PAD
@@ -153,8 +147,6 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     checked = None if opacity is None else check_opacity(opacity, face_count, index)
     return LocalMesh(
         frame=frame,
-        points=points,
-        rows=rows,
         corners=corners,
         index=index,
         face_count=face_count,

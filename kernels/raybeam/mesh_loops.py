@@ -100,7 +100,9 @@ def weigh(  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
             record = int64s(address)
             mesh_address = record[memory.MESH_FIELD]
             row = row - record[memory.FIRST_ROW_FIELD]
-            ox, oy, oz, dx, dy, dz, _ = enter_instance(float64s(address), ox, oy, oz, dx, dy, dz)
+            ox, oy, oz, dx, dy, dz, _ = enter_instance(
+                float64s(address), ox=ox, oy=oy, oz=oz, dx=dx, dy=dy, dz=dz
+            )
         axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
         corners = corners_of(float64s(int64s(mesh_address)[0]), row, axis)
         a, b, c, det, _ = areas(corners, (p, q, r, sx, sy, sz))

@@ -402,11 +402,11 @@ def _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs):  # type: ig
         pose = (poses[0, p], poses[1, p], poses[2, p]), pose_rotation(poses, p)
         ray = rays.ctypes.data + 8 * first
         (x, y, z), radius = _sphere_around(corners, pose, pads[pair])
-        if not _near_sphere(ray, count, x, y, z, radius, near.ctypes.data):
+        if not _near_sphere(ray, count, x=x, y=y, z=z, radius=radius, near=near.ctypes.data):
             continue
         for k in range(begin, end):
             if near[k - first] and _ray_passes_box(
-                ray, count, k - first, reaches[k], pose, corners, pads[pair]
+                ray, count, k - first, reach=reaches[k], pose=pose, corners=corners, pad=pads[pair]
             ):
                 ray_pairs[0, written] = k
                 ray_pairs[1, written] = pair
@@ -445,5 +445,5 @@ def rays_through_boxes(
         # A ray that ends at NaN passes no box.
         reaches = np.concatenate([reaches, np.full(CELL - len(reaches), np.nan)])
     near = np.empty(CELL, np.int64)
-    count = _pair_rays(rays, reaches, pairs, poses, boxes, near, ray_pairs)
+    count = _pair_rays(rays, reaches, pairs, poses, boxes, near=near, ray_pairs=ray_pairs)
     return ray_pairs[0, :count], ray_pairs[1, :count]

@@ -132,14 +132,16 @@ class _Pairs:
     node: Indices
     enter: Floats32
 
-    def select(self, rows: Indices) -> _Pairs:
+    def select(self, row_indices: Indices) -> _Pairs:
         """Return the pairs in rows.
 
         Rows are distinct, so as many rows as pairs select all.
         """
-        if len(rows) == len(self.ray):
+        if len(row_indices) == len(self.ray):
             return self
-        return _Pairs(self.ray.take(rows), self.node.take(rows), self.enter.take(rows))
+        return _Pairs(
+            self.ray.take(row_indices), self.node.take(row_indices), self.enter.take(row_indices)
+        )
 
 
 class _Nodes:

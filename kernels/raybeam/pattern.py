@@ -90,7 +90,7 @@ class Pattern:
             self.offsets = np.ascontiguousarray(np.asarray(offsets, np.float64).T)
 
     def divided(
-        self, sub_rays: SubRays, offsets: Floats | None = None, rows: Ints | None = None
+        self, sub_rays: SubRays, offsets: Floats | None = None, beam_indices: Ints | None = None
     ) -> Pattern:
         """Return a copy with sub-rays, of all beams or of the rows (m,), without another check.
 
@@ -99,10 +99,10 @@ class Pattern:
         """
         _ = self.step  # guessed here for all copies: takes as long as 5,000 rays
         pattern = copy(self)
-        if rows is not None:
-            pattern._directions = self._directions.take(rows, axis=1, mode="wrap")
+        if beam_indices is not None:
+            pattern._directions = self._directions.take(beam_indices, axis=1, mode="wrap")
             if self._origins is not None:
-                pattern._origins = self._origins.take(rows, axis=1, mode="wrap")
+                pattern._origins = self._origins.take(beam_indices, axis=1, mode="wrap")
         pattern.sub_rays = sub_rays
         pattern.offsets = None if offsets is None else np.ascontiguousarray(offsets.T)
         return pattern

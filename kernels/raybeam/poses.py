@@ -235,9 +235,9 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
     )
 
 
-def determinants(rows: Floats) -> Floats:
+def determinants(matrix_rows: Floats) -> Floats:
     """Return the determinants (k,) of matrices by rows (3, 3, k)."""
-    (a, b, c), (d, e, f), (g, h, i) = rows
+    (a, b, c), (d, e, f), (g, h, i) = matrix_rows
     return np.asarray((a * (e * i - f * h) - b * (d * i - f * g)) + c * (d * h - e * g))
 
 

@@ -150,7 +150,7 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
     shares = float64s(cast.shares)
     offsets = float64s(cast.offsets)
     directions = float64s(cast.directions)
-    rows = cast.rows
+    rows = cast.beam_count
     lanes = cast.lanes_per_beam
     row_of = row_at(ROW, rays)
     origin = row_at(OX, rays)
@@ -201,7 +201,7 @@ def _make_lone_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # no
     shares = float64s(cast.shares)
     offsets = float64s(cast.offsets)
     directions = float64s(cast.directions)
-    rows = cast.rows
+    rows = cast.beam_count
     row_of = row_at(ROW, rays)
     origin = row_at(OX, rays)
     target = row_at(DX, rays)
@@ -394,7 +394,7 @@ def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
     if not has_starts:
         _clear_origins(tile, rays)
     if cast.origins != 0:
-        _add_to_origins(tile, rays, cast.origins, cast.rows, ROW)
+        _add_to_origins(tile, rays, cast.origins, cast.beam_count, ROW)
     if cast.origins != 0 or has_starts:
         if cast.rotations != 0:
             _rotate(tile, rays, OX, cast.rotations, cast.poses)
@@ -443,7 +443,7 @@ def _copy_out(tile, rays, first_row, address, total, count):  # type: ignore[no-
 @inlined
 def first_ray(cast, ray):  # type: ignore[no-untyped-def]
     """Return the `FirstRay` of a call, by the number of its first ray in the scan."""
-    total = cast.rows * cast.subrays
+    total = cast.beam_count * cast.subrays
     rays_per_pose = cast.rays_per_pose
     pose = ray // rays_per_pose
     within = ray - pose * rays_per_pose
@@ -462,7 +462,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     cast = carray(casts_at(address), 1)[0]
     tile = cast.tile
     first = first_ray(cast, start)
-    _find_rows(tile, rays, first.row, cast.rows * cast.subrays)
+    _find_rows(tile, rays, first.row, cast.beam_count * cast.subrays)
     if cast.poses > 1 or cast.delays != 0:
         _find_poses(tile, rays, first, cast.rays_per_pose, cast.poses)
     if cast.shares != 0:
@@ -471,7 +471,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
         else:
             _make_sub_rays(tile, rays, cast)
     else:
-        _look_up_beams(tile, rays, cast.directions, cast.rows)
+        _look_up_beams(tile, rays, cast.directions, cast.beam_count)
     if cast.rotations != 0:
         _rotate(tile, rays, DX, cast.rotations, cast.poses)
     if cast.delays != 0:

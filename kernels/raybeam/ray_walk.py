@@ -96,8 +96,22 @@ def _start_of_ray(floats, k, rays):  # type: ignore[no-untyped-def]  # noqa: PLR
     near_z = 16 if iz >= 0 else 40
     # So far away, the start is off by more than the margins of the test in float32.
     undecided = -1 if entry > _MAX_ENTRY else 0
-    d = np.float32(dx), np.float32(dy), np.float32(dz)
-    return _Start(entry, x, y, z, *d, ix, iy, iz, near_x, near_y, near_z, undecided)
+    return _Start(
+        entry=entry,
+        x=x,
+        y=y,
+        z=z,
+        dx=np.float32(dx),
+        dy=np.float32(dy),
+        dz=np.float32(dz),
+        ix=ix,
+        iy=iy,
+        iz=iz,
+        near_x=near_x,
+        near_y=near_y,
+        near_z=near_z,
+        undecided=undecided,
+    )
 
 
 @inlined
@@ -222,8 +236,10 @@ def walk_by_one(tile, rays, ray, first_row, mesh, instance, waiting):  # type: i
             continue
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
-            count = _open_node_for_one(tile, address, nodes, code, start, limit, count)
-        elif _test_leaf_by_one(tile, rays, ray, mesh, instance, ~code, start):
+            count = _open_node_for_one(
+                tile, address, nodes, node=code, start=start, limit=limit, count=count
+            )
+        elif _test_leaf_by_one(tile, rays, ray, mesh, instance, code=~code, start=start):
             limit = _limit_of(floats[t_at] * length, entry)
 
 
@@ -236,12 +252,12 @@ def _enter(tile, rays, ray, instance):  # type: ignore[no-untyped-def]  # noqa: 
     i = row_at(IX, rays) + ray
     ox, oy, oz, dx, dy, dz, length = enter_instance(
         float64s(instance),
-        floats[k],
-        floats[k + rays],
-        floats[k + 2 * rays],
-        floats[k + 3 * rays],
-        floats[k + 4 * rays],
-        floats[k + 5 * rays],
+        ox=floats[k],
+        oy=floats[k + rays],
+        oz=floats[k + 2 * rays],
+        dx=floats[k + 3 * rays],
+        dy=floats[k + 4 * rays],
+        dz=floats[k + 5 * rays],
     )
     floats[i] = ox
     floats[i + rays] = oy
@@ -280,7 +296,9 @@ def walk_instances_by_one(tile, rays, ray, nodes, instances):  # type: ignore[no
             continue
         code = np.int64(codes[ENTRY * count + 1])
         if code >= 0:
-            count = _open_node_for_one(tile, address, nodes, code, start, limit, count)
+            count = _open_node_for_one(
+                tile, address, nodes, node=code, start=start, limit=limit, count=count
+            )
             continue
         number = ~code >> LEAF_BITS
         record = instances + INSTANCE_BYTES * number

@@ -150,7 +150,7 @@ class Groups:
     def __init__(self, starts: Ints, keep_every: int) -> None:
         self._starts = starts
         self.keep_every = keep_every
-        self.hits = np.zeros(len(starts), np.int64)  # hits of each group so far
+        self.hit_counts = np.zeros(len(starts), np.int64)  # hits of each group so far
 
     def spans(self, start: int, stop: int) -> tuple[slice, Ints]:
         """Find the groups that rays `start` to `stop` belong to.
@@ -181,8 +181,8 @@ class Groups:
             the number of hits to keep.
         """
         # Hits in the chunks before: not 0 for the first group.
-        earlier_hits = self.hits[groups].copy()
-        self.hits[groups] += counts
+        earlier_hits = self.hit_counts[groups].copy()
+        self.hit_counts[groups] += counts
         first_kept = -earlier_hits % self.keep_every
         return first_kept, np.maximum(-((first_kept - counts) // self.keep_every), 0)
 
@@ -232,14 +232,14 @@ class Collector(Groups):
         if len(first_kept) == 1:
             return np.arange(first_kept[0], len(ray), self.keep_every)
         offset = cuts[:-1] + first_kept - self.keep_every * (np.cumsum(kept_counts) - kept_counts)
-        rows: Indices = np.repeat(offset, kept_counts)
-        rows += self.keep_every * np.arange(len(rows))
-        return rows
+        row_indices: Indices = np.repeat(offset, kept_counts)
+        row_indices += self.keep_every * np.arange(len(row_indices))
+        return row_indices
 
-    def tally(self, rows: Integers) -> None:
+    def tally(self, tally_indices: Integers) -> None:
         """Count the hits of a chunk by their rows (m,) in the tally, if there is a tally."""
         if self._tally is not None:
-            np.add.at(self._tally, rows.astype(np.intp), 1)
+            np.add.at(self._tally, tally_indices.astype(np.intp), 1)
 
     def add(
         self,
@@ -257,4 +257,4 @@ class Collector(Groups):
     def result(self) -> ScanReturns:
         """Return the result of all chunks."""
         ray, distance, triangle, instance = join_hits(self._parts)
-        return ScanReturns(ray, distance, triangle, self.hits, self._tally, instance)
+        return ScanReturns(ray, distance, triangle, self.hit_counts, self._tally, instance)

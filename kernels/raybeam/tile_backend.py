@@ -122,7 +122,7 @@ class TileBackend(Backend):
         if len(origins) > 1:
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
-        self._weigh(cast.record, origins, directions, row, instance, u, v)
+        self._weigh(cast.record, origins, directions, row, instance, u=u, v=v)
         t = distance * self._scene.frame.scale  # local; exact, since the scale is a power of two
         return ClosestHits(ray, t, self._index[row], u, v, instance)
 

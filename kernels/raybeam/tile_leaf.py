@@ -221,7 +221,9 @@ def test_leaf(tile, rays, mesh, instance, code, mask, deepest):  # type: ignore[
         axis = numbers[eight_at + (ray >> 3)]
         if axis >= 0 and opaque:
             key = instance + np.int64(order[position])
-            hits = decide_four(tile, rays, ray, axis, corners, position, key)
+            hits = decide_four(
+                tile, rays, ray, axis=axis, corners=corners, position=position, key=key
+            )
         else:
             hits = np.int64(0)
             left = survivor & 15

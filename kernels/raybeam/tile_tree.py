@@ -91,11 +91,11 @@ def _nodes(tree: WideTree, child: Ints32) -> Floats32:
     return nodes
 
 
-def _aligned(rows: int, columns: int) -> Floats32:
+def _aligned(row_count: int, columns: int) -> Floats32:
     """Return float32 zeros (rows, columns) that start at a line of the cache."""
-    memory = np.zeros(rows * columns + 16, np.float32)
+    memory = np.zeros(row_count * columns + 16, np.float32)
     start = -memory.ctypes.data % 64 // 4
-    return memory[start : start + rows * columns].reshape(rows, columns)
+    return memory[start : start + row_count * columns].reshape(row_count, columns)
 
 
 @compiled()

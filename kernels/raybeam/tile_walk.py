@@ -167,7 +167,9 @@ def walk(tile, rays, mesh, instance, mask):  # type: ignore[no-untyped-def]
         if subtiles == 0:
             continue
         if code >= 0:
-            count = _open_node(tile, nodes, blocks, code, subtiles, deepest, count)
+            count = _open_node(
+                tile, nodes, blocks, node=code, mask=subtiles, deepest=deepest, count=count
+            )
             continue
         leaves += 1
         if leaves > rays:
@@ -201,7 +203,9 @@ def list_instances(tile, nodes, mask):  # type: ignore[no-untyped-def]
         code = np.int64(codes[ENTRY * count + 1])
         subtiles = codes[ENTRY * count + 2]
         if code >= 0:
-            count = _open_node(tile, nodes, nodes, code, subtiles, deepest, count)
+            count = _open_node(
+                tile, nodes, nodes, node=code, mask=subtiles, deepest=deepest, count=count
+            )
         else:
             put(met, met_codes, met_count, near, ~code >> LEAF_BITS, subtiles)
             met_count += 1

@@ -216,7 +216,7 @@ def test_what_has_no_range_image_says_why():
     plain = Cloud(cloud().positions, {})
     for a, b, says in (
         (plain, cloud(), "cloud A has no rings: the range image needs a column ring or channel"),
-        (cloud(), Cloud(cloud().positions + 30, cloud().columns), "no cones around zero"),
+        (cloud(), Cloud(cloud().positions + 30, cloud().columns), "not cones around zero"),
         (cloud(), Cloud(cloud().positions * [1, 1, 9], cloud().columns), "not of the same sensor"),
     ):
         found = compare(a, b).figures
@@ -233,7 +233,7 @@ def test_of_many_points_and_cells_some_are_compared(monkeypatch):
     assert found["range_image"]["residual"]["rmse_m"] == pytest.approx(0.02, rel=0.07)
     assert "2,000 points and cells" in found["notes"][0]
     thin = compare(cloud(), cloud(), most_points=3000).figures
-    assert thin["a"]["points"] == 3000 and "11,520 points, of which 26 %" in thin["notes"][0]
+    assert thin["a"]["points"] == 3000 and "11,520 points; 26 % are compared" in thin["notes"][0]
 
 
 # -- formats --------------------------------------------------------------------------------------
@@ -365,7 +365,7 @@ def test_sweeps_of_data_sets(tmp_path, kind):
     found = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="front").figures
     assert found["pairs"] == found["a"]["sweeps"] == 15  # of five jobs
     assert found["distances"]["a_to_b"]["max_m"] == 0
-    assert "pairs of which one has no points are left out" in found["notes"]
+    assert "pairs with an empty sweep are left out" in found["notes"]
     other = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="rear/left", sweeps=[3]).figures
     assert other["pairs"] == 1 and other["distances"]["a_to_b"]["median_m"] > 1
 

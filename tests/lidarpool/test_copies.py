@@ -74,7 +74,7 @@ def test_a_list_gives_places_turns_and_factors(made):
     )
     linear = Pose((0, 0, 0), 30, 5).rotation * [1, 2, 0.5]
     assert np.allclose(scene.instances.transforms[2, :, :3], linear)
-    assert len(scene.instances.parts) == 1 and scene.triangles == 400 + 2 + 3 * 208
+    assert len(scene.instances.mesh_parts) == 1 and scene.triangles == 400 + 2 + 3 * 208
 
 
 @pytest.mark.extended
@@ -192,7 +192,7 @@ def test_a_file_is_read_once_for_all_entries(made, monkeypatch):
         module, "load_objects", lambda path, **more: read.append(path.name) or plain(path, **more)
     )
     scene = made(TREE | {"at": [[0, 0]]}, TREE | {"name": "Bush", "at": [[5, 0]]}).scene
-    assert read == ["land.glb", "tree.stl"] and len(scene.instances.parts) == 1
+    assert read == ["land.glb", "tree.stl"] and len(scene.instances.mesh_parts) == 1
     assert scene.names[2:] == ("Tree", "Bush")
 
 

@@ -82,7 +82,7 @@ def test_what_is_committed_is_there_once(db, job):
     for found in (job, read(again)):
         parts = found.parts
         assert [p.name for p in parts.ordered] == [one.name, two.name]
-        assert (parts.scans_done, parts.point_count, parts.hits) == (7, 9, 27)
+        assert (parts.scans_done, parts.point_count, parts.hit_count) == (7, 9, 27)
         assert parts.missing(0, SCANS) == [(5, 10), (12, SCANS)]
         assert found.missing_count == SCANS - 7 and not found.scans_complete
     again.close()
@@ -144,7 +144,7 @@ def test_parts_that_are_dropped_are_missing_again(db, job):
     again = reopened(db)
     for found in (job, read(again)):
         assert found.parts.missing(0, SCANS) == [(4, 8)]
-        counts = found.parts.scans_done, found.parts.point_count, found.parts.hits
+        counts = found.parts.scans_done, found.parts.point_count, found.parts.hit_count
         assert counts == (16, 14, 42)
     two = receipt(4, 6), receipt(6, 8)
     assert commit(again, found, *two) == [*two]
@@ -178,11 +178,11 @@ def test_frames_that_were_handed_out_are_kept_with_the_next_commit(db, job):
 
 
 def test_the_cells_of_all_parts(db, job):
-    assert job.parts.cells is None
+    assert job.parts.cell_box is None
     commit(db, job, receipt(0, 1, cells=()), receipt(1, 2, cells=(-5, 0, 3, 0, 9, 4)))
-    assert job.parts.cells.tolist() == [[-5, 0, 3], [0, 9, 4]]
+    assert job.parts.cell_box.tolist() == [[-5, 0, 3], [0, 9, 4]]
     commit(db, job, receipt(2, 3, cells=(0, -7, 3, 1, 1, 2**40)))
-    assert read(reopened(db)).parts.cells.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
+    assert read(reopened(db)).parts.cell_box.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
 
 
 def test_values_and_trials_come_back(db, job):

@@ -320,7 +320,7 @@ class Run:
             scans = list(job.scans)
             if job.has_frames:
                 assert [frame.scan for frame in self.frames[number]] == scans
-                assert [frame.hits for frame in self.frames[number]] == scans
+                assert [frame.hit_count for frame in self.frames[number]] == scans
             spans = sorted((part.first, part.stop) for part in self.committed[number])
             assert [scan for span in spans for scan in range(*span)] == scans
             for part in self.committed[number]:

@@ -104,7 +104,7 @@ def test_a_model_keeps_what_the_recording_does_not_tell(recording):
     stated = flat.model.performance
     assert stated.detection.range_m == 90 and stated.precision is None
     assert flat.model.firings_per_turn == 1024
-    assert "note: the recorded rings are not those of Livox Mid-40: check --model" in repr(
+    assert "note: the recorded rings are not the rings of Livox Mid-40: check --model" in repr(
         fit(recording, model="mid40")
     )
 

@@ -57,9 +57,9 @@ def test_what_is_packed_comes_back(first, counts):
     assert scans.tolist() == [s for s, n in enumerate(counts, first) for _ in range(n)]
     if len(part):
         axes = np.stack([part.columns[axis] for axis in "xyz"], axis=1)
-        assert again.cells.tolist() == [axes.min(axis=0).tolist(), axes.max(axis=0).tolist()]
+        assert again.cell_box.tolist() == [axes.min(axis=0).tolist(), axes.max(axis=0).tolist()]
     else:
-        assert again.cells is None
+        assert again.cell_box is None
 
 
 SMALL = part_of(3, [1, 2], columns=COLUMNS[:4])
@@ -169,7 +169,7 @@ def stored_cloud(storage, counts):
         parts.append(part_of(first, of_scans))
         storage.write(f"{number}.npz", pack(parts[-1]))
         first = parts[-1].stop
-    found = [part.cells for part in parts if part.cells is not None]
+    found = [part.cell_box for part in parts if part.cell_box is not None]
     cells = None
     if found:
         table = np.array(found)

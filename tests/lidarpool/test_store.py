@@ -553,7 +553,7 @@ def test_a_lost_database_is_made_again_from_the_parts(harm, folder, place):
     ) and "is made again" in again.notes[0]
     add(again, 2, 3), add(again, 5, 6)
     assert set(again.only_job.sample_rays()[:, 1, 0]) == {0, 2, 3, 5}
-    assert again.only_job.parts.hits == 12 == again.only_job.hit_counts().sum()
+    assert again.only_job.parts.hit_count == 12 == again.only_job.hit_counts().sum()
 
 
 def test_a_database_of_another_program_stays(folder):

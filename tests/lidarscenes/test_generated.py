@@ -82,7 +82,7 @@ def test_detailed_trees_and_cars_are_instances(furnished):
     assert {"Oak", "Oak.2"} <= set(furnished.names)
     kinds, _ = stripped(furnished, CARS)
     assert len(kinds) == 150 and set(kinds) == set(CARS)
-    assert len(furnished.instances) == 450 and len(furnished.instances.parts) == 8
+    assert len(furnished.instances) == 450 and len(furnished.instances.mesh_parts) == 8
     scales = np.cbrt(np.linalg.det(furnished.instances.transforms[:, :, :3]))
     assert (scales > 0.69).all() and (scales < 1.31).all()
     assert furnished.kept_triangles < 200_000 < furnished.triangles
@@ -97,7 +97,7 @@ def test_same_seed_same_trees_and_cars(tmp_path):
     one, same, other = (file.read_bytes() for file in files)
     assert one == same != other
     assert len(one) < 2_500_000
-    assert len(city(20_000, 3, trees=50).instances.parts) == 5
+    assert len(city(20_000, 3, trees=50).instances.mesh_parts) == 5
     assert any(name.startswith("tree-") for name in city(20_000, 3, cars=5).names)
 
 

@@ -154,6 +154,41 @@ def test_modes(mode):
     assert dual.distance.tolist() == [2.0, 7.0, 9.0]
 
 
+def test_a_surface_that_continues_takes_hits_between_its_hits():
+    """The example of `continue_surfaces`: a drop, ground at three sub-rays, and a post."""
+    from lidarsim.simulator.steps.pulse_loops import Neighbours
+    from lidarsim.simulator.steps.random_loops import RandomKeys
+    from lidarsim.simulator.steps.separation_loops import (
+        ALL,
+        Receiver,
+        ReturnArrays,
+        SubrayHits,
+        separate,
+    )
+
+    distance = np.array([10.0, 11.0, 12.2, 10.6])
+    down = -1 / distance[:3]
+    directions = np.array([*np.stack([np.sqrt(1 - down**2), 0 * down, down], axis=1), [1, 0, 0]])
+    normals = np.array([[0, 0, 1], [0, 0, 1], [0, 0, 1], [-1, 0, 0]], float)
+    pairs = np.array([[0, 1], [1, 2], [2, 3]])
+    found = ReturnArrays(*np.zeros((2, 5), np.int64), *np.zeros((3, 5)))
+    count = separate(
+        hits=SubrayHits(
+            np.arange(4), distance, np.array([1.0, 1, 1, 2]), np.zeros(0), np.ones(4, bool)
+        ),
+        air=SubrayHits(
+            np.zeros(1, np.int64), np.array([8.0]), np.array([0.4]), np.zeros(0), np.zeros(0, bool)
+        ),
+        neighbours=Neighbours(4, pairs, normals.T.copy(), directions.T.copy()),
+        receiver=Receiver(4, 0.3, ALL, False, 0.0, 0.0, 0.0, np.zeros(0)),
+        keys=RandomKeys(np.zeros(0, np.uint64), 0, np.zeros(1, np.int64), 0),
+        output=found,
+    )
+    assert count == 2 and found.row[:count].tolist() == [-1, 3]
+    assert found.distance[:count].tolist() == pytest.approx([8.0, 10.88])
+    assert found.energy[:count].tolist() == pytest.approx([0.1, 1.25])
+
+
 # -- glass and mirrors ---------------------------------------------------------------------------
 
 
@@ -258,7 +293,7 @@ def test_weak_returns_are_lost_by_the_model(distance):
     sigma = math.sqrt(MANY * share * (1 - share))
     assert abs(len(found["range"]) - MANY * share) < 3 * sigma + 2
     batch = found["batch"]
-    assert len(found["range"]) == batch.hits.sum() == tally_of([batch]).sum()
+    assert len(found["range"]) == batch.hit_counts.sum() == tally_of([batch]).sum()
 
 
 # -- the same bits however it is batched ----------------------------------------------------------
@@ -312,8 +347,8 @@ def test_returns_are_thinned_out_scan_by_scan():
     assert every["returns"].max() > 1
     for name in COLUMNS:
         assert np.array_equal(every[name][::3], third[name])
-    assert every["batch"].hits.tolist() == third["batch"].hits.tolist()
-    assert every["batch"].hits.sum() == len(every["ray"])
+    assert every["batch"].hit_counts.tolist() == third["batch"].hit_counts.tolist()
+    assert every["batch"].hit_counts.sum() == len(every["ray"])
 
 
 def test_one_subray_without_noise_is_the_plain_ray():

@@ -159,7 +159,7 @@ def test_mirrored_instances_and_many_places(tmp_path, backend):
         {"mesh": 0, "name": "Behind", "translation": [2, 0, 0], "scale": [1, 2, 2]},
     ]
     scene = load(tmp_path / "m.glb", header, body)
-    assert len(scene.instances.parts) == 1 and len(scene.instances) == 3
+    assert len(scene.instances.mesh_parts) == 1 and len(scene.instances) == 3
     solid = load(tmp_path / "m.glb", header, body, opacity="ignore")
     want = seen(solid, backend)
     got = seen(scene, backend)
@@ -424,7 +424,9 @@ def test_scenes_with_masks_are_written(tmp_path, suffix):
     if suffix == ".glb":
         assert read.masked == made.masked == made.names
         np.testing.assert_allclose(seen(read), seen(made), atol=2e-4)
-        assert len({id(part.mask) for part in read.instances.parts if part.mask is not None}) == 2
+        assert (
+            len({id(part.mask) for part in read.instances.mesh_parts if part.mask is not None}) == 2
+        )
         # Another reader finds the same, Y-up.
         other = trimesh.load(tmp_path / "m.glb", force="scene")
         materials = [getattr(shape.visual, "material", None) for shape in other.geometry.values()]

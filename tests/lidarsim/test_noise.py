@@ -185,9 +185,9 @@ def test_ranges_that_noise_moves_out_of_the_sensors_range_are_no_returns(keep_ev
         inside = (everything >= 0.5) & (everything <= 60.1)
         within = np.isin(made[0][1], rays)
         assert (~inside).sum() > 0 and np.array_equal(everything[within], ranges)
-        assert batch.hits.sum() == batch.tally[1].sum() == len(ranges)
+        assert batch.hit_counts.sum() == batch.tally[1].sum() == len(ranges)
     else:
-        assert batch.hits.sum() >= len(ranges) * keep_every - keep_every
+        assert batch.hit_counts.sum() >= len(ranges) * keep_every - keep_every
 
 
 def test_numbers_of_returns_count_those_within_the_sensors_range():
@@ -200,7 +200,7 @@ def test_numbers_of_returns_count_those_within_the_sensors_range():
     )  # fmt: skip
     [batch] = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
     count = np.bincount(batch.ray.astype(np.int64))
-    assert (batch.range <= 30.3).all() and batch.hits.sum() == len(batch)
+    assert (batch.range <= 30.3).all() and batch.hit_counts.sum() == len(batch)
     assert np.array_equal(batch.returns, count[batch.ray]) and {*count} == {1, 2}
     first = np.append(True, np.diff(batch.ray) > 0)
     assert (batch.return_number[first] == 1).all() and (batch.return_number[~first] == 2).all()

@@ -142,7 +142,7 @@ def test_each_sensor_of_a_survey_has_its_own_unseen_objects(kind, backend):
         for column in ("x", "y", "z", "ray", "object", "intensity", "triangle"):
             assert made[column].tobytes() == single[column].tobytes(), (name, column)
         assert np.array_equal(tally_of([batch]), tally_of([expected]))
-        assert int(tally_of([batch]).sum()) == int(batch.hits.sum()) > 100
+        assert int(tally_of([batch]).sum()) == int(batch.hit_counts.sum()) > 100
         seen = {scene.all_names[k] for k in np.unique(made["object"])}
         assert not seen & {*unseen[name]}
         assert {first, second, "Car"} - {*unseen[name]} <= seen

@@ -34,7 +34,7 @@ def test_fewer_triangles_cover_about_as_much(avenue, most):
     assert 0.9 * most < len(drawn.scene.faces) <= most
     assert np.ptp(sizes(drawn)) == 0
     area = triangle_areas(drawn.scene.vertices[drawn.scene.faces]).sum()
-    part = avenue.instances.parts[0]
+    part = avenue.instances.mesh_parts[0]
     whole = 40 * triangle_areas(part.vertices[part.faces]).sum()
     assert 0.6 * whole < area < 1.5 * whole
     # No branch that was made larger sticks out.
@@ -48,7 +48,7 @@ def test_what_is_near_the_sensors_has_more_triangles(avenue):
     place = np.array([[200.0, 3, 2], [205, 3, 2]])
     drawn = SimplifiedScene.from_scene(avenue, 40_000, [place])
     some = sizes(drawn)
-    assert some[20] == len(avenue.instances.parts[0].faces)
+    assert some[20] == len(avenue.instances.mesh_parts[0].faces)
     assert (np.diff(some[:20]) >= 0).all() and (np.diff(some[21:]) <= 0).all()
     assert some.min() == 500 and some.sum() <= 40_000 < 2 * some.sum()
     assert SimplifiedScene.from_scene(avenue, 40_000, [np.zeros((0, 3))]).scene.triangles <= 40_000
@@ -58,7 +58,7 @@ def test_what_is_near_the_sensors_has_more_triangles(avenue):
 def test_hits_are_shared_by_area(avenue):
     drawn = SimplifiedScene.from_scene(avenue, 40_000, [np.zeros((1, 3))])
     counts = np.arange(40.0)
-    hits = drawn.hits(counts)
+    hits = drawn.triangle_hit_counts(counts)
     assert np.bincount(drawn.scene.face_object, hits) == pytest.approx(counts)
 
 
@@ -84,8 +84,8 @@ def test_what_masks_leave_is_drawn(repeats):
     if repeats == 1:
         assert np.mean((middle[:, 0] < 1.01) & (middle[:, 1] < 0.76)) == 1
     counts = np.array([3.0, 4, 5])
-    shared = np.bincount(drawn.counter, drawn.hits(counts))
-    assert np.allclose(shared, np.bincount(before.counter, before.hits(counts)))
+    shared = np.bincount(drawn.counter, drawn.triangle_hit_counts(counts))
+    assert np.allclose(shared, np.bincount(before.counter, before.triangle_hit_counts(counts)))
     assert cut_masks(Scene.from_meshes([wall])).faces.shape == (2, 3)
 
 

@@ -163,7 +163,7 @@ def test_each_point_of_a_drive_is_new_once_and_all_of_stations_are_there(drive, 
     counts = []
 
     def frames(film):
-        counts[:] = [len(places) for places, _ in film.parts]
+        counts[:] = [len(places) for places, _ in film.new_points]
         return iter([np.zeros((54, 96, 3), np.uint8)] * len(counts))
 
     monkeypatch.setattr(Film, "frames", frames)

@@ -66,7 +66,7 @@ def test_a_visit_sees_what_a_scan_returns(vase, every):
     assert vase.on_device
     for got, name in zip(hits, ("ray", "distance", "triangle", "instance"), strict=True):
         np.testing.assert_array_equal(got, getattr(want, name))
-    assert counts.tolist() == want.hits.tolist()
+    assert counts.tolist() == want.hit_counts.tolist()
     assert rows.tolist() == np.flatnonzero(want.tally).tolist()
     assert counted.tolist() == want.tally[rows].tolist()
     pose = {"start": 700, "rays_per_pose": CASE["each"], "motion": CASE["motion"]}

@@ -134,7 +134,7 @@ def test_scans_and_tallies_of_many_instances(backend, shapes):
     hits = caster.cast([0, 0, 0], directions)
     scan = caster.scan(Pattern(directions), [0, 0, 0], keep_every=3, tally=True)
     ray = np.flatnonzero(hits.hit)
-    assert scan.hits.tolist() == [len(ray)]
+    assert scan.hit_counts.tolist() == [len(ray)]
     assert len(ray) > 2_000
     for name in ("distance", "triangle", "instance"):
         np.testing.assert_array_equal(getattr(scan, name), getattr(hits, name)[ray[::3]])

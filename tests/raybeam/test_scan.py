@@ -125,7 +125,7 @@ def check(caster, case, windows, limits):
         want = hits_of(caster, origins, directions, *limits)
         got = scanned(caster, case, window, t_min=limits[0], t_max=limits[1])
         same(got, want)
-        assert got.hits.tolist() == [len(want.ray)]
+        assert got.hit_counts.tolist() == [len(want.ray)]
         assert got.tally is None
         assert len(want.ray) > len(origins) / 10 or not len(origins)
         some = np.random.default_rng(1).integers(0, max(len(origins), 1), 50)[: len(origins)]
@@ -231,12 +231,12 @@ def test_thinning_keeps_what_the_whole_has(caster, shapes, name, limits, monkeyp
         for groups in GROUPS:
             got = scanned(vase, case, **given, keep_every=every, groups=groups, tally=True)
             hits, keep = thinned(whole, groups, every, 2400)
-            assert got.hits.tolist() == hits
+            assert got.hit_counts.tolist() == hits
             np.testing.assert_array_equal(got.ray, whole.ray[keep])
             np.testing.assert_array_equal(got.distance, whole.distance[keep])
             np.testing.assert_array_equal(got.triangle, whole.triangle[keep])
             np.testing.assert_array_equal(got.tally, want_tally)
-            assert got.hits.dtype == got.tally.dtype == np.int64
+            assert got.hit_counts.dtype == got.tally.dtype == np.int64
 
 
 @pytest.mark.extended
@@ -256,7 +256,7 @@ def test_thinning_where_rays_graze(caster):
             assert whole.distance.min() >= limits[0]
             assert whole.distance.max() <= limits[1]
             got = floor.scan(pattern, [0.1, 0.2, height], keep_every=3, **given)
-            assert got.hits.tolist() == [len(whole)]
+            assert got.hit_counts.tolist() == [len(whole)]
             np.testing.assert_array_equal(got.ray, whole.ray[::3])
             np.testing.assert_array_equal(got.distance, whole.distance[::3])
 
@@ -267,9 +267,9 @@ def test_nothing_to_scan(caster, shapes):
         assert pattern_rays(pattern, np.zeros(0, int), [1, 2, 3])[1].shape == (0, 3)
         found = vase.scan(pattern, [0, 0, 1], window=(0, 0), keep_every=3, groups=[0, 0])
         assert len(found) == 0
-        assert found.hits.tolist() == [0, 0]
+        assert found.hit_counts.tolist() == [0, 0]
     away = vase.scan(Pattern([[0, 0, 1]] * 5), [0, 0, 50], keep_every=2, tally=True)
-    assert (len(away), away.hits.tolist(), away.tally.sum()) == (0, [0], 0)
+    assert (len(away), away.hit_counts.tolist(), away.tally.sum()) == (0, [0], 0)
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
         result = simulate(
             job.scene, job.survey, client=client, backend="numpy", folder=tmp_path / "run"
         )
-    estimate = {"rays": 24_000, "hits": result.hits, "points": len(result.points)}
+    estimate = {"rays": 24_000, "hits": result.hit_count, "points": len(result.points)}
     assert made["estimate"] == estimate and result.rays == 24_000
     assert made["precision_m"] == 0.01
     kept = sum(path.stat().st_size for path in (tmp_path / "run" / "parts").iterdir())
@@ -105,7 +105,7 @@ def test_an_estimate_is_near_what_a_run_gives(name):
     rig = Rig(scene, survey)
     found = [one for k in range(0, survey.scan_count, 36) for one in cast(rig, k)]
     assert made["points"] == pytest.approx(sum(map(len, found)), rel=0.05)
-    assert made["hits"] == pytest.approx(sum(one.hits.sum() for one in found), rel=0.05)
+    assert made["hits"] == pytest.approx(sum(one.hit_counts.sum() for one in found), rel=0.05)
 
 
 def cast(rig: Rig, first: int) -> Iterator[Any]:

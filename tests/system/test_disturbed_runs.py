@@ -42,7 +42,9 @@ def test_frames_come_in_order_and_every_scan_once(
     result = simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
     assert [frame.scan for frame in frames] == list(range(SURVEY.scan_count))
     assert result.rays == sum(frame.rays for frame in frames) == SURVEY.ray_count
-    assert result.hits == result.hit_counts.sum() == sum(frame.hits for frame in frames) > 0
+    assert (
+        result.hit_count == result.hit_counts.sum() == sum(frame.hit_count for frame in frames) > 0
+    )
     assert len(result.points) == sum(frame.count for frame in frames)
     assert same_cloud(result.cloud, cloud)
     assert (np.diff(result.cloud.scan.astype(np.int64)) >= 0).all()

@@ -83,7 +83,7 @@ def test_points_lie_where_the_sensors_own_geometry_says(result):
     cloud = result.cloud
     wanted = survey()
     assert result.rays == wanted.ray_count == 2 * 30 * 40 * 12
-    assert len(cloud) == result.hits > 1000
+    assert len(cloud) == result.hit_count > 1000
     firings = cloud["time"] % (30 * 40 * 50_000) // 50_000
     stations = cloud.scan // 30
     places = np.array([(0, 0, 1.5), (4, 2, 1)])[stations]

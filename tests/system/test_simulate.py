@@ -36,7 +36,7 @@ def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
     survey = Survey(SENSOR, poses=[(1, 1, 0), (-2, 0.5, 1)], steps=60, keep_every=1)
     result = simulate(room(), survey, client=client)
     cloud = result.cloud
-    assert result.hits == result.rays == survey.ray_count == len(cloud)
+    assert result.hit_count == result.rays == survey.ray_count == len(cloud)
     inside = np.abs(cloud.positions) <= [5.005, 4.005, 3.005]
     assert inside.all()
     axis = {0: (0, -5), 1: (0, 5), 2: (1, -4), 3: (1, 4), 4: (2, -3), 5: (2, 3)}

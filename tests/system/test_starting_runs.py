@@ -56,7 +56,7 @@ def break_off(client: Client):
 def test_a_run_starts_without_a_worker_that_breaks_off(client, break_off, question):
     break_off(question)
     result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
-    assert result.hits > 0
+    assert result.hit_count > 0
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_workers_that_die_when_a_run_starts_are_waited_for(client, lose_gpu):
 
     lose_gpu(kill_all)
     result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
-    assert result.hits > 0
+    assert result.hit_count > 0
 
 
 @pytest.mark.slow
@@ -106,7 +106,7 @@ def test_a_worker_that_stops_when_it_has_prepared_itself_is_done_without(client,
 
     monkeypatch.setattr(CastingWorkers, "_take", stop_and_take)
     try:
-        assert simulate(Scene.seed(), SURVEY, client=client, on_frame=go_on).hits > 0
+        assert simulate(Scene.seed(), SURVEY, client=client, on_frame=go_on).hit_count > 0
     finally:
         os.kill(stopped[0], signal.SIGCONT)
 
@@ -124,7 +124,9 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
     ):
 
         def run(**options: float) -> int:
-            return simulate(Scene.seed(), SURVEY, client=client, backend="numpy", **options).hits
+            return simulate(
+                Scene.seed(), SURVEY, client=client, backend="numpy", **options
+            ).hit_count
 
         comes = threading.Timer(0.5, cluster.add, [("GPU", 1)])
         comes.start()

@@ -200,14 +200,15 @@ class _JobStarter:
     def __init__(
         self,
         cluster: SpecCluster,
-        parts: Mapping[str, _PartitionJobs],
+        partition_jobs: Mapping[str, _PartitionJobs],
         tell: Callable[[str], object],
     ) -> None:
         self._cluster = cluster
-        self._parts = parts
+        self._parts = partition_jobs
         self._tell = tell
         samples = (
-            part.describe(cluster, "", part.name, 1, 0, part.options) for part in parts.values()
+            part.describe(cluster, "", part.name, 1, 0, part.options)
+            for part in partition_jobs.values()
         )
         self._logs = _JobLogs(sample["options"] for sample in samples)
         self._messages: set[str] = set()  # messages so far, without numbers

@@ -191,7 +191,7 @@ class Result(RunResult):
         yield (
             "survey",
             f"{scans_in_words(self.survey.scan_count, self.survey.sweep_count)}, "
-            f"{self.rays:,} rays, {self.hits:,} hits on "
+            f"{self.rays:,} rays, {self.hit_count:,} hits on "
             f"{plural(len(self.objects), 'object')} ({self.backend}, "
             f"{self.survey_seconds:.1f} s)",
         )

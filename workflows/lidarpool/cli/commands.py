@@ -174,19 +174,28 @@ class _Commands(click.Group):
     """The commands of this package, and the commands of plug-ins."""
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of a name; LidarError if its plug-in cannot be used."""
+        """Return the command of a name.
+
+        LidarError if the plug-in of the command cannot be used.
+        """
         command = super().get_command(ctx, cmd_name)
         if command is None and (plugin := find_plugin(PLUGINS, cmd_name)) is not None:
             return plugin.load(click.Command)
         return command
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete the name of a command or option; plug-ins are named, and not imported."""
+        """Complete the name of a command or option.
+
+        Plug-ins are named, and not imported.
+        """
         items = super().shell_complete(ctx, incomplete)
         return items or completion.starting_with(incomplete, plugins_of(PLUGINS))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the commands for the help; plug-ins are named, and not imported."""
+        """Write the commands for the help.
+
+        Plug-ins are named, and not imported.
+        """
         super().format_commands(ctx, formatter)
         rows = [
             (name, " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in plugins))
@@ -352,7 +361,9 @@ def run(
 def merge(
     shards: tuple[Any, ...], out: Any, quiet: bool, strict: bool, as_json: bool, **settings: Any
 ) -> None:
-    """Merge shards into a data set or result; after a kill, the same command goes on.
+    """Merge shards into a data set or result.
+
+    After a kill, the same command goes on.
 
     \b
     Examples:
@@ -429,7 +440,7 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def _explanation(error: Exception) -> str | None:
-    """Return the message for an error that users can correct; None for a defect."""
+    """Return the message for an error that users can correct, or None for a defect."""
     match error:
         case click.MissingParameter():
             usage = error.ctx.get_usage() if error.ctx else ""

@@ -36,7 +36,10 @@ class _FormatName(click.Choice[str]):
         super().__init__(EXPORTS)
 
     def convert(self, value: str, param: Any, ctx: Any) -> str:
-        """Return the name; LidarError for an unknown format, or a plug-in that cannot be used."""
+        """Return the name of a format.
+
+        LidarError for an unknown format, or a plug-in that cannot be used.
+        """
         if value in EXPORTS or value == "ply":
             return super().convert(value, param, ctx)
         row_of(value)
@@ -211,7 +214,10 @@ def export(
 
 
 def _tell(note: str) -> None:
-    """Print a note; `Terminal.tell` would import Dask, for which a view does not wait."""
+    """Print a note.
+
+    `Terminal.tell` would import Dask, and a view does not wait for Dask.
+    """
     click.echo(f"note: {note}", err=True)
 
 
@@ -343,11 +349,11 @@ def view(
 )
 @options.as_json
 def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None:
-    """Compare two clouds or recordings of the same place; B is the reference.
+    """Compare two clouds or recordings of the same place.
 
-    A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz, .e57, text such as .csv,
-    .pts, .ptx, .npy, .bin, bags of ROS 2, .pcap and .osf. Sweeps of one sensor are compared by
-    range images; clouds without rings by distances.
+    B is the reference. A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz,
+    .e57, text such as .csv, .pts, .ptx, .npy, .bin, bags of ROS 2, .pcap and .osf. Sweeps of one
+    sensor are compared by range images, clouds without rings by distances.
 
     \b
     Examples:

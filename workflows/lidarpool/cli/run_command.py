@@ -90,7 +90,10 @@ def _run_survey(
     extent: str | None,
     note_on: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
-    """Run a job, and write the result of a survey; `note_on` returns a note on the result."""
+    """Run a job, and write the result of a survey.
+
+    `note_on` returns a note on the result.
+    """
     assert options.out is not None, "commands write"
     for note in advice(built):
         terminal.tell(note)
@@ -110,7 +113,10 @@ def _run_survey(
 def run_campaign(
     campaign: CampaignSpec, terminal: Terminal, options: RunOptions, backend: str | None
 ) -> None:
-    """Run a campaign, and print a summary; LidarError if the run or a job fails."""
+    """Run a campaign, and print a summary.
+
+    LidarError if the run or a job fails.
+    """
     options = options.with_pool(campaign.pool, {"backend": backend})
     assert options.out is not None, "commands write"
     for warning in _first_job_warnings(campaign, terminal):
@@ -209,11 +215,12 @@ def _result_lines(
     """Yield the outcome of a survey as lines of text."""
     yield from terminal.notes(report["notes"])
     surface_hits = report["hits_on_surfaces"]
+    hits_on_none = result.hit_count - surface_hits
     yield (
         f"{scans_in_words(job.survey.scan_count, job.survey.sweep_count)}, "
         f"{plural(result.rays, 'ray')}, "
         f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
-        f"{f' and {result.hits - surface_hits:,} on none' if result.hits > surface_hits else ''}, "
+        f"{f' and {hits_on_none:,} on none' if hits_on_none > 0 else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )

@@ -44,10 +44,10 @@ _SENSOR_FORMATS = "Format of the file: " + ", ".join(row.name for row in FORMATS
 @options.mesh_options
 @options.flag("--all", "every", help="Write every field with its default and a description.")
 def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every: bool) -> None:
-    """Write a commented scenario file with your options and poses; the rest has defaults.
+    """Write a commented scenario file with your options and poses.
 
-    Its JSON Schema is written beside it, so that editors complete and check it. An existing
-    scenario is not overwritten.
+    All other settings have their defaults. The JSON Schema of the scenario is written beside the
+    file, so that editors complete and check the scenario. An existing scenario is not overwritten.
 
     \b
     Examples:
@@ -311,7 +311,9 @@ def _generated_scene_options(triangles: int) -> Callable[[Command], Command]:
 @click.option("--trees", default=0, help="Number of detailed trees, instead of the simple ones.")
 @click.option("--cars", default=0, help="Number of detailed cars, instead of the simple ones.")
 def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars: int) -> None:
-    """Make a city: streets, houses, towers, trees, cars; larger with more triangles.
+    """Make a city: streets, houses, towers, trees, cars.
+
+    A city with more triangles is larger.
 
     \b
     Examples:
@@ -329,7 +331,9 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
 @click.option("--side", default=1000.0, help="Length of a side in metres.")
 @click.option("--trees", default=0, help="Number of trees, in woods on ground that is not steep.")
 def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, trees: int) -> None:
-    """Make a square of hills and mountains; finer with more triangles.
+    """Make a square of hills and mountains.
+
+    A square with more triangles is finer.
 
     \b
     Examples:
@@ -404,7 +408,10 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
 
 
 def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
-    """Make a scene and write the scene to a file; `paint` gives a generated scene its colours."""
+    """Make a scene and write the scene to a file.
+
+    `paint` gives a generated scene its colours.
+    """
     from lidarscenes.procedural.paint import painted
     from lidarscenes.writers.scene_file import check_target, write_scene
 
@@ -500,7 +507,7 @@ def sensors(
     if model is not None:
         _show_model(model)
     if out is None:
-        assert model is not None  # without a file there is no calibration
+        assert model is not None  # a calibration needs a file
         command = f"lidarpool sensors {shlex.quote(model)} --out"
         click.echo(f"to draw its pattern: {command} pattern.png")
         click.echo(f"for other programs: {command} rays.npz")

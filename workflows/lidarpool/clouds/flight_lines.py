@@ -102,7 +102,7 @@ class FlightLines:
         fields.edge[:] = (line >= 0) & same_pulse
         return fields
 
-    def _fill(self, fields: LineFields, rows: Indices, sweep: int, points: Cloud) -> None:
+    def _fill(self, fields: LineFields, row_indices: Indices, sweep: int, points: Cloud) -> None:
         """Fill in the fields of the points of a sweep, without edges."""
         sweeps = self.sweeps
         poses = sweeps.firing_poses(sweep, points)
@@ -114,9 +114,9 @@ class FlightLines:
         ahead = _level(steps.T, sweeps.pose.rotations[sweep][:, 0])
         rays = in_world - poses.positions
         to_right = rays[:, 0] * ahead[:, 1] - rays[:, 1] * ahead[:, 0]
-        fields.scan_angle_deg[rows] = np.degrees(np.arctan2(to_right, -rays[:, 2]))
+        fields.scan_angle_deg[row_indices] = np.degrees(np.arctan2(to_right, -rays[:, 2]))
         source = self._sources[sweep]
-        fields.source[rows] = source if source <= _MAX_SOURCE else 0
+        fields.source[row_indices] = source if source <= _MAX_SOURCE else 0
         sensor = int(sweeps.sensor[sweep])
         mirror = sweeps.lidars[sensor].lines if sweeps.lidars else None
         if mirror is None:
@@ -126,8 +126,8 @@ class FlightLines:
         line = mirror.numbers(begin_ns + sweeps.since_ns(sweep, points))
         # The sensor looks backwards.
         against = sweeps.pose.rotations[sweep][:, 0] @ self._directions[sweep] < 0
-        fields.direction[rows] = mirror.leftwards(line) == int(against)
-        fields.line[rows] = (sensor * sweeps.stations + station) * _LINES + line
+        fields.direction[row_indices] = mirror.leftwards(line) == int(against)
+        fields.line[row_indices] = (sensor * sweeps.stations + station) * _LINES + line
 
     @cached_property
     def _directions(self) -> Floats:

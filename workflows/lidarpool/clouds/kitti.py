@@ -150,9 +150,9 @@ def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
     return [first, *(f"{first}_{name}" for name in names)]
 
 
-def _table(rows: Floats) -> bytes:
+def _table(matrix: Floats) -> bytes:
     memory = io.BytesIO()
-    np.savetxt(memory, rows, "%.9e")
+    np.savetxt(memory, matrix, "%.9e")
     return memory.getvalue()
 
 
@@ -290,9 +290,9 @@ def _calibration(path: Path) -> Floats:
     return np.eye(4)
 
 
-def _square(rows: Floats) -> Floats:
+def _square(matrix_rows: Floats) -> Floats:
     """Return a matrix (3, 4) as (4, 4)."""
-    return np.vstack([rows, [0, 0, 0, 1]])
+    return np.vstack([matrix_rows, [0, 0, 0, 1]])
 
 
 def _read_sweep(path: Path, labels: Path, pose: Floats | None) -> Read:

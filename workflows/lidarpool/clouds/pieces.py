@@ -101,11 +101,11 @@ class Pieces:
             details.append(detail)
         return count, details
 
-    def spans(self, parts: int = 1) -> list[PieceRange]:
-        """Divide all pieces into ranges, at least `parts` if there are as many pieces."""
+    def spans(self, min_spans: int = 1) -> list[PieceRange]:
+        """Divide all pieces into ranges, at least `min_spans` if there are as many pieces."""
         count = len(self)
         by_points = RANGE_POINTS * count // max(1, len(self.cloud))
-        size = max(1, min(RANGE_PIECES, by_points, count // parts))
+        size = max(1, min(RANGE_PIECES, by_points, count // min_spans))
         return [(first, min(first + size, count)) for first in range(0, count, size)]
 
     def finish(self, storage: Storage, written: Iterable[WrittenRange]) -> list[Any]:

@@ -40,7 +40,7 @@ class SweepFiles(NamedTuple):
     read: Callable[[int], Read]
     times_ns: Floats | None = None  # (sweeps,): start of each sweep; None if unknown
     point_count: int | None = None  # number of points of a cloud in parts; None for sweeps
-    sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
+    sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
     notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
     epsg: int | None = None  # EPSG code of the file's system, if that is in metres
 
@@ -65,23 +65,23 @@ class RecordedPoints:
     def __len__(self) -> int:
         return len(self.points)
 
-    def part(self, rows: Indices) -> RecordedPoints:
+    def part(self, row_indices: Indices) -> RecordedPoints:
         """Select points, without the keys of their rays."""
         return RecordedPoints(
-            self.points[rows],
-            None if self.rings is None else self.rings[rows],
-            None if self.intensities is None else self.intensities[rows],
+            self.points[row_indices],
+            None if self.rings is None else self.rings[row_indices],
+            None if self.intensities is None else self.intensities[row_indices],
         )
 
     @classmethod
-    def joined(cls, parts: list[RecordedPoints]) -> RecordedPoints:
+    def joined(cls, recorded: list[RecordedPoints]) -> RecordedPoints:
         """Concatenate parts of the same recording, which have the same columns."""
-        if not parts:
+        if not recorded:
             return cls(np.empty((0, 3)))
-        rings = [part.rings for part in parts if part.rings is not None]
-        intensities = [part.intensities for part in parts if part.intensities is not None]
+        rings = [part.rings for part in recorded if part.rings is not None]
+        intensities = [part.intensities for part in recorded if part.intensities is not None]
         return cls(
-            np.concatenate([part.points for part in parts]),
+            np.concatenate([part.points for part in recorded]),
             np.concatenate(rings) if rings else None,
             np.concatenate(intensities) if intensities else None,
         )
@@ -104,7 +104,7 @@ class NoiseFilter:
         return points[usable], kept, pose
 
     def note(self) -> str:
-        """Return a sentence on the points that were left out of what was read; empty for none."""
+        """Return a sentence on the points that were left out, or an empty string for none."""
         totals = np.sum([(0, 0), *self.counts.values()], axis=0).tolist()
         return LeftOut(*totals).note()
 
@@ -119,7 +119,7 @@ class FiredPoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A recording of sweeps; or a cloud without sweeps (`is_cloud`), in parts instead."""
+    """A recording of sweeps, or a cloud without sweeps (`is_cloud`) that is read in parts."""
 
     name: str
     count: int  # number of sweeps or parts
@@ -129,7 +129,7 @@ class Recording:
     point_count: int | None = None  # None if unknown before the points are read
     times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
     notes: tuple[str, ...] = ()
-    thinned: bool = False  # whether hits were left out: gaps are no lost returns
+    thinned: bool = False  # whether hits were left out: gaps are not lost returns
     white: float | None = None  # intensity of a white surface, if it is the same at all ranges
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
@@ -139,7 +139,7 @@ class Recording:
     # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
     # None if they are unknown; None if the recording has no frames.
     frame_poses: Callable[[], Floats | None] | None = None
-    sequence: str = ""  # name of a drive with coordinates of its own; "" for the only one
+    sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
     noise_filter: NoiseFilter | None = None  # applied by `read`; None if nothing is left out
     # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
     fired: Callable[[int], FiredPoints] | None = None
@@ -151,7 +151,7 @@ class Recording:
         return [f"{self.name}: {note}"] if note else []
 
     def poses(self, numbers: Iterable[int]) -> Floats | None:
-        """Return the poses (n, 4, 4) of sweeps in the world; None if one of these is unknown.
+        """Return the poses (n, 4, 4) of sweeps in the world, or None if a pose is unknown.
 
         LidarError if the recording cannot be read.
         """
@@ -233,18 +233,22 @@ class RecordingSource:
     unit: str | None = None  # replaces the unit that the file states
 
     def recording(self, count: int, read: Callable[[int], Read], **fields: Any) -> Recording:
-        """Return a recording of `count` sweeps or parts; `fields` are fields of `Recording`."""
+        """Return a recording of `count` sweeps or parts, with further fields of `Recording`."""
         return Recording(self.name, count, read, self.intensity, **fields)
 
     def choose(self, kind: str, names: Iterable[str]) -> str:
-        """Return the chosen sensor or topic, or the only one; `kind` is the plural, as "sensors".
+        """Return the chosen sensor or topic, or the only one.
 
+        `kind` is the plural, such as "sensors".
         LidarError without a choice among several, or for a name that is not there.
         """
         return choose(self.name, kind, names, self.sensor)
 
     def of_sensors(self, sensors: Mapping[str, SweepFiles]) -> Recording:
-        """Return the sweeps of one of several sensors, {name: sweeps}; "" for the only one."""
+        """Return the sweeps of the chosen sensor of {name: sweeps}.
+
+        The only sensor of a recording may have the name "".
+        """
         files = sensors[self.choose("sensors", sensors)]
         return self.recording(
             files.sweeps,
@@ -393,8 +397,9 @@ def positions_of(columns: Columns) -> Floats:
 
 
 def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> str:
-    """Return the chosen sensor or topic, or the only sensor or topic; else raise LidarError.
+    """Return the chosen sensor or topic, or the only sensor or topic.
 
+    LidarError without a choice among several, or for a name that the recording does not have.
     `kind` is the plural, such as "sensors"; `name` is the recording's name.
     """
     available = list(names)

@@ -51,7 +51,7 @@ class Pieces(pieces.Pieces):
         if clash := [column.name for column in cloud.table if column.name in _RESERVED]:
             raise LidarError(f"WebDataset has other {clash[0]!r}: rename the column.")
 
-    def spans(self, parts: int = 1) -> list[PieceRange]:
+    def spans(self, min_spans: int = 1) -> list[PieceRange]:
         """Divide all sweeps into ranges with separate tar files, wherever they are written."""
         return super().spans()
 

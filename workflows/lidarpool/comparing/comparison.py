@@ -58,7 +58,7 @@ class MeasuredPoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Result of `compare`; printed as a table."""
+    """Result of `compare`, printed as a table."""
 
     __signature__ = ReadableSignature()
 
@@ -107,9 +107,9 @@ class _ImageLayout(NamedTuple):
     bottom: int = 90
 
     @classmethod
-    def for_rows(cls, rows: int) -> _ImageLayout:
+    def for_rows(cls, row_count: int) -> _ImageLayout:
         """Lay out images of a number of rings."""
-        image_height = int(np.clip(2.2 * rows, 90, 300))
+        image_height = int(np.clip(2.2 * row_count, 90, 300))
         defaults = cls._field_defaults
         gaps = defaults["top"] + 2 * defaults["gap"] + defaults["bottom"]
         return cls(image_height, 3 * image_height + gaps)

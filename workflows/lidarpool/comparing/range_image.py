@@ -20,10 +20,10 @@ from lidarsim.base.words import plural
 from ..clouds.recording import RecordedPoints
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings close to each other
-_STEP_TOLERANCE = 0.15  # by how much single steps may differ from their mean
-_MEAN_STEP_TOLERANCE = 0.01  # by how much the mean steps of two sweeps in one mode may differ
+_STEP_TOLERANCE = 0.15  # relative difference of single steps from their mean, at most
+_MEAN_STEP_TOLERANCE = 0.01  # relative difference of mean steps of two sweeps in one mode
 _SECTOR_DEG = 90.0  # a gap as wide as this in all rings is outside the field of view
-_BLOCKS = 36  # of a revolution, in each of which the pulses of a ring are evenly spaced
+_BLOCKS = 36  # blocks of a revolution; the pulses of a ring are evenly spaced in a block
 _MIN_SHARE = 0.7  # share of rings whose numbers must fit one rule for it to number all rings
 _FINEST_DEG = 1e-3  # points closer in azimuth are of one pulse
 
@@ -38,15 +38,17 @@ class RangeImages:
     start_deg: float  # azimuth of the first column
     # (2, 4, r, c): range, intensity, azimuth and elevation, degrees, in A and in B; NaN if unknown
     images: Floats
-    hidden_shares: tuple[float, float]  # of the points of A and B, behind others in their cells
+    hidden_shares: tuple[float, float]  # shares of points behind others in their cells
     notes: tuple[str, ...]
-    rows: Ints  # (k,): of all cells, or of all rays that have a return
-    compared: Floats  # (2, 2, k): range and intensity at `rows` in A and in B, NaN where unknown
+    cell_rows: Ints  # (k,): of all cells, or of all rays that have a return
+    compared: (
+        Floats  # (2, 2, k): range and intensity at `cell_rows` in A and in B, NaN where unknown
+    )
     paired_by: str = "cells"  # or "rays"
 
     @property
     def ranges(self) -> Floats:
-        """Ranges of A and B, (2, r, c), metres; NaN without a return."""
+        """Ranges of A and B, (2, r, c), metres, NaN without a return."""
         return self.images[:, 0]
 
     @property
@@ -76,7 +78,10 @@ class _PolarSweep:
 
     @classmethod
     def from_points(cls, sweep: RecordedPoints, name: str) -> _PolarSweep:
-        """Convert a sweep; LidarError if there are no rings, or no cones around zero."""
+        """Convert a sweep into a range image.
+
+        LidarError if the sweep has no rings, or its rings are not cones around zero.
+        """
         if sweep.rings is None:
             raise LidarError(f"{name} has no rings: the range image needs a column ring or channel")
         x, y, z = sweep.points.T
@@ -91,13 +96,21 @@ class _PolarSweep:
         )
         if np.median(upper - lower) > max(_TILT_DEG, _spacing(middle) / 2):
             raise LidarError(
-                f"{name} has rings that are no cones around zero, which the range image needs: its "
-                "points are in the world's axes, or of several poses, or its sensor has no rings, "
-                "as a Livox"
+                f"{name} has rings that are not cones around zero, and the range image needs "
+                "cones: its points are in the world's axes, or of several poses, or its sensor has "
+                "no rings, as a Livox"
             )
         ranges = np.linalg.norm(sweep.points, axis=1)
         azimuth = np.degrees(np.arctan2(y, x)) % 360
-        return cls(azimuth, elevation, ranges, index, sweep.intensities, rings, middle)
+        return cls(
+            azimuth=azimuth,
+            elevation=elevation,
+            ranges=ranges,
+            ring_index=index,
+            intensities=sweep.intensities,
+            rings=rings,
+            ring_elevation=middle,
+        )
 
     def step(self) -> float:
         """Return the typical step from a pulse to the next pulse of its ring, degrees."""
@@ -120,13 +133,13 @@ class _PolarSweep:
             step = similar_steps(step).mean()
         return float(step)
 
-    def phases(self, rows: Ints, cells: _Cells) -> Floats:
+    def phases(self, ring_rows: Ints, cells: _Cells) -> Floats:
         """Return where pulses are within a step, in steps: (rows, blocks), NaN without pulses.
 
-        `rows` (r,) are the rows of the sweep's rings in the cells.
+        `ring_rows` (r,) are the rows of the sweep's rings in the cells.
         """
         row_count, _ = cells.shape
-        bins = rows[self.ring_index] * _BLOCKS + self._block
+        bins = ring_rows[self.ring_index] * _BLOCKS + self._block
         phasors = np.exp(2j * np.pi * self.azimuth / cells.step_deg)
         real, imaginary = (
             np.bincount(bins, part, row_count * _BLOCKS) for part in (phasors.real, phasors.imag)
@@ -140,18 +153,18 @@ class _PolarSweep:
         """Index (n,) of the block of each point."""
         return (self.azimuth * (_BLOCKS / 360)).astype(np.int64).clip(0, _BLOCKS - 1)
 
-    def image(self, rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
+    def image(self, ring_rows: Ints, phases: Floats, cells: _Cells) -> tuple[Floats, float]:
         """Return `RangeImages.images` of a sweep, and the share of points hidden in cells.
 
-        `rows` (r,) are the rows of the sweep's rings; `phases` come from the method `phases`. Of
-        several points in a cell, the point closest to the middle is taken, and of several returns
-        of a pulse the nearest.
+        `ring_rows` (r,) are the rows of the sweep's rings; `phases` come from the method `phases`.
+        Of several points in a cell, the point closest to the middle is taken, and of several
+        returns of a pulse the nearest.
         """
         row_count, column_count = cells.shape
-        position = self.azimuth / cells.step_deg - phases[rows[self.ring_index], self._block]
+        position = self.azimuth / cells.step_deg - phases[ring_rows[self.ring_index], self._block]
         column = np.round(position)
         offset = np.round(np.abs(position - column), 3)
-        cell = rows[self.ring_index] * column_count + column.astype(np.int64) % column_count
+        cell = ring_rows[self.ring_index] * column_count + column.astype(np.int64) % column_count
         order = np.lexsort((self.ranges, offset, cell))
         chosen = order[np.diff(cell[order], prepend=-1) > 0]
         image = np.full((4, row_count * column_count), np.nan)
@@ -194,7 +207,7 @@ def range_images(
         images=images,
         hidden_shares=(hidden_a, hidden_b),
         notes=common.notes,
-        rows=np.repeat(np.arange(row_count), len(columns)),
+        cell_rows=np.repeat(np.arange(row_count), len(columns)),
         compared=images[:, :2].reshape(2, 2, -1),
     )
 
@@ -236,7 +249,7 @@ def _common_phases(
         if len(finite):
             row[finite] = np.unwrap(row[finite], period=1)
             row -= np.round(np.median(row[finite]))
-    # Several pulses in a cell have no phase of their own.
+    # Several pulses in a cell do not have one phase.
     if same_mode and abs(step / steps[1] - 1) < _STEP_TOLERANCE:
         return _CommonPhases(step, middle + difference, middle)
     return _CommonPhases(step, middle, middle)
@@ -268,7 +281,7 @@ def paired_images(
     return replace(
         images,
         images=values[..., ray_of_cell],
-        rows=(rings[:, None] == images.rings).argmax(axis=1),
+        cell_rows=(rings[:, None] == images.rings).argmax(axis=1),
         compared=values[:, :2, :-1],
         paired_by="rays",
     )
@@ -294,7 +307,7 @@ def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _Co
     """Match rings of A and B that look at the same elevation.
 
     Some programs count from below, others from above or from 1: if the numbers of A follow from
-    B's numbers, rings of which only A or B has returns have a row, too. Raises LidarError if the
+    B's numbers, a ring with returns in only A or only B has a row, too. Raises LidarError if the
     rings look at other elevations.
     """
     numbers, notes = _ring_numbers(a, b)
@@ -355,8 +368,8 @@ def _check_elevations(
         range_a = f"{a.ring_elevation.min():.1f}° to {a.ring_elevation.max():.1f}°"
         range_b = f"{b.ring_elevation.min():.1f}° to {b.ring_elevation.max():.1f}°"
         raise LidarError(
-            f"the rings of {names[0]} look at {range_a} and those of {names[1]} at {range_b}, at "
-            "other angles: they are not of the same sensor"
+            f"the rings of {names[0]} look at {range_a} and the rings of {names[1]} at {range_b}, "
+            "at other angles: they are not of the same sensor"
         )
 
 

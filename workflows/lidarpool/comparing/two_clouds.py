@@ -27,7 +27,7 @@ from ..recordings.opening import open_recording
 from .comparison import CELLS, RESIDUALS, Comparison, MeasuredPoints
 from .range_image import RangeImages, paired_images, range_images
 
-MAX_POINTS = 10_000_000  # of each cloud in memory
+MAX_POINTS = 10_000_000  # points of each cloud in memory
 
 MAX_VALUES = 4_000_000  # cells and points of all sweeps whose figures are taken
 
@@ -50,8 +50,9 @@ def compare(
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
     most_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
 ) -> Comparison:
-    """Compare two clouds or recordings of the same place; B is the reference.
+    """Compare two clouds or recordings of the same place.
 
+    B is the reference.
     Recordings of one sensor are compared sweep by sweep in the sensor's axes: the range image,
     returns that only A or B has, intensities, and distances to nearest neighbours. A cloud without
     rings or sweeps has distances alone, in the world frame. Clouds are compared as they are,
@@ -76,7 +77,7 @@ def compare(
         yd or mi), in place of metres or of the units that a .las, a .laz or a header states.
     keep_noise
         Whether points are compared that a .las or .laz withholds or classifies as noise (classes 7
-        and 18), and those of such columns of other clouds; by default they are left out.
+        and 18), or that another cloud marks in such columns. By default they are left out.
     azimuth_deg
         Width of a cell; by default the step from pulse to pulse, the coarser one.
     distances_m
@@ -122,7 +123,10 @@ def compare(
 
 
 def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the pairs at indices `sweeps`, in order; LidarError for an index out of range."""
+    """Return the pairs at indices `sweeps`, in order.
+
+    LidarError for an index out of range.
+    """
     for number in sweeps:
         if not 0 <= number < len(pairs):
             raise LidarError(
@@ -162,7 +166,10 @@ def _pair_sweeps(a: Recording, b: Recording, match: str, notes: list[str]) -> li
 
 
 def _sweep_times(recording: Recording) -> Floats:
-    """Return the start of each sweep, ns; LidarError if the recording has no times."""
+    """Return the start of each sweep, ns.
+
+    LidarError if the recording has no times.
+    """
     if recording.times is None:
         raise LidarError(f"{recording.name} has no times of sweeps: leave out --match time.")
     return np.fromiter(recording.times(), np.float64)
@@ -181,7 +188,7 @@ class _NearestPairs(NamedTuple):
     """Points of a cloud, each with its nearest neighbour in the compared cloud, (n,) each."""
 
     distance: Floats  # metres
-    intensity: Floats  # of the point
+    intensity: Floats  # intensity of the point
     nearest_intensity: Floats
 
 
@@ -199,7 +206,8 @@ class _Comparing:
         self.images: RangeImages | None = None
         self.measured_points: list[MeasuredPoints] = []
         self.cells: list[_CellPairs] = []
-        self.nearest: tuple[list[_NearestPairs], list[_NearestPairs]] = ([], [])  # from A, from B
+        # pairs from A, and from B
+        self.nearest: tuple[list[_NearestPairs], list[_NearestPairs]] = ([], [])
         # {ring: its elevation, and the number of its cells in each state of `CELLS`}
         self.rings: dict[int, tuple[float, Ints]] = {}
 
@@ -219,7 +227,7 @@ class _Comparing:
         if share == 1 or not parts:
             return RecordedPoints.joined(parts)
         self.note(
-            f"{recording.name} has {count:,} points, of which {100 * share:.3g} % are compared, "
+            f"{recording.name} has {count:,} points; {100 * share:.3g} % are compared, "
             "chosen evenly: distances to it are too long"
         )
         return replace(RecordedPoints.joined(parts), rings=None)
@@ -230,7 +238,7 @@ class _Comparing:
         if max(len(a), len(b)) > budget:
             self.note(f"of each sweep, {budget:,} points and cells are compared, chosen evenly")
         if not len(a) or not len(b):
-            self.note("pairs of which one has no points are left out")
+            self.note("pairs with an empty sweep are left out")
             return
         self._add_images(a, b, budget)
         for pairs, cloud, reference in zip(self.nearest, (a, b), (b, a), strict=True):
@@ -245,7 +253,10 @@ class _Comparing:
                 pairs.append(_NearestPairs(distance, intensity, reference.intensities[index]))
 
     def _add_images(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
-        """Compare the range images of two sweeps; add a note instead if there are none."""
+        """Compare the range images of two sweeps.
+
+        Without range images, a note is added instead.
+        """
         first, second = self.recordings
         same_rays = first.firing_key and first.firing_key == second.firing_key
         make_images = paired_images if same_rays else range_images
@@ -262,12 +273,15 @@ class _Comparing:
         in_both = np.flatnonzero(in_a & in_b)
         in_both = in_both[even_indices(len(in_both), budget)]
         (range_a, intensity_a), (range_b, intensity_b) = images.compared[..., in_both]
-        ring = images.rings[images.rows[in_both]]
+        ring = images.rings[images.cell_rows[in_both]]
         self.cells.append(_CellPairs(range_a - range_b, ring, intensity_a, intensity_b))
 
     def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
-        """Add the cells of each ring to its states; `in_a` and `in_b` (k,) mark returns."""
-        rows = images.rows
+        """Add the cells of each ring to its states.
+
+        `in_a` and `in_b` (k,) mark returns.
+        """
+        rows = images.cell_rows
         returned_a, returned_b = images.returned
         rows_of_neither, _ = np.nonzero(~returned_a & ~returned_b)
         rows_of_states = (
@@ -286,7 +300,7 @@ class _Comparing:
             self.rings[ring] = elevation, total + count
 
     def result(self, pair_count: int) -> Comparison:
-        """Return all figures of a number of pairs of sweeps; 0 for clouds without sweeps."""
+        """Return all figures of a number of pairs of sweeps, 0 for clouds without sweeps."""
         counts = self.point_counts.tolist()
         for recording, count in zip(self.recordings, counts, strict=True):
             if not count:
@@ -380,7 +394,7 @@ class _Comparing:
 
 
 def _intensity_figures(a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
-    """Return figures of pairs of intensities (n,); None without a rank correlation."""
+    """Return figures of pairs of intensities (n,), or None without a rank correlation."""
     correlation = rank_correlation(a, b)
     if correlation is None:
         return None
@@ -388,7 +402,10 @@ def _intensity_figures(a: Floats, b: Floats, paired_by: str) -> dict[str, Any] |
 
 
 def _residual_figures(values: Floats) -> dict[str, Any]:
-    """Return figures of residuals A - B (n,), metres; None for each figure without residuals."""
+    """Return figures of residuals A - B (n,), metres.
+
+    Without residuals, each figure is None.
+    """
     if not len(values):
         return {"cells": 0, **dict.fromkeys(RESIDUALS)}
     p05, median, p95 = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
@@ -410,7 +427,7 @@ def _no_return_figures(counts: Any) -> dict[str, Any]:
 
 
 def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
-    """Return precision, recall and their harmonic mean; None where undefined."""
+    """Return precision, recall and their harmonic mean, None where undefined."""
     f1 = None
     if precision is not None and recall is not None:
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0

@@ -114,7 +114,7 @@ class Alignment:
 
 
 class AlignedSweep(NamedTuple):
-    """Returns of a sweep; arrays of n points."""
+    """Returns of a sweep, as arrays of n points."""
 
     points: Floats  # (n, 3): in the sensor frame of the start, calibrated, metres
     world: Floats  # (n, 3): metres
@@ -142,7 +142,7 @@ class AlignedSweeps:
         return self.recorded.recording.name
 
     def read(self, number: int) -> AlignedSweep:
-        """Read a sweep; LidarError if the recording cannot be read."""
+        """Read a sweep, or raise LidarError if the recording cannot be read."""
         return self.aligned(self.recorded.read(number), number)
 
     def lost(self, number: int, answering: Bools) -> AlignedSweep:
@@ -281,7 +281,7 @@ def _planes(
     mapped: Sequence[int],
     voxel_m: float,
 ) -> VoxelPlanes:
-    """Return the planes of the map of some sweeps; LidarError without planes."""
+    """Return the planes of the map of some sweeps, or raise LidarError without planes."""
     parts = [
         placed(alignment.compensated(samples[number], number)[0], alignment.poses[number])
         for number in mapped

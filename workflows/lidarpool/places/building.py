@@ -264,7 +264,7 @@ class _Building:
     def _hold_out(
         self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], mapped: list[int]
     ) -> tuple[HeldOut, Page]:
-        """Compare held-out sweeps with the place of the mapped ones; draw one of these."""
+        """Compare held-out sweeps with the place of the mapped sweeps, and draw a sweep."""
         place, reflectances = rebuild(sweeps, mapped, self.voxel_m)
         others = np.setdiff1d(np.arange(self.recorded.count), mapped)
         compared = others[even_indices(len(others), _COMPARED_SWEEPS)].tolist()

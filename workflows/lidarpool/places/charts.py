@@ -106,7 +106,7 @@ def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int,
 
 
 def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats:
-    """Return the image (r, c) of values (n,): the last of each cell; NaN without any."""
+    """Return the image (r, c) of values (n,): the last value of each cell, or NaN."""
     cell, shape = cells
     image = np.full(shape[0] * shape[1], np.nan)
     image[cell] = values

@@ -25,7 +25,7 @@ _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # classes of ranges
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Rays of held-out sweeps, and what they meet in the twin; arrays of n rays.
+    """Rays of held-out sweeps, and what they meet in the twin, as arrays of n rays.
 
     Attributes
     ----------

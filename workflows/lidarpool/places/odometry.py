@@ -87,7 +87,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
 
 
 def _times_s(sweeps: RecordedSweeps) -> Floats:
-    """Return the times (s,) of the sweeps, seconds; at 10 Hz from 0 if unknown."""
+    """Return the times (s,) of the sweeps, seconds, at 10 Hz from 0 if unknown."""
     times = sweeps.recording.times
     if times is None:
         return DEFAULT_PERIOD_S * np.arange(sweeps.count, dtype=np.float64)

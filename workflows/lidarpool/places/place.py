@@ -48,7 +48,7 @@ class Observations(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What the rays of a sweep meet in a place; arrays of the k rays that meet a surfel."""
+    """Surfels that the rays of a sweep meet, as arrays of the k rays that meet a surfel."""
 
     rays: Ints  # (k,): indices of the points of the sweep
     surfel: Ints
@@ -78,7 +78,7 @@ class Place:
         return cls(surfels, RayCaster(surfels.mesh.vertices, surfels.mesh.faces))
 
     def see(self, sweep: AlignedSweep, chosen: Bools | None = None) -> Seen:
-        """Cast the rays of a sweep; `chosen` (n,) are some of its points."""
+        """Cast the rays of a sweep, or the rays of its points that `chosen` (n,) marks."""
         rows = np.arange(len(sweep.world)) if chosen is None else np.flatnonzero(chosen)
         directions = sweep.world[rows] - sweep.origins[rows]
         hits = self.caster.cast(sweep.origins[rows], directions)
@@ -141,7 +141,7 @@ class Place:
 
 
 def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float) -> Place:
-    """Build the place of the points of sweeps that stand; LidarError if too few stand."""
+    """Build the place of the points that stand, or raise LidarError if too few stand."""
     points = _standing(sweeps, standing)
     if not len(points):
         raise LidarError(f"{sweeps.name} has no points that stand: nothing is left.")

@@ -87,7 +87,7 @@ class RecordedSweeps:
 
     @classmethod
     def of_recording(cls, recording: Recording) -> RecordedSweeps:
-        """Find the rings of a recording; LidarError if it cannot be read or has no sweeps."""
+        """Find the rings of a recording, or raise LidarError if no sweep can be read."""
         if recording.is_cloud or not recording.count:
             raise LidarError(f"{recording.name} has no sweeps: give a recording of sweeps.")
         references = []
@@ -128,7 +128,7 @@ class RecordedSweeps:
 
     @property
     def ring_count(self) -> int:
-        """Number of rings; 1 for a sensor without rings."""
+        """Number of rings, 1 for a sensor without rings."""
         return max(len(self.elevation_rad), 1)
 
     @property
@@ -144,7 +144,7 @@ class RecordedSweeps:
         return self.recording.fired is not None
 
     def read(self, number: int) -> RecordedSweep:
-        """Read a sweep; LidarError if the recording cannot be read."""
+        """Read a sweep, or raise LidarError if the recording cannot be read."""
         points, columns = _returns(self.recording, number)
         ring, known = self._rings(points, columns)
         intensities = intensities_of(self.recording, columns)
@@ -250,7 +250,7 @@ def _medians(values: Floats, starts: Ints) -> Floats:
 
 
 def _runs_in_order(points: Floats) -> Floats | None:
-    """Return the median elevations (k,) of runs, radians; None if the runs are not rings."""
+    """Return the median elevations (k,) of runs, radians, or None if the runs are not rings."""
     if len(points) < _MAX_RINGS:
         return None
     starts, is_ring = _runs(points)

@@ -49,7 +49,7 @@ class Reflectances:
     white: float
 
     def intensities(self, sweep: AlignedSweep, seen: Seen) -> Floats:
-        """Return the intensities (n,) of the rays of a sweep; NaN for a ray that meets nothing."""
+        """Return the intensities (n,) of the rays of a sweep, NaN for a ray that meets nothing."""
         factors = self.by_range[_range_bin(seen.distance_m)]
         factors = factors * self.by_incidence[_incidence_bin(seen.cosine)]
         factors *= self.by_ring[sweep.ring[seen.rays]] * self.white
@@ -68,7 +68,7 @@ class Reflectances:
 
 
 def fit_reflectances(seen: Observations, surfels: Surfels, ring_count: int) -> Reflectances | None:
-    """Fit reflectances of surfels and the sensor's response; None without intensities.
+    """Fit reflectances of surfels and the sensor's response, or return None without intensities.
 
     Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
     Sums, not logarithms, are compared: many sensors report dark surfaces as 0.
@@ -106,7 +106,7 @@ def fit_reflectances(seen: Observations, surfels: Surfels, ring_count: int) -> R
 
 
 def _ratios(row: Ints, values: Floats, expected: Floats, before: Floats) -> Floats:
-    """Return ratios of sums of values (k,) to sums of what is expected, by row; else `before`."""
+    """Return ratios of sums of values (k,) to sums of expected values, by row, or `before`."""
     count = len(before)
     sums = np.bincount(row, values, count)
     sums_expected = np.bincount(row, expected, count)

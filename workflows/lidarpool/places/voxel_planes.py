@@ -28,7 +28,7 @@ class VoxelPlanes:
 
     @classmethod
     def of_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
-        """Find planes among points (n, 3) of a recording; None without any.
+        """Find planes among points (n, 3) of a recording, or return None without planes.
 
         LidarError if the points are too far apart to be sorted into voxels.
         """

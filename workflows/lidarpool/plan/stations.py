@@ -184,7 +184,7 @@ def plan_stations(
     objects = len(scene.names)
     covered_m2 = visibility.area_m2 * choice.covered
     return StationPlan(
-        stations=positions[choice.rows] + scene.origin,
+        stations=positions[choice.row_indices] + scene.origin,
         coverage=np.array(choice.shares),
         candidates=positions + scene.origin,
         spacing_m=spacing_m,
@@ -280,7 +280,7 @@ def _visibility(scene: Scene, sight: Sight, positions: Floats) -> _Visibility:
 class _Choice(NamedTuple):
     """Chosen rows of `_Visibility`, in order."""
 
-    rows: list[int]
+    row_indices: list[int]
     shares: list[float]  # shares of the area, covered after each row
     covered: Bools  # (n,)
 

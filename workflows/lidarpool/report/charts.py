@@ -90,8 +90,8 @@ def draw_varied(figures: Figures) -> Page | None:
 class _Layout(NamedTuple):
     """Rows and columns of charts, in pixels."""
 
-    rows: int
-    columns: int
+    row_count: int
+    column_count: int
     width: float  # width of a chart
     row_height: int
 
@@ -108,11 +108,11 @@ class _Layout(NamedTuple):
     @property
     def page_height(self) -> int:
         """Height of the page, pixels."""
-        return TOP + self.rows * self.row_height + (self.rows - 1) * ROW_GAP
+        return TOP + self.row_count * self.row_height + (self.row_count - 1) * ROW_GAP
 
     def add_charts(self, page: Page, number: int) -> tuple[Axes, Axes]:
         """Add the upper and the lower chart of a quantity."""
-        row, column = divmod(number, self.columns)
+        row, column = divmod(number, self.column_count)
         x = LEFT + column * (self.width + COLUMN_GAP)
         y = TOP + row * (self.row_height + ROW_GAP)
         upper = _chart(page, x, y, self.width, COUNTS_HEIGHT)
@@ -123,7 +123,7 @@ class _Layout(NamedTuple):
         self, page: Page, number: int, scale: Varied, upper: Axes, lower: Axes
     ) -> None:
         """Label the axes of the charts of a quantity, and write its name above."""
-        is_first = number % self.columns == 0
+        is_first = number % self.column_count == 0
         for axes, quantity in ((upper, "jobs"), (lower, "points of a job")):
             _set_labels(page, axes, scale, self.width)
             if is_first:

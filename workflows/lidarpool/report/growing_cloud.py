@@ -41,7 +41,7 @@ class _Part(NamedTuple):
     first: int  # number of its first scan
     stop: int  # number of the scan after its last scan
     name: str  # name in the storage of the parts
-    rows: int  # number of points
+    point_count: int
     cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
 
 
@@ -174,13 +174,15 @@ class GrowingCloud:
             self._thread.join()
         self._discard()
 
-    def add(self, parts: Sequence[Receipt]) -> None:
+    def add(self, receipts: Sequence[Receipt]) -> None:
         """Append committed parts once all earlier scans are appended, and return at once."""
-        if not parts:
+        if not receipts:
             return
-        self._committed_scans += sum(part.stop - part.first for part in parts)
-        self._committed_bytes += sum(part.size for part in parts)
-        self._queue.put([_Part(p.first, p.stop, p.name, p.rows, p.cell_box) for p in parts])
+        self._committed_scans += sum(part.stop - part.first for part in receipts)
+        self._committed_bytes += sum(part.size for part in receipts)
+        self._queue.put(
+            [_Part(p.first, p.stop, p.name, p.point_count, p.cell_box) for p in receipts]
+        )
         if self._thread.ident is None:
             self._thread.start()
 
@@ -230,7 +232,7 @@ class GrowingCloud:
         """Append the parts that are next in scan order."""
         while not self._is_stopped and (part := self._waiting.pop(self._next_scan, None)):
             self._next_scan = part.stop
-            if part.rows:
+            if part.point_count:
                 self._append(part)
 
     def _append(self, part: _Part) -> None:
@@ -261,7 +263,7 @@ class GrowingCloud:
 
         Its number of points is estimated from the parts.
         """
-        rows = sum(part.rows for part in self._appended)
+        rows = sum(part.point_count for part in self._appended)
         scans = self._next_scan - self._job.scans.start
         expected_count = rows * len(self._job.scans) // scans
         return CloudWriter(
@@ -277,7 +279,7 @@ class GrowingCloud:
         scans_left = len(self._job.scans) - self._committed_scans
         bytes_left = self._committed_bytes * scans_left // self._committed_scans
         free_bytes = shutil.disk_usage(self._path.parent).free
-        if free_bytes < part.rows * row_bytes + bytes_left:
+        if free_bytes < part.point_count * row_bytes + bytes_left:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
 
     def _discard(self) -> None:

@@ -59,7 +59,7 @@ _AGAIN = "run their shards again with --resume (of a campaign --verify), and mer
 
 
 @dataclass(frozen=True)
-class _Part:
+class _ShardFolder:
     """Shards of a run in a folder.
 
     `record` is the content of CAMPAIGN_FILE of a data set.
@@ -91,7 +91,7 @@ class _Part:
 
     @property
     def common(self) -> dict[str, Any]:
-        """Properties that all parts must have in common, {name: value}."""
+        """Properties that all shard folders must have in common, {name: value}."""
         record = self.record
         properties = {"kind": [*record["identity"]]} | record["identity"]
         properties |= {f"the file {name}": digest for name, digest in record["files"]}
@@ -140,25 +140,25 @@ def merge(
     screen = screen or Screen()
     shard_storages = {_real_path(storage): storage for storage in map(Storage.at, shards)}
     _check_apart(Storage.at(target), shard_storages)
-    parts = list[_Part]()
+    shard_folders = list[_ShardFolder]()
     mistakes = Mistakes()
     for storage in shard_storages.values():
         with mistakes.noted():
-            parts.append(_read_part(storage))
+            shard_folders.append(_read_folder(storage))
     mistakes.lines += (
         [] if shard_storages else ["there is nothing to merge: give the folders of shards."]
     )
     with suppress(LidarError):  # the result would have the place of the shard's points
-        if "made_of" in _read_part(Storage.at(target)).record:
+        if "made_of" in _read_folder(Storage.at(target)).record:
             message = f"{target} holds a shard of a survey: give another folder with --out."
-            parts = []
+            shard_folders = []
             mistakes.lines = [message]
-    if not (partial and parts):
+    if not (partial and shard_folders):
         mistakes.tell()
-    if "made_of" in parts[0].record:
-        return _merge_survey(parts, target, partial, scenario, screen)
+    if "made_of" in shard_folders[0].record:
+        return _merge_survey(shard_folders, target, partial, scenario, screen)
     with result_folder(target), screen.status("merging the data set"):
-        return _merge_dataset(parts, Storage.at(target), partial, screen)
+        return _merge_dataset(shard_folders, Storage.at(target), partial, screen)
 
 
 def _real_path(storage: Storage) -> str:
@@ -187,7 +187,7 @@ def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None
             )
 
 
-def _read_part(storage: Storage) -> _Part:
+def _read_folder(storage: Storage) -> _ShardFolder:
     """Read a finished shard, or data set of several shards.
 
     Raises LidarError if damaged or unfinished.
@@ -207,7 +207,7 @@ def _read_part(storage: Storage) -> _Part:
     )
 
 
-def _read_dataset(storage: Storage, shard_count: int = 1) -> _Part:
+def _read_dataset(storage: Storage, shard_count: int = 1) -> _ShardFolder:
     """Read a data set of shards.
 
     A complete data set has the `shard_count` shards.
@@ -217,10 +217,10 @@ def _read_dataset(storage: Storage, shard_count: int = 1) -> _Part:
     if shards == [ALL]:
         shards = [Shard(number, shard_count) for number in range(1, shard_count + 1)]
     told = read_notes(storage) if LAST_FILE in storage.sizes() else ()
-    return _Part(storage, record, shards, record["campaign"]["count"], told)
+    return _ShardFolder(storage, record, shards, record["campaign"]["count"], told)
 
 
-def _read_survey(storage: Storage, run: Storage) -> _Part:
+def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
     """Read a shard of a survey.
 
     Raises LookupError for an unfinished shard or another run.
@@ -244,7 +244,7 @@ def _read_survey(storage: Storage, run: Storage) -> _Part:
                 if job.missing_count:
                     raise LookupError("scans are missing")
                 parts = job.parts.ordered
-                return _Part(
+                return _ShardFolder(
                     storage=storage,
                     record=record,
                     shards=[shard],
@@ -260,92 +260,120 @@ def _read_survey(storage: Storage, run: Storage) -> _Part:
             ) from error
 
 
-def _check(parts: Sequence[_Part], partial: bool, earlier: _Part | None = None) -> list[str]:
-    """Check that parts are of the same run and, unless `partial`, complete.
+def _check(
+    shard_folders: Sequence[_ShardFolder], partial: bool, earlier: _ShardFolder | None = None
+) -> list[str]:
+    """Check that shard folders are of the same run and, unless `partial`, complete.
 
     Returns all notes.
 
-    Shards of the `earlier` data set may be in further parts, too. LidarError names wrong parts.
+    Shards of the `earlier` data set may be in further folders, too. LidarError names wrong folders.
     """
     mistakes = Mistakes()
     expected = software()
     first = "the software here"
     first_fields: Mapping[str, str] = {}
-    parts_by_shard = dict[int, _Part]()
-    for part in sorted(parts, key=lambda part: not part.record["casting"]):
-        common = part.common
-        if part.shards == [ALL] and part is not earlier and len(parts) > 1 + bool(earlier):
-            mistakes.lines.append(f"{part.storage} is a whole run: give it alone, or leave it out.")
+    folders_by_shard = dict[int, _ShardFolder]()
+    for shard_folder in sorted(
+        shard_folders, key=lambda shard_folder: not shard_folder.record["casting"]
+    ):
+        common = shard_folder.common
+        if (
+            shard_folder.shards == [ALL]
+            and shard_folder is not earlier
+            and len(shard_folders) > 1 + bool(earlier)
+        ):
+            mistakes.lines.append(
+                f"{shard_folder.storage} is a whole run: give it alone, or leave it out."
+            )
             continue
         if differs := [
             name for name in expected if common.get(name, expected[name]) != expected[name]
         ]:
-            changed = differences(first_fields, part.record["fields"]) if first_fields else ""
-            message = f"{part.storage} and {first} differ in {differs[0]}"
+            changed = (
+                differences(first_fields, shard_folder.record["fields"]) if first_fields else ""
+            )
+            message = f"{shard_folder.storage} and {first} differ in {differs[0]}"
             message += f" ({changed})" * bool(changed)
             mistakes.lines.append(f"{message}: merge shards of one run and of the same software.")
         elif len(common) > len(expected):
             expected = common
-            first = str(part.storage)
-            first_fields = part.record["fields"]
-        if part is earlier:
+            first = str(shard_folder.storage)
+            first_fields = shard_folder.record["fields"]
+        if shard_folder is earlier:
             continue
-        for shard in part.shards:
-            if (first_part := parts_by_shard.setdefault(shard.number, part)) is not part:
-                twice = f"shard {shard} is in {first_part.storage} and in {part.storage}"
+        for shard in shard_folder.shards:
+            if (
+                first_folder := folders_by_shard.setdefault(shard.number, shard_folder)
+            ) is not shard_folder:
+                twice = f"shard {shard} is in {first_folder.storage} and in {shard_folder.storage}"
                 mistakes.lines.append(f"{twice}: give one of them.")
     mistakes.tell()
-    notes = [*dict.fromkeys(note for part in parts for note in part.notes)]
-    if not (missing := _missing(parts)):
+    notes = [*dict.fromkeys(note for shard_folder in shard_folders for note in shard_folder.notes)]
+    if not (missing := _missing(shard_folders)):
         return notes
     message = (
         f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], MAX_NAMED)}"
     )
     if not partial:
-        grown = any(shard in part.shards for part in parts for shard in missing)
+        grown = any(
+            shard in shard_folder.shards for shard_folder in shard_folders for shard in missing
+        )
         give = f"give them, too{', run again with the larger count and --resume' * grown}"
         raise LidarError(f"{message}: {give}, or merge what there is with --partial.")
     return [*notes, message]
 
 
-def _missing(parts: Sequence[_Part]) -> list[Shard]:
+def _missing(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
     """List the shards that are missing, or lack jobs that the campaign has gained."""
-    shard_count = parts[-1].shards[0].total
-    parts = sorted(parts, key=lambda part: part.run_size)
-    have = {shard.number: len(part.numbers(shard)) for part in parts for shard in part.shards}
+    shard_count = shard_folders[-1].shards[0].total
+    shard_folders = sorted(shard_folders, key=lambda shard_folder: shard_folder.run_size)
+    have = {
+        shard.number: len(shard_folder.numbers(shard))
+        for shard_folder in shard_folders
+        for shard in shard_folder.shards
+    }
     have.setdefault(1, -1)  # which plans the path, even if it has no scans
     every = (Shard(number, shard_count) for number in range(1, shard_count + 1))
-    return [shard for shard in every if have.get(shard.number, 0) < len(parts[-1].numbers(shard))]
+    return [
+        shard
+        for shard in every
+        if have.get(shard.number, 0) < len(shard_folders[-1].numbers(shard))
+    ]
 
 
 def _merge_dataset(
-    parts: Sequence[_Part], target: Storage, partial: bool, screen: Screen
+    shard_folders: Sequence[_ShardFolder], target: Storage, partial: bool, screen: Screen
 ) -> dict[str, Any]:
-    """Take the jobs of all parts into a data set, and write its shared files."""
+    """Take the jobs of all folders into a data set, and write its shared files."""
     begun = CAMPAIGN_FILE in target.sizes()
     dataset_files(target, begun=begun)
-    earlier = _read_dataset(target, shard_count=parts[0].shards[0].total) if begun else None
-    all_parts = [earlier, *parts] if earlier else parts
-    notes = _check(all_parts, partial, earlier)
-    record = _merged_record(all_parts, parts[0])
+    earlier = _read_dataset(target, shard_count=shard_folders[0].shards[0].total) if begun else None
+    all_folders = [earlier, *shard_folders] if earlier else shard_folders
+    notes = _check(all_folders, partial, earlier)
+    record = _merged_record(all_folders, shard_folders[0])
     dataset = DataSet(replace(target, durable=False), **record["campaign"]["keep"])
     dataset.check_installed()
     if earlier is None:  # the files belong to the campaign now
         write_record(target, record | {"shards": []})
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        files = [_RowFile(Path(folder, str(index))) for index in range(len(all_parts))]
+        files = [_RowFile(Path(folder, str(index))) for index in range(len(all_folders))]
         damaged = list[str]()
         with explained(f"{target} cannot be merged"):
-            for part, file in zip(parts, files[-len(parts) :], strict=True):
-                file.write(part, _take_jobs(part, dataset, damaged), _seconds(part, notes))
+            for shard_folder, file in zip(shard_folders, files[-len(shard_folders) :], strict=True):
+                file.write(
+                    shard_folder,
+                    _take_jobs(shard_folder, dataset, damaged),
+                    _seconds(shard_folder, notes),
+                )
             if earlier:  # after a killed merge without casting times: no note
                 files[0].write(earlier, _rows_of(earlier, dataset), known_seconds(target))
         if not damaged:
-            damaged += _lacking(all_parts, _merged(files))
+            damaged += _lacking(all_folders, _merged(files))
         if damaged:
             raise LidarError(f"missing or damaged: {listed(damaged, MAX_NAMED)}; {_AGAIN}.")
-        lacking = _missing(all_parts)
-        shards = {shard for part in all_parts for shard in part.shards}
+        lacking = _missing(all_folders)
+        shards = {shard for shard_folder in all_folders for shard in shard_folder.shards}
         record["shards"] = [*map(str, sorted(shards.difference(lacking)) if lacking else [ALL])]
         if empty := [row for row in _merged(files) if row.done and not row.points]:
             notes.append(empty_jobs_warning(empty, ""))
@@ -358,41 +386,45 @@ def _merge_dataset(
     return report
 
 
-def _merged_record(parts: Sequence[_Part], fallback: _Part) -> dict[str, Any]:
-    """Return the content of CAMPAIGN_FILE for a data set of parts.
+def _merged_record(shard_folders: Sequence[_ShardFolder], fallback: _ShardFolder) -> dict[str, Any]:
+    """Return the content of CAMPAIGN_FILE for a data set of shard folders.
 
-    The software is the software of a part with cast rays, else of the fallback.
+    The software is the software of a shard folder with cast rays, else of the fallback.
     """
     sensors = dict[str, str]()
-    for part in parts:
-        sensors = with_sensors(sensors, part.record["sensors"].items())
-    cast = next((part for part in parts if part.record["casting"]), fallback)
-    campaign = max(parts, key=lambda part: part.run_size).record["campaign"]
+    for shard_folder in shard_folders:
+        sensors = with_sensors(sensors, shard_folder.record["sensors"].items())
+    cast = next(
+        (shard_folder for shard_folder in shard_folders if shard_folder.record["casting"]), fallback
+    )
+    campaign = max(shard_folders, key=lambda shard_folder: shard_folder.run_size).record["campaign"]
     return {**cast.record, "sensors": sensors, "campaign": campaign}
 
 
 class _RowFile:
-    """Rows of the jobs of a part in a temporary file, so that manifests are read only once."""
+    """Rows of the jobs of a shard folder in a temporary file: manifests are read only once."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._offsets: dict[int, int] = {}  # {number of a job: first byte of its row}
 
-    def write(self, part: _Part, rows: Iterator[JobRow], seconds: Mapping[int, float]) -> None:
+    def write(
+        self, shard_folder: _ShardFolder, rows: Iterator[JobRow], seconds: Mapping[int, float]
+    ) -> None:
         """Write rows with their casting times, {number: seconds}.
 
-        LidarError if the part cannot have such a job, or two manifests are of one job.
+        LidarError if the shard folder cannot have such a job, or two manifests are of one job.
         """
-        ranges = [part.numbers(shard) for shard in part.shards]
+        ranges = [shard_folder.numbers(shard) for shard in shard_folder.shards]
         with self._path.open("wb") as file:
             for row in rows:
-                path = part.storage.path(manifest_file(row.name))
+                path = shard_folder.storage.path(manifest_file(row.name))
                 number = row.number
                 if not any(number in numbers for numbers in ranges):
                     raise LidarError(
                         f"{path} is of job {number}, which is not in shard "
-                        f"{listed([*map(str, part.shards)])} of {part.run_size:,} jobs: move it "
-                        "elsewhere, and merge again."
+                        f"{listed([*map(str, shard_folder.shards)])} of {shard_folder.run_size:,} "
+                        "jobs: move it elsewhere, and merge again."
                     )
                 if number in self._offsets:
                     raise LidarError(
@@ -412,18 +444,22 @@ class _RowFile:
                     yield JobRow.from_json(json.loads(file.readline()))
 
 
-def _take_jobs(part: _Part, dataset: DataSet, damaged: list[str]) -> Iterator[JobRow]:
-    """Take the jobs of a part into a data set.
+def _take_jobs(
+    shard_folder: _ShardFolder, dataset: DataSet, damaged: list[str]
+) -> Iterator[JobRow]:
+    """Take the jobs of a shard folder into a data set.
 
     Yields their rows, and adds files to `damaged`.
     """
-    for _, row, wrong in dataset.take(part.storage, fingerprint(dict(part.record["identity"]))):
+    for _, row, wrong in dataset.take(
+        shard_folder.storage, fingerprint(dict(shard_folder.record["identity"]))
+    ):
         damaged += [wrong] if wrong else []
         if row is not None:
             yield row
 
 
-def _rows_of(earlier: _Part, dataset: DataSet) -> Iterator[JobRow]:
+def _rows_of(earlier: _ShardFolder, dataset: DataSet) -> Iterator[JobRow]:
     """Yield the rows of the shards that a data set had before the merge."""
     ranges = [earlier.numbers(shard) for shard in earlier.shards]
     for row, _ in dataset.rows():
@@ -431,28 +467,28 @@ def _rows_of(earlier: _Part, dataset: DataSet) -> Iterator[JobRow]:
             yield row
 
 
-def _seconds(part: _Part, notes: list[str]) -> Mapping[int, float]:
-    """Return the casting times of the jobs of a part, {number: seconds}.
+def _seconds(shard_folder: _ShardFolder, notes: list[str]) -> Mapping[int, float]:
+    """Return the casting times of the jobs of a shard folder, {number: seconds}.
 
     A note says if they are lost.
     """
-    if not part.shards:
+    if not shard_folder.shards:
         return {}
     try:
-        return read_seconds(part.storage)
+        return read_seconds(shard_folder.storage)
     except LidarError as error:
         notes.append(str(error).rstrip("."))
     return {}
 
 
-def _lacking(parts: Sequence[_Part], rows: Iterator[JobRow]) -> list[str]:
-    """List the jobs of parts that have no row, as a folder and a number."""
+def _lacking(shard_folders: Sequence[_ShardFolder], rows: Iterator[JobRow]) -> list[str]:
+    """List the jobs of shard folders that have no row, as a folder and a number."""
     numbers = {row.number for row in rows}
     return [
-        f"the manifest of job {number} in {part.storage}"
-        for part in parts
-        for shard in part.shards
-        for number in part.numbers(shard)
+        f"the manifest of job {number} in {shard_folder.storage}"
+        for shard_folder in shard_folders
+        for shard in shard_folder.shards
+        for number in shard_folder.numbers(shard)
         if number not in numbers
     ]
 
@@ -460,7 +496,7 @@ def _lacking(parts: Sequence[_Part], rows: Iterator[JobRow]) -> list[str]:
 def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
     """Yield the rows of all jobs by number.
 
-    Of a job in several parts, a row that is done is taken.
+    Of a job in several folders, a row that is done is taken.
     """
     number = attrgetter("number")
     tables = [file.rows() for file in files]
@@ -469,15 +505,15 @@ def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
 
 
 def _merge_survey(
-    parts: Sequence[_Part],
+    shard_folders: Sequence[_ShardFolder],
     out: Path | Storage,
     partial: bool,
     scenario: str | Path | None,
     screen: Screen,
 ) -> dict[str, Any]:
-    """Build the survey again, and write its result from the points of all parts."""
-    notes = _check(parts, partial)
-    record = parts[0].record
+    """Build the survey again, and write its result from the points of all folders."""
+    notes = _check(shard_folders, partial)
+    record = shard_folders[0].record
     made_of = record["made_of"]
     path = Path(scenario or made_of["path"])
     if not path.exists():
@@ -493,7 +529,11 @@ def _merge_survey(
             f"{path} has another {differs[0]} than these shards{f', {changed}' * bool(changed)}: "
             "give --scenario."
         )
-    fields: dict[str, Any] = {"scenario": built.scenario, "parts": parts, "notes": notes}
+    fields: dict[str, Any] = {
+        "scenario": built.scenario,
+        "shard_folders": shard_folders,
+        "notes": notes,
+    }
     output = _Merged(out, job.survey, job.outputs, made_of["extent"], **fields)
     options = RunOptions(out=out, folder=Storage.at(out).below(RUN_FOLDER), resume=True)
     return Run(jobs, options, output, screen, RunPage()).execute()[1]
@@ -501,9 +541,9 @@ def _merge_survey(
 
 @dataclass(eq=False)
 class _Merged(SurveyOutput):
-    """The result of a survey whose points are in parts."""
+    """The result of a survey whose points are in shard folders."""
 
-    parts: Sequence[_Part] = ()
+    shard_folders: Sequence[_ShardFolder] = ()
     notes: Sequence[str] = ()
     casts = False
 
@@ -535,15 +575,15 @@ class _Merged(SurveyOutput):
                 store.storage.remove([name])
             return None
 
-        for part in self.parts:
-            if casting := part.record["casting"]:
-                store.cast_with(part.record["backend"], casting)
-            if part.trials and not only.trials:
-                store.db.add_trials(only, part.trials)
-            source = parts_of(part.storage.below(RUN_FOLDER), part.record["parts"])
+        for shard_folder in self.shard_folders:
+            if casting := shard_folder.record["casting"]:
+                store.cast_with(shard_folder.record["backend"], casting)
+            if shard_folder.trials and not only.trials:
+                store.db.add_trials(only, shard_folder.trials)
+            source = parts_of(shard_folder.storage.below(RUN_FOLDER), shard_folder.record["parts"])
             missing = (
                 receipt
-                for receipt in part.points
+                for receipt in shard_folder.points
                 if only.parts.missing(receipt.first, receipt.stop)
             )
             for expected, receipt in read_ahead(partial(take, source), missing):

@@ -136,10 +136,10 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         folder = run.stack.enter_context(staging(self._folder, self.target))
         self._growing = run.stack.enter_context(GrowingCloud(folder / CLOUD, job))
 
-    def on_parts(self, parts: Sequence[Receipt]) -> None:
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Append parts to the cloud."""
         if self._growing is not None:
-            self._growing.add(parts)
+            self._growing.add(receipts)
 
     def finish(
         self, run: Run[tuple[RunResult, dict[str, Any]]]

@@ -16,7 +16,9 @@ def picture_content(result: RunResult) -> PictureContent:
     planning = planning_picture(result.planning, result.plan, result.trials)
     content, drawn = PictureContent.before_casting(result.scene, result.survey, planning)
     return replace(
-        content, hit_counts=drawn.hits(result.hit_counts), sample_rays=result.sample_rays
+        content,
+        hit_counts=drawn.triangle_hit_counts(result.hit_counts),
+        sample_rays=result.sample_rays,
     )
 
 

@@ -83,9 +83,9 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "scans": survey.scan_count,
         "sweeps": survey.sweep_count,
         "rays": result.rays,
-        "hits": result.hits,
+        "hits": result.hit_count,
         # The counts of large scenes are large: without need they are not read.
-        "hits_on_surfaces": int(result.hit_counts.sum()) if cloud.no_surface else result.hits,
+        "hits_on_surfaces": int(result.hit_counts.sum()) if cloud.no_surface else result.hit_count,
         "points": len(result.points),
         "points_by_object": {
             name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)

@@ -232,7 +232,7 @@ class RunLoop:
             scans=job.survey.scan_count,
             sweeps=len(job.sweeps),
             rays=job.survey.ray_count,
-            hits=under_way.parts.hits,
+            hits=under_way.parts.hit_count,
             seconds=under_way.seconds,
         )
         return JobFiles(row, under_way.points(), job.sweeps, job.made_of)

@@ -35,7 +35,7 @@ class RunResult:
         The best path and all trials; None and empty without planning.
     backend
         Name of the ray-casting backend that was used.
-    rays, hits
+    rays, hit_count
         Rays fired, and rays that hit a surface.
     stages
         All tasks of each stage together.
@@ -63,7 +63,7 @@ class RunResult:
     trials: tuple[Trial, ...]
     backend: str
     rays: int
-    hits: int
+    hit_count: int
     stages: tuple[StageTotals, ...]
     resumed: int
     notes: tuple[str, ...]

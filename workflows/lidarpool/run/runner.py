@@ -70,7 +70,7 @@ class Output(Generic[R]):
     def look(self, run: Run[R]) -> None:
         """Compare the output with the results of an earlier run in the store."""
 
-    def on_parts(self, parts: Sequence[Receipt]) -> None:
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Note that parts of the only job were committed, and return at once."""
 
     def finish(self, run: Run[R]) -> R:
@@ -229,7 +229,7 @@ class Run(Generic[R]):
         self.cluster = Cluster(first, store, options, self.screen, enter, self._local)
         dataset = self.output.dataset
         self.page.follow(self.cluster.partitions, dataset)
-        listeners = Listeners(self._frame, self._parts)
+        listeners = Listeners(self._frame, self._on_parts)
         self.loop = RunLoop(self.cluster, store, self.page, self._maker, dataset, listeners)
         with self.screen.progress() as show:
             self.loop.run(first, show)
@@ -239,9 +239,9 @@ class Run(Generic[R]):
         if self._on_frame is not None:
             self._on_frame(frame)
 
-    def _parts(self, parts: Sequence[Receipt]) -> None:
-        self.page.on_parts(parts)
-        self.output.on_parts(parts)
+    def _on_parts(self, receipts: Sequence[Receipt]) -> None:
+        self.page.on_parts(receipts)
+        self.output.on_parts(receipts)
 
     # -- for outputs -------------------------------------------------------------------------
 
@@ -265,7 +265,7 @@ class Run(Generic[R]):
             trials=trials,
             backend=self.store.backend,
             rays=job.survey.ray_count,
-            hits=only_job.parts.hits,
+            hit_count=only_job.parts.hit_count,
             stages=loop.stages if loop else (),
             resumed=only_job.resumed,
             notes=tuple(self.store.notes),

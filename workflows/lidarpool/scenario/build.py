@@ -217,16 +217,18 @@ def _build(
         if placing.grid:  # no sensor is given, and the scene is a single object
             sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
     track_or_poses = track or scenario.poses or (placing.poses if placing else SEED_POSES)
-    parts = _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg)
+    survey_parts = _SurveyParts(scenario, findings, sensors, track_or_poses, scene.origin, epsg)
     actors = _build_actors(shapes, static.standing, track)
-    vehicles = _build_traffic(parts, shapes, static.standing)
+    vehicles = _build_traffic(survey_parts, shapes, static.standing)
     if actors or vehicles:
         scene = scene.with_actors([*scene.actors, *actors, *(actor for actor, _ in vehicles)])
     mistakes = Mistakes()
     planning = None
     with mistakes.noted():
         with prefixed(scenario.source):
-            survey = _build_survey(parts, _materials(scenario, findings, scene, vehicles), columns)
+            survey = _build_survey(
+                survey_parts, _materials(scenario, findings, scene, vehicles), columns
+            )
             unseen_objects(scene, survey)
         MaterialTable.build(survey.materials, scene.surface_kinds, voxels=scene.has_voxels)
     if plans:
@@ -329,19 +331,21 @@ def _placing(scenario: Scenario, scene: Scene, findings: Findings, sensor: Mount
 
 
 def _build_traffic(
-    parts: _SurveyParts, shapes: Shapes, standing: StandingSurfaces
+    survey_parts: _SurveyParts, shapes: Shapes, standing: StandingSurfaces
 ) -> list[tuple[Actor, VehicleSection]]:
     """Build the actors of the traffic that are present during the survey.
 
     Each actor comes with the entry of `traffic.vehicles` that gives its shape; the list is empty
     without traffic.
     """
-    scenario = parts.scenario
+    scenario = survey_parts.scenario
     if scenario.traffic is None:
         return []
     with prefixed(scenario.source):
-        duration_s = _build_survey(parts, []).duration_ns / 1e9  # materials do not matter for it
-        track_or_poses = parts.track_or_poses
+        duration_s = (
+            _build_survey(survey_parts, []).duration_ns / 1e9
+        )  # materials do not matter for it
+        track_or_poses = survey_parts.track_or_poses
         # of the survey, by the clock of the carrier's trajectory
         start_s = track_or_poses.start_s or 0.0 if isinstance(track_or_poses, Track) else 0.0
         return _traffic_actors(scenario.traffic, shapes, standing, start_s, duration_s)
@@ -605,15 +609,15 @@ def _with_object_class(
 
 
 def _build_survey(
-    parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str] = ()
+    survey_parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str] = ()
 ) -> Survey:
     """Build the survey along a trajectory or at poses, in local coordinates.
 
     `columns` are names of columns that the cloud gets beside the columns of the scenario and of
     formats.
     """
-    scenario = parts.scenario
-    sensors = parts.sensors
+    scenario = survey_parts.scenario
+    sensors = survey_parts.sensors
     format_columns = scenario.output.needs
     cloud = declared(scenario.cloud, CloudOptions)
     cloud["columns"] = (*scenario.cloud.columns, *format_columns, *columns)
@@ -624,24 +628,26 @@ def _build_survey(
     elif not any(mounted.sensor.optics.resolution_m for mounted in sensors):
         cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
     check_whole((*format_columns, *columns), cloud["keep_every"] or 1)
-    track_or_poses = parts.track_or_poses
+    track_or_poses = survey_parts.track_or_poses
     track = track_or_poses if isinstance(track_or_poses, Track) else None
     poses = () if isinstance(track_or_poses, Track) else track_or_poses
     all_have_noise = all(mounted.noise is not None for mounted in sensors)
     mounted_on_purpose = scenario.sensors or scenario.mount is not None or scenario.sensor.unseen
     needs_no_mounting = not mounted_on_purpose and sensors[0].noise is None
     survey = Survey(
-        poses=[replace(p, position=tuple(np.subtract(p.position, parts.origin))) for p in poses],
+        poses=[
+            replace(p, position=tuple(np.subtract(p.position, survey_parts.origin))) for p in poses
+        ],
         trajectory=track,
         **({"sensor": sensors[0].sensor} if needs_no_mounting else {"sensors": sensors}),
         steps=scenario.steps,
         materials=materials,
-        classes=_class_names(parts, materials, cloud["columns"]),
+        classes=_class_names(survey_parts, materials, cloud["columns"]),
         returns=Returns(**dict(scenario.returns)),
         noise=Noise() if all_have_noise else Noise(**dict(scenario.noise)),
         navigation=scenario.navigation,
         faults=scenario.faults,
-        epsg=scenario.world.epsg or parts.epsg,
+        epsg=scenario.world.epsg or survey_parts.epsg,
         **declared(scenario.weather, Weather),
         **cloud,
     )
@@ -650,14 +656,14 @@ def _build_survey(
 
 
 def _class_names(
-    parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str]
+    survey_parts: _SurveyParts, materials: Sequence[Material], columns: Sequence[str]
 ) -> dict[int, str]:
     """Return the names of the classes of a survey, {number: name}.
 
     Names come from `scenario.classes`, and from the classes that files give to objects, unless the
     scenario uses the number or the name otherwise. `columns` are the columns of the cloud.
     """
-    scenario = parts.scenario
+    scenario = survey_parts.scenario
     entries = (*scenario.placed, *(scenario.traffic.vehicles if scenario.traffic else ()))
     scenario_classes = {entry.semantic_class for entry in (*scenario.materials, *entries)}
     file_classes = {material.semantic_class for material in materials} - scenario_classes
@@ -665,7 +671,7 @@ def _class_names(
     if scenario.classes or "class" in columns:
         numbers = {
             name: number
-            for number, name in parts.findings.class_names.items()
+            for number, name in survey_parts.findings.class_names.items()
             if number in file_classes
         }
     numbers |= {name: number for number, name in scenario.classes.items()}

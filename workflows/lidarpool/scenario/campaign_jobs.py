@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from itertools import chain, combinations, count, islice
+from itertools import chain, combinations, islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -222,7 +223,7 @@ def _unique(stems: Iterable[str]) -> list[str]:
     lower_case: set[str] = set()  # some systems do not distinguish capitals
     for stem in stems:
         first = _UNSAFE.sub("_", stem).lstrip(".") or "job"
-        names = chain([first], (f"{first}-{number}" for number in count(2)))
+        names = chain([first], (f"{first}-{number}" for number in itertools.count(2)))
         name = next(name for name in names if name.lower() not in lower_case)
         lower_case.add(name.lower())
         unique_names.append(name)

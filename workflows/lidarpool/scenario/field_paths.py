@@ -107,31 +107,35 @@ def _path_in(scenario: Scenario, names: Sequence[str], name: str) -> str:
     return "" if is_absent else ".".join([*keys, name])
 
 
-def _match_name(names: Sequence[str], parts: Sequence[str], path: str) -> tuple[str, int]:
+def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> tuple[str, int]:
     """Return the longest name that leading parts of a path make, and the number of parts.
 
     Names may have dots.
     """
-    for part_count in range(len(parts), 0, -1):
-        if (name := ".".join(parts[:part_count])) in names:
+    for part_count in range(len(path_parts), 0, -1):
+        if (name := ".".join(path_parts[:part_count])) in names:
             return name, part_count
-    hint = did_you_mean(parts[0], names) or (f" It has {', '.join(names[:5])}." if names else "")
-    raise LidarError(f"{path} of the base has no {parts[0]!r}.{hint}")
+    hint = did_you_mean(path_parts[0], names) or (
+        f" It has {', '.join(names[:5])}." if names else ""
+    )
+    raise LidarError(f"{path} of the base has no {path_parts[0]!r}.{hint}")
 
 
-def _match_entry(entries: Sequence[Any], parts: Sequence[str], path: str) -> tuple[int, int]:
+def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -> tuple[int, int]:
     """Return the index of the entry that leading parts of a path name, and the number of parts."""
-    if parts[0].isdecimal():
-        digits = parts[0].lstrip("0") or "0"  # Python refuses to convert thousands of them
+    if path_parts[0].isdecimal():
+        digits = path_parts[0].lstrip("0") or "0"  # Python refuses to convert thousands of them
         index = int(digits) if len(digits) <= len(f"{len(entries)}") else len(entries)
         if index < len(entries):
             return index, 1
         raise LidarError(
             f"{path} of the base has {plural(len(entries), 'entry', 'entries')}, counted from 0, "
-            f"and no entry {shortened(parts[0])}."
+            f"and no entry {shortened(path_parts[0])}."
         )
     names = [getattr(entry, "name", None) for entry in entries]
-    name, part_count = _match_name([name for name in names if isinstance(name, str)], parts, path)
+    name, part_count = _match_name(
+        [name for name in names if isinstance(name, str)], path_parts, path
+    )
     return names.index(name), part_count
 
 

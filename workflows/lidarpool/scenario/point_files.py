@@ -37,7 +37,9 @@ _COLOURS = (("red", "green", "blue"), ("colorRed", "colorGreen", "colorBlue"))
 
 @dataclass(frozen=True, eq=False)
 class ScannedPoints:
-    """Points of a file, in metres, and the quantities that surfels keep; None for those without.
+    """Points of a file, in metres, and the quantities that surfels keep.
+
+    A quantity that the file does not have is None.
 
     Attributes
     ----------
@@ -62,14 +64,14 @@ class ScannedPoints:
     def __len__(self) -> int:
         return len(self.positions)
 
-    def take(self, rows: Indices) -> ScannedPoints:
+    def take(self, row_indices: Indices) -> ScannedPoints:
         """Return selected points."""
         return ScannedPoints(
-            self.positions[rows],
-            None if self.outward is None else self.outward[rows],
-            None if self.classes is None else self.classes[rows],
-            None if self.intensities is None else self.intensities[rows],
-            None if self.colours is None else self.colours[rows],
+            self.positions[row_indices],
+            None if self.outward is None else self.outward[row_indices],
+            None if self.classes is None else self.classes[row_indices],
+            None if self.intensities is None else self.intensities[row_indices],
+            None if self.colours is None else self.colours[row_indices],
         )
 
 
@@ -90,8 +92,7 @@ def read_points(
     unit
         Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
     tell
-        Called with lines on converted units, on points that are left out, and on the columns that
-        are left out.
+        Called with lines on converted units, and on points and columns that are left out.
     epsg
         Code of the system that points are brought to; by default coordinates are kept.
     keep_noise
@@ -153,7 +154,7 @@ def _check_points(path: Path, points: ScannedPoints, left_out: LeftOut) -> None:
 
 
 def _without_noise(path: Path, content: FilePoints, tell: Callable[[str], None]) -> FilePoints:
-    """Return content without withheld points and noise; call `tell` with their number."""
+    """Return content without withheld points and noise, and call `tell` with their number."""
     usable, left_out = usable_points(content.columns, content.noise_classes)
     if usable is None:
         return content
@@ -174,7 +175,10 @@ def _to_metres(
     epsg: int | None,
     tell: Callable[[str], None],
 ) -> Callable[[Floats], Floats]:
-    """Return a function from positions (n, 3) of a file to true metres; tells what it does."""
+    """Return a function from positions (n, 3) of a file to true metres.
+
+    `tell` gets a message that says how positions are converted.
+    """
     finite = content.positions[np.isfinite(content.positions).all(axis=1)]
     if epsg is not None:
         if unit is not None:
@@ -229,7 +233,7 @@ def _scanned_points(content: FilePoints, to_metres: Callable[[Floats], Floats]) 
 
 
 def _first(columns: Columns, names: Iterable[str]) -> AnyArray | None:
-    """Return the first column that a file has and that is not zero throughout; else None.
+    """Return the first column that a file has and that is not zero throughout, or None.
 
     LAS has a column for each quantity, zero where the quantity was not measured.
     """
@@ -238,7 +242,7 @@ def _first(columns: Columns, names: Iterable[str]) -> AnyArray | None:
 
 
 def _first_vectors(columns: Columns, names: Iterable[Vectors]) -> AnyArray | None:
-    """Return the first three columns of vectors that a file has, (n, 3); None without any."""
+    """Return the first three columns of vectors that a file has, (n, 3), or None."""
     for axes in names:
         if all(name in columns for name in axes):
             vectors = np.stack([columns[name] for name in axes], axis=1)
@@ -248,7 +252,10 @@ def _first_vectors(columns: Columns, names: Iterable[Vectors]) -> AnyArray | Non
 
 
 def _as_integers(classes: AnyArray) -> Ints:
-    """Return classes as integers; ValueError if a class is no whole number."""
+    """Return classes as integers.
+
+    ValueError if a class is not a whole number.
+    """
     numbers = classes.astype(np.int64)
     if not np.array_equal(numbers, classes):
         raise ValueError("classes of its points are not whole numbers")

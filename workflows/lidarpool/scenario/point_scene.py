@@ -34,11 +34,12 @@ from .point_files import ScannedPoints, read_points
 # between points, and makes surfels reach farther beyond edges.
 _NEIGHBOURS = MIN_POINTS
 _EXTENT = 0.85
-_MAX_HALF_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
+# length of half a surfel, in voxels: distant and stray points have no neighbours
+_MAX_HALF_VOXELS = 3
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
-_MAX_VOXELS = 1 << 62  # of the box around the points: voxels are numbered by 64 bits
-_WHITE_QUANTILE = 0.99  # of intensities that are not brighter than white: mirrors return more
+_MAX_VOXELS = 1 << 62  # voxels of the box around the points: 64 bits number voxels
+_WHITE_QUANTILE = 0.99  # share of intensities up to white: mirrors return more
 
 
 @checked
@@ -70,22 +71,22 @@ def scene_of_points(
         Z-up; .las and .laz in the units of their coordinate system, text in the units of its
         header, others in metres.
     voxel_m
-        Edge of the cubes in each of which all points become their mean. By default the median
-        distance of points to the eighth of their neighbours.
+        Edge of cubes; the points of a cube become their mean. By default the median distance of
+        points to the eighth of their neighbours.
     size
         A factor of the surfels' sides: larger surfels close gaps, and reach farther beyond edges.
     unit
         Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
     epsg
-        Code of a projected system in true metres, to which points are brought from the system that
-        the file states, such as the code of a UTM zone; needs rasterio. Heights are converted to
-        metres and stay as in the file otherwise. By default coordinates are kept.
+        Code of a projected system in true metres, such as the code of a UTM zone. Points are
+        brought to the system from the system that the file states; needs rasterio. Heights are
+        converted to metres and stay as in the file otherwise. By default coordinates are kept.
     keep_noise
         Whether points become surfaces that a file withholds or classifies as noise (class 7, in
         point formats 6 to 10 of LAS also 18); by default they are left out.
     colour
-        What colours surfels: red, green and blue, or mean intensities as greys, of which the 99th
-        percentile is white. By default red, green and blue if the file has them.
+        What colours surfels: red, green and blue, or mean intensities as greys. The 99th
+        percentile of intensities is white. By default red, green and blue if the file has them.
     tell
         Called with a line on converted units, on points that are left out, and on what a scene does
         not keep; by default this package's logger warns.
@@ -118,7 +119,10 @@ def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0
 def _coloured(
     path: Path, points: ScannedPoints, colour: str | None, tell: Callable[[str], None]
 ) -> ScannedPoints:
-    """Return points with either colours or intensities; LidarError if the chosen are missing."""
+    """Return points with either colours or intensities.
+
+    LidarError if the chosen quantity is missing.
+    """
     present = {"rgb": points.colours is not None, "intensity": points.intensities is not None}
     if colour is not None and not present[colour]:
         quantity = "colours" if colour == "rgb" else "intensities"
@@ -180,7 +184,10 @@ def surfel_faces(count: int) -> Ints:
 
 @dataclass(frozen=True, eq=False)
 class Voxels:
-    """Points sorted by the voxels that contain them; only voxels with points are counted."""
+    """Points sorted by the voxels that contain the points.
+
+    Only voxels with points are counted.
+    """
 
     order: Ints  # (n,): indices of the points, voxel by voxel
     starts: Ints  # (v,): where the points of each voxel start in `order`
@@ -188,7 +195,10 @@ class Voxels:
 
     @classmethod
     def of_points(cls, path: Path, positions: Floats, voxel_m: float) -> Voxels:
-        """Sort the points (n, 3) of a file into voxels; LidarError if there are too many voxels."""
+        """Sort the points (n, 3) of a file into voxels.
+
+        LidarError if there are too many voxels.
+        """
         lower = positions.min(axis=0)
         spans = (positions.max(axis=0) - lower) / voxel_m + 1
         if spans.prod() > _MAX_VOXELS:

@@ -85,7 +85,10 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
 
 
 def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
-    """Return the data of a scenario file with another sensor; LidarError for other options."""
+    """Return the data of a scenario file with another sensor.
+
+    LidarError for other options.
+    """
     is_campaign = isinstance(data, dict) and "base" in data
     if is_campaign or {*options} != {"sensor"}:
         name = next((name for name in options if name != "sensor"), "sensor")

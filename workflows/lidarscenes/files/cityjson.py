@@ -416,13 +416,13 @@ def _looks_like_angles(corners: Floats) -> bool:
     return bool(is_small and height > _MAX_SLOPE * max(width, depth))
 
 
-def _points(rows: Any) -> Floats:
+def _points(coordinates: Any) -> Floats:
     """Return coordinates (v, 3).
 
     Raises ValueError for another shape.
     """
     try:
-        points = np.array(rows or np.zeros((0, 3)), np.float64)
+        points = np.array(coordinates or np.zeros((0, 3)), np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError("its vertices are not rows of three numbers") from error
     if points.ndim != 2 or points.shape[1] != 3:

@@ -222,19 +222,25 @@ class _Document:
         return Piece(points, faces, colours=colours)
 
     def _colours(
-        self, paint: _Effects, primitive: Element, material: Element, corners: Ints, rows: Ints
+        self,
+        paint: _Effects,
+        primitive: Element,
+        material: Element,
+        corners: Ints,
+        triangle_corners: Ints,
     ) -> Colours | None:
         """Return the colours of triangles by a material, or None if its effect has no colour.
 
-        `corners` (c, stride) are the numbers in <p>, `rows` (t, 3) the triangles' corners.
+        `corners` (c, stride) are the numbers in <p>. Rows of `corners` are the corners of
+        triangles, `triangle_corners` (t, 3).
         """
         url = material.find("instance_effect[@url]")
         assert url is not None
         shade = paint.shade(self._target(url, "effect"), self._ids)
         if isinstance(shade, Texture):
             uv, offset = self._coordinates(primitive)
-            return shade.colours(uv, corners[:, offset][rows])
-        return None if shade is None else Colours.plain(shade, len(rows))
+            return shade.colours(uv, corners[:, offset][triangle_corners])
+        return None if shade is None else Colours.plain(shade, len(triangle_corners))
 
     def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
         """Return texture coordinates (c, 2), and the offset of their indices in <p>."""

@@ -154,9 +154,11 @@ def _raster_mesh(
         return mesh, _summary(source, grid, request.step_m, valid)
 
 
-def _read_values(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> tuple[Floats, Bools]:
+def _read_values(
+    grid: _RasterGrid, column_range: PixelRange, row_range: PixelRange
+) -> tuple[Floats, Bools]:
     """Return the values of the first band (rows, columns), and whether they are valid."""
-    band = grid.file.read(1, window=(rows, columns), masked=True)
+    band = grid.file.read(1, window=(row_range, column_range), masked=True)
     values = np.ma.getdata(band).astype(np.float64)
     return values, ~np.ma.getmaskarray(band) & np.isfinite(values)
 
@@ -551,13 +553,13 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
 
 
 def _check_size(
-    grid: _RasterGrid, columns: PixelRange, rows: PixelRange, name: str, *, chosen: bool
+    grid: _RasterGrid, column_range: PixelRange, row_range: PixelRange, name: str, *, chosen: bool
 ) -> None:
     """Raise MeshFileError for too many pixels, with a window and a step that fit the memory.
 
     Without a `chosen` window or step the limit is lower, for a mesh that is quick to read and show.
     """
-    sides = np.array([columns[1] - columns[0], rows[1] - rows[0]])
+    sides = np.array([column_range[1] - column_range[0], row_range[1] - row_range[0]])
     count = int(np.prod(sides.astype(object)))
     max_read = max_pixels = min(memory_share() // _PIXEL_BYTES, MAX_TRIANGLES // 2)
     if not chosen:
@@ -565,7 +567,7 @@ def _check_size(
     if count <= max_pixels:
         return
     lower, upper = grid.extent
-    x, y = grid.coordinates(np.array([sum(columns) / 2]), np.array([sum(rows) / 2]))
+    x, y = grid.coordinates(np.array([sum(column_range) / 2]), np.array([sum(row_range) / 2]))
     # Less by a tenth, for pixels that are askew.
     half = np.minimum(0.9 * math.sqrt(max_pixels), sides) * grid.pixel_m / 2
     window = [round(float(side), 1) for side in (x[0] - half[0], y[0] - half[1])]
@@ -592,8 +594,8 @@ def _check_size(
 def _grid_mesh(
     name: str,
     grid: _RasterGrid,
-    columns: PixelRange,
-    rows: PixelRange,
+    column_range: PixelRange,
+    row_range: PixelRange,
     heights: Floats,
     valid: Bools,
 ) -> SceneMesh:
@@ -610,7 +612,7 @@ def _grid_mesh(
         part |= cells
     row, column = np.nonzero(used)
     vertices = np.empty((len(row), 3))
-    x, y = grid.coordinates(column + (columns[0] + 0.5), row + (rows[0] + 0.5))
+    x, y = grid.coordinates(column + (column_range[0] + 0.5), row + (row_range[0] + 0.5))
     vertices[:, 0] = x
     vertices[:, 1] = y
     vertices[:, 2] = heights[used]

@@ -77,27 +77,27 @@ class MeshLook:
         self._value_indices = value_indices
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
-    def coordinates(self, source: ColourSource, rows: Ints) -> tuple[Floats, Ints]:
+    def coordinates(self, source: ColourSource, face_indices: Ints) -> tuple[Floats, Ints]:
         """Return texture coordinates (c, 2) as in glTF, and their indices at corners, (k, 3)."""
-        values, corners = self._corner_values(source["values"], rows, 2)
+        values, corners = self._corner_values(source["values"], face_indices, 2)
         matrix = np.array(source.get("matrix", np.eye(3, 2)))
         u, v = (matmul(values, matrix[:2]) + matrix[2]).T
         return np.stack([u, 1 - v], axis=1), corners
 
-    def painted(self, name: str, rows: Ints) -> Colours | None:
+    def painted(self, name: str, face_indices: Ints) -> Colours | None:
         """Return colours of triangles by values, linear light, or None without values."""
         if name not in self._values:
             return None
-        values, corners = self._corner_values(name, rows, 3)
+        values, corners = self._corner_values(name, face_indices, 3)
         colours = as_srgb(np.nan_to_num(values))
         if len(colours) == 1:
-            return Colours.plain(colours[None], len(rows))
+            return Colours.plain(colours[None], len(face_indices))
         return Colours.of_corners(colours[corners])
 
-    def _corner_values(self, name: str, rows: Ints, width: int) -> tuple[Floats, Ints]:
+    def _corner_values(self, name: str, face_indices: Ints, width: int) -> tuple[Floats, Ints]:
         """Return values (c, width), and their indices at corners (k, 3), or raise MaskError."""
         if not name:  # a texture without coordinates has its value at zero everywhere
-            return np.zeros((1, width)), np.zeros((len(rows), 3), np.int64)
+            return np.zeros((1, width)), np.zeros((len(face_indices), 3), np.int64)
         if name not in self._values:
             raise MaskError(f"its mesh has no {name!r}")
         interpolation, number = self._values[name]
@@ -105,9 +105,9 @@ class MeshLook:
         corners = self._value_indices.get(interpolation)
         if corners is None:
             raise MaskError("its shape has no texture coordinates that are read")
-        if values.shape[1] != width or not corners[rows].max(initial=-1) < len(values):
+        if values.shape[1] != width or not corners[face_indices].max(initial=-1) < len(values):
             raise MaskError(f"{name!r} of its mesh has {len(values)} values of {values.shape[1]}")
-        return values.astype(np.float64), corners[rows]
+        return values.astype(np.float64), corners[face_indices]
 
 
 class UsdMaterials:
@@ -140,7 +140,7 @@ class UsdMaterials:
             else str(self._materials[number]["name"])
         )
 
-    def colours(self, number: int | None, look: MeshLook, rows: Ints) -> Colours | None:
+    def colours(self, number: int | None, look: MeshLook, face_indices: Ints) -> Colours | None:
         """Return the colours that a material gives triangles, or None."""
         if not self.coloured:
             return None
@@ -148,20 +148,20 @@ class UsdMaterials:
         source = material.get("colour", _DISPLAY)
         for colour_source in (source, source.get("instead", _DISPLAY)):
             with self.notes.without_colour(material["name"]):
-                if not self._allowance.fits(FACE_BYTES * len(rows)):
+                if not self._allowance.fits(FACE_BYTES * len(face_indices)):
                     raise MaskError("there are too many triangles")
                 if "unread" in colour_source:
                     raise MaskError(colour_source["unread"])
                 if "value" in colour_source:
                     light = np.nan_to_num(np.array(colour_source["value"]))
-                    return Colours.plain(as_srgb(light).reshape(1, 1, 3), len(rows))
+                    return Colours.plain(as_srgb(light).reshape(1, 1, 3), len(face_indices))
                 if "image" in colour_source:
-                    coordinates = look.coordinates(colour_source, rows)
+                    coordinates = look.coordinates(colour_source, face_indices)
                     return self._shades(_Use.from_source(colour_source)).colours(*coordinates)
-                return look.painted(colour_source["values"], rows)
+                return look.painted(colour_source["values"], face_indices)
         return None
 
-    def cutout(self, number: int | None, look: MeshLook, rows: Ints) -> Cutout | None:
+    def cutout(self, number: int | None, look: MeshLook, face_indices: Ints) -> Cutout | None:
         """Return the mask that a material gives triangles, or None for solid triangles."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
@@ -176,7 +176,7 @@ class UsdMaterials:
             if mask == "glass":
                 self.notes.glass[material["name"]] = None
             elif mask is not None:
-                return mask.cutout(*look.coordinates(source, rows))
+                return mask.cutout(*look.coordinates(source, face_indices))
         return None
 
     def _image(self, number: int) -> bytes:

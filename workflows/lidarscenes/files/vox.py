@@ -98,15 +98,15 @@ def _read_table(data: bytes) -> _Table:
     return _Table(header, grid, columns[column], indices, densities)
 
 
-def _numbers(rows: bytes, columns: list[str], used: tuple[int, ...], first_line: int) -> Floats:
+def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line: int) -> Floats:
     """Return the numbers (n, k) of the used columns.
 
     Raises ValueError that names a wrong line.
     """
     try:
-        return np.asarray(np.loadtxt(io.BytesIO(rows), usecols=used, ndmin=2), np.float64)
+        return np.asarray(np.loadtxt(io.BytesIO(text), usecols=used, ndmin=2), np.float64)
     except ValueError:  # read cell by cell, which names the line
-        lines = io.TextIOWrapper(io.BytesIO(rows), "utf-8", "replace")
+        lines = io.TextIOWrapper(io.BytesIO(text), "utf-8", "replace")
         return RowReader(columns, used, used=used).read(lines, first_line)
 
 

@@ -329,64 +329,64 @@ class _CityBlocks:
             centrality=np.exp(-((np.hypot(*self._middle[block].T) / reach) ** 2)),
         )
 
-    def _towers(self, lots: _Lots, rows: Ints) -> AnyArray:
+    def _towers(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
         """Return towers on lots, by the rows of the lots (n,)."""
         rng = self._rng
-        n = len(rows)
-        height = np.clip(lots.centrality[rows] * rng.uniform(0.2, 1.15, n), 0, 0.999)
+        n = len(lot_indices)
+        height = np.clip(lots.centrality[lot_indices] * rng.uniform(0.2, 1.15, n), 0, 0.999)
         shapes = 4
         floors = (height * (self._count["tower"] // shapes)).astype(np.int64)
         kind = floors * shapes + rng.integers(shapes, size=n)
         scale = np.column_stack(
             [
-                (lots.size[rows, 0] - 1.5) / 19 * rng.uniform(0.85, 1, n),
+                (lots.size[lot_indices, 0] - 1.5) / 19 * rng.uniform(0.85, 1, n),
                 rng.uniform(0.95, 1.25, n),
                 rng.uniform(0.92, 1.08, n),
             ]
         )
-        y = lots.edge[rows] - lots.side[rows] * (1 + 8.7 * scale[:, 1])
-        xy = np.column_stack([lots.x[rows], y])
+        y = lots.edge[lot_indices] - lots.side[lot_indices] * (1 + 8.7 * scale[:, 1])
+        xy = np.column_stack([lots.x[lot_indices], y])
         return self._rows(
             BUILDING,
             "tower",
             kind=kind,
-            block=lots.block[rows],
+            block=lots.block[lot_indices],
             xy=xy,
-            yaw=lots.yaw[rows],
+            yaw=lots.yaw[lot_indices],
             scale=scale,
         )
 
-    def _houses(self, lots: _Lots, rows: Ints) -> AnyArray:
+    def _houses(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
         """Return houses on lots, by the rows of the lots (n,)."""
         rng = self._rng
-        n = len(rows)
+        n = len(lot_indices)
         kind = rng.integers(self._count["house"], size=n)
         scale = rng.uniform(0.88, 1.12, (n, 3))
         set_back = rng.uniform(10.5, 12.5, n)
-        x = lots.x[rows] + rng.uniform(-1.5, 1.5, n)
-        xy = np.column_stack([x, lots.edge[rows] - lots.side[rows] * set_back])
+        x = lots.x[lot_indices] + rng.uniform(-1.5, 1.5, n)
+        xy = np.column_stack([x, lots.edge[lot_indices] - lots.side[lot_indices] * set_back])
         return self._rows(
             BUILDING,
             "house",
             kind=kind,
-            block=lots.block[rows],
+            block=lots.block[lot_indices],
             xy=xy,
-            yaw=lots.yaw[rows],
+            yaw=lots.yaw[lot_indices],
             scale=scale,
         )
 
-    def _yard_trees(self, lots: _Lots, rows: Ints) -> AnyArray:
+    def _yard_trees(self, lots: _Lots, lot_indices: Ints) -> AnyArray:
         """Return trees behind houses, by the rows of the lots (n,)."""
         rng = self._rng
-        n = len(rows)
-        depth = rng.uniform(0.72, 0.95, n) * lots.size[rows, 1]
+        n = len(lot_indices)
+        depth = rng.uniform(0.72, 0.95, n) * lots.size[lot_indices, 1]
         xy = np.column_stack(
             [
-                lots.x[rows] + rng.uniform(-0.4, 0.4, n) * lots.size[rows, 0],
-                lots.edge[rows] - lots.side[rows] * depth,
+                lots.x[lot_indices] + rng.uniform(-0.4, 0.4, n) * lots.size[lot_indices, 0],
+                lots.edge[lot_indices] - lots.side[lot_indices] * depth,
             ]
         )
-        return self._trees(lots.block[rows], xy)
+        return self._trees(lots.block[lot_indices], xy)
 
     def _park_trees(self) -> AnyArray:
         """Return trees in the parks."""

@@ -193,12 +193,12 @@ def _lamp() -> Solid:
     )
 
 
-def joined(parts: Iterable[Solid]) -> Solid:
+def joined(solids: Iterable[Solid]) -> Solid:
     """Return a solid of several solids.
 
     Touching or overlapping parts keep their surfaces.
     """
-    return Solid(*stacked(parts))
+    return Solid(*stacked(solids))
 
 
 def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:

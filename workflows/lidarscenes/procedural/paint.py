@@ -60,11 +60,11 @@ def painted(scene: Scene) -> Scene:
     paint("terrain", faces.up < _STEEP, "rock")
     instances = scene.instances
     if instances is not None:
-        parts = [
+        mesh_parts = [
             part._replace(colours=Colours(_PALETTE, _part_paint(part.faces, number)))
-            for number, part in enumerate(instances.parts)
+            for number, part in enumerate(instances.mesh_parts)
         ]
-        instances = replace(instances, parts=tuple(parts))
+        instances = replace(instances, mesh_parts=tuple(mesh_parts))
     return replace(scene, colours=Colours(_PALETTE, image), instances=instances)
 
 

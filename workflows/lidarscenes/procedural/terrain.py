@@ -144,13 +144,13 @@ def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, F
     return lower + u * along_u + v * along_v, slope
 
 
-def grid_faces(columns: int, rows: int) -> Ints:
+def grid_faces(column_count: int, row_count: int) -> Ints:
     """Return two triangles for each cell of a grid of points: (columns * rows, 2, 3).
 
     The grid has (columns + 1) x (rows + 1) points.
     """
-    corner = (np.arange(columns)[:, None] * (rows + 1) + np.arange(rows)).reshape(-1)
-    beside = corner + rows + 1
+    corner = (np.arange(column_count)[:, None] * (row_count + 1) + np.arange(row_count)).reshape(-1)
+    beside = corner + row_count + 1
     return np.stack([corner, beside, beside + 1, corner, beside + 1, corner + 1], axis=1).reshape(
         -1, 2, 3
     )

@@ -56,9 +56,9 @@ class Stations:
     def __len__(self) -> int:
         return len(self.s)
 
-    def take(self, rows: AnyArray | slice) -> Stations:
+    def take(self, station_selection: AnyArray | slice) -> Stations:
         """Return selected stations."""
-        return Stations(self.s[rows], self.pieces[rows])
+        return Stations(self.s[station_selection], self.pieces[station_selection])
 
 
 class Samples(NamedTuple):

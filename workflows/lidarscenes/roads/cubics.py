@@ -53,7 +53,7 @@ class Cubics:
             return np.zeros_like(stations.s)
         if self.is_constant and len(self) == 1:
             return np.full_like(stations.s, self._coefficients[0, 0])
-        rows = self._rows(stations.pieces)
+        rows = self._row_indices(stations.pieces)
         a, b, c, d = self._coefficients[:, rows]
         x = np.maximum(stations.s - self.starts[rows], 0)
         return np.asarray(((d * x + c) * x + b) * x + a)
@@ -62,12 +62,12 @@ class Cubics:
         """Return the first derivatives at stations (k,)."""
         if self.is_constant:
             return np.zeros_like(stations.s)
-        rows = self._rows(stations.pieces)
+        rows = self._row_indices(stations.pieces)
         _, b, c, d = self._coefficients[:, rows]
         x = np.maximum(stations.s - self.starts[rows], 0)
         return np.asarray((3 * d * x + 2 * c) * x + b)
 
-    def _rows(self, distances: Floats) -> Ints:
+    def _row_indices(self, distances: Floats) -> Ints:
         """Return the polynomials (k,) that are valid at distances."""
         return np.maximum(np.searchsorted(self.starts, distances, "right") - 1, 0)
 

@@ -263,9 +263,11 @@ def section_surfaces(
     The tolerance is `sag_m` in plan, and a tenth of this in height.
     """
 
-    def surfaces_at(rows: Sequence[int], placed: Sequence[PlacedStations]) -> list[SectionSurface]:
+    def surfaces_at(
+        section_indices: Sequence[int], placed: Sequence[PlacedStations]
+    ) -> list[SectionSurface]:
         """Return the surfaces of selected sections at stations."""
-        pairs = [sections[k] for k in rows]
+        pairs = [sections[k] for k in section_indices]
         frames = network.frames([road for road, _ in pairs], [entry.stations for entry in placed])
         stops = np.cumsum([len(entry.stations) for entry in placed]).tolist()
         return [

@@ -132,12 +132,12 @@ class PlanTable:
                 array[mask] = values
         return points
 
-    def _clothoid_points(self, distances: Floats, rows: Ints) -> PlanPoints:
+    def _clothoid_points(self, distances: Floats, row_indices: Ints) -> PlanPoints:
         """Return points on clothoids.
 
         Points in rows of cubics have no meaning.
         """
-        start, x, y, heading, curvature, growth = self._table[rows].T
+        start, x, y, heading, curvature, growth = self._table[row_indices].T
         along = distances - start
         sines, cosines = sin_cos(heading + (curvature + growth / 2 * along) * along)
         x = x + cosines * along
@@ -148,8 +148,8 @@ class PlanTable:
         node_sines, node_cosines = sin_cos(heading[curved, None] + turned * steps)
         # Sums of five products in a fixed order have the same bits on every processor.
         for array, origin, parts in (
-            (x, self._table[rows[curved], 1], node_cosines * _WEIGHTS),
-            (y, self._table[rows[curved], 2], node_sines * _WEIGHTS),
+            (x, self._table[row_indices[curved], 1], node_cosines * _WEIGHTS),
+            (y, self._table[row_indices[curved], 2], node_sines * _WEIGHTS),
         ):
             mean = ((parts[:, 0] + parts[:, 4]) + (parts[:, 1] + parts[:, 3])) + parts[:, 2]
             array[curved] = origin + mean * along[curved]

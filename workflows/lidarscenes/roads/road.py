@@ -45,9 +45,9 @@ class Frames(NamedTuple):
     up: Floats  # (k, 3): unit vectors, upright on both
     level_side: Floats  # (k, 3): horizontal unit vectors to the left
 
-    def take(self, rows: slice | Ints) -> Frames:
+    def take(self, station_selection: slice | Ints) -> Frames:
         """Return the frames of selected stations."""
-        return Frames(*(array[rows] for array in self))
+        return Frames(*(array[station_selection] for array in self))
 
 
 class Road:
@@ -214,12 +214,12 @@ class LateralShapes:
 
     def kinks(self, start: float, stop: float) -> Floats:
         """Return t (j,) at which cubics start, of all stations that matter between distances."""
-        starts = self._starts[self._rows(start, stop)]
+        starts = self._starts[self._row_range(start, stop)]
         return np.unique(starts[np.isfinite(starts)])
 
     def steps(self, start: float, stop: float) -> Floats:
         """Return t (j,) at which heights step, of all stations that matter between distances."""
-        rows = self._rows(start, stop)
+        rows = self._row_range(start, stop)
         starts = self._starts[rows]
         a, b, c, d = self._coefficients[:, rows]
         with np.errstate(invalid="ignore"):  # infinite starts of cubics that lack
@@ -230,7 +230,7 @@ class LateralShapes:
 
     def max_bends(self, start: float, stop: float, knots: Floats) -> Floats:
         """Return the largest second derivatives between ascending t (j + 1,), 1/m."""
-        rows = self._rows(start, stop)
+        rows = self._row_range(start, stop)
         t = (knots[1:] + knots[:-1]) / 2
         pieces = np.maximum((self._starts[rows, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)
         indices = np.arange(rows.start, rows.stop)[:, None]
@@ -240,18 +240,20 @@ class LateralShapes:
         is_before = t < origins  # where heights are level
         return np.where(is_before, 0.0, np.maximum(*ends)).max(axis=0)
 
-    def _rows(self, start: float, stop: float) -> slice:
+    def _row_range(self, start: float, stop: float) -> slice:
         """Return the stations between which the heights between two distances are."""
         first = int(np.searchsorted(self.stations, start, "right")) - 1
         last = int(np.searchsorted(self.stations, stop, "left")) + 1
         count = len(self.stations)
         return slice(min(max(first, 0), count - 1), min(max(last, 1), count))
 
-    def _profiles(self, rows: Ints, t: Floats, pieces: Floats) -> Floats:
-        """Return the heights of the stations `rows` (k,) at t (..., k), m."""
-        cubics = np.maximum((self._starts[rows] <= pieces[..., None]).sum(axis=-1) - 1, 0)
-        a, b, c, d = self._coefficients[:, rows, cubics]
-        x = np.maximum(t - self._starts[rows, cubics], 0)
+    def _profiles(self, station_indices: Ints, t: Floats, pieces: Floats) -> Floats:
+        """Return the heights of stations, by their indices (k,), at t (..., k), m."""
+        cubics = np.maximum(
+            (self._starts[station_indices] <= pieces[..., None]).sum(axis=-1) - 1, 0
+        )
+        a, b, c, d = self._coefficients[:, station_indices, cubics]
+        x = np.maximum(t - self._starts[station_indices, cubics], 0)
         return np.asarray(((d * x + c) * x + b) * x + a)
 
 

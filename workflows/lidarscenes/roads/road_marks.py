@@ -79,16 +79,16 @@ def painted_quads(
     ]
 
 
-def _quads(rows: Ints, count: int) -> Ints:
+def _quads(right: Ints, count: int) -> Ints:
     """Return triangles (f, 3) between cross sections and the following.
 
-    `rows` are the cross sections' right points; their left points follow after `count`.
+    `right` are the cross sections' right points; their left points follow after `count`.
     """
-    left = rows + count
+    left = right + count
     return np.concatenate(
         [
-            np.stack([rows, rows + 1, left + 1], axis=1),
-            np.stack([rows, left + 1, left], axis=1),
+            np.stack([right, right + 1, left + 1], axis=1),
+            np.stack([right, left + 1, left], axis=1),
         ]
     )
 

@@ -213,7 +213,7 @@ class Robot:
         share arrays share a tree.
         """
         if without not in self._body_meshes:
-            parts: dict[str, list[SceneMesh]] = {}
+            link_meshes: dict[str, list[SceneMesh]] = {}
             names: dict[str, str] = {}
             # {link: moving link of its body, matrix from the link's frame to the body's}
             bodies = {self.links[0]: (self.links[0], np.eye(4))}
@@ -228,9 +228,9 @@ class Robot:
                     names.setdefault(body, link)
                     if link not in without:
                         moved = mesh.moved(link, matrix[:3, :3], matrix[:3, 3])
-                        parts.setdefault(body, []).append(moved)
+                        link_meshes.setdefault(body, []).append(moved)
             self._body_meshes[without] = {
-                body: join_meshes(names[body], meshes) for body, meshes in parts.items()
+                body: join_meshes(names[body], meshes) for body, meshes in link_meshes.items()
             }
         return self._body_meshes[without]
 

@@ -74,11 +74,11 @@ class _Writer:
         parts.append(part)
         return len(parts) - 1
 
-    def add(self, name: str, parts: list[SceneMesh | SceneInstance]) -> None:
+    def add(self, name: str, object_parts: list[SceneMesh | SceneInstance]) -> None:
         """Add an object, whose parts have a common matrix, as a node."""
-        meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in parts]
+        meshes = [part.mesh if isinstance(part, SceneInstance) else part for part in object_parts]
         key = tuple(id(mesh) for mesh in meshes)
-        translated = self._origin.any() and not isinstance(parts[0], SceneInstance)
+        translated = self._origin.any() and not isinstance(object_parts[0], SceneInstance)
         if key not in self._meshes:
             self._referenced += meshes
             if translated:
@@ -86,9 +86,11 @@ class _Writer:
             primitives = [primitive for mesh in meshes for primitive in self._primitives(mesh)]
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}
-        if isinstance(parts[0], SceneInstance):
+        if isinstance(object_parts[0], SceneInstance):
             to_y_up = affine(UP_AXES["y"].T, np.zeros(3))
-            node["matrix"] = matmul(matmul(to_y_up, parts[0].matrix), to_y_up.T).T.ravel().tolist()
+            node["matrix"] = (
+                matmul(matmul(to_y_up, object_parts[0].matrix), to_y_up.T).T.ravel().tolist()
+            )
         elif translated:
             node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
@@ -155,10 +157,10 @@ class _Writer:
         return primitives
 
     def _corners(
-        self, mesh: SceneMesh, rows: Indices, uv: AnyArray | None, tints: Bytes | None
+        self, mesh: SceneMesh, face_indices: Indices, uv: AnyArray | None, tints: Bytes | None
     ) -> dict[str, int]:
         """Return the attributes of triangles (k,) with separate corners (k, 3, …)."""
-        corners = turned(mesh.vertices[mesh.faces[rows]].reshape(-1, 3), UP_AXES["y"].T)
+        corners = turned(mesh.vertices[mesh.faces[face_indices]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
             attributes["TEXCOORD_0"] = self._array(uv.reshape(-1, 2).astype("<f4"), "VEC2")
@@ -167,16 +169,16 @@ class _Writer:
             attributes["COLOR_0"] = self._array(light, "VEC3")
         return attributes
 
-    def _array(self, rows: AnyArray, kind: str) -> int:
+    def _array(self, values: AnyArray, kind: str) -> int:
         """Add an accessor of attributes, or of indices (scalars), and return its number."""
-        view = self._view(rows.tobytes(), target=34963 if kind == "SCALAR" else 34962)
-        limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        view = self._view(values.tobytes(), target=34963 if kind == "SCALAR" else 34962)
+        limits = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         return self._put(
             "accessors",
             {
                 "bufferView": view,
-                "componentType": _TYPES[rows.dtype.kind],
-                "count": len(rows),
+                "componentType": _TYPES[values.dtype.kind],
+                "count": len(values),
                 "type": kind,
                 **limits,
             },

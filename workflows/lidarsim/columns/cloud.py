@@ -227,15 +227,15 @@ class Cloud(CloudDisplay):
         return int(np.searchsorted(self["scan"], scan))
 
     @classmethod
-    def joined(cls, parts: list[Cloud]) -> Cloud:
+    def joined(cls, clouds: list[Cloud]) -> Cloud:
         """Concatenate one or more clouds with the same columns."""
-        first = parts[0]
-        if len(parts) == 1:
+        first = clouds[0]
+        if len(clouds) == 1:
             return first
         columns = {
-            name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns
+            name: np.concatenate([part.columns[name] for part in clouds]) for name in first.columns
         }
-        positions = np.concatenate([part.positions for part in parts])
+        positions = np.concatenate([part.positions for part in clouds])
         return cls(positions, columns, first.custom_columns, first.sweeps)
 
 

@@ -68,13 +68,13 @@ class CloudFile:
         scan_column = self._rows["scan"]
         return bisect_left(scan_column, scans[0]), bisect_right(scan_column, scans[1])
 
-    def values(self, name: str, rows: Ints | slice) -> AnyArray:
+    def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
         """Return values of a column, or of x, y or z.
 
         Values of a slice stay on the disk.
         """
         files = {column.name: column.in_files for column in self.table}
-        return np.asarray(self._rows[files.get(name, name)][rows])
+        return np.asarray(self._rows[files.get(name, name)][row_selection])
 
     def _cloud(self, rows: Records, dtype: Any = None) -> Cloud:
         """Return a cloud of rows, with positions of `dtype`, by default as in the file."""

@@ -44,7 +44,7 @@ class PartColumns:
         return self.first + len(self.counts)
 
     @property
-    def cells(self) -> Ints | None:
+    def cell_box(self) -> Ints | None:
         """Lowest and highest cells, (2, 3), or None without rows."""
         if not len(self):
             return None

@@ -373,12 +373,12 @@ class SurfaceKinds:
         """First kind of each object, and the number of kinds: (objects + 1,)."""
         return np.searchsorted(self.object, np.arange(len(self.names) + 1))
 
-    def of_rows(self, rows: Indices) -> Indices:
+    def of_rows(self, object_indices: Indices) -> Indices:
         """Return the kinds of objects, by the objects' rows (m,)."""
         if len(self.object) == len(self.names):
-            return rows
-        starts = self.first[rows]
-        stops = self.first[rows + 1]
+            return object_indices
+        starts = self.first[object_indices]
+        stops = self.first[object_indices + 1]
         ranges = [np.arange(start, stop) for start, stop in zip(starts, stops, strict=True)]
         return np.concatenate([np.zeros(0, np.intp), *ranges])
 
@@ -528,7 +528,7 @@ def with_classes(
 
 
 def with_class(
-    materials: Sequence[Material], semantic_class: int, rows: Indices, kinds: SurfaceKinds
+    materials: Sequence[Material], semantic_class: int, object_indices: Indices, kinds: SurfaceKinds
 ) -> list[Material]:
     """Return materials with a class for objects, by their rows (m,), and otherwise unchanged.
 
@@ -538,7 +538,7 @@ def with_class(
         If a material applies to no kind.
     """
     first = first_matches(materials, kinds)
-    selected_kinds = kinds.of_rows(rows)
+    selected_kinds = kinds.of_rows(object_indices)
     entries: list[Material] = []
     for number in (*range(len(materials)), -1):
         object_rows = np.unique(
@@ -639,34 +639,36 @@ class MaterialTable:
         """Whether the reflectance of any surface is its colour."""
         return bool(self.scale.any())
 
-    def shares(self, rows: Integers, luminance: Floats | None) -> Floats:
+    def shares(self, kind_indices: Integers, luminance: Floats | None) -> Floats:
         """Return the share of light that surfaces scatter, by their kinds (n,): (n,).
 
         `luminance` (n,) is the luminance of the hit colours, if the table is `textured`.
         """
-        shares = self.reflectance[rows]
+        shares = self.reflectance[kind_indices]
         if luminance is not None:
-            scale = self.scale[rows]
+            scale = self.scale[kind_indices]
             bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
             shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
         return shares
 
-    def scattered(self, rows: Integers, cosine: Floats, luminance: Floats | None = None) -> Floats:
+    def scattered(
+        self, kind_indices: Integers, cosine: Floats, luminance: Floats | None = None
+    ) -> Floats:
         """Return the share of light that surfaces return, by their kinds (n,): (n,).
 
         The share is 1 for a white surface hit at right angles. `cosine` (n,) is the cosine of the
         angle of incidence; `luminance` (n,) is the luminance of the hit colours, if the table is
         `textured`.
         """
-        shares = self.shares(rows, luminance)
-        back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
+        shares = self.shares(kind_indices, luminance)
+        back = shares * np.where(self.retro[kind_indices], RETRO_GAIN, cosine)
         if self.roughness.any():
-            rough = np.flatnonzero(self.roughness[rows])
-            metal = self.metalness[rows[rough]]
+            rough = np.flatnonzero(self.roughness[kind_indices])
+            metal = self.metalness[kind_indices[rough]]
             diffuse = shares[rough]
             front = POLISHED * (1 - metal) + diffuse * metal
             back[rough] *= 1 - metal
-            back[rough] += front * gloss(cosine[rough], self.roughness[rows[rough]])
+            back[rough] += front * gloss(cosine[rough], self.roughness[kind_indices[rough]])
         return back
 
 

@@ -72,20 +72,20 @@ def _end_slopes(times: Floats, values: Floats) -> Floats:
     return slopes
 
 
-def _reduce(rows: Floats) -> None:
+def _reduce(equations: Floats) -> None:
     """Solve padded tridiagonal equations (2 + d, n) in place, by cyclic reduction (Hockney, 1965).
 
     Row 0 is the factor of the unknown before, row 1 of the unknown after; the others are the right
     sides, and then the solutions. The factors, 1/2 at most, are squared in each step, and at last
     are below a rounding.
     """
-    count = rows.shape[1] - 2 * _PAD
-    lower = rows[0, _PAD:-_PAD]
-    upper = rows[1, _PAD:-_PAD]
-    right_sides = rows[2:, _PAD:-_PAD]
+    count = equations.shape[1] - 2 * _PAD
+    lower = equations[0, _PAD:-_PAD]
+    upper = equations[1, _PAD:-_PAD]
+    right_sides = equations[2:, _PAD:-_PAD]
     for distance in (1, 2, 4, 8, 16, _PAD):
-        rows_before = rows[:, _PAD - distance : _PAD - distance + count]
-        rows_after = rows[:, _PAD + distance : _PAD + distance + count]
+        rows_before = equations[:, _PAD - distance : _PAD - distance + count]
+        rows_after = equations[:, _PAD + distance : _PAD + distance + count]
         scale = 1 - lower * rows_before[1] - upper * rows_after[0]
         reduced = (right_sides - lower * rows_before[2:] - upper * rows_after[2:]) / scale
         lower[:] = -lower * rows_before[0] / scale

@@ -46,18 +46,18 @@ class Shots:
         return ~np.isnan(self.range_m)
 
     @classmethod
-    def joined(cls, parts: list[Shots]) -> Shots:
+    def joined(cls, tables: list[Shots]) -> Shots:
         """Concatenate one or more parts with firings, which have the same columns."""
-        if len(parts) == 1:
-            return parts[0]
+        if len(tables) == 1:
+            return tables[0]
         columns = {
-            name: np.concatenate([part.columns[name] for part in parts], axis=1)
-            for name in parts[0].columns
+            name: np.concatenate([part.columns[name] for part in tables], axis=1)
+            for name in tables[0].columns
         }
         arrays = {
-            name: np.concatenate([getattr(part, name) for part in parts]) for name in _OF_FIRINGS
+            name: np.concatenate([getattr(part, name) for part in tables]) for name in _OF_FIRINGS
         }
-        range_m = np.concatenate([part.range_m for part in parts], axis=1)
+        range_m = np.concatenate([part.range_m for part in tables], axis=1)
         return cls(**arrays, range_m=range_m, columns=columns)
 
     @classmethod

@@ -100,7 +100,7 @@ class VelodyneEncoder(PacketEncoder):
         state = VelodyneState(
             model=source.sensor.model,
             serial=source.name or "lidarpool",
-            returns=source.mode.title(),
+            return_mode=source.mode.title(),
             rpm=round(60 * source.sensor.head.rate_hz),  # type: ignore[attr-defined]
             pps_state="Locked" if source.dated else "Absent",
         )

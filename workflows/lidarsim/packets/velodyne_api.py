@@ -26,7 +26,7 @@ class VelodyneState:
 
     model: str
     serial: str
-    returns: str  # Strongest, Last or Dual
+    return_mode: str  # Strongest, Last or Dual
     rpm: int
     pps_state: str  # Locked or Absent
 
@@ -103,7 +103,7 @@ class VelodyneApi(HttpService):
 
     def _settings(self) -> Mapping[str, Any]:
         return {
-            "returns": self._state.returns,
+            "returns": self._state.return_mode,
             "rpm": str(self._state.rpm),
             "laser": self._laser,
             "fov": {"start": "0", "end": "359"},
@@ -132,7 +132,7 @@ class VelodyneApi(HttpService):
 
         Raises RefusedError for what cannot be set.
         """
-        current = {"returns": self._state.returns, "rpm": str(self._state.rpm)}
+        current = {"returns": self._state.return_mode, "rpm": str(self._state.rpm)}
         laser = self._laser
         for name, value in values.items():
             if name == "laser" and value.title() in ("On", "Off"):

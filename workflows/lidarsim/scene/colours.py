@@ -81,19 +81,19 @@ class Colours:
         """Return a plain colour for each face, from colours (f, 3)."""
         return cls.of_corners(colours[:, None].repeat(3, axis=1))
 
-    def take(self, rows: Integers | slice) -> Colours:
+    def take(self, face_selection: Integers | slice) -> Colours:
         """Return the colours of selected faces."""
-        uv = None if self.uv is None else self.uv[rows]
-        corners = None if self.corners is None else self.corners[rows]
-        return Colours(self.images, self.image[rows], uv, corners)
+        uv = None if self.uv is None else self.uv[face_selection]
+        corners = None if self.corners is None else self.corners[face_selection]
+        return Colours(self.images, self.image[face_selection], uv, corners)
 
-    def divided(self, rows: Integers, weights: Floats) -> Colours:
-        """Return the colours of pieces of the faces `rows` (k,).
+    def divided(self, face_indices: Integers, weights: Floats) -> Colours:
+        """Return the colours of pieces of faces, by the indices of the faces (k,).
 
         `weights` (k, 3, 3) are the barycentric coordinates of the corners of each piece in its
         face.
         """
-        faces = self.take(rows)
+        faces = self.take(face_indices)
         uv = None if faces.uv is None else matmul(weights, faces.uv).astype(np.float32)
         corners = None if faces.corners is None else matmul(weights, faces.corners).astype(np.uint8)
         return replace(faces, uv=uv, corners=corners)
@@ -193,20 +193,20 @@ class Lookup:
         self._texture = _Planes.joined(textured, textures)
         self._light = _Planes.joined(tinted, lights)
 
-    def colours_at(self, rows: Integers, points: Floats) -> UInts32:
+    def colours_at(self, face_indices: Integers, points: Floats) -> UInts32:
         """Return the packed colours (n,) of points (n, 3) on faces (n,), the texel of an image."""
-        image = self._image.take(rows)
+        image = self._image.take(face_indices)
         texel = self._first.take(image)
         positions = np.ascontiguousarray(points.T)
         if self._texture is not None:
-            selected, (u, v) = self._texture.values_at(rows, positions)
+            selected, (u, v) = self._texture.values_at(face_indices, positions)
             image = image[selected]
             width = self._width.take(image)
             row = _element(v, self._height.take(image))
             texel[selected] += row * width + _element(u, width)
         colours = self._texels.take(texel)
         if self._light is not None:
-            selected, light = self._light.values_at(rows, positions)
+            selected, light = self._light.values_at(face_indices, positions)
             tinted = LINEAR[unpacked(colours[selected])] * np.clip(light.T, 0, 1)
             colours[selected] = packed(as_srgb(tinted))
         return colours
@@ -215,7 +215,7 @@ class Lookup:
 class _Planes(NamedTuple):
     """Values on faces that are linear in the position."""
 
-    rows: Ints32  # (f,): row of `slopes` of each face; -1 for faces without values
+    slope_rows: Ints32  # (f,): row of `slopes` of each face; -1 for faces without values
     slopes: Floats  # (k, 4 w): for each of w values, slopes along x, y and z, and value at zero
     everywhere: bool  # all faces have values
 
@@ -227,13 +227,13 @@ class _Planes(NamedTuple):
         slope_rows = np.where(has_values, np.cumsum(has_values) - 1, -1).astype(np.int32)
         return cls(slope_rows, np.concatenate(blocks), bool(has_values.all()))
 
-    def values_at(self, rows: Integers, points: Floats) -> tuple[Any, Floats]:
+    def values_at(self, face_indices: Integers, points: Floats) -> tuple[Any, Floats]:
         """Return the selection of the faces (n,) with values, and the values at points (3, n).
 
         The selection is a slice of all, or indices (m,); the values are (w, m).
         """
         selected: Any = slice(None)
-        slope_rows = self.rows.take(rows)
+        slope_rows = self.slope_rows.take(face_indices)
         if not self.everywhere:
             selected = np.flatnonzero(slope_rows >= 0)
             slope_rows = slope_rows[selected]
@@ -301,16 +301,16 @@ def luminance(colours: UInts32) -> Floats:
 _SHARES = WEIGHTS[:, None] * LINEAR
 
 
-def join_colours(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
+def join_colours(mesh_colours: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
     """Join the colours of meshes in order, or return None if no mesh has colours.
 
     `sizes` are the numbers of faces of the meshes; a mesh without colours becomes grey.
     """
-    if not any(part is not None for part in parts):
+    if not any(part is not None for part in mesh_colours):
         return None
     coloured = [
         Colours.plain(GREY, size) if part is None else part
-        for part, size in zip(parts, sizes, strict=True)
+        for part, size in zip(mesh_colours, sizes, strict=True)
     ]
     image_numbers: dict[int, int] = {}  # {id of an image: its number}
     images: list[Bytes] = []
@@ -338,9 +338,9 @@ def join_colours(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colou
     return Colours(tuple(images), np.concatenate(image_indices), uv, corners)
 
 
-def colours_summary(parts: Iterable[Colours | None]) -> str:
+def colours_summary(mesh_colours: Iterable[Colours | None]) -> str:
     """Return a summary of colours: «2 textures, 1 plain colour, colours of vertices»."""
-    coloured = [part for part in parts if part is not None]
+    coloured = [part for part in mesh_colours if part is not None]
     kinds = {
         id(part.images[number]): "texture" if part.images[number].size > 3 else "plain colour"
         for part in coloured

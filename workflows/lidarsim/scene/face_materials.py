@@ -32,9 +32,9 @@ class FaceMaterials:
         """Return the same material for all faces, or None without a name."""
         return cls((name,)) if name else None
 
-    def take(self, rows: Integers | slice) -> FaceMaterials:
+    def take(self, face_selection: Integers | slice) -> FaceMaterials:
         """Return the materials of selected faces, with the same names."""
-        return self if self.index is None else FaceMaterials(self.names, self.index[rows])
+        return self if self.index is None else FaceMaterials(self.names, self.index[face_selection])
 
     def check(self, name: str, faces: int) -> None:
         """Check that names are distinct, and rows fit a number of faces.
@@ -111,17 +111,17 @@ class ObjectMaterials:
 
 
 def join_materials(
-    parts: Sequence[FaceMaterials | None], sizes: Iterable[int]
+    mesh_materials: Sequence[FaceMaterials | None], sizes: Iterable[int]
 ) -> FaceMaterials | None:
     """Join the materials of meshes in order, or return None if no mesh has materials.
 
     `sizes` are the numbers of faces of the meshes; faces without a material get the name "".
     """
-    if not any(part is not None for part in parts):
+    if not any(part is not None for part in mesh_materials):
         return None
     numbers: dict[str, int] = {}  # {name: row}
     index: list[Ints32] = []  # (f,) of each mesh
-    for part, size in zip(parts, sizes, strict=True):
+    for part, size in zip(mesh_materials, sizes, strict=True):
         names = ("",) if part is None else part.names
         rows = [numbers.setdefault(name, len(numbers)) for name in names]
         if part is None or part.index is None:

@@ -328,8 +328,8 @@ class Scene:
         object.__setattr__(scene, "world_origin", added)
         return scene
 
-    def moved(self, rows: Indices, positions: Floats, rotations: Floats) -> Scene:
-        """Return the same scene with instances `rows` (m,) at other poses.
+    def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Scene:
+        """Return the same scene with instances, by their indices (m,), at other poses.
 
         A pose is the pose of the mesh's frame in local coordinates: positions (m, 3), metres, and
         rotations (m, 3, 3). The instances keep their scales.
@@ -338,7 +338,7 @@ class Scene:
         scene = copy(self)
         for cached in ("bounds", "object_bounds", "footprints"):
             vars(scene).pop(cached, None)
-        moved = self.instances.moved(rows, positions, rotations)
+        moved = self.instances.moved(instance_indices, positions, rotations)
         object.__setattr__(scene, "instances", moved)
         return scene
 
@@ -412,7 +412,7 @@ class Scene:
 
         Only colours that exist are listed, in this order.
         """
-        parts = self.instances.parts if self.instances else ()
+        parts = self.instances.mesh_parts if self.instances else ()
         colours = [self.colours, *(part.colours for part in parts)]
         colours += [actor.mesh.colours for actor in self.actors]
         return [mesh_colours for mesh_colours in colours if mesh_colours is not None]
@@ -451,7 +451,7 @@ class Scene:
     @property
     def kept_triangles(self) -> int:
         """Number of static triangles in memory: a part counts once for all its instances."""
-        parts = self.instances.parts if self.instances else ()
+        parts = self.instances.mesh_parts if self.instances else ()
         return len(self.faces) + sum(len(part.faces) for part in parts)
 
     @property
@@ -507,7 +507,8 @@ class Scene:
                 by_object[owner].append(self._mesh_of_faces(owner, rows))
         if (instances := self.instances) is not None:
             meshes = [
-                self._mesh_of_shared_part(instances, index) for index in range(len(instances.parts))
+                self._mesh_of_shared_part(instances, index)
+                for index in range(len(instances.mesh_parts))
             ]
             for index, matrix, owner in zip(
                 instances.part, instances.transforms, instances.owner, strict=True
@@ -517,15 +518,17 @@ class Scene:
                 by_object[owner].append(instance)
         return tuple(item for items in by_object for item in items)
 
-    def _mesh_of_faces(self, owner: int, rows: Indices) -> SceneMesh:
-        """Return the faces `rows` (k,) of an object as a mesh in world coordinates."""
-        points, faces = compacted(self.vertices, self.faces[rows])
+    def _mesh_of_faces(self, owner: int, face_indices: Indices) -> SceneMesh:
+        """Return faces of an object, by their indices (k,), as a mesh in world coordinates."""
+        points, faces = compacted(self.vertices, self.faces[face_indices])
         return SceneMesh(
             self.names[owner],
             points + self.origin,
             faces,
-            colours=self.colours and self.colours.take(rows),
-            materials=None if self.materials is None else self.materials.of_object(owner, rows),
+            colours=self.colours and self.colours.take(face_indices),
+            materials=None
+            if self.materials is None
+            else self.materials.of_object(owner, face_indices),
         )
 
     def _mesh_of_shared_part(self, instances: Instances, index: int) -> SceneMesh:
@@ -533,7 +536,7 @@ class Scene:
 
         The mesh has the name of the first object that has the part.
         """
-        part = instances.parts[index]
+        part = instances.mesh_parts[index]
         cutouts = () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),)
         return SceneMesh(
             self.names[instances.owner[np.argmax(instances.part == index)]],
@@ -638,7 +641,7 @@ class _SplitObjects:
 
     meshes: list[SceneMesh] = field(default_factory=list)  # without masks and voxels
     mesh_owners: list[int] = field(default_factory=list)  # index of each mesh's object
-    parts: list[MeshPart] = field(default_factory=list)
+    mesh_parts: list[MeshPart] = field(default_factory=list)
     placed_parts: list[_PlacedPart] = field(default_factory=list)
 
     def add_mesh(self, owner: int, mesh: SceneMesh) -> None:
@@ -652,7 +655,7 @@ class _SplitObjects:
             return None
         owners, parts, matrices = zip(*self.placed_parts, strict=True)
         return Instances(
-            tuple(self.parts),
+            tuple(self.mesh_parts),
             np.array(parts, np.intp),
             np.array(matrices)[:, :3],
             np.array(owners, np.int32),
@@ -695,11 +698,11 @@ def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObject
             mesh = item.mesh
             matrix = item.matrix
         if mesh not in part_indices:
-            first = len(split.parts)
-            split.parts += parts_of(mesh)
-            part_indices[mesh] = range(first, len(split.parts))
+            first = len(split.mesh_parts)
+            split.mesh_parts += parts_of(mesh)
+            part_indices[mesh] = range(first, len(split.mesh_parts))
         for index in part_indices[mesh]:
-            part = split.parts[index]
+            part = split.mesh_parts[index]
             if is_mesh and part.mask is None and part.voxels is None:
                 split.add_mesh(owner, _mesh_of_part(item.name, part))
             else:
@@ -725,7 +728,7 @@ def _check_counts(split: _SplitObjects) -> None:
     """
     vertices = sum(len(mesh.vertices) for mesh in split.meshes)
     triangles = sum(len(mesh.faces) for mesh in split.meshes)
-    triangles += sum(len(split.parts[placed.part].faces) for placed in split.placed_parts)
+    triangles += sum(len(split.mesh_parts[placed.part].faces) for placed in split.placed_parts)
     max_count = np.iinfo(np.int32).max
     if max(vertices, triangles) > max_count:
         raise LidarError(

@@ -157,7 +157,7 @@ class Instances:
 
     Attributes
     ----------
-    parts
+    mesh_parts
         Parts, each once.
     part
         intp (n,): index of each instance's part.
@@ -167,7 +167,7 @@ class Instances:
         int32 (n,): index of each instance's object.
     """
 
-    parts: tuple[MeshPart, ...]
+    mesh_parts: tuple[MeshPart, ...]
     part: Indices
     transforms: Floats
     owner: Ints32
@@ -198,7 +198,7 @@ class Instances:
     @cached_property
     def sizes(self) -> Ints:
         """Number of triangles of each instance, (n,)."""
-        return np.array([len(part.faces) for part in self.parts], np.int64)[self.part]
+        return np.array([len(part.faces) for part in self.mesh_parts], np.int64)[self.part]
 
     @property
     def triangles(self) -> int:
@@ -207,13 +207,13 @@ class Instances:
 
     def owners(self, condition: Callable[[MeshPart], bool]) -> Ints32:
         """Return the objects of the instances whose part fulfils a condition."""
-        fulfilled = np.array([condition(part) for part in self.parts], np.bool_)
+        fulfilled = np.array([condition(part) for part in self.mesh_parts], np.bool_)
         return self.owner[fulfilled[self.part]]
 
     def placed(self) -> Iterator[tuple[Indices, Floats]]:
         """Yield blocks of instances (k,) of the same part, and their vertices: (k, 3, v), local."""
         for number in np.unique(self.part):
-            part = self.parts[number]
+            part = self.mesh_parts[number]
             rows = np.flatnonzero(self.part == number)
             step = max(1, BLOCK_POINTS // len(part.vertices))
             for start in range(0, len(rows), step):
@@ -267,17 +267,17 @@ class Instances:
         """Scales of instances that have moved, shared by all copies: moves keep the scales."""
         return _Scales(np.zeros((len(self), 3, 3)), np.zeros(len(self), np.bool_))
 
-    def _scales_of(self, rows: Indices) -> Floats:
-        """Return the scales (m, 3, 3) of instances `rows` (m,)."""
+    def _scales_of(self, instance_indices: Indices) -> Floats:
+        """Return the scales (m, 3, 3) of instances, by their indices (m,)."""
         scales, is_known = self._scales
-        unknown = rows[~is_known[rows]]
+        unknown = instance_indices[~is_known[instance_indices]]
         if len(unknown):
             scales[unknown] = scales_of(self.transforms[unknown, :, :3])
             is_known[unknown] = True
-        return np.asarray(scales[rows])
+        return np.asarray(scales[instance_indices])
 
-    def moved(self, rows: Indices, positions: Floats, rotations: Floats) -> Instances:
-        """Return the instances with instances `rows` (m,) at other poses.
+    def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Instances:
+        """Return the instances, with instances at other poses by their indices (m,).
 
         Poses are positions (m, 3) and rotations (m, 3, 3). The moved instances keep their scales.
         Rows have no duplicates. LidarError if a position is too far from zero.
@@ -285,9 +285,9 @@ class Instances:
         if not (np.abs(positions) <= MAX_COORDINATE_M).all():
             for position in positions:
                 check_coordinate(position)
-        linear = matmul(rotations, self._scales_of(rows))
+        linear = matmul(rotations, self._scales_of(instance_indices))
         transforms = self.transforms.copy()
-        transforms[rows] = np.concatenate([linear, positions[:, :, None]], axis=2)
+        transforms[instance_indices] = np.concatenate([linear, positions[:, :, None]], axis=2)
         instances = copy(self)
         object.__setattr__(instances, "transforms", transforms)
         earlier_bounds = self._earlier_bounds
@@ -299,7 +299,7 @@ class Instances:
         if earlier_bounds is not None:
             bounds, changed = earlier_bounds
             changed = changed.copy()
-            changed[rows] = True
+            changed[instance_indices] = True
             earlier_bounds = bounds, changed
         object.__setattr__(instances, "_earlier_bounds", earlier_bounds)
         return instances

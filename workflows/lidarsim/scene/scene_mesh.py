@@ -214,12 +214,12 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
         raise LidarError(f"{name!r} has {faces} faces, and cutouts of {cutout_faces}.")
 
 
-def stacked(parts: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
+def stacked(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
     """Concatenate pairs of vertices (v, 3) and faces (f, 3), with faces renumbered."""
     vertices = []
     faces = []
     offset = 0
-    for points, corners in parts:
+    for points, corners in meshes:
         vertices.append(points)
         faces.append(corners + offset)
         offset += len(points)

@@ -56,12 +56,12 @@ class SimplifiedScene:
         shares = _triangle_shares(shared, max_triangles, near_positions)
         copies = _CopiedInstances(scene)
         for index, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
-            part = _drawn_part(shared.parts[index], share)
+            part = _drawn_part(shared.mesh_parts[index], share)
             for row in np.flatnonzero((shared.part == index) & (shares == share)):
                 copies.add(part, shared, int(row))
         return cls(copies.scene(), np.concatenate(copies.counters))
 
-    def hits(self, counts: AnyArray) -> AnyArray:
+    def triangle_hit_counts(self, counts: AnyArray) -> AnyArray:
         """Return the hits of each triangle, and of the actors' triangles, from hit counters."""
         if self.is_original:
             return counts
@@ -148,15 +148,15 @@ def cut_masks(scene: Scene) -> Scene:
     The hit counters stay the same.
     """
     shared = scene.instances
-    masked = sum(part.mask is not None for part in shared.parts) if shared else 0
+    masked = sum(part.mask is not None for part in shared.mesh_parts) if shared else 0
     if shared is None or not masked:
         return scene
-    instance_counts = np.bincount(shared.part, minlength=len(shared.parts))
+    instance_counts = np.bincount(shared.part, minlength=len(shared.mesh_parts))
     parts = tuple(
         _cut_part(part, min(CUT_TRIANGLES, DRAWN_TRIANGLES / (masked * count)))
-        for part, count in zip(shared.parts, instance_counts.tolist(), strict=True)
+        for part, count in zip(shared.mesh_parts, instance_counts.tolist(), strict=True)
     )
-    return replace(scene, instances=replace(shared, parts=parts))
+    return replace(scene, instances=replace(shared, mesh_parts=parts))
 
 
 def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
@@ -231,7 +231,7 @@ class _SimplifiedPart(NamedTuple):
 
     vertices: Floats  # (v, 3)
     faces: Ints32  # (k, 3)
-    rows: Indices  # (k,), the original face of each face
+    face_indices: Indices  # (k,), the original face of each face
 
 
 def _simplified_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
@@ -245,8 +245,10 @@ def _simplified_part(part: MeshPart, max_triangles: int) -> _SimplifiedPart:
     # A single surface has half as many vertices as faces.
     has_pieces = len(np.unique(part.vertices, axis=0)) > len(part.faces)
     merged = _merge_vertices(part.vertices, part.faces, max_triangles)
-    if not has_pieces and len(merged.rows) >= max_triangles // 4:
-        return _SimplifiedPart(merged.vertices, merged.faces[merged.rows], merged.rows)
+    if not has_pieces and len(merged.face_indices) >= max_triangles // 4:
+        return _SimplifiedPart(
+            merged.vertices, merged.faces[merged.face_indices], merged.face_indices
+        )
     corners = part.vertices[part.faces]
     order = np.argsort(-triangle_areas(corners), kind="stable")
     large, small = np.split(order, [max_triangles // 4])
@@ -271,9 +273,9 @@ def simplified(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
     for small objects that vanish.
     """
     merged = _merge_vertices(scene.vertices, scene.faces, max_triangles)
-    owners = scene.face_object[merged.rows]
-    colours = scene.colours and scene.colours.take(merged.rows)
-    faces = merged.faces[merged.rows]
+    owners = scene.face_object[merged.face_indices]
+    colours = scene.colours and scene.colours.take(merged.face_indices)
+    faces = merged.faces[merged.face_indices]
     coarse = Scene(merged.vertices, faces, owners, scene.names, scene.origin, colours=colours)
     return coarse, merged.substitutes
 
@@ -283,8 +285,10 @@ class _MergedMesh(NamedTuple):
 
     vertices: Floats  # (v, 3)
     faces: Ints32  # (f, 3), all faces, with the new vertices
-    rows: Indices  # (k,), faces to keep: with an area, and each only once
-    substitutes: Ints  # (f,), index into `rows` of the face that stands for each face; -1 for none
+    face_indices: Indices  # (k,), faces to keep: with an area, and each only once
+    substitutes: (
+        Ints  # (f,), index into `face_indices` of the face that stands for each face; -1 for none
+    )
 
 
 def _merge_vertices(points: Floats, corners: Ints32, max_triangles: int) -> _MergedMesh:

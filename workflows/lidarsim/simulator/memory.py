@@ -106,7 +106,7 @@ def _bytes(setup: Setup, scans: int, on_device: bool) -> float:
     firings = (stop - first) * scans
     rays = firings * sensor.channels
     subrays = min(rays * setup.reporting.subrays, CHUNK_RAYS)
-    returns = rays * _returns(setup)
+    returns = rays * _returns_per_pulse(setup)
     beams = subrays / setup.reporting.subrays
     sizes = Sizes(rays, beams, subrays, returns, returns / survey.keep_every)
     memory = _casting_memory(setup, sizes, firings, on_device)
@@ -158,7 +158,7 @@ def _point_bytes(setup: Setup, scans: int, on_device: bool) -> float:
     return POINT + POINT_BYTE * columns + columns * on_device
 
 
-def _returns(setup: Setup) -> float:
+def _returns_per_pulse(setup: Setup) -> float:
     """Estimate the mean number of reported returns of a pulse that hits a surface."""
     subrays = setup.reporting.subrays
     mode = setup.reporting.mode

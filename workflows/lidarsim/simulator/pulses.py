@@ -1,14 +1,28 @@
 """Returns of the pulses of one sensor: casts the sensor's scans, and applies the steps to the hits.
 
-The way through a worker: `Rig.cast` groups scans, and `Rig.returns` finds the `Firings` of a group
-and the `CastPoses` of its beams. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at a
-time and passes `PulseReturns` through the steps in the order of `step_list.py`: steps that aim
-beams; `CastStep`, which finds the hits of all rays; steps that add light of rain, spray and dirt;
-those that make returns of hits, detect, receive, lose and choose returns. What is kept of them is
-`Scanned`. Steps on reported returns get all beams at once, and returns out of range are removed.
-`BatchPoints` holds it, and `columns_of` makes columns of `BatchPoints`. If each ray can have one
-return only (`Setup.return_count_varies`), `SceneCaster` itself counts and thins out the hits; on
-CUDA without steps, `DeviceColumns` does all of it.
+The way through a worker, from `intersect` of a casting task to a part's columns:
+
+1. `Rig.cast` groups scans of one sensor and station whose firings follow each other.
+2. `Rig.returns` finds the `Firings` of a group and the `CastPoses` of its beams.
+3. `PulseCaster.scan` makes a `PulseBatch` for some of the beams at a time, and passes
+   `PulseReturns` through the steps in the order of `step_list.py`:
+
+   a. Steps aim the beams.
+   b. `CastStep` finds the hits of all sub-rays; `CastStep.apply` lists its passes. From here on,
+      `PulseReturns` has a row for each hit.
+   c. Steps add the light of rain, spray and dirt, as further hits.
+   d. `SeparationStep` or `WaveformStep` makes returns of hits; `_mark_returns` of
+      `separation_loops.py` follows five hits of a beam. From here on, `PulseReturns` has a row for
+      each return.
+   e. Steps detect, receive, lose and choose returns.
+
+4. `PulseCaster` counts the returns of each scan, and keeps every n-th: `Scanned`.
+5. Steps on reported returns get all beams at once, and returns out of range are removed.
+6. `BatchPoints` holds the returns that are left, and `columns_of` makes their columns.
+
+If each ray can have one return only (`Setup.return_count_varies`), `SceneCaster` itself counts and
+thins out the hits, in place of 3 and 4; of the steps of 3, only steps that aim beams act. On CUDA
+without steps, `DeviceColumns` does 3 to 6.
 """
 
 from __future__ import annotations
@@ -26,7 +40,7 @@ from ..scene.scene import Scene
 from ..survey.survey import Survey
 from .casting.motion import CastPoses, Firings
 from .casting.scene_caster import SceneCaster
-from .casting.surfaces import Surfaces, light_of
+from .casting.surfaces import Surfaces, sensor_light_of
 from .returns import NO_SURFACE, Keys, PulseReturns, joined, required
 from .steps.doppler import radial_velocities
 from .steps.step import Emitter, PulseBatch, PulseStep, Role
@@ -39,7 +53,7 @@ class Scanned(NamedTuple):
     """Kept returns of scans, and counts of all returns."""
 
     returns: PulseReturns
-    hits: Ints  # (scans,): returns of each scan, kept or not
+    hit_counts: Ints  # (scans,): returns of each scan, kept or not
     tally: Ints | None  # (counters,): hits by `StoredTriangles.counter`, kept or not, on request
 
 
@@ -152,7 +166,7 @@ class PulseCaster:
             return scanned
         removed = np.flatnonzero(~in_range)
         removed_scan = np.searchsorted(scan_starts, returns.ray[removed], "right") - 1
-        hits = scanned.hits - np.bincount(removed_scan, minlength=len(scan_starts))
+        hit_counts = scanned.hit_counts - np.bincount(removed_scan, minlength=len(scan_starts))
         tally = scanned.tally
         if tally is not None:
             triangle = returns.triangle[removed]
@@ -162,11 +176,11 @@ class PulseCaster:
         stop = np.searchsorted(returns.ray, returns.ray, "right")
         removed_before = np.append(0, np.cumsum(~in_range))  # removed returns before each row
         number = required(returns.number) - (removed_before[:-1] - removed_before[start])
-        count = required(returns.returns) - (removed_before[stop] - removed_before[start])
+        count = required(returns.return_counts) - (removed_before[stop] - removed_before[start])
         renumbered = returns._replace(
-            number=number.astype(np.uint8), returns=count.astype(np.uint8)
+            number=number.astype(np.uint8), return_counts=count.astype(np.uint8)
         )
-        return Scanned(renumbered.take(in_range), hits, tally)
+        return Scanned(renumbered.take(in_range), hit_counts, tally)
 
     def _pulses(self, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch after all steps that act before returns are thinned out."""
@@ -200,7 +214,7 @@ class PulseCaster:
         returns = PulseReturns.single_returns(hits.ray, hits.distance, hits.triangle)
         if batch.offsets is not None:
             returns = self._with_light(returns, batch)
-        return Scanned(returns, hits.hits, hits.tally)
+        return Scanned(returns, hits.hit_counts, hits.tally)
 
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Add energy, colour and velocity to returns of deflected beams, by cast directions."""
@@ -227,12 +241,12 @@ class PulseCaster:
             points += origins
             colour = surfaces.colours(triangle, points, times, poses.actor_trajectories)
             del points  # which takes as much memory as the normals
-        light = light_of(setup.survey, setup.sensor)
+        sensor_light = sensor_light_of(setup.survey, setup.sensor)
         lit = surfaces.lit(
             triangle,
             directions,
             distance=distance,
-            light=light,
+            sensor_light=sensor_light,
             times=times,
             trajectories=poses.actor_trajectories,
             colours=colour,
@@ -245,14 +259,14 @@ class PulseCaster:
 
         keep_every = self.setup.survey.keep_every
         size = len(returns.ray)
-        hits = np.zeros(len(scan_starts), np.int64)
+        hit_counts = np.zeros(len(scan_starts), np.int64)
         rows = np.empty(size, np.int64)
         number, returns_of_pulse = np.empty((2, size), np.uint8)
         count = pulse_loops.thin_out(
             owned(returns.ray, np.int64),
             owned(scan_starts, np.int64),
             keep_every=keep_every,
-            counts=hits,
+            counts=hit_counts,
             rows=rows,
             number=number,
             returns=returns_of_pulse,
@@ -261,10 +275,10 @@ class PulseCaster:
         thinned = thinned._replace(
             ray=thinned.ray.astype(np.uint32),
             number=number[:count],
-            returns=returns_of_pulse[:count],
+            return_counts=returns_of_pulse[:count],
             reported=thinned.distance,
         )
         if not tally:
-            return Scanned(thinned, hits, None)
+            return Scanned(thinned, hit_counts, None)
         triangle = returns.triangle[returns.triangle != NO_SURFACE]
-        return Scanned(thinned, hits, self._surfaces.triangles.count(triangle))
+        return Scanned(thinned, hit_counts, self._surfaces.triangles.count(triangle))

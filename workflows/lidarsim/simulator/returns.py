@@ -29,13 +29,13 @@ NO_SURFACE = -1  # triangle and object of returns that are not from a surface
 SURFACE = CAUSES.index("surface")
 
 
-def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
+def selected(columns: Iterable[Any], row_selection: Any) -> Iterator[Any]:
     """Yield the selected rows of each column, or None for a column that is None."""
     for column in columns:
         if isinstance(column, np.ndarray) and column.flags.f_contiguous:  # twice as fast
-            yield column.T.take(rows, axis=-1).T
+            yield column.T.take(row_selection, axis=-1).T
         else:
-            yield None if column is None else column[rows]
+            yield None if column is None else column[row_selection]
 
 
 # Columns of every hit and return.
@@ -65,7 +65,7 @@ class PulseReturns(NamedTuple):
     # Recorded (`columns.waveforms.record`); `BatchPoints` adds `location_ps` and `toward`.
     waveform: Records | None = None
     number: Bytes | None = None  # among the reported returns of its pulse, from 1
-    returns: Bytes | None = None  # number of reported returns of its pulse
+    return_counts: Bytes | None = None  # number of reported returns of its pulse
     reported: Floats | None = None  # distance with noise, metres
 
     @classmethod
@@ -77,13 +77,13 @@ class PulseReturns(NamedTuple):
     def single_returns(cls, ray: Integers, distance: Floats, triangle: Ints32) -> PulseReturns:
         """Return a table where each ray (n,) has a single return, without noise."""
         single = np.ones(len(ray), np.uint8)
-        return cls(ray, distance, triangle, number=single, returns=single, reported=distance)
+        return cls(ray, distance, triangle, number=single, return_counts=single, reported=distance)
 
-    def take(self, rows: Bools | Indices) -> PulseReturns:
+    def take(self, row_selection: Bools | Indices) -> PulseReturns:
         """Return the selected rows of all columns."""
-        if rows.dtype == np.bool_:  # a mask would be counted again for each column
-            rows = np.flatnonzero(rows)
-        return PulseReturns(*selected(self, rows))
+        if row_selection.dtype == np.bool_:  # a mask would be counted again for each column
+            row_selection = np.flatnonzero(row_selection)
+        return PulseReturns(*selected(self, row_selection))
 
     @property
     def height(self) -> Floats:
@@ -106,22 +106,22 @@ def required(column: T | None) -> T:
 _LACKING: dict[str, Any] = {"cause": np.uint8(SURFACE), "velocity": np.nan, "width": 0.0}
 
 
-def joined(parts: list[PulseReturns]) -> PulseReturns:
+def joined(tables: list[PulseReturns]) -> PulseReturns:
     """Concatenate tables of hits. Columns outside `_LACKING` are in all tables, or in none."""
-    if len(parts) == 1:
-        return parts[0]
-    return PulseReturns._make(_column(name, parts) for name in PulseReturns._fields)
+    if len(tables) == 1:
+        return tables[0]
+    return PulseReturns._make(_column(name, tables) for name in PulseReturns._fields)
 
 
-def _column(name: str, parts: list[PulseReturns]) -> AnyArray | None:
+def _column(name: str, tables: list[PulseReturns]) -> AnyArray | None:
     """Concatenate a column of several tables, or return None if all tables lack the column."""
-    columns = [getattr(part, name) for part in parts]
+    columns = [getattr(part, name) for part in tables]
     if all(column is None for column in columns):
         return None
     return np.concatenate(
         [
             np.full(len(part.ray), _LACKING[name]) if column is None else column
-            for part, column in zip(parts, columns, strict=True)
+            for part, column in zip(tables, columns, strict=True)
         ]
     )
 

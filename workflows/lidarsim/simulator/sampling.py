@@ -58,8 +58,8 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
         rays = sum(spec.ray_count for spec in batch.specs)
         cast_rays = cast_rays + rays
         sampled_rays = sampled_rays + rays * every
-        hits += int(batch.hits.sum()) * every
-        points += int(np.ceil(batch.hits * every / survey.keep_every).sum())
+        hits += int(batch.hit_counts.sum()) * every
+        points += int(np.ceil(batch.hit_counts * every / survey.keep_every).sum())
     share = survey.ray_count / sampled_rays
     return {"rays": cast_rays, "hits": round(hits * share), "points": round(points * share)}
 

@@ -41,7 +41,9 @@ class Image:
         first_firing = np.array(sensor.firings(first_step)[:1])
         lead_ns = float(sensor.begins_ns(first_firing)[0]) + sensor.lead_ns
         begin_ns = round(sweeps.begins_ns[sweep] - lead_ns)
-        return cls.from_steps(sensor, steps, first_scan, begin_ns, fired.returns[number], points)
+        return cls.from_steps(
+            sensor, steps, first_scan, begin_ns, fired.returns_per_pulse[number], points
+        )
 
     @classmethod
     def from_steps(
@@ -50,13 +52,13 @@ class Image:
         steps: range,
         first_scan: int,
         begin_ns: float,
-        returns: int,
+        returns_per_pulse: int,
         points: Cloud,
     ) -> Image:
         """Return the pixels of the points of consecutive time steps of a sensor.
 
         `first_scan` is the scan of the first step, `begin_ns` the start of the station, and a pulse
-        has up to `returns`. LidarError if the points are not in order, or of other steps.
+        has up to `returns_per_pulse`. LidarError if the points are not in order, or of other steps.
         """
         from . import image_loops  # not before: numba takes half a second to import
 
@@ -84,7 +86,7 @@ class Image:
             plane=plane,
             row=row,
             column=column,
-            planes=max(returns, max_returns),
+            planes=max(returns_per_pulse, max_returns),
         )
 
     def filled(self, values: AnyArray) -> AnyArray:

@@ -88,7 +88,9 @@ class FiredRays:
     """All rays of each sweep, with and without returns."""
 
     sensors: tuple[Sensor, ...]
-    returns: tuple[int, ...]  # reported returns of a pulse of each sensor at most; 1 if unknown
+    returns_per_pulse: tuple[
+        int, ...
+    ]  # reported returns of a pulse of each sensor at most; 1 if unknown
     steps: Ints  # (n,): first time step of each sweep, counted from the start of its station
     seeds: tuple[int, ...]  # seeds of each sensor's noise, which dropped packets depend on
 
@@ -390,7 +392,11 @@ class Sweeps:
             arrays[f"{prefix}positions"] = poses.positions
             arrays[f"{prefix}quaternions"] = poses.quaternions
         if self.fired is not None and (sensors := to_plain_data(self.fired.sensors, arrays)):
-            rays = {"sensors": sensors, "returns": self.fired.returns, "seeds": self.fired.seeds}
+            rays = {
+                "sensors": sensors,
+                "returns": self.fired.returns_per_pulse,
+                "seeds": self.fired.seeds,
+            }
             arrays["rays"] = np.frombuffer(json.dumps(rays).encode(), np.uint8)
             arrays["steps"] = self.fired.steps
         return packed(arrays)

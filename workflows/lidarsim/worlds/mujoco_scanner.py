@@ -184,10 +184,10 @@ class MujocoScanner:
         return _matrices(data.xpos, data.xmat, self._bodies)
 
 
-def _matrices(positions: Any, rotations: Any, rows: Indices) -> Floats:
+def _matrices(positions: Any, rotations: Any, row_indices: Indices) -> Floats:
     """Return matrices (k, 4, 4) of positions (n, 3) and rotations (n, 9), selected by rows (k,)."""
-    matrices = np.zeros((len(rows), 4, 4))
-    matrices[:, :3, 3] = np.asarray(positions).reshape(-1, 3)[rows]
-    matrices[:, :3, :3] = np.asarray(rotations).reshape(-1, 3, 3)[rows]
+    matrices = np.zeros((len(row_indices), 4, 4))
+    matrices[:, :3, 3] = np.asarray(positions).reshape(-1, 3)[row_indices]
+    matrices[:, :3, :3] = np.asarray(rotations).reshape(-1, 3, 3)[row_indices]
     matrices[:, 3, 3] = 1
     return matrices

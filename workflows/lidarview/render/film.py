@@ -97,7 +97,8 @@ class Film:
     """
 
     moments_ns: Floats  # (k,) of the frames
-    parts: Iterable[tuple[Floats, Floats]]  # per frame: new points (n, 3), colours (n, 4) in 0 to 1
+    # for each frame, its new points (n, 3) and their colours (n, 4), 0 to 1
+    new_points: Iterable[tuple[Floats, Floats]]
     keep_share: float  # share of the points that later frames show, too
     scene_triangles: AnyFloats  # (f, 3, 3): triangles of the scene
     top: float  # height above which the scene is cut open
@@ -115,7 +116,7 @@ class Film:
         points = _FilmPoints()
         scene = [_shape(self.scene_triangles, SURFACE)] if len(self.scene_triangles) else []
         sights = self._sights()
-        for number, (moment, part) in enumerate(zip(self.moments_ns, self.parts, strict=True)):
+        for number, (moment, part) in enumerate(zip(self.moments_ns, self.new_points, strict=True)):
             camera = sights.camera(number)
             shapes = [*scene, *self._actor_shapes(moment)]
             image, depth = _draw_surfaces(shapes, camera, sights.focus, self.top)

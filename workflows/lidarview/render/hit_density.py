@@ -22,7 +22,7 @@ _MAX_RATIO = 300.0  # densest to sparsest colour
 
 
 def hit_colours(
-    scene: Scene, corners: Floats32, hits: Floats, points: Floats32, max_pieces: int
+    scene: Scene, corners: Floats32, hit_counts: Floats, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, tuple[float, float]]:
     """Colour triangles by hits per square metre.
 
@@ -33,7 +33,7 @@ def hit_colours(
 
     Parameters
     ----------
-    corners, hits
+    corners, hit_counts
         (f, 3, 3), metres, and (f,): the drawn triangles of the scene, and the hits of each.
     points
         (n, 3): an evenly spaced sample of hit points, which may lack some places.
@@ -51,8 +51,8 @@ def hit_colours(
     limits
         Ends of the logarithmic scale, hits per square metre; its colours are `TURBO`.
     """
-    triangle_density = hit_density(scene, hits)
-    pieces, owner, areas, point_density = _divide(corners, hits > 0, points, max_pieces)
+    triangle_density = hit_density(scene, hit_counts)
+    pieces, owner, areas, point_density = _divide(corners, hit_counts > 0, points, max_pieces)
     is_counted = np.isfinite(point_density)
     piece_density = triangle_density[owner]
     if point_density[is_counted].any():
@@ -66,7 +66,9 @@ def hit_colours(
             pieces[is_counted], areas[is_counted], corner_density[is_counted]
         )
     # Where points were counted, none are grey; elsewhere the hits are known.
-    colours = _density_colours(corner_density, (~is_counted & (hits[owner] > 0))[:, None], limits)
+    colours = _density_colours(
+        corner_density, (~is_counted & (hit_counts[owner] > 0))[:, None], limits
+    )
     return pieces, owner, colours, limits
 
 
@@ -97,9 +99,9 @@ def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
     return np.divide(hits, area, out=np.zeros_like(hits), where=area > 0)
 
 
-def _rounds(hits: Floats) -> int:
+def _rounds(hit_counts: Floats) -> int:
     """Choose how many times to share hits with the neighbours."""
-    hit = hits[hits > 0]
+    hit = hit_counts[hit_counts > 0]
     if not len(hit):
         return 0
     # Counts of one do not show how many triangles were missed: assume three times as many as
@@ -108,19 +110,19 @@ def _rounds(hits: Floats) -> int:
     return min(_MAX_ROUNDS, math.floor(_MIN_HITS / typical / 2))
 
 
-def _share(faces: Ints32, hits: Floats, area: Floats, vertices: int) -> Floats:
+def _share(faces: Ints32, hit_counts: Floats, area: Floats, vertices: int) -> Floats:
     """Spread hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
     corner_hits = np.zeros(vertices)
     corner_areas = np.zeros(vertices)
     for corner in faces.T:
-        corner_hits += np.bincount(corner, weights=hits / 3, minlength=vertices)
+        corner_hits += np.bincount(corner, weights=hit_counts / 3, minlength=vertices)
         corner_areas += np.bincount(corner, weights=area, minlength=vertices)
     density = np.divide(
         corner_hits, corner_areas, out=np.zeros_like(corner_hits), where=corner_areas > 0
     )
     shared = area * density[faces].sum(axis=1)
     # Triangles without area have no density; they keep their hits.
-    return np.where(area > 0, shared, hits)
+    return np.where(area > 0, shared, hit_counts)
 
 
 def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:

@@ -58,8 +58,8 @@ class _Pattern(NamedTuple):
 class _Window(NamedTuple):
     """Part of the grid of cells that has rays."""
 
-    rows: slice
-    columns: slice
+    row_range: slice
+    column_range: slice
     extent: tuple[float, float, float, float]  # left, right, bottom, top, degrees
 
 
@@ -100,7 +100,7 @@ def pattern_page(sensor: Sensor) -> Page:
         image[..., :3] = _COVERED
         image[..., 3] = covered
         axes.imshow(
-            image[window.rows, window.columns],
+            image[window.row_range, window.column_range],
             origin="lower",
             extent=window.extent,
             aspect="auto" if is_wide else "equal",

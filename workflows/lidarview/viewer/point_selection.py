@@ -38,14 +38,14 @@ class HeldPoints:
     def __len__(self) -> int:
         return len(self._cloud)
 
-    def values(self, name: str, rows: Ints | slice) -> AnyArray:
+    def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
         """Return the values of a column at rows.
 
         Columns x, y and z are world coordinates.
         """
         if name in AXES:
-            return np.asarray(self._cloud.positions[rows, AXES.index(name)])
-        return self._cloud[name][rows]
+            return np.asarray(self._cloud.positions[row_selection, AXES.index(name)])
+        return self._cloud[name][row_selection]
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
         """Return all rows."""
@@ -70,28 +70,29 @@ class JoinedPoints:
 
     table: tuple[Column, ...]
 
-    def __init__(self, parts: Sequence[Points]) -> None:
-        self._firsts = np.cumsum([0, *map(len, parts)])  # rows; the last is one past all
-        self.parts = [*zip(self._firsts[:-1].tolist(), parts, strict=True)]
-        shared = set.intersection(*({column.name for column in part.table} for part in parts))
-        self.table = (*(entry for entry in parts[0].table if entry.name in shared), RESULT)
+    def __init__(self, results: Sequence[Points]) -> None:
+        self._firsts = np.cumsum([0, *map(len, results)])  # rows; the last is one past all
+        # [(row of the first point, points of a result)]
+        self.results = [*zip(self._firsts[:-1].tolist(), results, strict=True)]
+        shared = set.intersection(*({column.name for column in result.table} for result in results))
+        self.table = (*(entry for entry in results[0].table if entry.name in shared), RESULT)
 
     def __len__(self) -> int:
         return int(self._firsts[-1])
 
-    def values(self, name: str, rows: Ints | slice) -> AnyArray:
+    def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
         """Return the values of a column at ascending rows.
 
         Columns x, y and z are world coordinates.
         """
-        if isinstance(rows, slice):
-            rows = np.arange(*rows.indices(len(self)))
-        bounds = np.searchsorted(rows, self._firsts)
+        if isinstance(row_selection, slice):
+            row_selection = np.arange(*row_selection.indices(len(self)))
+        bounds = np.searchsorted(row_selection, self._firsts)
         if name == RESULT.name:
-            return np.repeat(np.arange(len(self.parts), dtype=np.uint8), np.diff(bounds))
-        pieces = zip(self.parts, itertools.pairwise(bounds), strict=True)
+            return np.repeat(np.arange(len(self.results), dtype=np.uint8), np.diff(bounds))
+        pieces = zip(self.results, itertools.pairwise(bounds), strict=True)
         return np.concatenate(
-            [part.values(name, rows[a:b] - first) for (first, part), (a, b) in pieces]
+            [part.values(name, row_selection[a:b] - first) for (first, part), (a, b) in pieces]
         )
 
 
@@ -149,15 +150,15 @@ class Filter:
             tuple(values for values in self.hidden if values[0] != column),
         )
 
-    def keeps(self, points: Points, rows: Ints | slice) -> Bools:
+    def keeps(self, points: Points, row_selection: Ints | slice) -> Bools:
         """Return a mask (n,) of the points at rows that are within all limits."""
-        x, y, z = (points.values(axis, rows) for axis in AXES)
+        x, y, z = (points.values(axis, row_selection) for axis in AXES)
         is_kept = np.asarray(np.isfinite(x + y + z))
         for name, lower, upper in self.limits:
-            values = points.values(name, rows)
+            values = points.values(name, row_selection)
             is_kept &= (values >= lower) & (values <= upper)  # False for NaN
         for name, hidden_values in self.hidden:
-            is_kept &= ~np.isin(points.values(name, rows), hidden_values)
+            is_kept &= ~np.isin(points.values(name, row_selection), hidden_values)
         return is_kept
 
 
@@ -237,10 +238,10 @@ def even_shares(counts: AnyArray, max_points: int) -> Floats:
     return np.minimum(level / np.maximum(counts, 1e-9), 1.0)
 
 
-def positions(points: Points, rows: Ints | slice) -> Floats:
+def positions(points: Points, row_selection: Ints | slice) -> Floats:
     """Return the positions at rows, float64 (n, 3), world coordinates, metres."""
     # The matrix product of a camera is fastest on contiguous columns.
-    return np.stack([points.values(axis, rows) for axis in AXES], dtype=np.float64).T
+    return np.stack([points.values(axis, row_selection) for axis in AXES], dtype=np.float64).T
 
 
 class Abandoned(Exception):  # noqa: N818 - no error: nobody waits for the answer any more
@@ -290,11 +291,13 @@ class PointFinder:
         ranges = [(0, len(self.points))]  # ranges of rows, first and after the last
         if scans is not None:
             points = self.points
-            parts: Sequence[tuple[int, Any]] = [(0, points)]
+            results: Sequence[tuple[int, Any]] = [(0, points)]
             if isinstance(points, JoinedPoints):
-                parts = points.parts
+                results = points.results
             row_ranges = (
-                (first, part.rows_of(scan_range)) for first, part in parts for scan_range in scans
+                (first, result.rows_of(scan_range))
+                for first, result in results
+                for scan_range in scans
             )
             ranges = sorted((first + start, first + stop) for first, (start, stop) in row_ranges)
         total = sum(stop - start for start, stop in ranges)
@@ -316,8 +319,8 @@ class PointFinder:
         )
         return rows, count
 
-    def _local(self, rows: Ints | slice) -> Floats:
-        return positions(self.points, rows) - self._origin
+    def _local(self, row_selection: Ints | slice) -> Floats:
+        return positions(self.points, row_selection) - self._origin
 
     def _search(
         self,

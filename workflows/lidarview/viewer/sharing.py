@@ -156,10 +156,17 @@ class _FilmSource:
         colours = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]  # darker colours are lost
         return local, np.pad(colours, ((0, 0), (0, 1)), constant_values=1)
 
-    def parts(self, box: Floats, spans: Sequence[ScanRanges]) -> Iterator[tuple[Floats, Floats]]:
+    def new_points(
+        self, box: Floats, spans: Sequence[ScanRanges]
+    ) -> Iterator[tuple[Floats, Floats]]:
         """Yield the points and colours of each frame's scans."""
         for scans in spans:
             yield self.points(box, _FRAME_POINTS, scans)
+
+
+def _never_abandoned() -> bool:
+    """Return False: a file waits for each answer of its view."""
+    return False
 
 
 def _film(view: View, max_frames: int) -> Film:
@@ -167,7 +174,7 @@ def _film(view: View, max_frames: int) -> Film:
     triangles = np.empty((0, 3, 3))
     top = np.inf
     if view.pictured is not None and len(view.pictured.scene.faces):
-        header, arrays = view.answer("surface", {"colour": "grey"}, bool)
+        header, arrays = view.answer("surface", {"colour": "grey"}, _never_abandoned)
         triangles = arrays["corners"]
         top = header["roof_cut"] or top
     source = _FilmSource(view, PointFinder(view.points, view.origin), top)
@@ -175,7 +182,7 @@ def _film(view: View, max_frames: int) -> Film:
     frames = int(np.clip(view.duration_ns / (1e6 * _FRAME_MS), _MIN_FRAMES, max_frames))
     film = Film(
         moments_ns=np.linspace(0, view.duration_ns, frames + 1)[1:],
-        parts=repeat(source.points(box, _FILM_POINTS), frames),
+        new_points=repeat(source.points(box, _FILM_POINTS), frames),
         keep_share=0.0,
         scene_triangles=triangles,
         top=top,
@@ -188,7 +195,9 @@ def _film(view: View, max_frames: int) -> Film:
     intervals = pairwise([-np.inf, *film.moments_ns[:-1], np.inf])
     spans = [_scans_between(view.sweeps, *interval) for interval in intervals]
     all_points = max(_FILM_POINTS, min(len(view.points), _FRAME_POINTS * frames))
-    film = replace(film, parts=source.parts(box, spans), keep_share=_FILM_POINTS / all_points)
+    film = replace(
+        film, new_points=source.new_points(box, spans), keep_share=_FILM_POINTS / all_points
+    )
     return _follow(film, moving[0], source, spans) if moving else film
 
 
@@ -304,14 +313,15 @@ def joined_modules(folder: Traversable, name: str) -> str:
 
 def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:
     """Return the answers to all questions of a page but for points: {question: packed answer}."""
-    header, arrays = view.answer("state", {}, bool)
+    header, arrays = view.answer("state", {}, _never_abandoned)
     answers = {"state?": _packed(header | {"offline": True, "exports": []}, arrays)}
     questions = [("surface", "colour", value) for value in header["scene_colours"] or ()]
     questions += [("column", "name", value) for value in view.columns]
     labels = [name for name, column in view.columns.items() if column.kind == "label"]
     questions += [("counts", "name", name) for name in labels]
     for number, (question, key, value) in enumerate(questions, 1):
-        answers[f"{question}?{key}={value}"] = _packed(*view.answer(question, {key: value}, bool))
+        answer = view.answer(question, {key: value}, _never_abandoned)
+        answers[f"{question}?{key}={value}"] = _packed(*answer)
         show("page", number, len(questions), "answers")
     return answers
 
@@ -351,7 +361,7 @@ def _packed_points(view: View, local: Floats, columns: Mapping[str, AnyArray]) -
     packed_columns |= {name: pack_column(values) for name, values in columns.items()}
     arrays: dict[str, AnyArray] = {name: c.planes for name, c in packed_columns.items()}
     legends = dict[str, Any]()
-    for name in view.answer("state", {}, bool)[0]["colours"]:
+    for name in view.answer("state", {}, _never_abandoned)[0]["colours"]:
         colouring = view.colouring(name)
         legends[name] = legend_of(colouring) | {"column": name, "divisor": colouring.divisor}
         if colouring.limits is not None:

@@ -99,7 +99,7 @@ class View:
     results: Sequence[str] = ()  # names, if the points are of several results
     # Returns the hits of each triangle of the scene, actors' triangles last, during a run; None
     # takes `pictured.hit_counts`.
-    hits: Callable[[], AnyArray] | None = None
+    read_hit_counts: Callable[[], AnyArray] | None = None
     triangles: int = MAX_TRIANGLES  # largest number of the scene's triangles that are shown
     downloads: Downloads | None = None  # None if points are not offered as files
     # {column: names of the values 0, 1, 2, …}, beside the names of the scene and the sweeps.
@@ -590,7 +590,7 @@ class View:
         hit_counts = pictured.hit_counts
         hit_points = np.zeros((0, 3), np.float32)
         if colour == "hits":
-            hit_counts = hit_counts if self.hits is None else self.hits()
+            hit_counts = hit_counts if self.read_hit_counts is None else self.read_hit_counts()
             if not len(hit_counts):  # before a run
                 hit_counts = np.zeros(len(pictured.scene.faces), np.int64)
             hit_counts = hit_counts[: len(pictured.scene.faces)]  # without actors' triangles

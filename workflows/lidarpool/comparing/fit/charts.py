@@ -26,7 +26,7 @@ class _Chart(NamedTuple):
 _CHARTS = {
     "noise_by_range": _Chart("range, m", "noise, mm", 1000),
     "noise_by_light": _Chart("intensity, or energy", "noise, mm", 1000),
-    "noise_by_tilt": _Chart("incidence, °", "noise with that of directions, mm", 1000),
+    "noise_by_tilt": _Chart("incidence, °", "noise with noise of directions, mm", 1000),
     "returned_by_light": _Chart("intensity, or energy", "pulses that return, %", 100),
     "lost_by_range": _Chart("range of the scene, m", "pulses lost, %", 100),
     "light_by_range": _Chart("range, m", "mean intensity", 1),

@@ -32,7 +32,7 @@ class Estimate(NamedTuple):
         return cls.from_variance(values.mean(), values.var() / len(values))
 
     @classmethod
-    def from_shares(cls, parts: Floats, totals: Ints) -> Estimate:
+    def from_shares(cls, counts: Floats, totals: Ints) -> Estimate:
         """Estimate a share: the sum of parts (n,) over the sum of totals (n,), as of lost pulses.
 
         The interval follows Clopper and Pearson for the number of independent pulses whose
@@ -42,8 +42,8 @@ class Estimate(NamedTuple):
         from scipy.stats import beta
 
         total = float(totals.sum())
-        share = float(parts.sum()) / total
-        share_variance = float(((parts - share * totals) ** 2).sum()) / total**2
+        share = float(counts.sum()) / total
+        share_variance = float(((counts - share * totals) ** 2).sum()) / total**2
         binomial_variance = share * (1 - share) / total
         pulses = (
             total * binomial_variance / share_variance
@@ -60,7 +60,7 @@ class Estimate(NamedTuple):
         return self.high - self.low <= 2 * share * abs(self.value)
 
     def power(self, exponent: float, scale: float = 1.0) -> Estimate:
-        """Return the estimate of `scale` times a power; negative numbers count as 0."""
+        """Return the estimate of `scale` times a power, where negative numbers count as 0."""
         value, *limits = (round(float(scale * max(number, 0.0) ** exponent), 9) for number in self)
         return Estimate(value, min(limits), max(limits))
 

@@ -1,4 +1,4 @@
-"""Fits the performance of a sensor to a recording; writes a sensor file and its page.
+"""Fits the performance of a sensor to a recording, and writes a sensor file and its page.
 
 A figure is a number of the performance, such as the noise of ranges; intervals of figures are
 confidence intervals of 95 %. Arrays have the axes of `stack`.
@@ -45,7 +45,7 @@ _MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not on
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """Result of `fit`; printed as a table."""
+    """Result of `fit`, printed as a table."""
 
     __signature__ = ReadableSignature()
 
@@ -57,9 +57,9 @@ class Fit:
 
     @checked
     def save(self, file: str | Path) -> list[Path]:
-        """Write the sensor file and a .html page beside the file; return both paths.
+        """Write the sensor file and a .html page beside the file, and return both paths.
 
-        LidarError if the file is no .yaml, or cannot be written.
+        LidarError if the file is not a .yaml, or cannot be written.
         """
         model_path = Path(file)
         if model_path.suffix not in MODEL_FILES:
@@ -115,7 +115,7 @@ def fit(
     ------
     LidarError
         If the recording cannot be read, has no sweeps or rings, or is of several sensors; if the
-        sensor moves, and there is no scene or the poses are unknown; or scipy is missing.
+        sensor moves, and the scene or the poses are unknown; or scipy is missing.
     """
     need("scipy", "fit", "Figures are fitted")
     if not isinstance(recording, Recording):
@@ -142,7 +142,7 @@ def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
     estimates = measured.estimates
     notes = list(stack.notes)
     if not _has_rings(base, stack):
-        notes.append(f"the recorded rings are not those of {base.name}: check --model")
+        notes.append(f"the recorded rings are not the rings of {base.name}: check --model")
     figures = {
         "versions": {"lidarpool": __version__},
         "name": name,
@@ -171,10 +171,10 @@ def _has_rings(model: SensorModel, stack: SweepStack) -> bool:
 def _with_performance(
     base: SensorModel, estimates: Mapping[str, Estimate], source: str
 ) -> SensorModel:
-    """Return a sensor with estimates in its performance; figures without estimates stay.
+    """Return a sensor with estimates in its performance.
 
-    The figures of range noise go together: an estimate of one replaces all of these, and
-    `precision`.
+    `estimates` is `Measured.estimates`. Figures without estimates stay. The figures of range noise
+    go together: an estimate of one replaces all of these, and `precision`.
     """
     values = {name: float(f"{estimate.value:.4g}") for name, estimate in estimates.items()}
     performance = base.performance or Performance()

@@ -37,14 +37,14 @@ class KnownPoses:
 
     numbers: Ints  # (n,): numbers of the sweeps
     matrices: Floats  # (n, 4, 4): from the sensor frame at the start of each sweep
-    are_given: bool  # by the user
+    are_given: bool  # whether the user gave the poses
     origin: Floats  # (3,): of the scene in the world, metres
 
     @classmethod
     def of_recording(
         cls, recording: Recording, pose: Any, scene: Scene | None
     ) -> KnownPoses | None:
-        """Return the poses given as `pose`, else the recording's poses; None if unknown.
+        """Return the poses given as `pose`, else the recording's poses, or None if unknown.
 
         LidarError if the given poses are neither one nor one for each sweep.
         """
@@ -66,7 +66,7 @@ class KnownPoses:
         return not self.are_given and recording.fired is not None
 
     def speed(self, recording: Recording) -> Speed | None:
-        """Return the mean motion from sweep to sweep; None if the sensor stands."""
+        """Return the mean motion from sweep to sweep, or None if the sensor stands."""
         positions = self.matrices[:, :3, 3]
         rotations = self.matrices[:, :3, :3]
         is_exact = self.are_given or self.are_of_firings(recording)

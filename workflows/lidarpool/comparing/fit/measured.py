@@ -46,9 +46,11 @@ class Measured:
     stack: SweepStack
     rays: SmoothRays
     energy: Floats | None  # (k,): as of `_pulse_energies`; None if unknown
-    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}; empty for a single sweep
+    # {figure: estimate}: fields of `Noise` (`fit_performance`), and for a sensor that stands also
+    # `false_alarms`, a field of `Performance`; empty for a single sweep of such a sensor
+    estimates: dict[str, Estimate]
     bias: dict[int, Estimate]  # {row: metres}
-    lost_by_range: Curve | None = None  # by the range of the scene; None without a scene
+    lost_by_range: Curve | None = None  # share by the range of the scene; None without a scene
     moves: bool = False  # whether the sensor moves
 
     def curves(self) -> dict[str, Curve]:
@@ -65,13 +67,16 @@ class Measured:
             "light_by_range": _curve(rays.distance, rays.intensity),
         }
         if self.stack.sweep_count > 1:
-            curves["returned_by_light"] = _curve(light, rays.returns / rays.trials)
+            curves["returned_by_light"] = _curve(light, rays.return_counts / rays.trials)
         if self.lost_by_range is not None:
             curves["lost_by_range"] = self.lost_by_range
         return curves
 
     def _range_variances(self) -> Floats:
-        """Return variances (k,) of ranges, m², less those by directions; NaN of single returns."""
+        """Return variances (k,) of ranges, m², less the variances that noise of directions causes.
+
+        The variance of a single return is NaN.
+        """
         rays = self.rays
         estimate = self.estimates.get("angle_deg")
         direction_noise_rad = 0.0 if estimate is None else np.radians(estimate.value)
@@ -150,7 +155,7 @@ def measure_moving(
         rays = pulses.rays(sigma)
         energy = _pulse_energies(rays, white or recording.white, recording.energies)
         estimates, sigma = fit_performance(rays, energy, all_known=True)
-    lost = 1 - rays.returns.astype(np.float64)
+    lost = 1 - rays.return_counts.astype(np.float64)
     bias = _pulse_bias(pulses)
     return Measured(stack, rays, energy, estimates, bias, _curve(rays.distance, lost), moves=True)
 
@@ -165,7 +170,10 @@ def _check_rays(count: int, name: str) -> None:
 
 
 def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> Floats:
-    """Cast a ray into each cell; return ranges of the scene (r, c), metres, NaN without a hit."""
+    """Cast a ray into each cell, and return ranges of the scene (r, c), metres.
+
+    The range of a ray that meets nothing is NaN.
+    """
     rays = stack.directions.reshape(-1, 3)
     sensor = ListedSensor(head=Spin(len(rays), 360), rays=rays, shot_ns=np.zeros(len(rays)))
     pose = np.eye(4) if poses is None else poses.matrices[0]
@@ -215,7 +223,7 @@ def _bias(
     cell = flat.row, flat.column
     if expected is not None:
         return _mean_by_row(flat.row, flat.distance - expected[cell])
-    error_m = sigma[cell] / np.sqrt(flat.returns) + _MIN_RANGE_ERROR_M
+    error_m = sigma[cell] / np.sqrt(flat.return_counts) + _MIN_RANGE_ERROR_M
     return ring_bias(flat, stack.directions[cell], error_m)
 
 
@@ -231,7 +239,7 @@ def _mean_by_row(row: Ints, errors: Floats) -> dict[int, Estimate]:
 
 
 def _root_mean(variances: Floats) -> dict[str, float] | None:
-    """Estimate the root of the mean of finite variances (n,); None for too few variances."""
+    """Estimate the root of the mean of finite variances (n,), or None for too few variances."""
     finite = variances[np.isfinite(variances)]
     if len(finite) < MIN_RAYS:
         return None

@@ -1,6 +1,6 @@
 """Pulses of a sensor that moves, against a scene: the poses of their firings are known.
 
-Each pulse has a ray of its own, so the mean range of a ray is unknown: the scene gives the range.
+No two pulses share a ray, so the mean range of a ray is unknown: the scene gives the range.
 Arrays of a sweep have r rows and c columns, as of `stack`.
 """
 
@@ -36,10 +36,11 @@ from .smooth_surfaces import (
 )
 from .stack import MAX_KINK_M, SweepStack
 
-_MAX_PULSES = 1 << 17  # that are fitted, chosen evenly
+_MAX_PULSES = 1 << 17  # pulses that are fitted, chosen evenly
 _SAME_RANGE_M = 1e-3  # difference of the ranges of a return, as rounded
-_MAX_GAP_DEG = 2.0  # from a cell to the nearest return of its ring, whose pose counts
-_MIN_LOST_STEPS = 1.5  # from a return to the next, between which a pulse is lost
+# angle from a cell to the nearest return of its ring, whose pose counts
+_MAX_GAP_DEG = 2.0
+_MIN_LOST_STEPS = 1.5  # steps between two returns if a pulse between the two is lost
 _LIGHT_COLUMNS = 3  # cells on either side whose intensities count
 
 
@@ -67,10 +68,10 @@ class Pulses:
     def near_scene(self, sigma: Floats) -> Bools:
         """Mark pulses (n,) that are lost, or return from the scene, by ranges' `sigma` (n,)."""
         limit_m = np.maximum(MAX_SIGMAS * sigma, SCENE_TOLERANCE_M)
-        return ~(np.abs(self.residual) > limit_m)  # also of NaN
+        return ~(np.abs(self.residual) > limit_m)  # NaN is marked, too
 
     def rays(self, sigma: Floats) -> SmoothRays:
-        """Return the pulses as rays of one pulse each; ranges have standard deviations (n,).
+        """Return the pulses as rays of one pulse each, with standard deviations (n,) of ranges.
 
         The variances belong to differences of neighbouring pulses: errors of poses and of the
         scene are alike in both.
@@ -84,7 +85,7 @@ class Pulses:
             distance=self.expected,
             slope=self.slope,
             intensity=self.intensity,
-            returns=returned.astype(np.int64),
+            return_counts=returned.astype(np.int64),
             trials=np.ones(len(self.row), np.int64),
             variance=np.where(paired, self.difference**2 / 2, 0.0),
             freedom=paired.astype(np.int64),
@@ -92,7 +93,7 @@ class Pulses:
 
 
 class SweepPulses(NamedTuple):
-    """Pulses of a sweep on smooth surfaces, or of all sweeps; returns that the scene explains."""
+    """Pulses of a sweep, or of all sweeps, on smooth surfaces of the scene."""
 
     pulses: Pulses
     compared: int  # returns where the scene has a surface
@@ -100,7 +101,7 @@ class SweepPulses(NamedTuple):
 
     @classmethod
     def joined(cls, sweeps: Sequence[SweepPulses]) -> SweepPulses:
-        """Join the pulses of sweeps; of many, choose pulses evenly."""
+        """Join the pulses of sweeps, and choose pulses evenly if there are many."""
         columns = zip(*(vars(sweep.pulses).values() for sweep in sweeps), strict=True)
         pulses = Pulses(*map(np.concatenate, columns))
         return cls(
@@ -217,7 +218,10 @@ class _NearestReturns(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _RayPoses:
-    """A trajectory in which each ray of a list has a pose; the time of ray i is i nanoseconds."""
+    """A trajectory that gives each ray of a list a pose.
+
+    The time of ray i is i nanoseconds.
+    """
 
     positions: Floats  # (k, 3)
     rotations: Floats  # (k, 3, 3)
@@ -314,7 +318,7 @@ def _pulses_of_sweep(
         # A pulse is lost between two returns of a surface; elsewhere the surface may be hidden, or
         # missing in the recorded place.
         usable &= returns.own | (np.abs(beside) < limit_m).all(axis=0)
-    # A surface of which no pulse nearby returns may be missing in the recorded place.
+    # A surface may be missing in the recorded place if no pulse nearby returns from the surface.
     usable &= np.isfinite(_means_beside(np.where(is_near, stack.ranges[sweep], np.nan)))
     difference = residual - np.roll(np.where(is_near, residual, np.nan), -1, axis=1)
     difference[:, 1::2] = np.nan  # each return is in one difference
@@ -351,7 +355,7 @@ def _turned(rotations: Floats, vectors: Floats) -> Floats:
 
 
 def _means_beside(values: Floats) -> Floats:
-    """Return the means (r, c) of the values of the cells beside each cell; NaN without any."""
+    """Return the means (r, c) of the values of the cells beside each cell, NaN without values."""
     shifts = [shift for shift in range(-_LIGHT_COLUMNS, _LIGHT_COLUMNS + 1) if shift]
     beside = np.stack([np.roll(values, shift, axis=1) for shift in shifts])
     known = np.isfinite(beside)

@@ -32,9 +32,9 @@ _MIN_TILT_TANGENT = 0.3
 
 # Lost pulses and false alarms
 _MIN_WEAK_RAYS = 30  # rays with losses that a threshold needs
-_LOG_STEP = 1e-3  # of logarithms, for derivatives
-# Rings and degrees of azimuth around a ray into the sky of which no ray returns twice: in smaller
-# gaps between leaves, leaves return once.
+_LOG_STEP = 1e-3  # step of logarithms, for derivatives
+# Around a ray into the sky, no ray within these rings and degrees of azimuth returns twice: in
+# smaller gaps between leaves, leaves return once.
 _SKY_RINGS = 7
 _SKY_DEG = 36.0
 _MIN_SKY_PULSES = 1000  # pulses into the sky that a share of false alarms needs
@@ -52,8 +52,16 @@ def fit_performance(
     """Estimate noise and lost pulses of a sensor from rays.
 
     `energy` (k,) is the energy of the returns of rays, if known. `all_known` says that rays without
-    any return are known, too, by a scene. Returns estimates by the field names of `Noise`, and the
-    standard deviations of rays (k,), metres, by range or by energy, whichever is likelier.
+    any return are known, too, by a scene.
+
+    Returns
+    -------
+    estimates
+        {field of `Noise`: estimate}: `range_m`, `angle_deg`, and `range_per_m` or, if likelier,
+        `range_at_threshold_m`; `detection_range_m` and `dropout`. Without a field that the rays do
+        not determine.
+    sigma
+        Standard deviations of the ranges of rays (k,), metres, by the likelier of range and energy.
     """
     threshold, dropout = _fit_detection(rays, energy, all_known)
     scatter = fit_scatter(rays, "range_per_m", rays.distance, 1)
@@ -78,7 +86,7 @@ def fit_performance(
 def _fit_detection(
     rays: SmoothRays, energy: Floats | None, all_known: bool
 ) -> tuple[Estimate | None, Estimate | None]:
-    """Estimate the energy of which half of the pulses return, and the share lost at any energy.
+    """Estimate the energy at which half of the pulses return, and the share lost at any energy.
 
     Either is None if undetermined; `energy` (k,) is None if unknown.
     """
@@ -99,7 +107,7 @@ def _fit_detection(
 
 
 def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> Estimate | None:
-    """Estimate the share of pulses that chosen rays (k,) lose; None for too few rays.
+    """Estimate the share of pulses that chosen rays (k,) lose, or None for too few rays.
 
     Without `all_known`, a ray without any return is unknown, so the rays that are known lose fewer
     pulses than others. For each return of a ray, the share is taken among the other `trials - 1`
@@ -109,19 +117,22 @@ def lost_share(rays: SmoothRays, chosen: Bools, *, all_known: bool = False) -> E
     chosen = chosen & (rays.trials >= min_trials)
     if chosen.sum() < MIN_RAYS:
         return None
-    returns = rays.returns[chosen]
+    return_counts = rays.return_counts[chosen]
     trials = rays.trials[chosen]
     if all_known:
-        return Estimate.from_shares((trials - returns).astype(np.float64), trials)
-    return Estimate.from_shares((trials - returns) * returns / (trials - 1), returns)
+        return Estimate.from_shares((trials - return_counts).astype(np.float64), trials)
+    return Estimate.from_shares(
+        (trials - return_counts) * return_counts / (trials - 1), return_counts
+    )
 
 
 class ScatterFit(NamedTuple):
     """Noise of ranges and directions that was fitted to the variances of rays."""
 
-    estimates: dict[str, Estimate]  # {field of `Noise`: estimate}
+    # {`range_m`, `angle_deg` or the name of the increase, fields of `Noise`: estimate}
+    estimates: dict[str, Estimate]
     sigma: Floats  # (k,): fitted standard deviation of the range of each ray, metres
-    deviance: float  # of the fit to all rays; a smaller deviance is likelier
+    deviance: float  # deviance of the fit to all rays; a smaller deviance is likelier
 
 
 class _VarianceSamples(NamedTuple):
@@ -129,7 +140,7 @@ class _VarianceSamples(NamedTuple):
 
     variance: Floats  # square metres
     freedom: Ints  # degrees of freedom of the variance
-    growth: Floats  # the quantity with which noise of ranges grows, such as the range
+    growth: Floats  # a quantity that noise of ranges grows with, such as the range
     slope: Floats  # metres in a radian
     distance: Floats  # metres
     patch: Ints  # number of the patch of neighbouring rays, whose errors may be alike
@@ -145,7 +156,7 @@ class _VarianceModel:
     marks; the others are 0.
     """
 
-    power: int  # of σ and the growth: 1 if noise adds, 2 if variances add
+    power: int  # power of σ and of the growth: 1 if noise adds, 2 if variances add
     fitted: Bools  # (3,): which parameters are fitted
     variance_scale: float  # usual variance v, square metres
     growth_scale: float  # usual growth, in its unit
@@ -202,11 +213,11 @@ def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int
 
 
 def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
-    """Choose the rays whose variances are fitted; `growth` (k,) is of all rays.
+    """Choose the rays whose variances are fitted, among all rays with `growth` (k,).
 
     Rays that lose many pulses are left out: only their nearer or brighter pulses return.
     """
-    repeated = (rays.freedom > 0) & (rays.returns >= MIN_RETURN_SHARE * rays.trials)
+    repeated = (rays.freedom > 0) & (rays.return_counts >= MIN_RETURN_SHARE * rays.trials)
     patch_columns = max(int(rays.column.max()) // _PATCHES, 1)
     patch = rays.row // _PATCH_ROWS * (_PATCHES + 2) + rays.column // patch_columns
     return _VarianceSamples(
@@ -261,10 +272,13 @@ def _fit_trimmed(
         weight = np.sqrt(freedom / 2) / expected
 
         def residuals(
-            parameters: Floats, rows: Bools = inliers, weight: Floats = weight, scale: Any = scale
+            parameters: Floats,
+            row_mask: Bools = inliers,
+            weight: Floats = weight,
+            scale: Any = scale,
         ) -> Any:
             variance = scale * model.expected(parameters, samples)
-            return ((samples.variance - variance) * weight)[rows]
+            return ((samples.variance - variance) * weight)[row_mask]
 
         x_scale = np.maximum(theta, 0.01)
         solved = least_squares(residuals, theta, bounds=(0, np.inf), x_scale=x_scale)
@@ -275,7 +289,7 @@ def _fit_trimmed(
 def fit_threshold(
     energy: Floats, rays: SmoothRays, dropout: float, *, all_known: bool = False
 ) -> Estimate | None:
-    """Estimate the energy of which half of the pulses return, by the curve of `Noise.detected`.
+    """Estimate the energy at which half of the pulses return, by the curve of `Noise.detected`.
 
     `energy` (k,) is the energy of rays; `dropout` is the share that is lost at any energy. Without
     `all_known`, a ray is known only if a pulse returns: the likelihood belongs to a truncated
@@ -291,7 +305,7 @@ def fit_threshold(
 
     def deviance(log_threshold: Any) -> Floats:
         p: Floats = detection(log_threshold)
-        likelihood = binom.logpmf(rays.returns, rays.trials, p)
+        likelihood = binom.logpmf(rays.return_counts, rays.trials, p)
         return (0 if all_known else np.log1p(-((1 - p) ** rays.trials))) - likelihood
 
     lower, upper = np.log(np.quantile(energy, (0.001, 0.999)))

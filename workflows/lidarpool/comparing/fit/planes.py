@@ -24,10 +24,10 @@ ARM_M = 10.0  # distance at which rotations are expressed in metres
 # noise of ranges, and motion, for which rays are weighted, metres
 _ASSUMED_NOISE_M = 0.02
 _ASSUMED_SHIFT_M = 0.5
-_MIN_EXPLAINED_SHARE = 0.5  # of the rays that a motion changes
+_MIN_EXPLAINED_SHARE = 0.5  # share of the rays that a motion changes
 _MAX_FACE_M = 0.3  # shift beyond which rays leave the faces of cars
 _VEHICLE_M = 4.0  # no front of a vehicle is as wide
-_CALM_FACTOR = 4.0  # of the median change, beyond which a change is of something that moves
+_CALM_FACTOR = 4.0  # a change above this multiple of the median is of something that moves
 _CALM_SIGMAS = 6.0
 # change of a range that may be noise, at least, and for each metre
 _STAYED_M = 0.05
@@ -36,8 +36,8 @@ _STAYED_PER_M = 0.01
 # Creep
 _CREEP_SWEEPS = 24  # sweeps, at most
 _CREEP_RAYS = 20_000  # rays, at most
-_SECTORS = 36  # of a revolution; errors of the rays of a sector are alike
-_CREEP_SIGMAS = 5.0  # of a significant motion
+_SECTORS = 36  # sectors of a revolution; errors of the rays of a sector are alike
+_CREEP_SIGMAS = 5.0  # standard deviations of a significant motion
 # share of the returns of a ray that are nearer to their median than so many standard deviations
 _MIN_NEAR_SHARE = 0.95
 _MAX_CREEP_SIGMAS = 10.0
@@ -50,7 +50,7 @@ _OFFSET = 6  # column of the offset of all ranges
 class RangeChanges:
     """Changes of the ranges of smooth surfaces between two sweeps."""
 
-    surfaces: Surfaces  # of the first sweep
+    surfaces: Surfaces  # surfaces of the first sweep
     # (r, c): rays that meet smooth surfaces, not steeply, in the first sweep and return in both
     chosen: Bools
     change: Floats  # (r, c): metres, second less first, without the change by shifted azimuths
@@ -61,7 +61,7 @@ class RangeChanges:
     def between(cls, stack: SweepStack, first: int, second: int) -> RangeChanges:
         """Compare the ranges of two sweeps where the first sweep meets smooth surfaces."""
         distance = stack.ranges[first].astype(np.float64)
-        # Changes of ranges from sweep to sweep are no noise if the sensor moves.
+        # If the sensor moves, changes of ranges from sweep to sweep are not noise.
         surfaces = find_surfaces(stack, distance, np.full_like(distance, _ASSUMED_NOISE_M))
         with np.errstate(invalid="ignore"):
             azimuth_change = stack.azimuth_offsets[second] - stack.azimuth_offsets[first]
@@ -101,11 +101,14 @@ class RangeChanges:
         return np.asarray(np.hypot(noise, _ASSUMED_SHIFT_M * self.normal_error))
 
     def motion(self) -> RigidMotion | None:
-        """Fit the motion of the sensor; None unless a motion explains most changes it predicts."""
+        """Fit the motion of the sensor.
+
+        Return None unless a motion explains most changes that the motion predicts.
+        """
         change = self.change[self.chosen]
         if len(change) < MIN_RAYS:
             return None
-        changed = np.abs(change) > 5 * self.noise  # in a street, few rays show the motion
+        changed = np.abs(change) > 5 * self.noise  # few rays show the motion in a street
         for rays in (slice(None), changed):
             motion = _rigid_motion(self.design[rays], change[rays], self.noise[rays])
             large = self._large(motion)
@@ -205,7 +208,7 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
 
 
 class Creep(NamedTuple):
-    """Steady motion of a sensor over a recording; 0 where noise may explain the changes."""
+    """Steady motion of a sensor over a recording, 0 where noise may explain the changes."""
 
     shift: Floats  # (3,): metres from sweep to sweep
     rotation: Floats  # (3,): rotation vector from sweep to sweep, radians
@@ -217,9 +220,10 @@ def fit_creep(stack: SweepStack) -> Creep:
     """Fit the steady motion of a sensor to the ranges of all sweeps.
 
     Each sweep has a small motion from the mean of all, by Tukey's biweight: rays of things that
-    move do not count. The steady motion is their slope. Its errors are those of noise, and those of
-    sectors of a revolution, by leaving out each (jackknife): one thing that moves is no motion of
-    the sensor. Nor is an offset that grows in all ranges, as of a sensor that warms up.
+    move do not count. The steady motion is the slope of the small motions. Errors follow from
+    noise, and from sectors of a revolution, each of them left out in turn (jackknife): one thing
+    that moves is not a motion of the sensor. Nor is an offset that grows in all ranges, such as
+    the offset of a sensor that warms up.
     """
     rays = _CreepRays.of_stack(stack)
     if len(rays.design) < MIN_RAYS:
@@ -240,7 +244,10 @@ def fit_creep(stack: SweepStack) -> Creep:
 
 
 class _SweepMotion(NamedTuple):
-    """Motion of a sensor from the mean of all sweeps, and its errors; columns of `_CreepRays`."""
+    """Motion of a sensor from the mean of all sweeps, and its errors.
+
+    Columns are the columns of `_CreepRays`.
+    """
 
     values: Floats  # (7,)
     covariance: Floats  # (7, 7): by noise

@@ -18,14 +18,14 @@ _PLANE_TOLERANCE_M = 0.05
 _MIN_PLANE_RAYS = 300
 _MAX_PLANE_POINTS = 20_000
 _MIN_RING_RAYS = 20  # rays of a ring on a plane that its bias needs
-_MAX_MEDIAN_OFFSET = 0.4  # of points from their plane, over the tolerance
+_MAX_MEDIAN_OFFSET = 0.4  # median distance of points from their plane, over the tolerance
 _MAX_DIRECTION_GAP = 0.1  # distance of neighbouring directions of one piece of a plane
 _OUTLIER_SIGMAS = 4.0  # beyond, points are not of their planes
 _STRICT_SIGMAS = 2.0  # the limit of a second solution, whose change is an error of the planes
 
 
 class _PlaneRays(NamedTuple):
-    """Rays on large planes that several rings cross, (n,) each; a plane is a flat surface."""
+    """Rays on large flat surfaces that several rings cross, arrays (n,)."""
 
     rays: Indices  # indices into the rays
     plane: Ints  # numbers of the planes
@@ -112,7 +112,7 @@ def _solve_without_outliers(
 
 
 def _segment_planes(points: Floats) -> Ints:
-    """Return the number of the large plane that each point (n, 3) lies in; -1 for no plane."""
+    """Return the number of the large plane that each point (n, 3) lies in, or -1."""
     o3d = load_open3d()
     o3d.utility.random.seed(0)
     plane = np.full(len(points), -1)
@@ -122,7 +122,8 @@ def _segment_planes(points: Floats) -> Ints:
             break
         cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[remaining]))
         (*normal, constant), _ = cloud.segment_plane(_PLANE_TOLERANCE_M, 3, 400)
-        offset = np.abs(points[remaining] @ normal + constant)  # from the plane of all inliers
+        # distance from the plane of all inliers
+        offset = np.abs(points[remaining] @ normal + constant)
         inliers = np.flatnonzero(offset < _PLANE_TOLERANCE_M)
         inlier_points = points[remaining[inliers]]
         directions = inlier_points / np.linalg.norm(inlier_points, axis=1)[:, None]

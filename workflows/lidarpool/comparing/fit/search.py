@@ -13,17 +13,17 @@ from .planes import ARM_M, RangeChanges
 from .sight import RigidMotion, Sight, SightPair
 from .stack import SweepStack
 
-MIN_SHIFT_M = 0.02  # shift from which on a sensor moves
-MIN_YAW_RAD = 0.003  # yaw from which on a sensor moves
+MIN_SHIFT_M = 0.02  # a sensor that shifts by less stands
+MIN_YAW_RAD = 0.003  # a sensor that turns by less stands
 _MIN_OBJECTS = 3  # objects that show a motion; two without a contradiction
-_SIMILAR_SHARE = 0.95  # of scores of the same motion
+_SIMILAR_SHARE = 0.95  # ratio of the scores of similar motions, at least
 
 # Motions that are tried: of cars, and of turns on the spot.
 _MAX_SPEED_M_S = 70.0
 _MAX_SHIFT_M = 12.0
 _FIRST_SHIFT_M = 0.05
 _SHIFT_STEP = 0.05  # relative
-_DIRECTIONS = 36  # in a plane of free directions
+_DIRECTIONS = 36  # directions that are tried in a plane of free directions
 _FREE_SHARE = 0.02  # share of an axis of `RangeChanges.axes` along which a shift is free
 _MAX_YAW_DEG = 45.0
 _YAW_STEP_DEG = 0.25
@@ -32,15 +32,15 @@ _CANDIDATES = 20
 _BATCH = 2000  # motions that are tried at once
 _REFINEMENTS_M = (0.1, 0.05, 0.02)  # steps, metres at a distance of `ARM_M`
 _FINE_POINTS = 600
-_CENTRE_STEPS = 15  # of the last size, to a side
-_SIMILAR_POINTS = 10  # by which scores of a motion's middle differ
-_THINGS = 3  # that are tried, the largest first
+_CENTRE_STEPS = 15  # steps of the last size, to a side
+_SIMILAR_POINTS = 10  # difference of scores around the middle of a motion, at most
+_THINGS = 3  # things that are tried, the largest first
 
 
 def motion_between(
     stack: SweepStack, first: int, second: int, period_ns: float | None
 ) -> RigidMotion | None:
-    """Find the motion of a sensor between two sweeps; None if the sensor may stand.
+    """Find the motion of a sensor between two sweeps, or None if the sensor may stand.
 
     `period_ns` is the time from sweep to sweep, if known.
     """
@@ -80,7 +80,7 @@ def _shown_by_sight(
 ) -> RigidMotion | None:
     """Search motions until one is shown, or few objects are left that changed.
 
-    The motion that explains most points may be that of a car beside the sensor.
+    The motion that explains most points may be the motion of a car beside the sensor.
     """
     remaining = pair
     for _ in range(_THINGS):
@@ -112,7 +112,10 @@ def _best_motion(pair: SightPair, changes: RangeChanges, max_shift_m: float) -> 
 
 
 def _free_axes(changes: RangeChanges) -> Floats:
-    """Return axes (m, 3) along which the sensor may shift; the two freest if there are none."""
+    """Return axes (m, 3) along which the sensor may shift.
+
+    If the sensor may shift along none, the two freest axes are returned.
+    """
     axes, shares = changes.axes()
     free = int((shares < _FREE_SHARE).sum())
     return axes[: free or 2]

@@ -23,16 +23,16 @@ from .stack import SweepStack
 _TOLERANCE_M = 0.05
 _TOLERANCE_SIGMAS = 6.0
 _TOLERANCE_PER_M = 0.01
-# Cells around a direction, rows and columns to a side, in which an object would have returned.
+# Rows and columns of cells, to either side of a direction, where an object would have returned.
 _EMPTY_ROWS = 1
 _EMPTY_COLUMNS = 3
-_MAX_RANGE_SHARE = 0.7  # of the largest ranges, up to which an object would have returned
+_MAX_RANGE_SHARE = 0.7  # share of the largest ranges where an object would have returned
 _MAX_POINTS = 20_000  # points of a sweep that are looked up in the other sweep
 _MAX_DISTANCE_M = 60.0  # farther objects are too small
 _CLUSTER_M = 2.0  # points of one object are closer
 _MIN_CLUSTER_POINTS = 3
 _LONGEST_VEHICLE_M = 20.0  # longer objects do not move
-_OWN_VEHICLE_M = 2.5  # from the sensor to its vehicle
+_OWN_VEHICLE_M = 2.5  # distance from the sensor to its vehicle
 _STAYED = 1  # index of the field of `Evidence`
 WALL_OBJECTS = 3  # objects that a wall counts as
 
@@ -75,13 +75,13 @@ class Sight:
 
     elevation_rad: Floats  # (r,): of the rows, descending
     step_rad: float  # width of a column
-    row_phase: Floats  # (r,): azimuths of the pulses of a row less those of its columns, in steps
+    row_phase: Floats  # (r,): azimuths of pulses less azimuths of columns, in steps
     points: Floats  # (n, 3): points on objects wider than a column, metres
     # (r - 1, c), metres: smallest and largest range in the rows i and i + 1, and in the columns
     # beside; inf where rays passed without a return, -inf where nothing is known
     lower_m: Floats
     upper_m: Floats
-    empty_m: float  # range up to which rays without a return have met nothing
+    empty_m: float  # rays without a return have met nothing up to this range
     tolerance_m: float
 
     @classmethod
@@ -154,7 +154,7 @@ def _pairs_of_rows(values: Floats, reduce: np.ufunc) -> Floats:
 
 
 def _empty_around(returned: Bools) -> Bools:
-    """Mark pairs of rows (r - 1, c) around which no cell has a return; `returned` is (r, c)."""
+    """Mark pairs of rows (r - 1, c) around which no cell has a return."""
     wide = returned.copy()
     for shift in range(1, _EMPTY_COLUMNS + 1):
         wide |= np.roll(returned, shift, axis=1) | np.roll(returned, -shift, axis=1)
@@ -177,8 +177,8 @@ def _is_wide(ranges: Floats, tolerance_m: float) -> Bools:
 class Evidence(NamedTuple):
     """Numbers of objects by what explains that both sweeps see them."""
 
-    moved: int  # the motion, and not that the sensor stands
-    stayed: int  # that the sensor stands, and not the motion
+    moved: int  # the motion, and not a sensor that stands
+    stayed: int  # the sensor stands, and not the motion
     unexplained: int  # neither
 
 
@@ -229,7 +229,10 @@ class SightPair:
         return self.second.look_up(in_second), self.first.look_up(in_first)
 
     def evidence(self, motion: RigidMotion | None) -> Evidence:
-        """Count objects for and against a motion; without a motion, those that changed."""
+        """Count the objects for and against a motion.
+
+        Without a motion, the objects that changed are counted.
+        """
         at_rest = np.append(self.seen_first, self.seen_second)
         if motion is None:
             points = np.concatenate([self.first.points, self.second.points])

@@ -116,9 +116,9 @@ class SmoothRays(NamedTuple):
     distance: Floats  # mean of the ranges, metres
     slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, metres in a radian
     intensity: Floats  # mean; NaN if unknown
-    returns: Ints  # number of sweeps with a return
+    return_counts: Ints  # number of sweeps with a return
     trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
-    variance: Floats  # of the range over the sweeps, square metres
+    variance: Floats  # variance of the range over the sweeps, square metres
     freedom: Ints  # degrees of freedom of the variance: its returns, less 1
 
     def select(self, chosen: Bools | Indices) -> SmoothRays:
@@ -131,7 +131,7 @@ class _RayStatistics(NamedTuple):
 
     mean_range: Floats  # metres
     mean_intensity: Floats
-    variance: Floats  # of the range, square metres
+    variance: Floats  # variance of the range, square metres
     return_count: Ints
 
 
@@ -142,7 +142,7 @@ def select_smooth_rays(
 
     A return is an outlier if the range is more than `MAX_SIGMAS` standard deviations from the
     median of the ray, by the noise of ranges `sigma` (r, c), metres, and of directions. Outliers
-    are left out, and rays with many outliers. Slopes are those of a scene's ranges `expected`
+    are left out, and rays with many outliers. Slopes are taken from a scene's ranges `expected`
     (r, c), metres, if known.
     """
     median = finite_median(stack.ranges, 0)
@@ -156,9 +156,9 @@ def select_smooth_rays(
         smooth &= np.abs(median - expected) < SCENE_TOLERANCE_M
     cell = np.nonzero(among_smooth(smooth))
     slope = slopes[cell]
-    returns = return_count[cell]
+    return_counts = return_count[cell]
     limit_m = MAX_SIGMAS * np.hypot(sigma[cell], direction_noise_rad * slope)
-    limit_m = np.where(returns > 1, limit_m, np.inf)
+    limit_m = np.where(return_counts > 1, limit_m, np.inf)
     statistics = _ray_statistics(stack, cell, surfaces.azimuth_slope[cell], median[cell], limit_m)
     rays = SmoothRays(
         row=cell[0],
@@ -166,13 +166,13 @@ def select_smooth_rays(
         distance=statistics.mean_range,
         slope=slope,
         intensity=statistics.mean_intensity,
-        returns=returns,
+        return_counts=return_counts,
         trials=stack.trials[cell],
         variance=statistics.variance,
         freedom=statistics.return_count - 1,
     )
     count = statistics.return_count
-    return rays.select(np.flatnonzero((count > 0) & (count >= MIN_RETURN_SHARE * returns)))
+    return rays.select(np.flatnonzero((count > 0) & (count >= MIN_RETURN_SHARE * return_counts)))
 
 
 def among_smooth(smooth: Bools) -> Bools:

@@ -25,14 +25,14 @@ MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are ch
 _MAX_FOREIGN_SHARE = 0.1  # share of a sweep's points in rings that the reference does not have
 _NEIGHBOUR_RAYS = 5  # rays on either side whose scatter counts
 _MIN_CELL_SHARE = 0.3  # a cell that returns in a smaller share of sweeps shows no gap
-_MAX_LOG_CHANCE = -16.0  # logarithm of the chance of lost pulses that are no losses instead
+_MAX_LOG_CHANCE = -16.0  # pulses missing together are a gap if losing them is unlikelier
 _STEADY_PATCH = (3, 9)  # rows and columns of cells whose returns are counted together
-MAX_KINK_M = 0.01  # by how much a surface may leave its plane within four columns
+MAX_KINK_M = 0.01  # distance of a surface from its plane within four columns, at most
 
 
 @dataclass(frozen=True, eq=False)
 class SweepStack:
-    """Returns of all sweeps in the same cells, the highest ring first; NaN without a return."""
+    """Returns of all sweeps in the same cells, the highest ring first, NaN without a return."""
 
     numbers: Ints  # (s,): numbers of the sweeps in the recording
     rings: Ints  # (r,): numbers of the rings
@@ -40,7 +40,7 @@ class SweepStack:
     directions: Floats  # (r, c, 3): mean unit directions of the cells
     ranges: Floats32  # (s, r, c): metres
     intensities: Floats32  # (s, r, c)
-    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less those of `directions`, radians
+    azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less `directions`, radians
     rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, metres
     covered: Bools  # (s, r, c): whether the sweep sent a pulse into the cell, returned or lost
     notes: tuple[str, ...]
@@ -108,11 +108,14 @@ def check_sweeps(recording: Recording) -> None:
 
 @dataclass(eq=False)
 class _CommonCells:
-    """Cells of a sensor that are filled sweep by sweep; a ring is added with its first return."""
+    """Cells of a sensor that are filled sweep by sweep.
+
+    A ring is added with its first return.
+    """
 
     numbers: Ints  # (s,): numbers of the sweeps of the recording that are read
     reference: RecordedPoints  # the sweep whose rings and steps of azimuth define the cells
-    images: RangeImages  # of the reference
+    images: RangeImages  # range images of the reference
     rings: Ints  # (r,)
     elevation_deg: Floats  # (r,)
     values: Floats32  # (4, s, r, c): range, metres; intensity; azimuth and elevation, degrees
@@ -138,7 +141,10 @@ class _CommonCells:
         return self.images.step_deg
 
     def read_sweep(self, recording: Recording, index: int) -> None:
-        """Read the sweep `numbers[index]` into the cells; LidarError if of another sensor."""
+        """Read the sweep `numbers[index]` into the cells.
+
+        LidarError if the sweep is of another sensor.
+        """
         number = int(self.numbers[index])
         points = recording.read_points(number)
         if not len(points):
@@ -198,7 +204,7 @@ def _mean_directions(
 ) -> tuple[Floats, Floats32]:
     """Return the mean directions of cells (r, c, 3), and offsets of azimuths (s, r, c), radians.
 
-    `values` (4, s, r, c) are those of `_CommonCells`, `elevation_deg` (r,) the elevations of rings.
+    `values` (4, s, r, c) come from `_CommonCells`, `elevation_deg` (r,) holds elevations of rings.
     """
     grid_azimuth = np.radians(step_deg * np.arange(values.shape[-1]))
     grid_elevation = elevation_deg[:, None]
@@ -219,7 +225,7 @@ def _mean_directions(
 
 
 def finite_median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
-    """Return medians of the finite values along axes, float64; NaN without finite values."""
+    """Return medians of the finite values along axes, float64, NaN without finite values."""
     with warnings.catch_warnings(action="ignore"):
         return np.nanmedian(values, axis=axis).astype(np.float64)
 

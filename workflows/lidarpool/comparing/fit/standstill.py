@@ -18,7 +18,7 @@ from .stack import SweepStack, finite_median
 
 _NEXT_PAIRS = 5  # pairs of a sweep and the next that are compared
 _MAX_CHANGE_M = 0.1  # median change of ranges, from sweep to sweep, of a static scene
-# growth of changes over many sweeps from which on ranges drift
+# ranges drift if changes over many sweeps grow by this factor
 _DRIFT_FACTOR = 1.5
 _DRIFT_M = 0.002
 _MIN_CREEP_M = 0.0015  # standard deviation of ranges by creep
@@ -58,7 +58,7 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
 
 
 def sweep_period_ns(recording: Recording, numbers: Ints) -> float | None:
-    """Return the median time from a sweep of `numbers` to the next; None if unknown."""
+    """Return the median time from a sweep of `numbers` to the next, or None if unknown."""
     if recording.times is None or len(numbers) < 2:
         return None
     times = np.array([*recording.times()])[numbers]
@@ -66,7 +66,10 @@ def sweep_period_ns(recording: Recording, numbers: Ints) -> float | None:
 
 
 def moving_message(name: str, speed: Speed, advice: str) -> str:
-    """Return the message that the sensor of a recording moves; `advice` is the first of three."""
+    """Return the message that the sensor of a recording moves.
+
+    `advice` is the first of three pieces of advice.
+    """
     parts = []
     if speed.shift_m > 0:
         by_time = ""
@@ -82,10 +85,11 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
 
 
 def find_motion(stack: SweepStack, period_ns: float | None) -> Speed | None:
-    """Find the motion of a sensor by the rays that the motion changes; None if the sensor stands.
+    """Find the motion of a sensor by the rays that the motion changes.
 
-    Sweeps are compared with the next, with those of half a recording later, and the first with the
-    last: a slow motion shows in sweeps that are far apart.
+    Return None if the sensor stands. Sweeps are compared with the next, and with the sweeps half a
+    recording later. The first sweep is compared with the last: a slow motion shows in sweeps that
+    are far apart.
     """
     last = stack.sweep_count - 1
     pairs_of_lag = {1: _NEXT_PAIRS, max(stack.sweep_count // 2, 1): 2, last: 1}

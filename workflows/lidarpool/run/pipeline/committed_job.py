@@ -23,15 +23,15 @@ class CommittedParts:
         self.ordered: list[Receipt] = []  # without summaries
         self.scans_done = 0
         self.point_count = 0
-        self.hits = 0
+        self.hit_count = 0
 
     @property
-    def cells(self) -> Ints | None:
+    def cell_box(self) -> Ints | None:
         """Lowest and highest cell of all points, (2, 3), or None without points."""
-        cells = [part.cell_box for part in self.ordered if part.cell_box]
-        if not cells:
+        boxes = [part.cell_box for part in self.ordered if part.cell_box]
+        if not boxes:
             return None
-        table = np.array(cells, np.int64).reshape(-1, 2, 3)
+        table = np.array(boxes, np.int64).reshape(-1, 2, 3)
         return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
 
     def reaching_past(self, scan: int) -> list[Receipt]:
@@ -77,8 +77,8 @@ class CommittedParts:
 
     def _count(self, part: Receipt, sign: int) -> None:
         self.scans_done += sign * len(part.scans)
-        self.point_count += sign * part.rows
-        self.hits += sign * part.hits
+        self.point_count += sign * part.point_count
+        self.hit_count += sign * part.hit_count
 
 
 class CommittedJob:

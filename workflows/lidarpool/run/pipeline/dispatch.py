@@ -191,7 +191,7 @@ class Dispatcher:
 
         If the worker died or no longer has the job's scene, the batches are offered again. If
         casting has failed, and the task had batches of several jobs, they are offered again, too,
-        each in a task with batches of its own job only (`Outcome.SEPARATE_JOBS`). With batches of a
+        each in a task with batches of one job only (`Outcome.SEPARATE_JOBS`). With batches of a
         single job, the job fails.
         """
         moved = False

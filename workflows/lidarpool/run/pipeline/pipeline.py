@@ -333,12 +333,12 @@ class Pipeline:
             return job is None or bool(job.condemned) or self.dispatcher.room(job) > 0
         return False
 
-    def _sort(self, job: PipelineJob, parts: Sequence[Receipt]) -> None:
+    def _sort(self, job: PipelineJob, receipts: Sequence[Receipt]) -> None:
         """Send the summaries of committed parts to the sorter, for jobs with frames.
 
         `_look` sends all again when the sorter starts.
         """
-        if parts and job.has_frames:
+        if receipts and job.has_frames:
             messages = [
                 Summaries(
                     job.number,
@@ -348,7 +348,7 @@ class Pipeline:
                     framed=job.frames,
                     until=job.scans.stop,
                 )
-                for part in parts
+                for part in receipts
             ]
             job.trace("handon", SORT, chain.from_iterable(m.scans for m in messages))
             self.stages.send(SORT, messages)

@@ -81,7 +81,7 @@ class PipelineJob(CommittedJob):
                 scan=scan,
                 sensor=survey.carried[spec.sensor].name,
                 rays=spec.ray_count,
-                hits=int(summary["hits"]),
+                hit_count=int(summary["hits"]),
                 count=int(summary["points"]),
                 samples=samples[~np.isnan(samples[:, 0])],
                 _survey=survey,

@@ -214,7 +214,7 @@ def _cast_batch(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
         trace("intersect.cast", **fields, scans=scans)
         part = replace(
             columns_of(batches),
-            scan_hits=np.concatenate([returns.hits for returns in batches]).astype(np.uint32),
+            scan_hits=np.concatenate([returns.hit_counts for returns in batches]).astype(np.uint32),
             samples=np.concatenate([_samples(returns) for returns in batches]),
         )
     batch = CastBatch(work.job, part, recorder.finish(stop - first))

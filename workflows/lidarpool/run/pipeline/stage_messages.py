@@ -121,9 +121,9 @@ class Receipt(Scans):
     """From stage 4: a part is whole in storage."""
 
     name: str  # name of the part
-    rows: int  # points
+    point_count: int
     size: int  # bytes
-    hits: int  # hits of its scans, before thinning out
+    hit_count: int  # hits of its scans, before thinning out
     cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
     summaries: bytes  # summaries of its scans, of `summary_type`
     record: TaskRecord | None = None  # the casting task; None for a receipt from the database
@@ -138,17 +138,16 @@ class Receipt(Scans):
         summaries["hits"] = part.scan_hits
         summaries["points"] = part.counts
         summaries["samples"] = part.samples
-        box = () if (cells := part.cells) is None else tuple(cells.ravel().tolist())
-        hits = int(part.scan_hits.sum())
+        box = () if part.cell_box is None else tuple(part.cell_box.ravel().tolist())
         data = summaries.tobytes()
         return cls(
             job=job,
             first=part.first,
             stop=part.stop,
             name=name,
-            rows=len(part),
+            point_count=len(part),
             size=size,
-            hits=hits,
+            hit_count=int(part.scan_hits.sum()),
             cell_box=box,
             summaries=data,
             record=record,
@@ -178,7 +177,7 @@ class ScanFrame:
         Its number.
     sensor
         Name of its sensor; "" for a single one without a name.
-    rays, hits, count
+    rays, hit_count, count
         Rays fired, rays that hit a surface, and points of the cloud.
     samples
         float32 (m, 3): ends of a few rays, metres, local coordinates.
@@ -189,7 +188,7 @@ class ScanFrame:
     scan: int
     sensor: str
     rays: int
-    hits: int
+    hit_count: int
     count: int
     samples: Floats32
     _survey: Survey = field(repr=False, compare=False)

@@ -85,7 +85,7 @@ class RunDatabase:
         self.meta: dict[str, str] = {}
         self.begun: set[int] = set()  # jobs under way with committed parts, trials or frames
         self.ended_count = 0  # jobs that have ended
-        self._ended = bytearray()  # for each job: 1 if it has ended
+        self._ended = bytearray()  # a byte for each job: 1 if the job has ended
         with _explained(self.path):
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
@@ -150,16 +150,16 @@ class RunDatabase:
                 raise ValueError(f"a part has scans {first} to {stop} of {scans}")
             name = part_name(self.meta["mark"], number, first, stop)
             box = json.loads(cells)
-            rows, size, hits = counts
+            point_count, size, hit_count = counts
             job.parts.add(
                 Receipt(
                     job=number,
                     first=first,
                     stop=stop,
                     name=name,
-                    rows=rows,
+                    point_count=point_count,
                     size=size,
-                    hits=hits,
+                    hit_count=hit_count,
                     cell_box=tuple(box),
                     summaries=b"",
                 )
@@ -229,7 +229,16 @@ class RunDatabase:
         if not new:
             return new
         rows = [
-            (p.job, p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cell_box), p.summaries)
+            (
+                p.job,
+                p.first,
+                p.stop,
+                p.point_count,
+                p.size,
+                p.hit_count,
+                json.dumps(p.cell_box),
+                p.summaries,
+            )
             for _, p in new
         ]
         try:

@@ -14,7 +14,8 @@ from .database import RunDatabase
 from .job_under_way import JobUnderWay
 
 CHECKERS = 4  # threads that check parts; each has two copies of a part in memory
-_IN_PART = attrgetter("first", "stop", "rows")  # values of a receipt that the part has as well
+# values of a receipt that the part has as well
+_IN_PART = attrgetter("first", "stop", "point_count")
 
 
 def check_parts(
@@ -69,9 +70,9 @@ def _state(job: JobUnderWay, part: Receipt, sizes: Mapping[str, int]) -> str:
     return "" if receipt is not None and _IN_PART(receipt) == _IN_PART(part) else "damaged"
 
 
-def _note(job: JobUnderWay, parts: Sequence[Receipt], state: str) -> str:
+def _note(job: JobUnderWay, receipts: Sequence[Receipt], state: str) -> str:
     """Return a note that scans are cast again because their parts were missing or damaged."""
-    names = listed([part.name for part in parts])
-    scans = listed([scans_in_words(part.first, part.stop) for part in parts])
-    verb = "was" if len(parts) == 1 else "were"
+    names = listed([part.name for part in receipts])
+    scans = listed([scans_in_words(part.first, part.stop) for part in receipts])
+    verb = "was" if len(receipts) == 1 else "were"
     return f"cast again: {scans}; {names} {verb} {state} in {job.storage.url}"

@@ -54,7 +54,7 @@ class _EarlierDatabase(NamedTuple):
 
     db: RunDatabase | None = None  # open; None if no result is committed
     mark: str = ""  # mark of a run without committed results
-    parts: str = ""  # location of the parts of such a run
+    parts_location: str = ""  # location of its parts; empty for the folder of the run
     damage: DamagedError | None = None  # why the database cannot be read
 
 
@@ -73,7 +73,7 @@ class RunStore:
     location
         Folder or URL of the run; None for a temporary folder that is deleted with the last user of
         the points.
-    parts
+    parts_location
         Another location for the parts, a path or URL, where they get a separate folder. A resumed
         run uses the earlier location of its parts.
     resume
@@ -83,8 +83,8 @@ class RunStore:
     ------
     LidarError
         If there is an unfinished run and `resume` is False, or the run cannot be resumed: it is of
-        other jobs, in use, or cast with another backend than requested. Also if there are `parts`
-        without a `location`, whose database lists the parts.
+        other jobs, in use, or cast with another backend than requested. Also if a `parts_location`
+        comes without a `location`, whose database lists the parts.
     """
 
     def __init__(
@@ -92,11 +92,11 @@ class RunStore:
         jobs: Jobs,
         backend: str = "auto",
         location: str | Path | Storage | None = None,
-        parts: str | Path | Storage | None = None,
+        parts_location: str | Path | Storage | None = None,
         *,
         resume: bool = False,
     ) -> None:
-        if parts is not None and location is None:
+        if parts_location is not None and location is None:
             raise LidarError(
                 "parts are given a place, and nothing would know of them afterwards: give a "
                 "folder for the run as well."
@@ -127,13 +127,13 @@ class RunStore:
         self.only_job: JobUnderWay | None = None  # the only job, of a survey; None for a campaign
         with ExitStack() as undo:
             undo.callback(self._folder.remove, [], folder=True)
-            self.db = self._open(parts, resume)
+            self.db = self._open(parts_location, resume)
             undo.callback(self.close)
             self._claim(resume)
             undo.pop_all()
         self.resumed = self.db.ended_count  # jobs of an earlier run
 
-    def _open(self, parts: str | Path | Storage | None, resume: bool) -> RunDatabase:
+    def _open(self, parts_location: str | Path | Storage | None, resume: bool) -> RunDatabase:
         """Open the run's database, or create a new database if the existing is empty or lost."""
         path = _database_path(self._folder)
         durable = self.lasting and self._remote is None
@@ -141,14 +141,18 @@ class RunStore:
         if earlier.db is not None:
             self.begun = True
             return earlier.db
-        meta = self._recover_meta(path, earlier.mark, parts) if resume else None
+        meta = self._recover_meta(path, earlier.mark, parts_location) if resume else None
         if meta is None:
             self._discard(earlier)
         path.unlink(missing_ok=True)
         self._folder.prepare()
         if meta is None:
             mark = secrets.token_hex(8)
-            shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
+            shared = (
+                Storage.at(parts_location).path(parts_folder(mark))
+                if parts_location is not None
+                else ""
+            )
             meta = {"mark": mark, "identity": json.dumps(self._run_identity), "parts": shared}
             meta["fields"] = json.dumps(dict(self.jobs.fields))
         try:
@@ -170,21 +174,21 @@ class RunStore:
             if db.used:
                 return _EarlierDatabase(db)
             db.close()
-            return _EarlierDatabase(mark=db.meta["mark"], parts=db.meta.get("parts", ""))
+            return _EarlierDatabase(mark=db.meta["mark"], parts_location=db.meta.get("parts", ""))
         except DamagedError as error:
             return _EarlierDatabase(damage=error)
         except LidarError as error:  # the user does not know the local copy of a database
             raise LidarError(str(error).replace(self._folder.url, self.location.url)) from error
 
     def _recover_meta(
-        self, path: Path, earlier_mark: str, parts: str | Path | Storage | None
+        self, path: Path, earlier_mark: str, parts_location: str | Path | Storage | None
     ) -> dict[str, str] | None:
         """Return the first values of a lost database from the folder of its parts, or None.
 
         `earlier_mark` is the mark of an existing empty database, or "". LidarError if the database
         is another program's, or the earlier run differs from this one.
         """
-        meta = self._read_mark(parts)
+        meta = self._read_mark(parts_location)
         if meta is None or (earlier_mark and self._difference(meta)):
             return None
         read_parts_location(path)  # raises if the database is another program's
@@ -203,13 +207,13 @@ class RunStore:
             reason = str(earlier.damage).replace(self._folder.url, self.location.url)
             raise LidarError(reason) from earlier.damage
         if self.lasting:
-            _remove(self.location, parts_of(self.location, earlier.parts), earlier.mark)
+            _remove(self.location, parts_of(self.location, earlier.parts_location), earlier.mark)
 
-    def _read_mark(self, parts: str | Path | Storage | None) -> dict[str, str] | None:
+    def _read_mark(self, parts_location: str | Path | Storage | None) -> dict[str, str] | None:
         """Return the first values of this run's database, from the folder of its parts."""
         locations = [self.location.below(PARTS)]
-        if parts is not None:
-            shared = Storage.at(parts)
+        if parts_location is not None:
+            shared = Storage.at(parts_location)
             folders = filter(PARTS_FOLDER.fullmatch, shared.entries())
             locations = [shared.below(name) for name in folders]
         for location in locations:
@@ -507,10 +511,10 @@ def _database_path(folder: Storage) -> Path:
     return folder.local(FILE)
 
 
-def parts_of(location: Storage, parts: str) -> Storage:
-    """Return the storage of the parts: below the run's location, or `parts` unless empty."""
-    folder, _, name = parts.rpartition("/")
-    return Storage.at(folder or "/").below(name) if parts else location.below(PARTS)
+def parts_of(location: Storage, parts_location: str) -> Storage:
+    """Return the storage of the parts: `parts_location`, or below the run's location if empty."""
+    folder, _, name = parts_location.rpartition("/")
+    return Storage.at(folder or "/").below(name) if parts_location else location.below(PARTS)
 
 
 @checked
@@ -543,13 +547,13 @@ def remove_run(folder: str | Path | Storage) -> None:
         _remove(location, parts_of(location, parts), mark)
 
 
-def _remove(location: Storage, parts: Storage, mark: str | None) -> None:
+def _remove(location: Storage, part_storage: Storage, mark: str | None) -> None:
     """Remove the database of a run, and the parts that have its mark.
 
     If `mark` is None, because the database could not be read, the mark file in the folder of the
     parts counts.
     """
     with explained(f"The run in {location} cannot be removed"):
-        names = deletable_files(parts, mark)  # an error if they are behind a link
-        parts.remove(names, folder=True)
+        names = deletable_files(part_storage, mark)  # an error if they are behind a link
+        part_storage.remove(names, folder=True)
         location.remove([FILE, f"{FILE}-journal", OWNER], folder=True)

@@ -54,7 +54,7 @@ class LiveJob:
         self._random = np.random.default_rng(0)
         self._share = 1.0  # share of the points of a part that are taken
         self._counts = np.zeros(self._job.scene.counters, np.int64)
-        self._hits = 0  # hits of the parts that were read
+        self._hit_count = 0  # hits of the parts that were read
         self.cloud = replace(self._points, names=(), rows=()).load()  # no points, with the columns
         self.frames: deque[ScanFrame] = deque(maxlen=MAX_FRAMES)  # the last frames
         self._view: View | None = None  # None before the first question
@@ -87,7 +87,7 @@ class LiveJob:
             with self._lock:
                 self._waiting = []
                 self._counts = result.hit_counts
-                self._hits = result.hits
+                self._hit_count = result.hit_count
                 self.cloud = result.points.sample(self._max_points, MAX_WAITING_PARTS)
             self._show()
             self.view.rays = result.sample_rays
@@ -116,7 +116,7 @@ class LiveJob:
                 with suppress(LidarError):
                     part = read_part(self._points.storage, name)
                     self._counts[part.triangles] += part.hits
-                    self._hits += int(part.hits.sum())
+                    self._hit_count += int(part.hits.sum())
                     rows = np.flatnonzero(self._random.random(len(part)) < self._share)
                     clouds.append(self._points.cloud_of(part, rows))
             if not names:
@@ -131,7 +131,9 @@ class LiveJob:
     def hit_counts(self) -> Floats:
         """Return hits by counters of the scene, scaled up to all hits if parts were not read."""
         with self._lock:
-            return np.asarray(self._counts * (self._under_way.parts.hits / max(self._hits, 1)))
+            return np.asarray(
+                self._counts * (self._under_way.parts.hit_count / max(self._hit_count, 1))
+            )
 
     @property
     def view(self) -> View:
@@ -146,7 +148,7 @@ class LiveJob:
                 self._view = View(
                     HeldPoints(self.cloud), pictured, sweeps, title=title, downloads=downloads()
                 )
-                self._view.hits = lambda: drawn.hits(self.hit_counts())
+                self._view.read_hit_counts = lambda: drawn.triangle_hit_counts(self.hit_counts())
             return self._view
 
     def _show(self) -> None:
@@ -168,7 +170,7 @@ class LiveJob:
         header = {
             "version": view.version,
             # The surface is large, and changes visibly only with a tenth more hits.
-            "hits_version": round(10 * np.log1p(self._hits)),
+            "hits_version": round(10 * np.log1p(self._hit_count)),
             "rays_version": newest,
             "time": self._job.survey.begins_ns(newest) / 1e9 if frames else None,
             "path": view.planned,

@@ -299,8 +299,8 @@ def _colour(level: Bytes) -> Any:
     return messages.Color(r=red, g=green, b=blue, a=_SCENE_ALPHA)
 
 
-def _triangle_list(surface: Surface, rows: Any, pose: Any, colour: Any) -> Any:
-    used, indices = np.unique(surface.faces[rows], return_inverse=True)
+def _triangle_list(surface: Surface, face_indices: Any, pose: Any, colour: Any) -> Any:
+    used, indices = np.unique(surface.faces[face_indices], return_inverse=True)
     return messages.TriangleListPrimitive(
         pose=pose,
         points=_points(surface.vertices[used]),

@@ -119,11 +119,11 @@ class GltfFile:
 
         Raises ValueError without such a part.
         """
-        parts: list[dict[str, Any]] = self.header.get(kind, [])
+        entries: list[dict[str, Any]] = self.header.get(kind, [])
         number = natural(index)
-        if number >= len(parts):
-            raise ValueError(f"it refers to number {number} of its {kind}, of {len(parts)}")
-        return parts[number]
+        if number >= len(entries):
+            raise ValueError(f"it refers to number {number} of its {kind}, of {len(entries)}")
+        return entries[number]
 
     def _read_accessor(self, index: int) -> AnyArray:
         """Return the numbers (count, width) of an accessor, if possible without a copy."""

@@ -72,14 +72,14 @@ def _clipped_polygon(vertices: Floats, corners: Ints) -> Ints:
     return clipped
 
 
-def _from_reflex_corner(vertices: Floats, rows: Ints) -> Ints:
+def _from_reflex_corner(vertices: Floats, quadrangles: Ints) -> Ints:
     """Rotate the corners of quadrangles (p, 4) to start at a reflex corner, so that a fan fits.
 
     The clipper would leave out half of a quadrangle so warped that its projection crosses itself.
     """
-    reflex = _reflex_corners(vertices[rows])
+    reflex = _reflex_corners(vertices[quadrangles])
     start = np.where(reflex.sum(axis=1) == 1, reflex.argmax(axis=1), 0)
-    return np.take_along_axis(rows, (start[:, None] + np.arange(4)) % 4, axis=1)
+    return np.take_along_axis(quadrangles, (start[:, None] + np.arange(4)) % 4, axis=1)
 
 
 def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:

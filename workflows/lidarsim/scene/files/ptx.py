@@ -136,17 +136,17 @@ def _header_numbers(entry: tuple[int, str], width: int, meaning: str) -> list[fl
     return values
 
 
-def _pose(rows: Floats, start: int) -> Floats:
+def _pose(matrix: Floats, start: int) -> Floats:
     """Return the matrix (4, 4) from the frame of the scan to the frame of the file.
 
-    `rows` (4, 4) are the transformation, whose header begins with line `start`. ValueError if it is
-    not a rotation and a position.
+    `matrix` (4, 4) is the transformation of the file, whose header begins with line `start`.
+    ValueError if it is not a rotation and a position.
     """
-    rotation = rows[:3, :3]
+    rotation = matrix[:3, :3]
     error = np.abs(matmul(rotation, rotation.T) - np.eye(3)).max()
-    if error > _MAX_ROTATION_ERROR or not np.array_equal(rows[:, 3], [0, 0, 0, 1]):
+    if error > _MAX_ROTATION_ERROR or not np.array_equal(matrix[:, 3], [0, 0, 0, 1]):
         raise ValueError(
             f"the transformation of the header that begins with line {start} is not a rotation "
             "(three rows that end with 0) and a position (a row that ends with 1)"
         )
-    return affine(rotation.T, rows[3, :3])
+    return affine(rotation.T, matrix[3, :3])

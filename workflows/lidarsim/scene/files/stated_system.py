@@ -472,7 +472,7 @@ def _tiff(records: Mapping[int, bytes]) -> bytes:
         _TiffTag(278, 4, 1, struct.pack("<I", 1)),  # rows
         _TiffTag(279, 4, 1, struct.pack("<I", 1)),  # bytes of the pixel
         _TiffTag(33550, 12, 3, struct.pack("<3d", 1, 1, 0)),  # size of the pixel
-        _TiffTag(33922, 12, 6, struct.pack("<6d", 0, 0, 0, 0, 0, 0)),  # its place
+        _TiffTag(33922, 12, 6, bytes(6 * 8)),  # its position, six zeros
         *(
             _TiffTag(number, kind, len(records[number]) // size, records[number])
             for number, kind, size in ((GEO_KEYS, 3, 2), (GEO_DOUBLES, 12, 8), (GEO_TEXTS, 2, 1))

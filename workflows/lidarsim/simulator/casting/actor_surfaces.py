@@ -31,23 +31,25 @@ class ActorSurfaces:
 
     def deformed(
         self,
-        rows: Indices,
+        triangle_indices: Indices,
         actors: Integers,
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> DeformedCorners:
         """Return the corners of triangles of actors that deform, at times (n,), nanoseconds.
 
-        `rows` (n,) are rows of stored triangles, and `actors` (n,) their actors.
+        `triangle_indices` (n,) are rows of stored triangles, and `actors` (n,) their actors.
         """
-        corners, corner_velocities, at_rest = np.empty((3, len(rows), 3, 3))
+        corners, corner_velocities, at_rest = np.empty((3, len(triangle_indices), 3, 3))
         frames, frame_rates = trajectories.played(actors, times)
         mesh_numbers = self._triangles.actor_mesh[actors]
         for mesh_number in np.unique(mesh_numbers).tolist():
             mesh = self._triangles.meshes[mesh_number]
             with_mesh = np.flatnonzero(mesh_numbers == mesh_number)
             assert mesh.animation is not None
-            vertex_rows = mesh.faces[rows[with_mesh] - self._triangles.mesh_starts[mesh_number]]
+            vertex_rows = mesh.faces[
+                triangle_indices[with_mesh] - self._triangles.mesh_starts[mesh_number]
+            ]
             corners[with_mesh], steps = mesh.animation.vertices_at(frames[with_mesh], vertex_rows)
             corner_velocities[with_mesh] = steps * frame_rates[with_mesh, None, None]
             at_rest[with_mesh] = mesh.vertices[vertex_rows]
@@ -69,15 +71,15 @@ class ActorSurfaces:
         self,
         points: Floats,
         triangle: Integers,
-        rows: Indices,
+        triangle_indices: Indices,
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> None:
         """Move the points on actors, among points (n, 3), to the actors' meshes at rest, in place.
 
         Points are in the scene frame before, and in the frames of the actors afterwards. `triangle`
-        (n,) are the triangles of all points, `rows` (n,) the stored rows of the triangles, and
-        `times` (n,) are nanoseconds.
+        (n,) are the triangles of all points, `triangle_indices` (n,) the rows of the stored
+        triangles, and `times` (n,) are nanoseconds.
         """
         on_actors, actor = self._actor_rows(triangle, trajectories)
         if not len(on_actors):
@@ -87,7 +89,10 @@ class ActorSurfaces:
         if len(deforming := trajectories.deforming(actor)):
             deformed_rows = on_actors[deforming]
             deformed = self.deformed(
-                rows[deformed_rows], actor[deforming], times[deformed_rows], trajectories
+                triangle_indices[deformed_rows],
+                actor[deforming],
+                times[deformed_rows],
+                trajectories,
             )
             weights = _weights(deformed.corners, points[deformed_rows])
             points[deformed_rows] = applied(deformed.at_rest.transpose(0, 2, 1), weights)

@@ -42,7 +42,7 @@ class MediaBodies:
                 bodies.append((scene.vertices, self._kinds.faces_of(kind)))
             if scene.instances is not None:
                 for row in np.unique(scene.instances.part[scene.instances.owner == owner]):
-                    part = scene.instances.parts[row]
+                    part = scene.instances.mesh_parts[row]
                     faces = self._kinds.select(kind, part.faces, part.materials)
                     bodies.append((part.vertices, faces))
             for vertices, faces in bodies:

@@ -184,7 +184,9 @@ class SceneCaster:
         trees = self._static.trees
         first_instance = min(1, self._face_count)
         last = first_instance + (0 if self._instances is None else len(self._instances))
-        return np.concatenate([np.arange(trees.face_bodies), first_instance + trees.rows, [last]])
+        return np.concatenate(
+            [np.arange(trees.face_bodies), first_instance + trees.instance_indices, [last]]
+        )
 
     @property
     def backend(self) -> str:
@@ -403,9 +405,12 @@ def casters_of_sensors(
 
 
 def move_instances(
-    casters: Sequence[SceneCaster], surfaces: Surfaces, instances: Instances, rows: Indices
+    casters: Sequence[SceneCaster],
+    surfaces: Surfaces,
+    instances: Instances,
+    instance_indices: Indices,
 ) -> None:
-    """Move instances `rows` to their transforms in `instances`, while no scan is under way.
+    """Move instances to their transforms in `instances`, while no scan is under way.
 
     Parameters
     ----------
@@ -413,11 +418,11 @@ def move_instances(
         Casters of the sensors of a survey.
     surfaces, instances
         Of the scene with the moved instances.
-    rows
+    instance_indices
         (m,): rows of the instances that have moved.
     """
     for static in dict.fromkeys(caster.bodies.static for caster in casters):
-        static.move(instances, rows)
+        static.move(instances, instance_indices)
     for caster in dict.fromkeys(casters):
         caster.with_moved_instances(surfaces, instances)
 

@@ -70,15 +70,15 @@ class _Trees(NamedTuple):
     region: Floats | None  # (2, 3), metres; None for the whole scene
     # (b,): first triangle of each instance of the caster; None for a caster of faces alone
     first_triangles: Ints32 | None
-    # (r,): rows in the scene's instances of the last r instances of the caster, ascending
-    rows: Ints
+    # (r,): indices in the scene's instances of the last r instances of the caster, ascending
+    instance_indices: Ints
     # {instance of the caster: the triangle of its mesh that each triangle is a part of}
     origins: dict[int, Indices]
 
     @property
     def face_bodies(self) -> int:
         """Number of instances of the caster that are the scene's faces: 0 or 1."""
-        return self.caster.instance_count - len(self.rows)
+        return self.caster.instance_count - len(self.instance_indices)
 
     def numbered(self, hits: ScanReturns) -> Ints32:
         """Return the triangles of hits (k,), by the numbers of the scene."""
@@ -187,19 +187,19 @@ class StaticBodies:
                 region = np.stack([lower, np.maximum(region[1], trees.region[1])])
             self._trees = self._build(None if _half_side(region) > MAX_REACH_M else region)
 
-    def move(self, instances: Instances, rows: Indices) -> None:
-        """Move instances `rows` (m,) to their transforms in `instances`. No cast may run.
+    def move(self, instances: Instances, instance_indices: Indices) -> None:
+        """Move instances by their indices (m,) to their transforms in `instances`. No cast may run.
 
         Trees are built again if an instance leaves for where no sensor reaches, such as a body that
         falls for ever, if it comes from there, or if it was cut.
         """
         self._instances = instances
         if self._instance_is_seen is not None:
-            rows = rows[self._instance_is_seen[rows]]
+            instance_indices = instance_indices[self._instance_is_seen[instance_indices]]
         trees = self._trees
-        if trees is None or not len(rows):
+        if trees is None or not len(instance_indices):
             return
-        offsets = instances.transforms[rows, :, 3] - self._centre
+        offsets = instances.transforms[instance_indices, :, 3] - self._centre
         is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
         if trees.region is None and is_remote.any() and self._can_cut:
             self._may_cut = True
@@ -207,19 +207,19 @@ class StaticBodies:
             return
         first = trees.face_bodies
         if trees.region is None and self._instance_is_seen is None:  # all instances have a tree
-            trees.caster.move(first + rows, instances.transforms[rows])
+            trees.caster.move(first + instance_indices, instances.transforms[instance_indices])
             return
-        numbers = first + np.searchsorted(trees.rows, rows)
+        numbers = first + np.searchsorted(trees.instance_indices, instance_indices)
         if trees.region is None:
-            trees.caster.move(numbers, instances.transforms[rows])
+            trees.caster.move(numbers, instances.transforms[instance_indices])
             return
-        has_tree = np.isin(rows, trees.rows)
+        has_tree = np.isin(instance_indices, trees.instance_indices)
         is_cut = has_tree & np.isin(numbers, list(trees.origins))
-        comes = ~has_tree & _is_near(instances, trees.region)[rows]
+        comes = ~has_tree & _is_near(instances, trees.region)[instance_indices]
         if (is_cut | comes | (has_tree & is_remote)).any():
             self._trees = self._build(trees.region)
             return
-        trees.caster.move(numbers[has_tree], instances.transforms[rows[has_tree]])
+        trees.caster.move(numbers[has_tree], instances.transforms[instance_indices[has_tree]])
 
     def _build(self, region: Floats | None) -> _Trees:
         """Build the trees of the bodies within a region (2, 3), or of all bodies.
@@ -278,7 +278,7 @@ class StaticBodies:
             index = int(instances.part[row])
             if cut_part is None:
                 if index not in meshes:
-                    meshes[index] = mesh_of(instances.parts[index])
+                    meshes[index] = mesh_of(instances.mesh_parts[index])
                 mesh = meshes[index]
             else:
                 origins[len(bodies)] = cut_part.origin
@@ -314,7 +314,7 @@ def _parts_in(
         is_near &= is_seen
     for row in np.flatnonzero(is_near).tolist():
         cut_part = None
-        part = instances.parts[instances.part[row]]
+        part = instances.mesh_parts[instances.part[row]]
         if not is_whole[row] and part.mask is None:
             planes = box_planes(region, instances.transforms[row])
             cut_part = cut(part.vertices, part.faces, planes)

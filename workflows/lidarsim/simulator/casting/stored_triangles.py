@@ -165,7 +165,7 @@ class StoredTriangles:
         ]
         bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in self.meshes]
         if scene.instances is not None:
-            parts = scene.instances.parts
+            parts = scene.instances.mesh_parts
             bodies += [(part.vertices, part.faces, part.colours) for part in parts]
         return bodies
 
@@ -186,7 +186,7 @@ class StoredTriangles:
     def part_starts(self) -> Indices:
         """Stored row of the first triangle of each part of instances."""
         assert self._scene.instances is not None
-        sizes = [len(part.faces) for part in self._scene.instances.parts]
+        sizes = [len(part.faces) for part in self._scene.instances.mesh_parts]
         return self._parts_start + np.cumsum([0, *sizes[:-1]])
 
 

@@ -113,8 +113,9 @@ class ActorTriangles(NamedTuple):
     A shape is a distinct mesh, which actors may share; its parts are cast separately.
     """
 
-    parts: Ints32  # (shapes, parts): first triangle of each part, numbered within the shape
-    shape: Ints  # (actors,): row of `parts`
+    # (shapes, parts): first triangle of each part of a shape, numbered within the shape
+    part_starts: Ints32
+    shape: Ints  # (actors,): row of `part_starts`
     firsts: Ints32  # (actors,): first triangle of each actor
 
 
@@ -394,7 +395,7 @@ def merge(ray, triangle, nearest, actors, output):
         actor = hit_actors[k]
         hit = i < len(ray) and ray[i] == k
         if actor >= 0:
-            part_triangle = actors.parts[actors.shape[actor], nearest.instance[k]]
+            part_triangle = actors.part_starts[actors.shape[actor], nearest.instance[k]]
             output.triangle[count] = nearest.triangle[k] + part_triangle + actors.firsts[actor]
         elif hit:
             output.triangle[count] = triangle[i]

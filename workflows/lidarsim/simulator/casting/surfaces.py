@@ -53,7 +53,7 @@ class LitHits(NamedTuple):
     film: Bools | None = None  # (n,): whether there may be a film of water
 
 
-def light_of(survey: Survey, sensor: Sensor) -> SensorLight:
+def sensor_light_of(survey: Survey, sensor: Sensor) -> SensorLight:
     """Return the light of a sensor in the air of a survey.
 
     Values are floats: for an int, loops would be compiled once more.
@@ -178,7 +178,7 @@ class Surfaces:
         triangle: Integers,
         directions: Floats,
         distance: Floats,
-        light: SensorLight,
+        sensor_light: SensorLight,
         times: Floats | Ints,
         trajectories: ActorTrajectories,
         colours: UInts32 | None = None,
@@ -191,7 +191,7 @@ class Surfaces:
             (n,): triangles on which the rays end, and the rays' lengths (optical paths), metres.
         directions
             (n, 3): unit directions of the rays, scene frame.
-        light
+        sensor_light
             Light of the sensor.
         times
             (n,): nanoseconds, for the poses of actors.
@@ -202,21 +202,21 @@ class Surfaces:
         """
         from . import surface_loops
 
-        table = self.at_wavelength(light.wavelength_nm)
+        table = self.at_wavelength(sensor_light.wavelength_nm)
         incidence, kinds = self._meet(triangle, directions, table, times, trajectories)
         normals, cosines, back = incidence
         bright = luminance(colours) if table.textured and colours is not None else None
         if table.textured or table.roughness.any():
             back = table.scattered(kinds, np.abs(cosines), bright)
         film = None
-        if light.wet:
+        if sensor_light.wet:
             film = np.empty(len(cosines), np.bool_)
-            water = surface_loops.WaterFilm(LEVEL, light.wet, table.passes | table.leafy)
+            water = surface_loops.WaterFilm(LEVEL, sensor_light.wet, table.passes | table.leafy)
             shares = table.shares(kinds, bright)
             surface_loops.soak(
                 normals[2], cosines, kinds=kinds, shares=shares, water=water, film=film, back=back
             )
-        surface_loops.fade(owned(distance), light.extinction, back)
+        surface_loops.fade(owned(distance), sensor_light.extinction, back)
         return LitHits(normals.T, cosines, kinds, back, film)
 
     def colours(
@@ -285,7 +285,7 @@ class Surfaces:
         triangle: Integers,
         cosine: Floats,
         distance: Floats,
-        light: SensorLight,
+        sensor_light: SensorLight,
         colours: UInts32 | None = None,
     ) -> Floats:
         """Return the received energy of rays that end on triangles (n,), at distances in metres.
@@ -295,7 +295,7 @@ class Surfaces:
         `NEAREST_M` count as `NEAREST_M`. Where materials are `textured`, the colours (n,) are
         needed.
         """
-        table = self.at_wavelength(light.wavelength_nm)
+        table = self.at_wavelength(sensor_light.wavelength_nm)
         bright = luminance(colours) if table.textured and colours is not None else None
         scattered = table.scattered(self.kinds(triangle), cosine, bright)
-        return np.asarray(scattered * at_right_angles(distance, light.extinction))
+        return np.asarray(scattered * at_right_angles(distance, sensor_light.extinction))

@@ -41,14 +41,14 @@ class TriangleKinds:
         rows, objects, _ = self._triangles.locate(triangle)
         return self.of_rows(rows, objects)
 
-    def of_rows(self, rows: Indices, objects: Ints32) -> Ints32:
+    def of_rows(self, triangle_indices: Indices, objects: Ints32) -> Ints32:
         """Return the kinds of surfaces, from rows of stored triangles (n,) and objects (n,): (n,).
 
         Objects are an argument because instances that share stored triangles may differ in object.
         """
         if self._kind_in_object is None:
             return objects
-        kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[rows]
+        kinds = self.material_kinds.first[:-1][objects] + self._kind_in_object[triangle_indices]
         return np.where(objects < 0, np.int32(-1), self._material_kind[kinds])
 
     @cached_property
@@ -60,7 +60,7 @@ class TriangleKinds:
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
         scene = self._scene
-        parts = () if scene.instances is None else scene.instances.parts
+        parts = () if scene.instances is None else scene.instances.mesh_parts
         meshes = [(len(mesh.faces), mesh.materials) for mesh in self._triangles.meshes]
         meshes += [(len(part.faces), part.materials) for part in parts]
         face_materials = None if scene.materials is None else scene.materials.index

@@ -45,16 +45,16 @@ class _GridRays(NamedTuple):
     # the leaves; 0 without a grid.
     projection: Floats
 
-    def take(self, rows: Indices) -> _GridRays:
+    def take(self, row_indices: Indices) -> _GridRays:
         """Return the light of selected rows."""
-        return _GridRays._make(array[..., rows] for array in self)
+        return _GridRays._make(array[..., row_indices] for array in self)
 
 
 class Grids:
     """The grids of the instances of a scene, with the densities of each part stored once."""
 
     def __init__(self, shared: Instances) -> None:
-        voxels = [part.voxels for part in shared.parts]
+        voxels = [part.voxels for part in shared.mesh_parts]
         sizes = [(0, 0, 0) if grid is None else grid.density.shape for grid in voxels]
         self._sizes = np.array(sizes, np.float64)
         self._starts = np.cumsum([0, *(int(np.prod(size)) for size in sizes[:-1])])
@@ -68,7 +68,7 @@ class Grids:
     @classmethod
     def from_instances(cls, shared: Instances | None) -> Grids | None:
         """Return the grids of instances, or None without grids."""
-        if shared is None or all(part.voxels is None for part in shared.parts):
+        if shared is None or all(part.voxels is None for part in shared.mesh_parts):
             return None
         return cls(shared)
 

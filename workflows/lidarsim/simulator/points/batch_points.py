@@ -23,7 +23,7 @@ from ...sensor.optics import LIGHT_M_NS
 from ...sensor.reflectivity import COUNTS, SCALES
 from ...survey.survey import ScanSpec, Survey
 from ..casting.motion import CastPoses, Firings
-from ..casting.surfaces import Surfaces, light_of
+from ..casting.surfaces import Surfaces, sensor_light_of
 from ..pulses import Scanned
 from ..returns import required
 from ..steps.cast import GHOST
@@ -64,7 +64,7 @@ class BatchPoints:
         counters = np.flatnonzero(counter_hits)
         self.tally = counters, counter_hits[counters]
         self.pulse_returns = scanned.returns
-        self.hits = scanned.hits  # (scans,): returns of each scan, kept or not
+        self.hit_counts = scanned.hit_counts  # (scans,): returns of each scan, kept or not
         self._surfaces = surfaces
         self._pattern = pattern
         self._start = start
@@ -78,9 +78,9 @@ class BatchPoints:
         """Values of a column."""
         return column.make(self)
 
-    def positions_of(self, rows: Ints) -> Floats:
-        """Return the positions of the returns `rows` (k,), as `positions`: (k, 3)."""
-        return self.positions[rows]
+    def positions_of(self, row_indices: Ints) -> Floats:
+        """Return the positions of returns by their rows (k,), as `positions`: (k, 3)."""
+        return self.positions[row_indices]
 
     # -- the ray -----------------------------------------------------------------------------
 
@@ -410,7 +410,7 @@ class BatchPoints:
     @cached_property
     def _lit(self) -> tuple[Floats, Floats]:
         """Cosines of incidence, of either sign, and energies, in blocks to save memory."""
-        light = light_of(self.survey, self.sensor)
+        sensor_light = sensor_light_of(self.survey, self.sensor)
         cosines, energy = np.empty((2, len(self)))
         colours = self._colours if self._surfaces.materials.textured else None
         for begin in range(0, len(self), BLOCK_HITS):
@@ -419,7 +419,7 @@ class BatchPoints:
                 self.pulse_returns.triangle[block],
                 self.directions[block],
                 distance=self.pulse_returns.distance[block],
-                light=light,
+                sensor_light=sensor_light,
                 times=self._actor_times_ns[block],
                 trajectories=self._poses.actor_trajectories,
                 colours=None if colours is None else colours[block],
@@ -549,7 +549,7 @@ class BatchPoints:
     @property
     def returns(self) -> Bytes:
         """Number of reported returns of its pulse."""
-        return required(self.pulse_returns.returns)
+        return required(self.pulse_returns.return_counts)
 
     @property
     def cause(self) -> Bytes:

@@ -82,7 +82,7 @@ class DevicePoints:
     survey: Survey
     specs: list[ScanSpec]
     counts: Ints  # (scans,): number of points of each scan
-    hits: Ints  # (scans,): number of hits of each scan, reported or not
+    hit_counts: Ints  # (scans,): number of hits of each scan, reported or not
     tally: tuple[Indices, Ints]  # numbers of hit counters that are not 0, and their hits
     columns: dict[str, AnyArray]  # {column name: values}
     returns: BatchPoints | None  # returns on the host, if NumPy computes columns
@@ -99,14 +99,14 @@ class DevicePoints:
         value = {"sensor": self.specs[0].sensor, "cause": SURFACE}.get(column.name, 1)
         return np.full(len(self), value, column.dtype)
 
-    def positions_of(self, rows: Ints) -> Floats:
-        """Return the positions of points `rows` (k,), metres: (k, 3).
+    def positions_of(self, row_indices: Ints) -> Floats:
+        """Return the positions of points by their rows (k,), metres: (k, 3).
 
         Positions are rounded to the precision unless NumPy computes columns.
         """
         if self.returns is not None:
-            return self.returns.positions_of(rows)
-        cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
+            return self.returns.positions_of(row_indices)
+        cells = np.stack([self.columns[axis.name][row_indices] for axis in AXES], axis=1)
         return cells * self.survey.precision_m
 
 
@@ -115,8 +115,8 @@ class SeenBodies:
 
     def __init__(self, caster: SceneCaster, bodies: Ints) -> None:
         self.caster = caster
-        self.rows = caster.body_rows  # rows in `StoredTriangles.bodies`
-        self.table = bodies[self.rows]  # all actors are the last body
+        self.body_rows = caster.body_rows  # rows in `StoredTriangles.bodies`
+        self.table = bodies[self.body_rows]  # all actors are the last body
         self.counters = caster.counters()
         self.device_table: Any = None
         self.device_normal_matrices: Any = None
@@ -195,11 +195,13 @@ class DeviceColumns:
             self, seen, specs, groups, max_points=-(-len(scan) // keep_every) + len(groups)
         )
         try:
-            hits, tally = seen.caster.caster.visit(scan, transfer.make, seen.counters, actor_hits)
+            hit_counts, tally = seen.caster.caster.visit(
+                scan, transfer.make, seen.counters, actor_hits
+            )
         finally:  # else the device would write to memory that goes back to the pool
             columns, (ray, distance, triangle) = transfer.finish()
         assert tally is not None
-        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hits, None)
+        scanned = Scanned(PulseReturns.single_returns(ray, distance, triangle), hit_counts, None)
         returns = BatchPoints(
             self._scene,
             survey,
@@ -217,8 +219,8 @@ class DeviceColumns:
             scene=self._scene,
             survey=survey,
             specs=specs,
-            counts=-(-hits // keep_every),
-            hits=hits,
+            counts=-(-hit_counts // keep_every),
+            hit_counts=hit_counts,
             tally=tally,
             columns=columns,
             returns=returns if self.needs_all_hits else None,
@@ -269,7 +271,7 @@ class DeviceColumns:
         if seen.device_table is None:
             seen.device_table = to_device(cupy, seen.table)
         if seen.device_normal_matrices is None:
-            normal_matrices = self._surfaces.triangles.bodies()[1][seen.rows]
+            normal_matrices = self._surfaces.triangles.bodies()[1][seen.body_rows]
             seen.device_normal_matrices = to_device(cupy, normal_matrices)
         return seen.device_table, *self._surface_tables, seen.device_normal_matrices
 

@@ -61,7 +61,7 @@ class RippleStep(PulseStep):
         """Add the errors of azimuth to the beams of a batch, and return the returns unchanged."""
         noise = self.setup.noise
         sensor = self.setup.sensor
-        azimuth = sensor.head.azimuths(batch.firings.numbers[batch.rows])
+        azimuth = sensor.head.azimuths(batch.firings.numbers[batch.row_range])
         sin, _ = sin_cos(noise.ripple_cycles * azimuth + np.radians(noise.ripple_phase_deg))
         # An error of azimuth moves a beam across by the horizontal part of its unit direction.
         level = hypot(*sensor.ahead.T[:2])

@@ -22,10 +22,10 @@ from ...scene.colours import luminance
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, Clock, along_rings
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, light_of
+from ..casting.surfaces import Surfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, SURFACE, PulseReturns, joined, selected
 from .doppler import range_rates_of_origins, velocities_of_ends
-from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, Rays, depths
+from .light_in_media import CROWN, LEAF, Draw, Leaves, LightInMedia, Media, MediaRays, depths
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
 GHOST = CAUSES.index("ghost")
@@ -58,9 +58,9 @@ class LightPaths:
     # if the next surface stood still; None if no column stores velocities.
     range_rate: Floats | None = None
 
-    def take(self, rows: Integers) -> LightPaths:
+    def take(self, row_indices: Integers) -> LightPaths:
         """Return the light of selected rows."""
-        return LightPaths(*selected(vars(self).values(), rows))
+        return LightPaths(*selected(vars(self).values(), row_indices))
 
     def optical_end(self, step_m: Floats) -> Floats:
         """Return the optical paths from the sensor to distances (n,) from the origins, metres."""
@@ -129,7 +129,7 @@ class Crossings(NamedTuple):
 class OnwardRows(NamedTuple):
     """Rows of light that continues: arrays (k,), with a row twice where the light divides."""
 
-    rows: Indices
+    row_indices: Indices
     reflected: Bools  # whether the light of the row is mirrored, else transmitted
     share: Floats  # share behind the surface, like `LightPaths.share`
 
@@ -148,7 +148,7 @@ class OnwardLight(NamedTuple):
 
     light: LightPaths
     start_m: Floats  # positions of those surfaces along the light, metres, at or below 0
-    path: Pattern  # the rays to cast: origins and directions of `light`
+    pattern: Pattern  # the rays to cast: origins and directions of `light`
 
 
 class CastStep(PulseStep):
@@ -174,7 +174,7 @@ class CastStep(PulseStep):
         super().__init__(setup, caster, surfaces)
         survey = setup.survey
         sensor = setup.sensor
-        self._sensor_light = light_of(survey, sensor)
+        self._sensor_light = sensor_light_of(survey, sensor)
         self._seed = setup.noise.seed
         table = surfaces.at_wavelength(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
@@ -218,22 +218,45 @@ class CastStep(PulseStep):
         The bytes are those while rays are cast and while returns are counted (`Memory`).
         """
         subray = 200 if not setup.has_onward_light else 1350 if setup.refracts else 650
-        casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.returns
-        return Memory(casting=casting, counting=75 * sizes.returns + 40 * sizes.points)
+        casting = (subray + 200 * setup.has_velocities) * sizes.subrays + 30 * sizes.return_count
+        return Memory(casting=casting, counting=75 * sizes.return_count + 40 * sizes.points)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Return the hits of the sub-rays of a batch, without using `returns`."""
+        """Return the hits of the sub-rays of a batch, without using `returns`.
+
+        A pass is a cast and what its hits do with the light:
+
+        1. `_cast_first` casts all sub-rays from the sensor. `CastLight` has a row for each sub-ray
+           that hits a surface: the path of its light (`LightPaths`), and the triangle.
+        2. `_surface_hits` computes what each row meets: a surface, or a leaf before the surface.
+           `SurfaceHits` has the colour, the normal and the energy of each row.
+        3. `_visible_hits` chooses the rows that the sensor sees, as `PulseReturns`, and marks rows
+           whose light continues: `VisibleHits`.
+        4. `_continue` takes these rows (`OnwardRows`), twice where light is both transmitted and
+           mirrored, and bends or mirrors the light (`Deflection`): `OnwardLight`. Without such rows
+           the passes end.
+        5. `_cast_again` casts this light, and returns the `CastLight` of the next pass, which goes
+           on with 2.
+        6. `_join` puts the hits of all passes in the order of sub-rays.
+
+        Two sub-rays meet a pane of glass at 4 m with a wall behind it at 9 m. Pass 1 has two rows,
+        hits on the pane, and both continue. Pass 2 has two rows, hits on the wall, and no row
+        continues. The joined hits have the sub-rays 0, 0, 1, 1, and the distances 4, 9, 4, 9. Hits
+        on clear glass have no energy, and no return is made of them.
+        """
         cast, rays = self._cast_first(batch)
         first_light = cast.light
-        parts: list[VisibleHits] = []
+        hits_by_pass: list[VisibleHits] = []
         for _ in range(MAX_LEAFY_PASSES if self._leafy else MAX_PASSES):
             surface_hits = self._surface_hits(cast, batch)
-            parts.append(self._visible_hits(cast.light, surface_hits))
-            onward = self._continue(cast.light, surface_hits, parts[-1], batch.subrays_per_beam)
+            hits_by_pass.append(self._visible_hits(cast.light, surface_hits))
+            onward = self._continue(
+                cast.light, surface_hits, hits_by_pass[-1], batch.subrays_per_beam
+            )
             if onward is None:
                 break
             cast = self._cast_again(onward, batch.subray_poses.actor_trajectories)
-        return self._join(batch, parts, rays, first_light)
+        return self._join(batch, hits_by_pass, rays, first_light)
 
     @property
     def _leafy(self) -> bool:
@@ -306,7 +329,7 @@ class CastStep(PulseStep):
             light.mirror_matrices = np.broadcast_to(np.eye(3), (count, 3, 3))
         if media is not None:
             leaf_depths = depths(self._draw(batch)(LEAF, ray)) if media.leafy else None
-            media_rays = Rays(origins, directions, times, poses.actor_trajectories)
+            media_rays = MediaRays(origins, directions, times, poses.actor_trajectories)
             light.in_media = media.initial_state(self.caster, media_rays, leaf_depths)
         return light
 
@@ -332,15 +355,15 @@ class CastStep(PulseStep):
             triangle,
             light.directions,
             distance=distance,
-            light=self._sensor_light,
+            sensor_light=self._sensor_light,
             times=light.times,
             trajectories=actor_trajectories,
             colours=colour,
         )
-        if leaves is not None and len(leaves.rows):
+        if leaves is not None and len(leaves.row_indices):
             # Leaves face the light: two leaves behind each other are then never one surface.
-            normals[leaves.rows] = light.directions[leaves.rows]
-            energy[leaves.rows] = self._leaf_energy(leaves, triangle, distance, colour)
+            normals[leaves.row_indices] = light.directions[leaves.row_indices]
+            energy[leaves.row_indices] = self._leaf_energy(leaves, triangle, distance, colour)
         energy *= light.share
         if light.in_media is not None:
             light.in_media.advance(step_m)
@@ -355,7 +378,7 @@ class CastStep(PulseStep):
             kinds=kinds,
             energy=energy,
             film=film,
-            leaves=np.zeros(0, np.intp) if leaves is None else leaves.rows,
+            leaves=np.zeros(0, np.intp) if leaves is None else leaves.row_indices,
             velocities=self._velocities(light, step_m, triangle, actor_trajectories),
         )
 
@@ -376,9 +399,9 @@ class CastStep(PulseStep):
             self._draw(batch),
         )
         step_m = cast.step_m.copy()
-        step_m[leaves.rows] = cast.start_m[leaves.rows] + leaves.metres
+        step_m[leaves.row_indices] = cast.start_m[leaves.row_indices] + leaves.metres
         triangle = cast.triangle.copy()
-        triangle[leaves.rows] = leaves.triangles
+        triangle[leaves.row_indices] = leaves.triangles
         return cast._replace(step_m=step_m, triangle=triangle), leaves
 
     def _leaf_energy(
@@ -388,7 +411,7 @@ class CastStep(PulseStep):
 
         `triangle`, `distance` (metres) and `colour` are of all hits (n,), with those on leaves.
         """
-        rows = leaves.rows
+        rows = leaves.row_indices
         leaf_colour = None if colour is None else colour[rows]
         return self.surfaces.energy(
             triangle[rows], leaves.cosines, distance[rows], self._sensor_light, leaf_colour
@@ -492,11 +515,11 @@ class CastStep(PulseStep):
         return self._cross(onward, crossings)
 
     def _divide(
-        self, light: LightPaths, surface_hits: SurfaceHits, rows: Indices, reflected: Bools
+        self, light: LightPaths, surface_hits: SurfaceHits, row_indices: Indices, reflected: Bools
     ) -> OnwardRows:
         """Compute the share of light that surfaces transmit or mirror, and drop faint light.
 
-        `rows` are rows of the light; `reflected` says which of them are mirrored. Both are
+        `row_indices` are rows of the light; `reflected` says which of them are mirrored. Both are
         overwritten. Light is dropped only if there are mirrors, and if no medium refracts: where
         light is refracted, its energy may exceed the limit that is computed here.
         """
@@ -505,15 +528,15 @@ class CastStep(PulseStep):
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
         if materials.textured and surface_hits.colour is not None:
-            bright = luminance(surface_hits.colour[rows])
+            bright = luminance(surface_hits.colour[row_indices])
         in_media = light.in_media
         drops_faint = light.mirrored is not None and not (
             in_media is not None and in_media.differentials
         )
-        share = np.empty(len(rows))
+        share = np.empty(len(row_indices))
         film = np.zeros(0, np.bool_) if surface_hits.film is None else surface_hits.film
         count = surface_loops.divide_light(
-            rows,
+            row_indices,
             reflected,
             hits=surface_loops.OnwardHits(
                 surface_hits.kinds,
@@ -522,7 +545,7 @@ class CastStep(PulseStep):
                 light.share,
                 surface_hits.distance,
             ),
-            shares=materials.shares(surface_hits.kinds[rows], bright),
+            shares=materials.shares(surface_hits.kinds[row_indices], bright),
             optics=surface_loops.OnwardOptics(
                 materials.specular, materials.passes, ~materials.refracts, materials.leafy
             ),
@@ -534,19 +557,19 @@ class CastStep(PulseStep):
             ),
             onward_share=share,
         )
-        return OnwardRows(rows[:count], reflected[:count], share[:count])
+        return OnwardRows(row_indices[:count], reflected[:count], share[:count])
 
     def _cast_again(self, onward: OnwardLight, actor_trajectories: ActorTrajectories) -> CastLight:
         """Cast the light behind surfaces, and return the light that hits a surface in range.
 
         With crowns, hits beyond the range are returned too: there may be leaves before them.
         """
-        light, start_m, path = onward
+        light, start_m, pattern = onward
         max_range_m = self.setup.sensor.max_range_m
         # Light takes no time: it travels 300 m in a microsecond.
         clock = Clock(light.times, np.zeros(1), actor_trajectories)
         poses = CastPoses(np.zeros(3), clock=clock)
-        hits = self.caster.scan(path, poses, t_max=self._reach_m)
+        hits = self.caster.scan(pattern, poses, t_max=self._reach_m)
         rows = hits.ray
         cast = CastLight(light.take(rows), start_m[rows], hits.distance, hits.triangle)
         if self._leafy or max_range_m == np.inf:
@@ -562,26 +585,30 @@ class CastStep(PulseStep):
         )
 
     def _join(
-        self, batch: PulseBatch, parts: list[VisibleHits], rays: Floats, first_light: LightPaths
+        self,
+        batch: PulseBatch,
+        hits_by_pass: list[VisibleHits],
+        rays: Floats,
+        first_light: LightPaths,
     ) -> PulseReturns:
         """Return the hits of all passes in the order of sub-rays, and set them in the batch.
 
-        `parts` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams have
-        several sub-rays. `rays` are all sub-rays (`_cast_first`); `first_light` is the light of
-        those that hit a surface.
+        `hits_by_pass` are the hits of each pass. Sets `batch.hits`, and `batch.planes` if beams
+        have several sub-rays. `rays` are all sub-rays (`_cast_first`); `first_light` is the light
+        of the sub-rays that hit a surface.
         """
-        hits = joined([part.hits for part in parts])
-        normals = parts[0].normals
-        if parts[1:]:
+        hits = joined([part.hits for part in hits_by_pass])
+        normals = hits_by_pass[0].normals
+        if hits_by_pass[1:]:
             order = np.argsort(hits.ray, kind="stable")
             hits = hits.take(order)
             if batch.subrays_per_beam > 1:
-                normals = np.concatenate([part.normals for part in parts])[order]
+                normals = np.concatenate([part.normals for part in hits_by_pass])[order]
         batch.hits = hits
         if batch.subrays_per_beam > 1:
             directions = first_light.directions
             # The rows differ from `first_light` after several passes, or if hits were left out.
-            if parts[1:] or len(hits.ray) != len(first_light.ray):
+            if hits_by_pass[1:] or len(hits.ray) != len(first_light.ray):
                 directions = rays[-3:].take(hits.ray, axis=1).T
             batch.planes = normals, directions
         return hits
@@ -607,7 +634,7 @@ class CastStep(PulseStep):
             cosines = np.abs(products(normals.T, outgoing.T))
         range_rate = _range_rate_behind(light, incoming_index, crossings.velocities, outgoing)
         clear_m = self.caster.clear_m / np.maximum(cosines, 1e-3)
-        path, origins = _path_behind(light, crossings.step_m, clear_m, outgoing)
+        pattern, origins = _pattern_behind(light, crossings.step_m, clear_m, outgoing)
         optical_m = clear_m if in_media is None else in_media.optical(clear_m)
         if in_media is not None:
             in_media.advance(clear_m)
@@ -615,7 +642,7 @@ class CastStep(PulseStep):
             ray=light.ray,
             times=light.times,
             origins=origins,
-            directions=path.directions,
+            directions=pattern.directions,
             share=deflection.share,
             optical_start=crossings.distance + optical_m,
             mirror_matrices=mirror_matrices,
@@ -623,7 +650,7 @@ class CastStep(PulseStep):
             in_media=in_media,
             range_rate=range_rate,
         )
-        return OnwardLight(behind, -clear_m, path)
+        return OnwardLight(behind, -clear_m, pattern)
 
     def _deflect(self, light: LightPaths, crossings: Crossings) -> Deflection:
         """Return the directions and shares of light behind surfaces that refract or mirror.
@@ -669,7 +696,7 @@ def _range_rate_behind(
     return light.range_rate + incoming_index * incoming_speed - light.index * outgoing_speed
 
 
-def _path_behind(
+def _pattern_behind(
     light: LightPaths, step_m: Floats, clear_m: Floats, outgoing: Floats
 ) -> tuple[Pattern, Floats]:
     """Return rays that start `clear_m` (n,) behind the ends of light, and their origins (n, 3).

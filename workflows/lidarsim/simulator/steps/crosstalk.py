@@ -115,7 +115,7 @@ class CrosstalkStep(PulseStep):
         """Return the memory of causes of returns, of rays, and of foreign pulses, in bytes."""
         foreign_pulses = _foreign_pulses(setup.survey, setup.sensor)
         return Memory(
-            retained=10 * sizes.returns, casting=(120 + 180 * foreign_pulses) * sizes.beams
+            retained=10 * sizes.return_count, casting=(120 + 180 * foreign_pulses) * sizes.beams
         )
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:

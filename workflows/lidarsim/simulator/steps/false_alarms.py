@@ -51,7 +51,7 @@ class FalseAlarmStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of a cause for each return, and of the rays, in bytes."""
-        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch and the false alarms of its rays."""

@@ -42,7 +42,7 @@ UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # direction of search, unlike edge
 Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 
 
-class Rays(NamedTuple):
+class MediaRays(NamedTuple):
     """Light of sub-rays at its origin, and the trajectories of actors."""
 
     origins: Floats  # (n, 3): metres, scene frame
@@ -63,37 +63,37 @@ class MediaStack:
         """Return the stacks of light in the air."""
         return cls(*(np.full((count, MAX_MEDIA), -1, np.int32) for _ in range(2)))
 
-    def __getitem__(self, rows: Integers) -> MediaStack:
+    def __getitem__(self, row_indices: Integers) -> MediaStack:
         """Return the stacks of selected sub-rays."""
-        return MediaStack(self.kinds[rows], self.triangles[rows])
+        return MediaStack(self.kinds[row_indices], self.triangles[row_indices])
 
-    def enter(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium within the media around light: a medium for each of `rows`.
+    def enter(self, row_indices: Indices, kinds: Ints32, triangles: Ints32) -> None:
+        """Add a medium within the media around light: a medium for each selected row.
 
         A full stack loses its outermost medium.
         """
         for table, values in ((self.kinds, kinds), (self.triangles, triangles)):
-            table[rows, 1:] = table[rows, :-1]
-            table[rows, 0] = values
+            table[row_indices, 1:] = table[row_indices, :-1]
+            table[row_indices, 0] = values
 
-    def surround(self, rows: Indices, kinds: Ints32, triangles: Ints32) -> None:
-        """Add a medium around the media of each of `rows`, while full stacks stay as they are."""
-        depth = (self.kinds[rows] >= 0).sum(axis=1)
+    def surround(self, row_indices: Indices, kinds: Ints32, triangles: Ints32) -> None:
+        """Add a medium around the media of selected rows, while full stacks stay as they are."""
+        depth = (self.kinds[row_indices] >= 0).sum(axis=1)
         free = depth < MAX_MEDIA
-        self.kinds[rows[free], depth[free]] = kinds[free]
-        self.triangles[rows[free], depth[free]] = triangles[free]
+        self.kinds[row_indices[free], depth[free]] = kinds[free]
+        self.triangles[row_indices[free], depth[free]] = triangles[free]
 
-    def leave(self, rows: Indices, kinds: Ints32) -> Bools:
-        """Remove a medium from the stacks of `rows`, and return False for rows without it."""
-        matches = self.kinds[rows] == kinds[:, None]
+    def leave(self, row_indices: Indices, kinds: Ints32) -> Bools:
+        """Remove a medium from the stacks of rows, and return False for rows without it."""
+        matches = self.kinds[row_indices] == kinds[:, None]
         in_stack = matches.any(axis=1)
-        rows = rows[in_stack]
+        row_indices = row_indices[in_stack]
         depth = matches[in_stack].argmax(axis=1)
         column = np.arange(MAX_MEDIA)
         column = column + (column >= depth[:, None])
         for table in (self.kinds, self.triangles):
-            padded = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
-            table[rows] = np.take_along_axis(padded, column, axis=1)
+            padded = np.pad(table[row_indices], ((0, 0), (0, 1)), constant_values=-1)
+            table[row_indices] = np.take_along_axis(padded, column, axis=1)
         return in_stack
 
 
@@ -114,9 +114,9 @@ class RayDifferentials:
         zeros = np.zeros(len(derivatives))
         return cls(index.copy(), index, zeros, np.zeros_like(derivatives), derivatives)
 
-    def __getitem__(self, rows: Integers) -> RayDifferentials:
+    def __getitem__(self, row_indices: Integers) -> RayDifferentials:
         """Return the differentials of selected sub-rays."""
-        return RayDifferentials(*selected(vars(self).values(), rows))
+        return RayDifferentials(*selected(vars(self).values(), row_indices))
 
     def advance(self, step: Floats, attenuation: Floats) -> None:
         """Move the light straight on by steps (n,), metres, through an attenuation (n,), 1/m."""
@@ -217,27 +217,27 @@ class Media:
         """Return whether light enters bodies: (n,), by `cosines` between normals and light."""
         return np.asarray((cosines < 0) != self._inwards[kinds])
 
-    def stack_at(self, caster: SceneCaster, light: Rays) -> MediaStack:
+    def stack_at(self, caster: SceneCaster, rays: MediaRays) -> MediaStack:
         """Return the media around the origins of light."""
-        stack = MediaStack.none(len(light.origins))
-        in_bounds = np.zeros(len(light.origins), np.bool_)
+        stack = MediaStack.none(len(rays.origins))
+        in_bounds = np.zeros(len(rays.origins), np.bool_)
         if not len(in_bounds):
             return stack
-        lower = light.origins.min(axis=0)
-        upper = light.origins.max(axis=0)
+        lower = rays.origins.min(axis=0)
+        upper = rays.origins.max(axis=0)
         overlapping = ((self._bounds[:, 0] <= upper) & (self._bounds[:, 1] >= lower)).all(axis=1)
         for box_min, box_max in self._bounds[overlapping]:
-            in_bounds |= ((light.origins >= box_min) & (light.origins <= box_max)).all(axis=1)
+            in_bounds |= ((rays.origins >= box_min) & (rays.origins <= box_max)).all(axis=1)
         rows = np.flatnonzero(in_bounds)
         if not len(rows):
             return stack
         # Most rays start at the same position and time as the ray before.
-        origins = light.origins[rows]
-        times = light.times[rows]
+        origins = rays.origins[rows]
+        times = rays.times[rows]
         first_of_run = np.ones(len(rows), np.bool_)
         first_of_run[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
         searched = self._search(
-            caster, origins[first_of_run], times[first_of_run], light.actor_trajectories
+            caster, origins[first_of_run], times[first_of_run], rays.actor_trajectories
         )
         search_rows = np.cumsum(first_of_run) - 1
         stack.kinds[rows] = searched.kinds[search_rows]
@@ -278,27 +278,27 @@ class Media:
         self,
         entered: MediaStack,
         surrounding: MediaStack,
-        rows: Indices,
+        probe_indices: Indices,
         triangles: Ints32,
         cosines: Floats,
     ) -> None:
-        """Update the stacks of a search for probes `rows` that cross triangles."""
+        """Update the stacks of a search for the probes that cross triangles, by their indices."""
         kinds = self._surfaces.kinds(triangles)
         at_medium = self.filled[kinds]
         entering = self.enters(kinds, cosines) & at_medium
-        entered.enter(rows[entering], kinds[entering], triangles[entering])
+        entered.enter(probe_indices[entering], kinds[entering], triangles[entering])
         leaving = np.flatnonzero(at_medium & ~entering)
-        was_entered = entered.leave(rows[leaving], kinds[leaving])
+        was_entered = entered.leave(probe_indices[leaving], kinds[leaving])
         leaving = leaving[~was_entered]
-        surrounding.surround(rows[leaving], kinds[leaving], triangles[leaving])
+        surrounding.surround(probe_indices[leaving], kinds[leaving], triangles[leaving])
 
     def initial_state(
-        self, caster: SceneCaster, light: Rays, depths: Floats | None
+        self, caster: SceneCaster, rays: MediaRays, depths: Floats | None
     ) -> LightInMedia:
         """Return the state of light at its origin, with optical depths to a leaf `depths` (n,)."""
-        stack = self.stack_at(caster, light)
+        stack = self.stack_at(caster, rays)
         differentials = (
-            RayDifferentials.from_directions(light.directions, self.index(stack))
+            RayDifferentials.from_directions(rays.directions, self.index(stack))
             if self.refracts
             else None
         )
@@ -353,11 +353,13 @@ class Media:
 
 
 class LightInGrids(NamedTuple):
-    """Light among all that passes grids of voxels: arrays (k,)."""
+    """Light among all light that passes grids of voxels: arrays (k,)."""
 
-    rows: Indices  # rows of the light
+    row_indices: Indices  # rows of the light
     metres: Floats  # metres to the leaf that the light meets; inf without a leaf
     remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
+    # (k, MAX_MEDIA): optical depth per metre; of a grid in the voxel where light meets a leaf, or 0
+    density: Floats
 
 
 class Refraction(NamedTuple):
@@ -372,7 +374,7 @@ class Refraction(NamedTuple):
 class Leaves(NamedTuple):
     """Leaves that light meets: arrays (k,)."""
 
-    rows: Indices  # rows of the light
+    row_indices: Indices  # rows of the light
     metres: Floats  # metres from the start of the span to the leaf
     triangles: Ints32  # through which the light entered the crown
     cosines: Floats  # mean cosine between light and leaves
@@ -387,10 +389,11 @@ class LightInMedia:
     differentials: RayDifferentials | None  # None if no medium refracts
     remaining_depth: Floats | None  # (n,): optical depth to a leaf; None without leaves
 
-    def __getitem__(self, rows: Integers) -> LightInMedia:
+    def __getitem__(self, row_indices: Integers) -> LightInMedia:
         """Return the state of selected sub-rays."""
         return LightInMedia(
-            self.media, *selected((self.stack, self.differentials, self.remaining_depth), rows)
+            self.media,
+            *selected((self.stack, self.differentials, self.remaining_depth), row_indices),
         )
 
     @property
@@ -426,6 +429,7 @@ class LightInMedia:
         if self.media.grids is not None:
             starts = origins + starts_m[:, None] * directions
             passage = self._pass_grids(starts, directions, length, density)
+            density[passage.row_indices] = passage.density
         cumulative = np.cumsum(density, axis=1)
         rows, metres = self._advance_to_leaves(cumulative[:, -1], length, passage)
         layer = _crown_layers(draw(CROWN, ray[rows]), cumulative[rows])
@@ -442,13 +446,13 @@ class LightInMedia:
         assert self.remaining_depth is not None
         depth = density * length
         if passage is not None:
-            in_grids = passage.rows
+            in_grids = passage.row_indices
             depth[in_grids] = self.remaining_depth[in_grids] - passage.remaining_depth
         rows = np.flatnonzero(depth > self.remaining_depth)
         metres = self.remaining_depth[rows] / density[rows]
         if passage is not None:
             metres_in_grids = np.full(len(depth), np.nan)
-            metres_in_grids[passage.rows] = passage.metres
+            metres_in_grids[passage.row_indices] = passage.metres
             metres = np.where(np.isnan(metres_in_grids[rows]), metres, metres_in_grids[rows])
         self.remaining_depth = self.remaining_depth - depth
         return rows, metres
@@ -456,11 +460,10 @@ class LightInMedia:
     def _pass_grids(
         self, starts: Floats, directions: Floats, length: Floats, density: Floats
     ) -> LightInGrids:
-        """Follow light through grids of voxels, and write their densities into `density`.
+        """Follow light through grids of voxels, and return the passage with new densities.
 
-        Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. Before, `density`
-        (n, MAX_MEDIA) has the optical depth per metre of grids for a leaf area density of 1 m²/m³;
-        afterwards, for the voxel where light meets a leaf, or 0. Other media keep their values.
+        Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. `density`
+        (n, MAX_MEDIA) is the optical depth per metre; of a grid for a leaf area density of 1 m²/m³.
         """
         grids = self.media.grids
         stack = self.stack
@@ -487,8 +490,7 @@ class LightInMedia:
             is_grid, grid_density, np.take_along_axis(media_density, grid_layers, 1)
         )
         np.put_along_axis(media_density, grid_layers, layer_density, 1)
-        density[rows] = media_density
-        return LightInGrids(rows, metres, remaining_depth)
+        return LightInGrids(rows, metres, remaining_depth, media_density)
 
     def advance(self, step: Floats) -> None:
         """Move the light straight on by steps (n,), metres."""

@@ -30,7 +30,7 @@ class DirtStep(PulseStep):
         sensor = self.setup.sensor
         beams = np.arange(batch.start, batch.stop)
         transmission = np.ones(len(beams))
-        x, y, z = sensor.directions(batch.firings.numbers[batch.rows]).reshape(-1, 3).T
+        x, y, z = sensor.directions(batch.firings.numbers[batch.row_range]).reshape(-1, 3).T
         for fault in self.setup.faults("dirt").values():
             in_spot = _in_spot(fault, x, y, z)
             if fault.from_s or fault.to_s is not None:

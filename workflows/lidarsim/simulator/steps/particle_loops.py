@@ -78,7 +78,7 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
                 )
             if tables.by_range[0, index] < reach[ray]:
                 quantile = uniform(starts[3], scan, number_in_scan, particle)
-                write_particle(ray, index, quantile, subrays, tables, hits, count)
+                write_particle(ray, index, quantile, subrays, tables, hits=hits, row=count)
                 count += 1
             particle += 1
         beam += 1

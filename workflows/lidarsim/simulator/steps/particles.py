@@ -165,21 +165,21 @@ class WeatherStep(PulseStep):
         reach = light_reach(
             self.surfaces.at_wavelength(self._wavelength_nm), self.surfaces, hits, count
         )
-        parts: list[SampledHits] = []
+        samples: list[SampledHits] = []
         for kind, seed in zip(self.detectable_kinds, self._seeds, strict=True):
             if kind is not None:
                 random = random_keys(seed, self.purposes[2:], keys, first)
-                parts += _particles(kind, random, subrays, reach)
+                samples += _particles(kind, random, subrays, reach)
         if self.fog_cells is not None:
             random = random_keys(self._seed, self.purposes[:2], keys, first)
-            parts.append(_fog_hits(self.fog_cells, random, subrays, self._fog_ends(hits, reach)))
-        if not parts:
+            samples.append(_fog_hits(self.fog_cells, random, subrays, self._fog_ends(hits, reach)))
+        if not samples:
             return None
-        ray, distance, energy = map(np.concatenate, zip(*parts, strict=True))
+        ray, distance, energy = map(np.concatenate, zip(*samples, strict=True))
         air_hits = returns_without_surface(hits, ray, distance, energy, AIR)
         if len(self._refracting(hits)):
             air_hits = air_hits.take(~self._in_refracting_bodies(hits, ray, distance))
-        if parts[1:] or subrays > 1:
+        if samples[1:] or subrays > 1:
             air_hits = air_hits.take(np.argsort(air_hits.ray, kind="stable"))
         return air_hits
 

@@ -129,6 +129,26 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
 
     A sub-ray may have several hits, each behind the panes of glass that it hit before: the hits of
     neighbouring sub-rays behind the same number of panes are compared.
+
+    A beam of four sub-rays, with the pairs (0, 1), (1, 2) and (2, 3), has five hits. Sub-rays 0, 1
+    and 2 graze the ground, sub-ray 3 meets a post, and sub-ray 0 meets a raindrop on its way:
+
+    ==============================================  ======  ======  ======  ======  ======
+    hit k                                           0 drop  1       2 post  3       4
+    ==============================================  ======  ======  ======  ======  ======
+    `distance`, metres                              8.0     10.0    10.6    11.0    12.2
+    `subray`                                        0       0       3       1       2
+    `solid`                                         no      yes     yes     yes     yes
+    `starts_return`, by a gap of 0.3 m              yes     yes     yes     yes     yes
+    `changes` by pair (0, 1), of hits 1 and 3       0       0       1       0       -1
+    `changes` by pair (1, 2), of hits 3 and 4, too  0       0       1       0       0
+    `continuing`, the sum of changes up to hit k    0       0       1       1       1
+    `starts_surface`                                yes     yes     no      no      no
+    ==============================================  ======  ======  ======  ======  ======
+
+    Pair (0, 1) clears the mark of the post as well: the post is between two hits of one surface.
+    The element of `changes` behind the last hit is -1 in the end. Pair (2, 3), ground and post, is
+    not on one surface. There are two returns, of the drop, and of the ground with the post.
     """
     subrays = neighbours.subrays
     solid = marks.solid

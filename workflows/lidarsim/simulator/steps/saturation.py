@@ -30,7 +30,7 @@ class SaturationStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of widths, amplitudes and joined returns, in bytes."""
-        return Memory(retained=16 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=16 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch after saturation."""

@@ -257,6 +257,16 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbours, scratch):
     `count` is the number of hits. `exceeds_gap` is False if no hit of the beam is farther from
     another hit than the receiver's gap. A surface that continues from sub-ray to sub-ray is in a
     single return.
+
+    In the example of `continue_surfaces`, with a gap of 0.3 m, `_collect_hits` has written the
+    drop, then the hits of sub-rays 0 to 3, and `_sort_by_distance` has moved the post before the
+    ground of sub-rays 1 and 2. `row[k, 0]` is -1, 0, 3, 1 and 2: the drop is row 0 of the table of
+    the air. Each hit is farther than the gap from the hit before, so `starts_return` is True for
+    all five. Hits on surfaces are in several returns, so `continue_surfaces` looks for surfaces
+    that continue, and clears `starts_return` of hits 2, 3 and 4. `_write_returns` then writes two
+    returns: the drop at 8.0 m, and hits 1 to 4 at their mean distance, weighted by energy. If the
+    post returns twice the energy of a ground hit, the mean is 10.88 m, and the return has the row
+    of the post, 3.
     """
     row = scratch.hits.row
     distance = scratch.hits.distance
@@ -335,14 +345,14 @@ def _detection_of(receiver, starts):
     loses = len(starts) > 0
     count = len(receiver.quantiles)
     return _Detection(
-        receiver.dropout,
-        receiver.threshold,
-        receiver.threshold_sigmas,
-        float64s(receiver.quantiles.ctypes.data),
-        receiver.quantiles[0] if count else 0.0,
-        receiver.quantiles[count - 1] if count else 0.0,
-        starts[0] if loses else np.uint64(0),
-        starts[1] if loses else np.uint64(0),
+        dropout=receiver.dropout,
+        threshold=receiver.threshold,
+        threshold_sigmas=receiver.threshold_sigmas,
+        quantiles=float64s(receiver.quantiles.ctypes.data),
+        lowest=receiver.quantiles[0] if count else 0.0,
+        highest=receiver.quantiles[count - 1] if count else 0.0,
+        loss_start=starts[0] if loses else np.uint64(0),
+        detection_start=starts[1] if loses else np.uint64(0),
     )
 
 
@@ -480,7 +490,15 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, P
             exceeds_gap = extent_m > receiver.gap_m
             if exceeds_gap:  # few beams hit an edge or graze a surface
                 _sort_by_distance(scratch.hits, collected)
-            _mark_returns(hits, air, collected, exceeds_gap, receiver, neighbours, scratch)
+            _mark_returns(
+                hits,
+                air,
+                count=collected,
+                exceeds_gap=exceeds_gap,
+                receiver=receiver,
+                neighbours=neighbours,
+                scratch=scratch,
+            )
             count = _write_returns(collected, beam, receiver, scratch, count, output)
         if loses and count > begin:
             number = keys.first + beam

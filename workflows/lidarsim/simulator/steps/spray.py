@@ -140,7 +140,7 @@ class SprayStep(PulseStep):
         mean, by_range = self._clump_distribution
         tables = spray_loops.ClumpTables(mean, by_range, self._step_mm, exponential())
         keys = random_keys(self.setup.noise.seed, self.purposes, batch.keys, batch.start)
-        parts: list[PulseReturns] = []
+        clump_hits: list[PulseReturns] = []
         row = 0
         while row < len(crossings.beam):
             hits = room_for_hits(1024 + len(crossings.beam))
@@ -153,8 +153,8 @@ class SprayStep(PulseStep):
                 reach=reach_m,
                 hits=hits,
             )
-            parts.append(returns_without_surface(returns, *hits.first(count), cause=SPRAY))
-        clumps = joined(parts)
+            clump_hits.append(returns_without_surface(returns, *hits.first(count), cause=SPRAY))
+        clumps = joined(clump_hits)
         return clumps.take(np.argsort(clumps.ray, kind="stable"))
 
     def _crossings(self, batch: PulseBatch, reach_m: Floats) -> Crossings:

@@ -149,7 +149,9 @@ def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: 
                     continue
                 span = _span_in_box(boxes, b, (p, q, r), (u, v, w), reach[k])
                 if span[0] < span[1]:
-                    _write_crossing(k, b, times[k], span, spray_boxes, crossings, count)
+                    _write_crossing(
+                        k, b, times[k], span, spray_boxes, crossings=crossings, count=count
+                    )
                     count += 1
         begin = end
     return count
@@ -237,7 +239,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
                     )
                 if ranges[column] < reach[ray]:
                     quantile = uniform(starts[2], scan, number_in_scan, clump)
-                    write_particle(ray, column, quantile, subrays, tables, hits, count)
+                    write_particle(ray, column, quantile, subrays, tables, hits=hits, row=count)
                     count += 1
                 clump += 1
                 index = np.int64(bits(starts[0], scan, number_in_scan, clump) >> SHIFT_TO_INDEX)

@@ -148,7 +148,7 @@ class Sizes(NamedTuple):
     rays: int  # rays of all scans whose memory is estimated
     beams: float  # beams of one `PulseBatch`
     subrays: int  # sub-rays of one `PulseBatch`
-    returns: float  # returns of `rays`
+    return_count: float  # returns of `rays`
     points: float  # returns that become points: every n-th (`Survey.keep_every`)
 
 
@@ -181,7 +181,7 @@ class Emitter:
         self,
         pattern: Pattern,
         offsets: Floats | None = None,
-        rows: Ints | None = None,
+        beam_indices: Ints | None = None,
         *,
         by_head: bool = False,
     ) -> Pattern:
@@ -194,7 +194,7 @@ class Emitter:
         offsets
             (n, 2): angles that are added to the directions of the n divided beams, radians
             (`PulseBatch.deflect`).
-        rows
+        beam_indices
             (n,): rows of `pattern` that are divided; by default all.
         by_head
             Whether the beams are in the frame of the head, not of the carrier.
@@ -203,7 +203,7 @@ class Emitter:
             return pattern
         axis = np.array([0.0, 0, 1]) if by_head else self._axis
         sub_rays = SubRays(self.beam.angles, self.beam.starts, axis if self._about_axis else None)
-        return pattern.divided(sub_rays, offsets, rows)
+        return pattern.divided(sub_rays, offsets, beam_indices)
 
 
 @dataclass(eq=False)
@@ -238,13 +238,13 @@ class PulseBatch:
         earlier = np.zeros((self.stop - self.start, 2)) if self.offsets is None else self.offsets
         self.offsets = earlier + offsets
 
-    def select(self, rows: Indices) -> PulseReturns:
+    def select(self, row_indices: Indices) -> PulseReturns:
         """Keep the selected rows of `hits` and `planes`, and return the remaining hits."""
         assert self.hits is not None
-        self.hits = self.hits.take(rows)
+        self.hits = self.hits.take(row_indices)
         if self.planes is not None:
             normals, directions = self.planes
-            self.planes = normals[rows], directions[rows]
+            self.planes = normals[row_indices], directions[row_indices]
         return self.hits
 
     @property
@@ -265,7 +265,7 @@ class PulseBatch:
         )
 
     @property
-    def rows(self) -> slice:
+    def row_range(self) -> slice:
         """Rows of the batch's firings in `firings`, in complete firings."""
         channels = self.firings.sensor.channels
         return slice(self.start // channels, self.stop // channels)

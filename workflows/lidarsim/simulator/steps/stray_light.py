@@ -17,7 +17,7 @@ from ...columns.table import CAUSES
 from ...media.materials import MaterialTable
 from ...scene.scene import Scene
 from ..casting.scene_caster import SceneCaster
-from ..casting.surfaces import Surfaces, light_of
+from ..casting.surfaces import Surfaces, sensor_light_of
 from ..returns import RETURN_COLUMNS, PulseReturns, merged, returns_without_surface
 from .detection import passes
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
@@ -44,7 +44,7 @@ class StrayLightStep(PulseStep):
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         super().__init__(setup, caster, surfaces)
-        self._sensor_light = light_of(setup.survey, setup.sensor)
+        self._sensor_light = sensor_light_of(setup.survey, setup.sensor)
         self._clusters = [*_retro_clusters(setup.scene, surfaces, caster.unseen)]
 
     @staticmethod
@@ -55,7 +55,7 @@ class StrayLightStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of the causes of returns, and of central rays, in bytes."""
-        return Memory(retained=10 * sizes.returns, casting=120 * sizes.beams)
+        return Memory(retained=10 * sizes.return_count, casting=120 * sizes.beams)
 
     def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns of a batch with the returns of stray light.
@@ -215,7 +215,7 @@ def _retro_clusters(
     shared = scene.instances
     if shared is not None:
         for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
-            mesh = shared.parts[part]
+            mesh = shared.mesh_parts[part]
             if has_retro[owner]:
                 vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
                 yield from clusters_of(mesh.faces, vertices, first)

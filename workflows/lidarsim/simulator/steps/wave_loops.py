@@ -328,15 +328,33 @@ def _fit(x, y, sample_count, count, scratch):
             guess[row, k] = best[row, k]
     widest = max((x[sample_count - 1] - x[0]) / (4 * count), 1.5)
     damping = 1e-3
-    cost = _residual(x, y, sample_count, best, count, residual, slopes)
+    cost = _residual(
+        x, y, sample_count, gaussians=best, count=count, residual=residual, slopes=slopes
+    )
     for _ in range(STEPS):
-        _step(residual, slopes, sample_count, count, damping, scratch.lower, step)
+        _step(
+            residual,
+            slopes,
+            sample_count,
+            count,
+            damping=damping,
+            lower=scratch.lower,
+            step=step,
+        )
         for k in range(count):
             position = best[1, k] + step[count + k]
             trial[0, k] = min(max(best[0, k] + step[k], 0.0), HIGHEST)
             trial[1, k] = min(max(position, guess[1, k] - MOVES), guess[1, k] + MOVES)
             trial[2, k] = min(max(best[2, k] + step[2 * count + k], 1.0), widest)
-        new_cost = _residual(x, y, sample_count, trial, count, new_residual, new_slopes)
+        new_cost = _residual(
+            x,
+            y,
+            sample_count,
+            gaussians=trial,
+            count=count,
+            residual=new_residual,
+            slopes=new_slopes,
+        )
         better = new_cost < cost
         converged = better and cost - new_cost <= GAIN * cost
         converged = converged or new_cost <= ENOUGH or damping >= 1e6
@@ -640,7 +658,7 @@ def _peak_of_hit(time, wave, stops, count):
 
 
 @compiled()
-def search_waveforms(light, parts, sampling, starts, peaks, scratch):
+def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
     """Sample waveforms, and write the peak that each of their hits belongs to.
 
     Waveform k has the hits `parts[k, 0]` to `parts[k, 1]` of `light`, a `WaveLight`.
@@ -651,13 +669,15 @@ def search_waveforms(light, parts, sampling, starts, peaks, scratch):
     time = light.time
     first_number = 0
     pulse_samples = np.int64(2 * CUT * sigma) + 1
-    for part in range(len(parts)):
-        begin = parts[part, 0]
-        stop = parts[part, 1]
+    for part in range(len(hit_ranges)):
+        begin = hit_ranges[part, 0]
+        stop = hit_ranges[part, 1]
         first = np.int64(math.ceil(time[begin] - CUT * sigma)) - 1
         last_first = np.int64(math.ceil(time[stop - 1] - CUT * sigma))
         length = last_first + pulse_samples - first + 1
-        top = _sample(light, begin, stop, first, length, sigma, scratch.samples)
+        top = _sample(
+            light, begin, stop, first, length=length, sigma=sigma, samples=scratch.samples
+        )
         wave = SampledWaveform(scratch.samples, length, first, top, sigma)
         if sampling.decomposes:
             count = _gaussians(wave, scratch.gaussians, scratch.stops, scratch.peaks)

@@ -183,23 +183,23 @@ def _wave_hits(hits: PulseReturns, subrays: int) -> WaveHits:
     )
 
 
-def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, parts: Ints) -> WavePeaks:
+def _search(hits: WaveHits, digitizer: Digitizer, subrays: int, hit_ranges: Ints) -> WavePeaks:
     """Return the peaks of hits in waveforms that are searched, and mark where peaks start.
 
-    `parts` (k, 2) are the first hit, and the hit after the last, of each waveform. Writes
+    `hit_ranges` (k, 2) are the first hit, and the hit after the last, of each waveform. Writes
     `hits.marks.starts`.
     """
     from . import wave_loops
 
     count = len(hits.beam)
     peaks = wave_loops.WavePeaks(np.full(count, -1), np.empty((3, count)))
-    if not len(parts):
+    if not len(hit_ranges):
         return peaks
     distance = hits.pulses.distance
-    lengths_m = distance[parts[:, 1] - 1] - distance[parts[:, 0]]
+    lengths_m = distance[hit_ranges[:, 1] - 1] - distance[hit_ranges[:, 0]]
     longest = int(float(lengths_m.max()) * digitizer.samples_per_m)
     scratch = wave_loops.scratch_for(longest + 2 * digitizer.reach + 8)
     sampling = wave_loops.WaveSampling(digitizer.sigma, digitizer.decomposes)
     light = wave_loops.WaveLight(distance * digitizer.samples_per_m, hits.energy / subrays)
-    wave_loops.search_waveforms(light, parts, sampling, hits.marks.starts, peaks, scratch)
+    wave_loops.search_waveforms(light, hit_ranges, sampling, hits.marks.starts, peaks, scratch)
     return peaks

@@ -30,9 +30,9 @@ class Windows(NamedTuple):
     first_hit: Ints  # row of the first hit of the beam
     stop_hit: Ints  # one past the row of the last hit of the beam
 
-    def take(self, rows: slice) -> Windows:
+    def take(self, row_range: slice) -> Windows:
         """Return the windows of a slice of rows."""
-        return Windows(*(column[rows] for column in self))
+        return Windows(*(column[row_range] for column in self))
 
 
 class RecordingStep(PulseStep):
@@ -52,7 +52,7 @@ class RecordingStep(PulseStep):
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
         """Return the memory of a block of samples, and of all records, in bytes."""
-        recorded = record(setup.waveform_samples).itemsize * sizes.returns
+        recorded = record(setup.waveform_samples).itemsize * sizes.return_count
         sampled = 40 * min(sizes.subrays * setup.waveform_samples, BLOCK_SAMPLES)
         return Memory(casting=sampled + recorded, counting=2.3 * recorded)
 
