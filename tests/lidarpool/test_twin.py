@@ -7,9 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from benchmarks.odometry import left_turn
 from click.testing import CliRunner
 
-from lidarpool import LidarError, Material, Mounted, Pose, Scene, Sensor, Survey, Track, twin
+from lidarpool import (
+    LidarError,
+    Material,
+    Mounted,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    load_sensor,
+    save_cloud,
+    twin,
+)
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.recording import Recording
 from lidarpool.places.lost_pulses import lost_pulses
@@ -17,6 +30,7 @@ from lidarpool.places.recorded_sweeps import RecordedSweep, RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.colours import LINEAR
@@ -84,6 +98,29 @@ def drive(street, survey):
 @pytest.fixture(scope="module")
 def place(drive):
     return twin(drive)
+
+
+def from_standstill(end_s):
+    """A car that starts in a street of the city, at 3 m/s²."""
+    times_s = np.arange(0, end_s + 0.1, 0.05)
+    ahead = 1.5 * np.square(times_s)
+    return Track(times_s, np.stack([ahead - 24, ahead * 0 - 3, ahead * 0], axis=1), smooth=True)
+
+
+def city_drive(model, options, sweeps, trajectory=left_turn, triangles=5_000):
+    """Return the recorded sweeps of a drive through a city: a cloud in memory."""
+    scene = city(triangles)
+    survey = Survey(
+        sensors=[Mounted(load_sensor(model, **options), Pose((0, 0, 1.9)), "lidar")],
+        trajectory=trajectory((sweeps + 1) * PERIOD_S),
+        steps=36 * sweeps,
+        columns=["time", "intensity", "class", "reflectivity", "ray", "range"],
+        precision_m=1e-4,
+    )
+    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
+    sweeps_of_survey = Sweeps.from_survey(survey, scene)
+    return replace(cloud, sweeps=lambda: sweeps_of_survey)
 
 
 def without_poses(drive, rows=None):
@@ -216,6 +253,87 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
     with pytest.raises(LidarError, match="has 2 poses for 12 sweeps without times"):
         twin(recording, trajectory=trajectory)
+
+
+def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
+    opened = open_recording(drive, name="drive")
+
+    def read(number):
+        points, columns, pose = opened.read(number)
+        level = points[:, 2] < -1.75  # of the floor, 1.8 m below the sensor
+        return points, {"ring": columns["channel"], "class": np.where(level, 11, 50)}, pose
+
+    found = twin(replace(opened, read=read))
+    found.save(tmp_path / "twin")
+    job = build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    scan = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, 36)))
+    cloud = scan.cloud((SCAN, *job.survey.stored_columns[3:]), 1e-4, job.scene.origin)
+    height = cloud.positions[:, 2]
+    assert (cloud["class"][height < -0.05] == 11).mean() > 0.99
+    assert (cloud["class"][height > 0.15] == 50).mean() > 0.99
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(
+    ("model", "options", "file", "choice"),
+    [
+        ("ouster/os1-32", {"columns": 512}, "drive.mcap", None),
+        ("velodyne/vlp16", {}, "packets", None),
+        ("livox/mid360", {}, "drive.mcap", "livox/mid360"),
+        ("velodyne/hdl32e", {}, "nuscenes", None),
+    ],
+)
+def test_recordings_of_sensors_in_their_formats(model, options, file, choice, tmp_path):
+    cloud = city_drive(model, options, sweeps=12)
+    path = tmp_path / file
+    formats = {"packets": "pcap", "nuscenes": "nuscenes"}
+    save_cloud(cloud, path, format=formats.get(file))
+    found = twin(path if file != "packets" else next(path.glob("*.pcap")), model=choice)
+    held = found.figures["held_out"]["standing"]
+    assert held["median_size_m"] < (0.03 if choice else 0.005)
+    assert held["missed"] < 0.06
+    assert found.figures["length_m"] == pytest.approx(6.6, abs=0.1)
+    found.save(tmp_path / "twin")
+    build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+
+
+@pytest.mark.extended
+def test_poses_are_found_in_a_city(tmp_path):
+    cloud = city_drive("ouster/os1-64", {"columns": 512}, 24, from_standstill, 60_000)
+    opened = open_recording(cloud, name="drive")
+    path = tmp_path / "drive.mcap"
+    save_cloud(cloud, path)
+    fired = open_recording(path, name="drive")
+
+    def read(number):
+        points, columns, _ = fired.read(number)
+        return points, columns, None
+
+    truth = opened.poses(range(24))
+    found = twin(Recording("drive", 24, read))
+    assert found.figures["poses"] == "by registration"
+    assert found.figures["motion"] == "as fired, at the times of the points"
+    relative = np.linalg.inv(found.poses[0]) @ found.poses
+    expected = np.linalg.inv(truth[0]) @ truth
+    assert np.abs(relative[:, :3, 3] - expected[:, :3, 3]).max() < 0.05
+    assert found.figures["held_out"]["standing"]["median_size_m"] < 0.01
+
+
+@pytest.mark.extended
+def test_a_mirrored_recording_with_poses_and_a_sensor_that_stood_are_noted(drive):
+    opened = open_recording(drive, name="drive")
+    turned = city_drive("ouster/os1-32", {"columns": 512}, sweeps=24)
+    recording = open_recording(turned, name="drive")
+
+    def mirrored(number):
+        points, columns, pose = recording.read(number)
+        return points * (1, -1, 1), columns, pose
+
+    found = twin(replace(recording, read=mirrored, fired=None))
+    assert "they do not fit the points" in found.figures["notes"][-1]
+    first = opened.read(0)
+    stood = twin(replace(opened, read=lambda _: first, count=6))
+    assert any("the sensor stood" in note for note in stood.figures["notes"])
 
 
 @pytest.mark.extended

@@ -24,7 +24,9 @@ from .shared_options import overwrite
     shell_complete=completion.sensors,
     help="The sensor; needed if it has no rings.",
 )
-@options.path("--trajectory", help="Poses of the sensor.  [default: the recording's, or KISS-ICP]")
+@options.path(
+    "--trajectory", help="Poses of the sensor.  [default: the recording's, or registered]"
+)
 @click.option(
     "--voxel-m", type=float, default=0.1, show_default=True, help="Distance of the surfels, metres."
 )

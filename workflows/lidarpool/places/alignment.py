@@ -77,8 +77,21 @@ class Alignment:
 
     @classmethod
     def unaligned(cls, poses: RecordedPoses, motion: Motion, ring_count: int) -> Alignment:
-        """Return the alignment of poses without corrections."""
-        return cls(poses.matrices.copy(), poses.times_s, motion, np.zeros((ring_count, 3)))
+        """Return the alignment of poses, moved to the starts of sweeps, without corrections."""
+        offsets = np.zeros((ring_count, 3))
+        alignment = cls(poses.matrices.copy(), poses.times_s, motion, offsets)
+        if motion is Motion.COMPENSATED or not poses.share:
+            return alignment
+        steps = [alignment.step(number)[0] for number in range(len(poses.matrices))]
+        return replace(
+            alignment,
+            poses=np.stack(
+                [
+                    pose @ step.part(-poses.share)
+                    for pose, step in zip(poses.matrices, steps, strict=True)
+                ]
+            ),
+        )
 
     def step(self, number: int) -> tuple[Step, float]:
         """Return the motion from a sweep to the next, and its seconds; of the last, from before."""

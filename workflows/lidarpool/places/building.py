@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,12 +38,13 @@ from ..comparing.fit.fitting import recorded_sensor
 from ..comparing.fit.stack import SweepStack
 from ..recordings.opening import open_recording
 from ..report.page.rendering import rendered
+from ..scenario.point_scene import CLASS_MATERIAL
 from .alignment import AlignedSweeps, align
 from .charts import draw_above, draw_errors, draw_sweep
 from .free_space import standing_points
 from .held_out import HeldOut, hold_out
 from .lost_pulses import answering_cells
-from .odometry import find_poses
+from .odometry import RecordedPoses, find_poses
 from .place import Place, build_place
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_reflectances
@@ -58,6 +60,8 @@ DEFAULT_VOXEL_M = 0.1
 _FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
 _COMPARED_SWEEPS = 12  # of the held-out sweeps
 _POSE_DECIMALS = 6
+_MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
+_MAX_CORRECTION_M = 0.5  # of poses by alignment: odometry is better
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -120,6 +124,13 @@ class Twin:
                 (staged / name).write_text(text, encoding="utf-8", newline="\n")
             return [(staged / name).replace(path / name) for name in (SCENE_FILE, *texts)]
 
+    def _classes(self) -> dict[int, str]:
+        """Return the names of the materials of surfels with a class of the recording."""
+        materials = self.scene.materials
+        names = () if materials is None else sorted({*chain.from_iterable(materials.names)})
+        numbers = {int(name.removeprefix(CLASS_MATERIAL)): name for name in names if name}
+        return {number: numbers[number] for number in sorted(numbers) if number >= 0}
+
     def _trajectory(self) -> str:
         """Return the table of the poses."""
         quaternions = quaternions_of(self.poses[:, :3, :3])
@@ -137,9 +148,17 @@ class Twin:
         }
         if self.origin.any():
             scenario["world"] = {"origin": self.origin.tolist()}
-        if self.scene.has_colours.any():
-            scenario["materials"] = [{"objects": "*", "reflectance": "texture"}]
-        scenario["cloud"] = {"keep_every": 1, "columns": ["time", "intensity"]}
+        light = {"reflectance": "texture"} if self.scene.has_colours.any() else {}
+        classes = self._classes()
+        materials: list[dict[str, Any]] = [
+            {"material": name} | light | {"class": number} for number, name in classes.items()
+        ]
+        if light:
+            materials.append({"objects": "*"} | light)
+        if materials:
+            scenario["materials"] = materials
+        columns = ["time", "intensity", *(["class"] if classes else [])]
+        scenario["cloud"] = {"keep_every": 1, "columns": columns}
         scenario["planning"] = {"enabled": False}
         head = (
             f"# The place of {self.figures['name']}, rebuilt by lidarpool {__version__}.\n"
@@ -174,7 +193,7 @@ def twin(
         rings. By default a sensor with the recorded rings.
     trajectory
         File of the poses of the sensor. By default the poses are the recording's, and without these
-        KISS-ICP finds them.
+        sweeps are registered to each other.
     voxel_m
         Edge of the cubes in each of which all points become their mean.
     sensor, intensity
@@ -242,7 +261,12 @@ class _Building:
             "held_out": held_out.figures(),
             "response": None if reflectances is None else reflectances.figures(),
             "model": model.name,
-            "notes": [*recorded.recording.notes, *recorded.notes, *notes],
+            "notes": [
+                *recorded.recording.notes,
+                *recorded.notes,
+                *notes,
+                *_drive_notes(sweeps, poses),
+            ],
         }
         pictures = {
             "sweep": picture,
@@ -364,6 +388,24 @@ def _place_of(
     place = build_place(sweeps, standing, voxel_m)
     seen = place.observations(sweeps, standing)
     return place, fit_reflectances(seen, place.surfels, sweeps.recorded.ring_count)
+
+
+def _drive_notes(sweeps: AlignedSweeps, poses: RecordedPoses) -> list[str]:
+    """Return notes on a sensor that stood, and on poses that do not fit the points."""
+    notes = []
+    aligned = sweeps.alignment.poses[:, :3, 3]
+    if np.ptp(aligned, axis=0).max() < _MIN_DRIVE_M:
+        notes.append(
+            "the sensor stood: the place is what it saw from there, and has holes behind things"
+        )
+    moved_m = np.linalg.norm(aligned - poses.matrices[:, :3, 3], axis=1)
+    moved_m -= np.median(moved_m)
+    if np.abs(moved_m).max() > _MAX_CORRECTION_M:
+        notes.append(
+            f"poses {poses.source} were changed by up to {np.abs(moved_m).max():.1f} m, so they do "
+            "not fit the points: check their frames, and that neither is mirrored"
+        )
+    return notes
 
 
 def _median(values: Floats) -> float | None:

@@ -18,6 +18,7 @@ from lidarsim.base.even_samples import even_indices
 from .recorded_sweeps import RecordedSweep, RecordedSweeps, elevations
 
 _MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep stretches steps
+_MAX_STEPS = 3.0  # of a ring's own step, over the typical step
 _MIN_RETURNS = 8  # of a ring whose steps are known
 _COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
 _ANSWERING_SWEEPS = 100  # that show these cells
@@ -47,7 +48,7 @@ def lost_pulses(
     gaps = _Gaps.of_sweep(sweep)
     lost = gaps.between(moved_m)
     silent = np.setdiff1d(np.arange(len(elevation_rad)), gaps.ring)
-    circle = np.arange(-np.pi, np.pi, gaps.step_rad)
+    circle = np.arange(-np.pi, np.pi, np.median(gaps.step_rad))
     azimuth = np.append(lost.azimuth, np.tile(circle, len(silent)))
     elevation = np.append(lost.elevation, elevation_rad[silent].repeat(len(circle)))
     ring = np.append(lost.ring, silent.repeat(len(circle)))
@@ -88,7 +89,7 @@ class _Gaps(NamedTuple):
     ring: Ints  # (n,)
     following: Ints  # (n,): next return of the ring; the first follows the last
     gap_rad: Floats  # (n,): to the next return of the ring
-    step_rad: float  # of the azimuths of neighbouring pulses
+    step_rad: Floats  # (n,): between the azimuths of neighbouring pulses of the ring
 
     @classmethod
     def of_sweep(cls, sweep: RecordedSweep) -> _Gaps:
@@ -104,9 +105,14 @@ class _Gaps(NamedTuple):
         following[lasts] = starts
         gap_rad = azimuth[following] - azimuth
         gap_rad[lasts] += 2 * np.pi
-        # Steps are those of the rings with few gaps.
-        filled = (counts >= counts.max() / 2).repeat(counts) & (gap_rad > 0)
-        step_rad = float(np.median(gap_rad[filled])) if filled.any() else 2 * np.pi
+        # Rings of some sensors fire half as often as others. A ring with few returns tells nothing.
+        parts = np.split(gap_rad, starts[1:])
+        steps_rad = np.array(
+            [np.median(part[part > 0]) if part.any() else np.inf for part in parts]
+        )
+        typical_rad = float(np.median(steps_rad[counts >= counts.max() / 2]))
+        is_known = (counts >= _MIN_RETURNS) & (steps_rad < _MAX_STEPS * typical_rad)
+        step_rad = np.where(is_known, steps_rad, typical_rad).repeat(counts)
         elevation = elevations(sweep.points)[order]
         range_m = np.linalg.norm(sweep.points, axis=1)[order]
         return cls(azimuth, elevation, range_m, ring, following, gap_rad, step_rad)

@@ -52,6 +52,15 @@ class Step(NamedTuple):
             pose[:3, :3].T @ (following[:3, 3] - pose[:3, 3]),
         )
 
+    def part(self, share: float) -> Floats:
+        """Return the motion (4, 4) of a share of the step."""
+        from scipy.spatial.transform import Rotation
+
+        moved = np.eye(4)
+        moved[:3, :3] = Rotation.from_rotvec(share * self.rotation).as_matrix()
+        moved[:3, 3] = share * self.translation
+        return moved
+
     def compensated(self, points: Floats, shares: Floats) -> Floats:
         """Return points (n, 3), fired at shares (n,) of the step, in the frame of its start."""
         from scipy.spatial.transform import Rotation

@@ -1,4 +1,4 @@
-"""Poses of the sweeps of a recording: recorded, of a file, or of KISS-ICP."""
+"""Poses of the sweeps of a recording: recorded, of a file, or by registration."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from lidarsim.motion.trajectory_files import load_trajectory
 
 from .recorded_sweeps import RecordedSweeps
 
-_VOXELS_OF_REACH = 100  # voxels of the map of KISS-ICP in the range of the sensor
+_VOXELS_OF_REACH = 75  # voxels of the map in the range of the sensor
 _MIN_VOXEL_M = 0.25
 _MAX_VOXEL_M = 1.0
-_MAX_REACH_M = 100.0  # farther points are too far apart to register sweeps by
+_POINTS_OF_VOXEL = 4  # points that are registered in the length of a voxel
+_MAX_DISTANCE_M = 1.0  # of a point from its voxel's plane
+_MAP_SWEEPS = 100  # since a voxel was last met, after which the map forgets it
+_MIN_POINTS = 100  # of a sweep that is registered; with fewer the motion goes on
 _MAX_LOCAL_M = 10_000.0  # coordinates of a place that single precision holds
 _MAX_STEP_M = 5.0  # from sweep to sweep at 10 Hz: 180 km/h
 DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 Hz
@@ -31,6 +34,7 @@ class RecordedPoses(NamedTuple):
     times_s: Floats  # (s,): ascending, from 0
     source: str  # a clause, such as "of the recording"
     origin: Floats  # (3,): of the frame of the place in the world, whole metres
+    share: float = 0.0  # of the motion of a sweep as fired, at which its pose holds
 
     def part(self, window: slice) -> RecordedPoses:
         """Return the poses of some consecutive sweeps."""
@@ -55,12 +59,12 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         The sweeps.
     trajectory
         A file of poses of the sensor; by default the poses are the recording's, and without these
-        KISS-ICP (Vizzo et al., 2023) registers each sweep to a map of the earlier ones.
+        VGICP (Koide et al., 2021) registers each sweep to a map of the earlier sweeps.
 
     Raises
     ------
     LidarError
-        If the recording has no times to look up in a trajectory, KISS-ICP is needed and not
+        If the recording has no times to look up in a trajectory, small_gicp is needed and not
         installed, or the poses jump.
     """
     times_s = _times_s(sweeps)
@@ -68,6 +72,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         poses, times_s = _of_file(sweeps, trajectory, times_s)
         return RecordedPoses.in_world(poses, times_s, f"of {trajectory.name}")
     recorded = sweeps.recording.poses(range(sweeps.count))
+    share = 0.0
     # Many files of a sweep each state the pose of none, as VIEWPOINT of PCD does.
     is_known = sweeps.recording.fired is not None  # of a result, which may stand
     if recorded is not None and (is_known or np.ptp(recorded, axis=0).any()):
@@ -75,15 +80,16 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         source = "of the recording"
     else:
         poses = _registered(sweeps)
-        source = "of KISS-ICP"
+        source = "by registration"
+        share = 0.5
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         if len(steps_m) and steps_m.max() > _MAX_STEP_M:
             number = int(steps_m.argmax()) + 1
             raise LidarError(
-                f"KISS-ICP moves {steps_m.max():.1f} m from sweep {number - 1} to sweep {number} "
-                f"of {sweeps.recording.name}, which is a failure: give --trajectory."
+                f"Registration moves {steps_m.max():.1f} m from sweep {number - 1} to sweep "
+                f"{number} of {sweeps.recording.name}, which is a failure: give --trajectory."
             )
-    return RecordedPoses.in_world(poses, times_s, source)
+    return RecordedPoses.in_world(poses, times_s, source)._replace(share=share)
 
 
 def _times_s(sweeps: RecordedSweeps) -> Floats:
@@ -122,26 +128,42 @@ def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple
 
 
 def _registered(sweeps: RecordedSweeps) -> Floats:
-    """Register sweeps by KISS-ICP in one thread, since its results depend on the threads."""
-    need("kiss_icp", "twin", "Sweeps without poses are registered")
-    from kiss_icp.config.parser import load_config
-    from kiss_icp.kiss_icp import KissICP
+    """Register each sweep to a map of the earlier sweeps, in one thread: threads change results.
+
+    Each voxel of the map and each point has a covariance, so that points move along planes freely.
+    Odometry from point to point finds hardly any motion on level ground, where the rings of all
+    sweeps are the same circles. Points are not compensated for the motion within sweeps: all sweeps
+    are distorted alike, and to compensate by a motion that is estimated so makes estimates swing.
+    """
+    need("small_gicp", "twin", "Sweeps without poses are registered")
+    import small_gicp
 
     first = sweeps.read(0)
     reach_m = float(np.quantile(np.linalg.norm(first.points, axis=1), 0.98)) if len(first) else 0.0
-    reach_m = min(max(reach_m, 1.0), _MAX_REACH_M)
-    config = load_config(None)
-    config.data.deskew = False
-    config.data.max_range = reach_m
-    config.data.min_range = 0.0
-    config.mapping.voxel_size = float(
-        np.clip(reach_m / _VOXELS_OF_REACH, _MIN_VOXEL_M, _MAX_VOXEL_M)
-    )
-    config.registration.max_num_threads = 1
-    odometry = KissICP(config)
-    poses = []
+    voxel_m = float(np.clip(reach_m / _VOXELS_OF_REACH, _MIN_VOXEL_M, _MAX_VOXEL_M))
+    voxels = small_gicp.GaussianVoxelMap(voxel_m)
+    voxels.set_lru(horizon=_MAP_SWEEPS, clear_cycle=10)
+    poses: list[Floats] = []
+    step = np.eye(4)
     for number in range(sweeps.count):
-        sweep = sweeps.read(number)
-        odometry.register_frame(np.ascontiguousarray(sweep.points), np.empty(0))
-        poses.append(np.array(odometry.last_pose))
+        sweep = sweeps.read(number) if number else first
+        pose = poses[-1] @ step if poses else np.eye(4)
+        if len(sweep) >= _MIN_POINTS:
+            points, _ = small_gicp.preprocess_points(
+                sweep.points, voxel_m / _POINTS_OF_VOXEL, num_threads=1
+            )
+            if voxels.size():
+                pose = np.array(
+                    small_gicp.align(
+                        voxels,
+                        points,
+                        pose,
+                        max_correspondence_distance=_MAX_DISTANCE_M,
+                        num_threads=1,
+                    ).T_target_source
+                )
+            voxels.insert(points, pose)
+        if poses:
+            step = np.linalg.inv(poses[-1]) @ pose
+        poses.append(pose)
     return np.array(poses)

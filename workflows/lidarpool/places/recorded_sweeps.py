@@ -172,9 +172,22 @@ class RecordedSweeps:
             return ring, self.ring_numbers[ring] == numbers
         starts, is_ring = _runs(points)
         lengths = np.diff(np.append(starts, count))
-        medians = _medians(elevations(points), starts)
-        nearest = np.abs(medians[:, None] - self.elevation_rad).argmin(axis=1)
-        return nearest.repeat(lengths), is_ring.repeat(lengths)
+        ring = self._rings_of_runs(_medians(elevations(points), starts), is_ring)
+        return ring.clip(min=0).repeat(lengths), (ring >= 0).repeat(lengths)
+
+    def _rings_of_runs(self, medians: Floats, is_ring: Bools) -> Ints:
+        """Return the rows (k,) of runs with median elevations (k,), -1 for a run without a ring.
+
+        Each ring is given to one run: the median elevation of a ring changes with what it meets, by
+        more than neighbouring rings differ.
+        """
+        from scipy.optimize import linear_sum_assignment
+
+        ring = np.full(len(medians), -1)
+        runs = np.flatnonzero(is_ring)
+        chosen, rows = linear_sum_assignment(np.abs(medians[runs, None] - self.elevation_rad))
+        ring[runs[chosen]] = rows
+        return ring
 
 
 def elevations(points: Floats) -> Floats:

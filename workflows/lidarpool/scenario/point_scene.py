@@ -39,6 +39,7 @@ _MAX_HALF_VOXELS = 3
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _MAX_VOXELS = 1 << 62  # voxels of the box around the points: 64 bits number voxels
+CLASS_MATERIAL = "class "  # and the number: name of the material of surfels with a class
 _WHITE_QUANTILE = 0.99  # share of intensities up to white: mirrors return more
 
 
@@ -262,7 +263,7 @@ def surfel_materials(points: ScannedPoints, voxels: Voxels) -> FaceMaterials | N
     classes, numbers = np.unique(points.classes, return_inverse=True)
     modes = voxels.most_frequent(numbers, len(classes))
     present, rows = np.unique(modes, return_inverse=True)
-    names = tuple(f"class {number}" for number in classes[present].tolist())
+    names = tuple(f"{CLASS_MATERIAL}{number}" for number in classes[present].tolist())
     return FaceMaterials(names, rows.astype(np.int32).repeat(2))
 
 
