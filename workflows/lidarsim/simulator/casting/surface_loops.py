@@ -309,7 +309,8 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
     the surface scatters. At surfaces of refracting media, light is not divided here into mirrored
     and transmitted light: `LightInMedia.cross` divides it. Light that is too faint is dropped:
     overwrites `row_indices` and `reflected` by the remaining light, and writes its `onward_share`:
-    of the energy, since light passes the surface out and back. Returns the number of remaining rows.
+    of the energy, since light passes the surface out and back. Returns the number of remaining
+    rows.
     """
     count = 0
     for j in range(len(row_indices)):
