@@ -184,14 +184,18 @@ class Intervals:
         if self.has_lead:
             counts[0] = 0
         stations = counts + has_stop
-        rows = np.repeat(np.arange(len(counts)), stations)
-        within = np.arange(len(rows)) - np.repeat(np.cumsum(stations) - stations, stations)
-        is_stop = within == counts[rows]
+        interval_indices = np.repeat(np.arange(len(counts)), stations)
+        within = np.arange(len(interval_indices)) - np.repeat(
+            np.cumsum(stations) - stations, stations
+        )
+        is_stop = within == counts[interval_indices]
         spans = self.ends[:, 1] - self.ends[:, 0]
-        s = self.ends[rows, 0] + spans[rows] * (within / np.maximum(counts, 1)[rows])
-        s[is_stop] = self.ends[rows[is_stop], 1]
-        pieces = np.where(within == 0, self.pieces[rows, 0], s)
-        pieces[is_stop] = self.pieces[rows[is_stop], 1]
+        s = self.ends[interval_indices, 0] + spans[interval_indices] * (
+            within / np.maximum(counts, 1)[interval_indices]
+        )
+        s[is_stop] = self.ends[interval_indices[is_stop], 1]
+        pieces = np.where(within == 0, self.pieces[interval_indices, 0], s)
+        pieces[is_stop] = self.pieces[interval_indices[is_stop], 1]
         return PlacedStations(Stations(s, pieces), np.flatnonzero(is_stop)[:-1])
 
 

@@ -478,9 +478,12 @@ class CastStep(PulseStep):
         crowns[surface_hits.leaves] = False
         # Optical paths are longer than the rays that were cast.
         in_range = surface_hits.distance <= self.setup.sensor.max_range_m
-        rows = np.flatnonzero(in_range & ~crowns)
+        row_indices = np.flatnonzero(in_range & ~crowns)
         return VisibleHits(
-            hits.take(rows), normals[rows], (transmits | crowns) & in_range, mirrors & in_range
+            hits.take(row_indices),
+            normals[row_indices],
+            (transmits | crowns) & in_range,
+            mirrors & in_range,
         )
 
     # -- light that continues ----------------------------------------------------------------

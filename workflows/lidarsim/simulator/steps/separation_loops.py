@@ -478,15 +478,17 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, P
         end_ray = (beam + 1) * subrays
         stop = _end_of_beam(hits.ray, hit_count, row, end_ray)
         air_stop = _end_of_beam(air.ray, air_count, air_row, end_ray)
-        rows = _BeamRows(row, stop, air_row, air_stop)
+        beam_rows = _BeamRows(row, stop, air_row, air_stop)
         row = stop
         air_row = air_stop
         begin = count
         single = False
-        if rows.air_start == rows.air_stop:  # mostly, there is one surface, and no hit in the air
-            single, count = _single_return(hits, rows, beam, receiver, count, output)
+        if (
+            beam_rows.air_start == beam_rows.air_stop
+        ):  # mostly, there is one surface, and no hit in the air
+            single, count = _single_return(hits, beam_rows, beam, receiver, count, output)
         if not single:
-            collected, extent_m = _collect_hits(hits, air, rows, scratch)
+            collected, extent_m = _collect_hits(hits, air, beam_rows, scratch)
             exceeds_gap = extent_m > receiver.gap_m
             if exceeds_gap:  # few beams hit an edge or graze a surface
                 _sort_by_distance(scratch.hits, collected)

@@ -122,9 +122,9 @@ class StrayLightStep(PulseStep):
                 triangles = self._triangles(cluster, table)
                 stray_loops.find_stray_light(cells, triangles, limits, chosen, light)
             if rotations is not None:  # back to the scene frame
-                rows = np.flatnonzero(light.new)
-                to_scene = rotations[rows].transpose(0, 2, 1)
-                light.points[rows] = into_axes(light.points[rows], to_scene)
+                row_indices = np.flatnonzero(light.new)
+                to_scene = rotations[row_indices].transpose(0, 2, 1)
+                light.points[row_indices] = into_axes(light.points[row_indices], to_scene)
         return light
 
     def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
