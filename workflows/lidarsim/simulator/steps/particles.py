@@ -411,8 +411,8 @@ def _fog_cells(
     if not len(energy):
         return None
     peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
-    probabilities = np.arange(len(energy) + 1)[:, None] + single(peaks)
-    return FogCells(min_range_m, cell_m, single(energy), probabilities.reshape(-1))
+    peak_rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
+    return FogCells(min_range_m, cell_m, single(energy), peak_rows.reshape(-1))
 
 
 def highest_probabilities(signals: Floats) -> Floats:
