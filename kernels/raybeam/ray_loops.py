@@ -117,7 +117,7 @@ def _find_poses(tile, rays, first, rays_per_pose, poses):  # type: ignore[no-unt
 
 
 @stage
-def _look_up_beams(tile, rays, directions, rows):  # type: ignore[no-untyped-def]
+def _look_up_beams(tile, rays, directions, beam_count):  # type: ignore[no-untyped-def]
     """Write the directions of a tile's rays, by their rows in the pattern."""
     numbers = int64s(tile)
     floats = float64s(tile)
@@ -127,8 +127,8 @@ def _look_up_beams(tile, rays, directions, rows):  # type: ignore[no-untyped-def
     for lane in range(rays):
         row = numbers[row_of + lane]
         floats[target + lane] = table[row]
-        floats[target + rays + lane] = table[rows + row]
-        floats[target + 2 * rays + lane] = table[2 * rows + row]
+        floats[target + rays + lane] = table[beam_count + row]
+        floats[target + 2 * rays + lane] = table[2 * beam_count + row]
 
 
 @inlined
@@ -150,7 +150,7 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
     shares = float64s(cast.shares)
     offsets = float64s(cast.offsets)
     directions = float64s(cast.directions)
-    rows = cast.beam_count
+    beam_count = cast.beam_count
     lanes = cast.lanes_per_beam
     row_of = row_at(ROW, rays)
     origin = row_at(OX, rays)
@@ -162,8 +162,8 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
         for lane in range(first, first + lanes):
             numbers[row_of + lane] = beam
         x = directions[beam]
-        y = directions[rows + beam]
-        z = directions[2 * rows + beam]
+        y = directions[beam_count + beam]
+        z = directions[2 * beam_count + beam]
         if cast.has_axis:
             a, b, c, d, e, f = axes_about(x, y, z, axis)
         else:
@@ -174,7 +174,7 @@ def _make_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # noqa: P
             up = load(shares, 2 * lanes + k)
             if cast.offsets != 0:
                 across = across + splat(offsets[beam])
-                up = up + splat(offsets[rows + beam])
+                up = up + splat(offsets[beam_count + beam])
                 straight = one / square_root((one + across * across) + up * up)
                 across = across * straight
                 up = up * straight
@@ -201,7 +201,7 @@ def _make_lone_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # no
     shares = float64s(cast.shares)
     offsets = float64s(cast.offsets)
     directions = float64s(cast.directions)
-    rows = cast.beam_count
+    beam_count = cast.beam_count
     row_of = row_at(ROW, rays)
     origin = row_at(OX, rays)
     target = row_at(DX, rays)
@@ -212,15 +212,15 @@ def _make_lone_sub_rays(tile, rays, cast):  # type: ignore[no-untyped-def]  # no
     for lane in range(rays):
         beam = numbers[row_of + lane]
         x = directions[beam]
-        y = directions[rows + beam]
-        z = directions[2 * rows + beam]
+        y = directions[beam_count + beam]
+        z = directions[2 * beam_count + beam]
         if cast.has_axis:
             a, b, c, d, e, f = axes_about(x, y, z, axis)
         else:
             a, b, c, d, e, f = any_axes(x, y, z)
         if cast.offsets != 0:
             across = shares[_LONE] + offsets[beam]
-            up = shares[2 * _LONE] + offsets[rows + beam]
+            up = shares[2 * _LONE] + offsets[beam_count + beam]
             straight = 1 / np.sqrt((1 + across * across) + up * up)
             across = across * straight
             up = up * straight

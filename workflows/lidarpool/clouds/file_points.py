@@ -60,7 +60,10 @@ def of_scans(scans: Sequence[CloudScan]) -> FilePoints:
 
 
 def _placed(scan: CloudScan) -> FilePoints:
-    """Return a scan in the frame of the file, without the pulses that had no return."""
+    """Return a scan in the frame of the file, without the pulses that had no return.
+
+    These pulses are points at zero. Fewer than `MIN_POINTS` points at zero remain.
+    """
     positions = scan.positions
     columns = scan.columns
     scanner = np.full(3, np.nan) if scan.scanner is None else scan.scanner

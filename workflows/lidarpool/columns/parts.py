@@ -219,9 +219,9 @@ class StoredCloud(CloudDisplay):
         """True if the points have waveforms."""
         return any(column.name == WAVEFORM for column in self.columns)
 
-    def cloud_of(self, part: PartColumns, rows: Integers | slice = slice(None)) -> Cloud:
+    def cloud_of(self, part: PartColumns, row_selection: Integers | slice = slice(None)) -> Cloud:
         """Return the points of a part, or a selection of rows."""
-        return part.cloud(self.table, self.precision_m, self.origin, rows, self.sweeps)
+        return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def columns_of(self, part: PartColumns) -> dict[str, AnyArray]:
         """Return the columns of a part without positions, {name: (n,)}, in the order of files."""
@@ -230,10 +230,10 @@ class StoredCloud(CloudDisplay):
             for column in self.table
         }
 
-    def positions_of(self, part: PartColumns, rows: slice) -> Iterator[tuple[str, Floats]]:
+    def positions_of(self, part: PartColumns, row_range: slice) -> Iterator[tuple[str, Floats]]:
         """Yield the names of axes with coordinates of rows of a part, (n,), metres."""
         for i, axis in enumerate(AXES):
-            cells = part.columns[axis.name][rows]
+            cells = part.columns[axis.name][row_range]
             yield axis.name, positions_of(cells, self.precision_m, self.origin[i])
 
     def cells_along(self, axis: int, coordinates: AnyFloats) -> Ints:

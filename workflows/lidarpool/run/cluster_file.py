@@ -113,12 +113,12 @@ class ClusterFile(BaseModel):
                 )
 
     def __str__(self) -> str:
-        parts = ", ".join(f"{name} {workers}" for name, workers in self.partitions.items())
+        partitions = ", ".join(f"{name} {workers}" for name, workers in self.partitions.items())
         total = plural(sum(group.worker_limit for group in self.partitions.values()), "worker")
         total = (
             f"up to {total}" if any(group.adapt for group in self.partitions.values()) else total
         )
-        return f"{self.cluster.rpartition('.')[2]}: {total}, {parts}"
+        return f"{self.cluster.rpartition('.')[2]}: {total}, {partitions}"
 
     @contextmanager
     def started(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:

@@ -221,10 +221,10 @@ def _disk(
     faces = job.scene.kept_triangles
     point_bytes = _point_bytes(job)
     large_parts = -(-survey.scan_count // scans_per_batch)
-    parts = min(survey.scan_count, large_parts + FIRST_PARTS)
+    part_count = min(survey.scan_count, large_parts + FIRST_PARTS)
     # Each part names the triangles that its rays hit.
     tally_bytes = 12 * min(faces, survey.ray_count // large_parts // 10) * large_parts
-    run_bytes = point_bytes * points + PART_BYTES * parts + tally_bytes
+    run_bytes = point_bytes * points + PART_BYTES * part_count + tally_bytes
     run_bytes += SUMMARY_BYTES * survey.scan_count
     # A row of the PLY has doubles for coordinates at most; a chunk exists twice.
     cloud_bytes = (point_bytes + 16) * (points + min(points, CHUNK_POINTS))

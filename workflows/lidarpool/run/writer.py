@@ -150,12 +150,12 @@ class JobWriter:
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
         ended: list[tuple[JobFiles, JobOutcome]] = []
-        for jobs, rows in self.tasks.take_done():
-            if rows is None:
+        for jobs, outcomes in self.tasks.take_done():
+            if outcomes is None:
                 self.hidden = True
                 self._write_here(jobs)
             else:
-                ended += zip(jobs, rows, strict=True)
+                ended += zip(jobs, outcomes, strict=True)
         for jobs, future in self.tasks.take_failed():
             if was_killed(future):
                 self._write_here(jobs)

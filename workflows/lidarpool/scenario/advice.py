@@ -89,9 +89,9 @@ def _size_note(built: Built, side: float) -> str:
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
     files = [file for file in files if file not in built.findings.classes]  # towns are large
     unitless = [file for file in files if _lacks_unit(scenario.path(file))]
-    parts = any(file.lower().endswith(".stl") for file in unitless)
+    has_stl = any(file.lower().endswith(".stl") for file in unitless)
     min_m = SMALL_M
-    max_m = LARGE_STL_M if parts else LARGE_M
+    max_m = LARGE_STL_M if has_stl else LARGE_M
     if surrounded := placing is not None and placing.surrounds_object:
         min_m = 0.0
         max_m = LARGE_OBJECT_M if unitless else LARGE_STATED_M
@@ -162,7 +162,10 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
 
 
 def _timing_notes(built: Built) -> Iterator[str]:
-    """Yield notes on faults without sweeps, and on actors that are absent or end early."""
+    """Yield notes on times: a date that is lost, faults without sweeps, and absent actors.
+
+    Animations of actors that end before the survey have notes, too.
+    """
     survey = built.survey
     if isinstance(survey.path, Track) and survey.start is None:
         start_s = survey.path.start_s

@@ -147,13 +147,15 @@ class Intervals:
         if spans.max() <= _MAX_SAMPLED_M:
             return self
         counts = np.clip(np.ceil(spans / _MAX_SAMPLED_M), 1, _MAX_CUTS).astype(np.int64)
-        rows = np.repeat(np.arange(len(self)), counts)
-        within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        is_last = within + 1 == counts[rows]
-        lower = self.ends[rows, 0] + spans[rows] * (within / counts[rows])
-        upper = np.where(is_last, self.ends[rows, 1], np.append(lower[1:], 0.0))
-        first = np.where(within == 0, self.pieces[rows, 0], lower)
-        last = np.where(is_last, self.pieces[rows, 1], upper)
+        interval_indices = np.repeat(np.arange(len(self)), counts)
+        within = np.arange(len(interval_indices)) - np.repeat(np.cumsum(counts) - counts, counts)
+        is_last = within + 1 == counts[interval_indices]
+        lower = self.ends[interval_indices, 0] + spans[interval_indices] * (
+            within / counts[interval_indices]
+        )
+        upper = np.where(is_last, self.ends[interval_indices, 1], np.append(lower[1:], 0.0))
+        first = np.where(within == 0, self.pieces[interval_indices, 0], lower)
+        last = np.where(is_last, self.pieces[interval_indices, 1], upper)
         return Intervals(
             np.stack([lower, upper], axis=1), np.stack([first, last], axis=1), self.has_lead
         )
@@ -182,14 +184,18 @@ class Intervals:
         if self.has_lead:
             counts[0] = 0
         stations = counts + has_stop
-        rows = np.repeat(np.arange(len(counts)), stations)
-        within = np.arange(len(rows)) - np.repeat(np.cumsum(stations) - stations, stations)
-        is_stop = within == counts[rows]
+        interval_indices = np.repeat(np.arange(len(counts)), stations)
+        within = np.arange(len(interval_indices)) - np.repeat(
+            np.cumsum(stations) - stations, stations
+        )
+        is_stop = within == counts[interval_indices]
         spans = self.ends[:, 1] - self.ends[:, 0]
-        s = self.ends[rows, 0] + spans[rows] * (within / np.maximum(counts, 1)[rows])
-        s[is_stop] = self.ends[rows[is_stop], 1]
-        pieces = np.where(within == 0, self.pieces[rows, 0], s)
-        pieces[is_stop] = self.pieces[rows[is_stop], 1]
+        s = self.ends[interval_indices, 0] + spans[interval_indices] * (
+            within / np.maximum(counts, 1)[interval_indices]
+        )
+        s[is_stop] = self.ends[interval_indices[is_stop], 1]
+        pieces = np.where(within == 0, self.pieces[interval_indices, 0], s)
+        pieces[is_stop] = self.pieces[interval_indices[is_stop], 1]
         return PlacedStations(Stations(s, pieces), np.flatnonzero(is_stop)[:-1])
 
 
@@ -222,10 +228,12 @@ class SampledSurface(NamedTuple):
         points = self.points.reshape(count, len(self.intervals), -1, 3)
         step = max(1, _GROUP_SIZE // points[:, 0].size)
         for k in range(0, len(self.intervals), step):
-            rows = slice(k, k + step)
+            interval_range = slice(k, k + step)
             yield self._replace(
-                intervals=Intervals(self.intervals.ends[rows], self.intervals.pieces[rows]),
-                points=points[:, rows].reshape(count, -1, 3),
+                intervals=Intervals(
+                    self.intervals.ends[interval_range], self.intervals.pieces[interval_range]
+                ),
+                points=points[:, interval_range].reshape(count, -1, 3),
             )
 
 
@@ -241,12 +249,12 @@ def placed_stations(
     bytes_per_point
         Memory that a point of the surfaces takes of the allowance, bytes.
     """
-    parts = _part_counts_in_groups(surfaces, sag_m)
+    surface_counts = _part_counts_in_groups(surfaces, sag_m)
     placed = []
     for surface in surfaces:
         counts = np.ones(len(surface.intervals))
         if surface.is_measured:
-            counts = np.maximum(next(parts), 1)
+            counts = np.maximum(next(surface_counts), 1)
             columns = len(surface.points) + 2
             allowance.take((int(counts.sum()) + 2 * len(counts)) * columns * bytes_per_point)
         placed.append(
@@ -303,7 +311,7 @@ class _Columns(NamedTuple):
     """Columns of points of surfaces in intervals, one after another, and the cells between them."""
 
     size: int  # number of intervals
-    intervals: Ints  # (r,): of columns
+    intervals: Ints  # (r,): interval of each column
     right: Ints  # (q,): columns on the right of cells
     left: Ints  # (q,): columns on the left of cells
 
@@ -314,30 +322,33 @@ class _Columns(NamedTuple):
         right = []
         left = []
         count = 0
-        rows = 0
+        column_count = 0
         for surface in surfaces:
             size = len(surface.intervals)
             numbers = np.arange(size)
             intervals.append(np.tile(count + numbers, len(surface.points)))
-            cells = (rows + size * np.flatnonzero(surface.is_cell)[:, None] + numbers).ravel()
+            cells = (
+                column_count + size * np.flatnonzero(surface.is_cell)[:, None] + numbers
+            ).ravel()
             right.append(cells)
             left.append(cells + size)
             count += size
-            rows += size * len(surface.points)
-        return cls(count, *(np.concatenate(parts) for parts in (intervals, right, left)))
+            column_count += size * len(surface.points)
+        return cls(count, *(np.concatenate(arrays) for arrays in (intervals, right, left)))
 
     def largest_of_columns(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest of values (r, k) in intervals (n,), as `_largest` does."""
+        """Return the largest of values (r, k) of columns in each interval (n,), as `_largest`."""
         return self._largest(self.intervals, values, ends)
 
     def largest_of_cells(self, values: Floats, ends: Floats) -> Floats:
-        """Return the largest of values (q, k) in intervals (n,), as `_largest` does."""
+        """Return the largest of values (q, k) of cells in each interval (n,), as `_largest`."""
         return self._largest(self.intervals[self.right], values, ends)
 
     def _largest(self, intervals: Ints, values: Floats, ends: Floats) -> Floats:
-        """Return the largest magnitudes of values (r, k) in intervals (n,).
+        """Return the largest magnitude of the values in each of the n = `size` intervals: (n,).
 
-        `ends` (3,) are the weights of the first three values, which extrapolate to the start of the
+        Row j of the values (m, k) has k samples along the interval `intervals[j]`, of (m,). `ends`
+        (3,) are the weights of the first three values, which extrapolate to the start of the
         interval, and in reverse order of the last three, which extrapolate to its stop.
         """
         a, b, c = ends
@@ -366,14 +377,14 @@ def _bend_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> tuple[Fl
     beside = columns.largest_of_columns(_beside(bends, along), _FROM_MIDDLE)
     sides = (columns.right, columns.left)
     across = [v[columns.left, 1:-1] - v[columns.right, 1:-1] for v in (x, y, z)]
-    along_sides = [[v[rows] for v in along] for rows in sides]
+    along_sides = [[v[column_indices] for v in along] for column_indices in sides]
     areas = [_cross(vectors, across) for vectors in along_sides]
     floor = np.maximum(np.abs(areas[0]), np.abs(areas[1])) / _MAX_STEEPENING
     is_wide = _is_wide(across)
     heights = np.zeros(columns.size)
-    for rows, vectors, signed in zip(sides, along_sides, areas, strict=True):
+    for column_indices, vectors, signed in zip(sides, along_sides, areas, strict=True):
         area = np.maximum(np.maximum(np.abs(signed), floor), 1e-30)
-        errors = _determinant([v[rows] for v in bends], vectors, across) / area
+        errors = _determinant([v[column_indices] for v in bends], vectors, across) / area
         errors = np.where(is_wide, errors, 0.0)
         heights = np.maximum(heights, columns.largest_of_cells(errors, _FROM_MIDDLE))
     return 4 * beside, 4 * heights
@@ -384,7 +395,9 @@ def _twist_errors(x: Floats, y: Floats, z: Floats, columns: _Columns) -> Floats:
     along = [v[:, 1:] - v[:, :-1] for v in (x, y, z)]
     across = [(v[:, 1:] + v[:, :-1]) / 2 for v in (x, y, z)]
     across = [v[columns.left] - v[columns.right] for v in across]
-    right, left = ([v[rows] for v in along] for rows in (columns.right, columns.left))
+    right, left = (
+        [v[column_indices] for v in along] for column_indices in (columns.right, columns.left)
+    )
     volumes = _determinant(right, across, left)
     areas = [_cross(right, across), _cross(left, across)]
     largest = np.maximum(np.abs(areas[0]), np.abs(areas[1]))

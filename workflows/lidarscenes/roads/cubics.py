@@ -53,18 +53,18 @@ class Cubics:
             return np.zeros_like(stations.s)
         if self.is_constant and len(self) == 1:
             return np.full_like(stations.s, self._coefficients[0, 0])
-        rows = self._row_indices(stations.pieces)
-        a, b, c, d = self._coefficients[:, rows]
-        x = np.maximum(stations.s - self.starts[rows], 0)
+        row_indices = self._row_indices(stations.pieces)
+        a, b, c, d = self._coefficients[:, row_indices]
+        x = np.maximum(stations.s - self.starts[row_indices], 0)
         return np.asarray(((d * x + c) * x + b) * x + a)
 
     def slopes(self, stations: Stations) -> Floats:
         """Return the first derivatives at stations (k,)."""
         if self.is_constant:
             return np.zeros_like(stations.s)
-        rows = self._row_indices(stations.pieces)
-        _, b, c, d = self._coefficients[:, rows]
-        x = np.maximum(stations.s - self.starts[rows], 0)
+        row_indices = self._row_indices(stations.pieces)
+        _, b, c, d = self._coefficients[:, row_indices]
+        x = np.maximum(stations.s - self.starts[row_indices], 0)
         return np.asarray((3 * d * x + 2 * c) * x + b)
 
     def _row_indices(self, distances: Floats) -> Ints:

@@ -222,8 +222,8 @@ class LaneSection:
 
         def is_above_at(distances: Floats) -> Bools:
             """Return whether each width or border is above its level at a distance."""
-            rows = np.arange(len(pairs))
-            return values(Stations.at(distances))[crossing[pairs], rows] > levels[pairs]
+            pair_indices = np.arange(len(pairs))
+            return values(Stations.at(distances))[crossing[pairs], pair_indices] > levels[pairs]
 
         return _changes(is_above_at, s[:, :-1][tuple(cells)], s[:, 1:][tuple(cells)])
 
@@ -294,14 +294,15 @@ def section_surfaces(
         allowance,
         _BYTES_PER_POINT,
     )
-    rows = []
+    recomputed_indices = []  # sections with stations that are not among the samples
     for k, (surface, entry) in enumerate(zip(surfaces, placed, strict=True)):
         part = surface.part_at(entry)
         if part is None:
-            rows.append(k)
+            recomputed_indices.append(k)
         else:
             surfaces[k] = part
-    for k, surface in zip(rows, surfaces_at(rows, [placed[k] for k in rows]), strict=True):
+    recomputed = surfaces_at(recomputed_indices, [placed[k] for k in recomputed_indices])
+    for k, surface in zip(recomputed_indices, recomputed, strict=True):
         surfaces[k] = surface
     return surfaces
 
@@ -324,8 +325,8 @@ class Strip(NamedTuple):
             columns, stations = self.t.shape
             is_step = np.zeros((columns - 1, stations - 1, 2), np.bool_)
             is_step[:, self.steps] = True
-            rows = np.flatnonzero(is_step)
-            thin = rows[~has_extent(self.points.reshape(-1, 3), faces[rows])]
+            face_indices = np.flatnonzero(is_step)
+            thin = face_indices[~has_extent(self.points.reshape(-1, 3), faces[face_indices])]
             faces = np.delete(faces, thin, axis=0)
         return faces if self.lane.side > 0 else faces[:, ::-1]
 
@@ -409,16 +410,21 @@ class SectionSurface:
 
     def part_at(self, placed: PlacedStations) -> SectionSurface | None:
         """Return the surface at stations that are all among the stations here, else None."""
-        rows = np.searchsorted(self.stations.pieces, placed.stations.pieces)
-        rows = np.minimum(rows, len(self.stations) - 1)
-        if (self.stations.pieces[rows] != placed.stations.pieces).any():
+        station_indices = np.searchsorted(self.stations.pieces, placed.stations.pieces)
+        station_indices = np.minimum(station_indices, len(self.stations) - 1)
+        if (self.stations.pieces[station_indices] != placed.stations.pieces).any():
             return None
         surface = copy(self)
         surface.stations, surface.steps = placed
-        surface.frames = self.frames.take(rows)
-        surface.borders = {key: t[rows] for key, t in self.borders.items()}
+        surface.frames = self.frames.take(station_indices)
+        surface.borders = {key: t[station_indices] for key, t in self.borders.items()}
         surface.strips = [
-            Strip(strip.lane, strip.t[:, rows], strip.points[:, rows], placed.steps)
+            Strip(
+                strip.lane,
+                strip.t[:, station_indices],
+                strip.points[:, station_indices],
+                placed.steps,
+            )
             for strip in self.strips
         ]
         surface._border_points = None

@@ -173,9 +173,11 @@ class _RoadReader:
                 if mask.all():
                     remaining.append(piece)
                 elif mask.any():
-                    rows = np.flatnonzero(mask)
-                    colours = None if piece.colours is None else piece.colours.take(rows)
-                    remaining.append(piece._replace(faces=piece.faces[rows], colours=colours))
+                    face_indices = np.flatnonzero(mask)
+                    colours = None if piece.colours is None else piece.colours.take(face_indices)
+                    remaining.append(
+                        piece._replace(faces=piece.faces[face_indices], colours=colours)
+                    )
             self._pieces[name] = remaining
 
 

@@ -117,14 +117,14 @@ class PlanTable:
 
     def max_curvatures(self, starts: Floats, stops: Floats) -> Floats:
         """Return the largest curvatures in intervals (k,), each within a piece, 1/m."""
-        rows = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
-        return np.asarray(self._bend_table[np.maximum(rows, 0), 1])
+        row_indices = np.searchsorted(self._bend_table[:, 0], (starts + stops) / 2, "right") - 1
+        return np.asarray(self._bend_table[np.maximum(row_indices, 0), 1])
 
     def points(self, distances: Floats, pieces: Floats) -> PlanPoints:
         """Return points at distances (k,) of the table, on the pieces at other distances (k,)."""
-        rows = np.maximum(np.searchsorted(self._starts, pieces, "right") - 1, 0)
-        points = self._clothoid_points(distances, rows)
-        kinds = self._kinds[rows]
+        row_indices = np.maximum(np.searchsorted(self._starts, pieces, "right") - 1, 0)
+        points = self._clothoid_points(distances, row_indices)
+        kinds = self._kinds[row_indices]
         for kind in np.unique(kinds[kinds >= 0]).tolist():
             mask = kinds == kind
             cubic_points = _cubic_points(self._cubics[kind], distances[mask])
@@ -147,11 +147,11 @@ class PlanTable:
         turned = curvature[curved, None] + growth[curved, None] / 2 * steps
         node_sines, node_cosines = sin_cos(heading[curved, None] + turned * steps)
         # Sums of five products in a fixed order have the same bits on every processor.
-        for array, origin, parts in (
+        for array, origin, terms in (
             (x, self._table[row_indices[curved], 1], node_cosines * _WEIGHTS),
             (y, self._table[row_indices[curved], 2], node_sines * _WEIGHTS),
         ):
-            mean = ((parts[:, 0] + parts[:, 4]) + (parts[:, 1] + parts[:, 3])) + parts[:, 2]
+            mean = ((terms[:, 0] + terms[:, 4]) + (terms[:, 1] + terms[:, 3])) + terms[:, 2]
             array[curved] = origin + mean * along[curved]
         return PlanPoints(x, y, cosines, sines)
 
@@ -268,12 +268,12 @@ def _parameters(cubic: _Cubic, along: Floats) -> Floats:
 
     Beyond its end, the parameters stay at the end.
     """
-    rows = np.searchsorted(cubic.distances, along, "right") - 1
-    rows = np.clip(rows, 0, len(cubic.distances) - 2)
-    gaps = cubic.distances[rows + 1] - cubic.distances[rows]
-    share = np.clip((along - cubic.distances[rows]) / gaps, 0, 1)
-    steps = cubic.parameters[rows + 1] - cubic.parameters[rows]
-    return np.asarray(cubic.parameters[rows] + share * steps)
+    sample_indices = np.searchsorted(cubic.distances, along, "right") - 1
+    sample_indices = np.clip(sample_indices, 0, len(cubic.distances) - 2)
+    gaps = cubic.distances[sample_indices + 1] - cubic.distances[sample_indices]
+    share = np.clip((along - cubic.distances[sample_indices]) / gaps, 0, 1)
+    steps = cubic.parameters[sample_indices + 1] - cubic.parameters[sample_indices]
+    return np.asarray(cubic.parameters[sample_indices] + share * steps)
 
 
 def _coefficients(shape: Element) -> tuple[Floats, Floats]:

@@ -177,9 +177,11 @@ class Road:
         gaps = np.diff(knots)
         counts = np.ceil(gaps * np.sqrt(bends / (8 * height_m)))
         counts = np.clip(counts, 1, MAX_LINES).astype(np.int64)
-        rows = np.repeat(np.arange(len(gaps)), counts)
-        within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
-        lines = np.append(knots[rows] + gaps[rows] * (within / counts[rows]), t[1])
+        gap_indices = np.repeat(np.arange(len(gaps)), counts)
+        within = np.arange(len(gap_indices)) - np.repeat(np.cumsum(counts) - counts, counts)
+        lines = np.append(
+            knots[gap_indices] + gaps[gap_indices] * (within / counts[gap_indices]), t[1]
+        )
         steps = self.shapes.steps(start, stop)
         return np.unique(np.concatenate([lines, steps - GAP_M, steps + GAP_M]))
 
@@ -205,11 +207,11 @@ class LateralShapes:
     def heights(self, distances: Floats, t: Floats, pieces: Floats) -> Floats:
         """Return heights at distances (k,) and t (..., k), in the cubics at `pieces`, m."""
         last = len(self.stations) - 1
-        rows = np.clip(np.searchsorted(self.stations, distances, "right") - 1, 0, last)
-        following = np.minimum(rows + 1, last)
-        gaps = np.maximum(self.stations[following] - self.stations[rows], 1e-9)
-        share = np.clip((distances - self.stations[rows]) / gaps, 0, 1)
-        lower = self._profiles(rows, t, pieces)
+        station_indices = np.clip(np.searchsorted(self.stations, distances, "right") - 1, 0, last)
+        following = np.minimum(station_indices + 1, last)
+        gaps = np.maximum(self.stations[following] - self.stations[station_indices], 1e-9)
+        share = np.clip((distances - self.stations[station_indices]) / gaps, 0, 1)
+        lower = self._profiles(station_indices, t, pieces)
         return np.asarray(lower + share * (self._profiles(following, t, pieces) - lower))
 
     def kinks(self, start: float, stop: float) -> Floats:
@@ -219,9 +221,9 @@ class LateralShapes:
 
     def steps(self, start: float, stop: float) -> Floats:
         """Return t (j,) at which heights step, of all stations that matter between distances."""
-        rows = self._row_range(start, stop)
-        starts = self._starts[rows]
-        a, b, c, d = self._coefficients[:, rows]
+        row_range = self._row_range(start, stop)
+        starts = self._starts[row_range]
+        a, b, c, d = self._coefficients[:, row_range]
         with np.errstate(invalid="ignore"):  # infinite starts of cubics that lack
             x = np.diff(starts, axis=1)
             ends = ((d[:, :-1] * x + c[:, :-1]) * x + b[:, :-1]) * x + a[:, :-1]
@@ -230,10 +232,10 @@ class LateralShapes:
 
     def max_bends(self, start: float, stop: float, knots: Floats) -> Floats:
         """Return the largest second derivatives between ascending t (j + 1,), 1/m."""
-        rows = self._row_range(start, stop)
+        row_range = self._row_range(start, stop)
         t = (knots[1:] + knots[:-1]) / 2
-        pieces = np.maximum((self._starts[rows, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)
-        indices = np.arange(rows.start, rows.stop)[:, None]
+        pieces = np.maximum((self._starts[row_range, :, None] <= t).sum(axis=1) - 1, 0)  # (m, j)
+        indices = np.arange(row_range.start, row_range.stop)[:, None]
         _, _, c, d = self._coefficients[:, indices, pieces]
         origins = self._starts[indices, pieces]
         ends = [np.abs(2 * c + 6 * d * np.maximum(k - origins, 0)) for k in (knots[:-1], knots[1:])]

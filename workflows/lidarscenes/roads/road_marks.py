@@ -68,14 +68,14 @@ def painted_quads(
     if not knots:
         return []
     points = _points_of(surface, knots)
-    rows_of_colours: dict[str, list[Ints]] = {}  # first cross sections of quadrangles
+    quads_of_colours: dict[str, list[Ints]] = {}  # first cross sections of quadrangles
     offset = 0
     for entry in knots:
-        rows_of_colours.setdefault(entry.colour, []).append(offset + entry.quads)
+        quads_of_colours.setdefault(entry.colour, []).append(offset + entry.quads)
         offset += len(entry.stations)
     return [
-        PaintedQuads(colour, points, _quads(np.concatenate(rows), offset))
-        for colour, rows in rows_of_colours.items()
+        PaintedQuads(colour, points, _quads(np.concatenate(quads), offset))
+        for colour, quads in quads_of_colours.items()
     ]
 
 
@@ -161,19 +161,21 @@ def _positions(distances: Floats, s: Floats, stations: Ints) -> Floats:
 
 def _points_of(surface: SectionSurface, knots: Sequence[_Knots]) -> Floats:
     """Return the right edges of lines, then the left edges, on the lanes' triangles, (2q, 3)."""
-    rows = np.concatenate([entry.stations for entry in knots])
+    station_indices = np.concatenate([entry.stations for entry in knots])
     shares = np.concatenate([entry.shares for entry in knots])
     first_t = np.concatenate([entry.first_t for entry in knots])
     second_t = np.concatenate([entry.second_t for entry in knots])
     half = np.concatenate([np.full(len(entry.stations), entry.width / 2) for entry in knots])
-    count = len(rows)
+    count = len(station_indices)
     corners = surface.points(
-        np.concatenate([rows, rows, rows + 1, rows + 1]),
+        np.concatenate(
+            [station_indices, station_indices, station_indices + 1, station_indices + 1]
+        ),
         np.concatenate([first_t - half, first_t + half, second_t - half, second_t + half]),
     )
     both_shares = np.concatenate([shares, shares])[:, None]
     points = corners[: 2 * count] + both_shares * (corners[2 * count :] - corners[: 2 * count])
-    up = surface.frames.up[np.concatenate([rows, rows])]
+    up = surface.frames.up[np.concatenate([station_indices, station_indices])]
     return np.asarray(points + LIFT_M * up)
 
 

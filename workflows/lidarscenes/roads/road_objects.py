@@ -538,8 +538,8 @@ def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
             np.stack([a, a + 1 + count, a + count], axis=1),
         ]
     )
-    rows = np.concatenate([steps, steps + count - 1])
-    thin = rows[~has_extent(points, faces[rows])]
+    face_indices = np.concatenate([steps, steps + count - 1])
+    thin = face_indices[~has_extent(points, faces[face_indices])]
     return Piece(points, np.delete(faces, thin, axis=0), material=CONCRETE)
 
 

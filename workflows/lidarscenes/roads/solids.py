@@ -83,10 +83,10 @@ def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, mate
     points = np.concatenate([bottom, bottom + height[:, None] * [0, 0, 1]])
     offset = 0
     faces = []
-    rows = []
+    top_rings = []
     for ring in rings:
         numbers = offset + np.arange(len(ring))
-        rows.append(numbers + count)
+        top_rings.append(numbers + count)
         following = np.roll(numbers, -1)
         if not closed:
             numbers = numbers[:-1]
@@ -95,8 +95,8 @@ def prism(rings: Sequence[Floats], heights: Sequence[Floats], closed: bool, mate
             faces.append(_walls(numbers, following, count))
         offset += len(ring)
     if closed:
-        rows = [row for row in rows if len(row) > 2]
-        faces += [with_holes(points, rows)] if rows else []
+        top_rings = [row for row in top_rings if len(row) > 2]
+        faces += [with_holes(points, top_rings)] if top_rings else []
     triangles = np.concatenate(faces) if faces else np.zeros((0, 3), np.int64)
     return Piece(points, triangles, material=material)
 
@@ -136,8 +136,8 @@ def painted_strips(starts: Floats, stops: Floats, width: float, material: str) -
     size = np.maximum(length(along), 1e-9)[:, None]
     left = np.stack([-along[:, 1], along[:, 0], np.zeros(len(along))], axis=1) / size * (width / 2)
     points = np.concatenate([starts - left, stops - left, stops + left, starts + left])
-    rows = np.arange(len(starts))
-    a, b, c, d = (rows + k * len(starts) for k in range(4))
+    strip_indices = np.arange(len(starts))
+    a, b, c, d = (strip_indices + k * len(starts) for k in range(4))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     return Piece(points, faces, material=material)
 

@@ -29,7 +29,7 @@ class PartColumns:
     counts: Ints  # (scans,): rows of each scan
     columns: Mapping[str, AnyArray]  # {name: (rows,)}, positions as cells
     triangles: Ints32  # (k,): triangles that were hit
-    hits: Ints  # (k,): hits of each of these triangles
+    hits: Ints  # (k,): number of hits of each of these triangles
     # (scans,) and (scans, samples, 3): hits of each scan, and ends of sampled rays, metres, local
     # coordinates, NaN in unused rows; empty in a part that is not stored.
     scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))
@@ -61,7 +61,7 @@ class PartColumns:
         table: Sequence[Column],
         precision_m: float,
         origin: Floats,
-        rows: Integers | slice = slice(None),
+        row_selection: Integers | slice = slice(None),
         sweeps: Callable[[], Any] | None = None,
     ) -> Cloud:
         """Return a cloud of the points of the part, or of selected rows.
@@ -74,18 +74,20 @@ class PartColumns:
             Size of a cell, metres.
         origin
             (3,): world position of cell 0, metres.
-        rows
-            Rows of the points.
+        row_selection
+            Rows of the points, as integers or a slice.
         sweeps
             Function that returns the sweeps of the survey (`Cloud`).
         """
-        cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
+        cells = np.stack([self.columns[axis.name][row_selection] for axis in AXES], axis=1)
         columns = {
-            c.name: self.scan_column()[rows] if c is SCAN else self.columns[c.name][rows]
+            c.name: self.scan_column()[row_selection]
+            if c is SCAN
+            else self.columns[c.name][row_selection]
             for c in table
         }
         if WAVEFORM in self.columns:
-            columns[WAVEFORM] = self.columns[WAVEFORM][rows]
+            columns[WAVEFORM] = self.columns[WAVEFORM][row_selection]
         return Cloud(positions_of(cells, precision_m, origin), columns, tuple(table), sweeps)
 
 

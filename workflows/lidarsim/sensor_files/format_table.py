@@ -76,7 +76,7 @@ class SensorFormat:
     def function(self, name: str) -> Any:
         """Import the module and return its function of a name.
 
-        Raises LidarError without its package.
+        Raises LidarError if a package that the module needs is not installed.
         """
         for package in self.packages:
             need(package, self.extra, f"Sensors as {self.name} are written and read")

@@ -260,22 +260,22 @@ class PulseCaster:
         keep_every = self.setup.survey.keep_every
         size = len(returns.ray)
         hit_counts = np.zeros(len(scan_starts), np.int64)
-        rows = np.empty(size, np.int64)
-        number, returns_of_pulse = np.empty((2, size), np.uint8)
+        row_indices = np.empty(size, np.int64)
+        number, return_counts = np.empty((2, size), np.uint8)
         count = pulse_loops.thin_out(
             owned(returns.ray, np.int64),
             owned(scan_starts, np.int64),
             keep_every=keep_every,
-            counts=hit_counts,
-            rows=rows,
+            hit_counts=hit_counts,
+            row_indices=row_indices,
             number=number,
-            returns=returns_of_pulse,
+            return_counts=return_counts,
         )
-        thinned = returns if count == size else returns.take(rows[:count])
+        thinned = returns if count == size else returns.take(row_indices[:count])
         thinned = thinned._replace(
             ray=thinned.ray.astype(np.uint32),
             number=number[:count],
-            return_counts=returns_of_pulse[:count],
+            return_counts=return_counts[:count],
             reported=thinned.distance,
         )
         if not tally:

@@ -115,13 +115,13 @@ def joined(tables: list[PulseReturns]) -> PulseReturns:
 
 def _column(name: str, tables: list[PulseReturns]) -> AnyArray | None:
     """Concatenate a column of several tables, or return None if all tables lack the column."""
-    columns = [getattr(part, name) for part in tables]
+    columns = [getattr(table, name) for table in tables]
     if all(column is None for column in columns):
         return None
     return np.concatenate(
         [
-            np.full(len(part.ray), _LACKING[name]) if column is None else column
-            for part, column in zip(tables, columns, strict=True)
+            np.full(len(table.ray), _LACKING[name]) if column is None else column
+            for table, column in zip(tables, columns, strict=True)
         ]
     )
 

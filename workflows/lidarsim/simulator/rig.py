@@ -156,12 +156,12 @@ class Rig:
         are shared: this rig must not cast afterwards, and no cast may be under way.
         """
         assert self.scene.instances is not None
-        rows, index = self.scene.instances.rows_of(owners)
+        instance_indices, index = self.scene.instances.rows_of(owners)
         rig = copy(self)
-        rig.scene = scene = self.scene.moved(rows, positions[index], rotations[index])
+        rig.scene = scene = self.scene.moved(instance_indices, positions[index], rotations[index])
         assert scene.instances is not None
         rig.surfaces = surfaces = self.surfaces.moved(scene)
-        move_instances(rig.scene_casters, surfaces, scene.instances, rows)
+        move_instances(rig.scene_casters, surfaces, scene.instances, instance_indices)
         rig.pulse_casters = [pulses.moved(scene, surfaces) for pulses in self.pulse_casters]
         rig._device = self._device and self._device.moved(scene, surfaces)
         return rig
@@ -274,7 +274,8 @@ class Rig:
     ) -> CastPoses:
         """Return the poses of consecutive firings on a path, with the clocks that motion needs.
 
-        With `by_head` the poses are of the head, else of the carrier. `late_ns` is as in `returns`.
+        With `by_head` the poses are of the head, else of the carrier. `late_ns`, nanoseconds, is
+        added to the times at which the carrier's poses are taken, and not to the actors' times.
         """
         spec = firings.spec
         carried = self.survey.carried[spec.sensor]

@@ -34,7 +34,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
 
     The rays are spread evenly over all scans, or over evenly spread sections of many thousand
     scans. All rays of a small survey are cast. The result has the numbers of `rays` that were cast,
-    and of `hits` and `points` of the whole survey.
+    and of `hit_count` and `points` of the whole survey.
     """
     firsts, stops = _sampled_scans(survey, range(survey.scan_count))
     subrays = max(returns.subrays for returns in survey.returns_each)
@@ -51,17 +51,17 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
         sampled = replace(survey, sensors=carried, noise=noise, faults=())
     cast_rays = 0
     sampled_rays = 0  # rays of the survey that the cast rays represent
-    hits = 0
+    hit_count = 0
     points = 0
     for batch in _batches(Rig(scene, sampled, backend), firsts, stops):
         every = getattr(sampled.carried[batch.specs[0].sensor].sensor, "every", 1)
         rays = sum(spec.ray_count for spec in batch.specs)
         cast_rays = cast_rays + rays
         sampled_rays = sampled_rays + rays * every
-        hits += int(batch.hit_counts.sum()) * every
+        hit_count += int(batch.hit_counts.sum()) * every
         points += int(np.ceil(batch.hit_counts * every / survey.keep_every).sum())
     share = survey.ray_count / sampled_rays
-    return {"rays": cast_rays, "hits": round(hits * share), "points": round(points * share)}
+    return {"rays": cast_rays, "hits": round(hit_count * share), "points": round(points * share)}
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:

@@ -147,7 +147,7 @@ class Scanner:
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
     def _assemble(self, scene: Scene, survey: Survey, options: dict[str, Any]) -> None:
-        """Check the backend and build the rig with `options`, arguments of `Rig`."""
+        """Check the backend, build the rig with `options` of `Rig`, and set all attributes."""
         check_backend_here(options["backend"])
         try:
             self._rig = Rig(scene, survey, **options)

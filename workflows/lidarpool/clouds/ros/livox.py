@@ -43,9 +43,10 @@ def check_lines(channels: int) -> None:
 def custom_message(
     store: Typestore, header: Any, stamp_ns: int, since_ns: AnyArray, rows: Records
 ) -> bytes:
-    """Return a serialised CustomMsg of points in the layout `livox`.
+    """Return a serialised CustomMsg of points.
 
-    `since_ns` (n,) are nanoseconds from the stamp to the firings.
+    `rows` (n,) are the points in the layout `livox`. `since_ns` (n,) are nanoseconds from the stamp
+    to the firings.
     """
     points = np.zeros(len(rows), LIVOX_POINT)
     points["offset_time"] = np.clip(since_ns, 0, 2**32 - 1)

@@ -247,12 +247,17 @@ def _root_mean(variances: Floats) -> dict[str, float] | None:
 
 
 def _curve(x: Floats, values: Floats, power: float = 1.0) -> Curve:
-    """Compute a curve: a power of the mean of values (k,) in parts of x (k,), of equal numbers."""
+    """Compute the curve of values (k,) over x (k,): a point for each of several intervals of x.
+
+    The intervals hold equal numbers of finite values, at least `MIN_RAYS`. A point has the median
+    of x, and the mean of the values to the power `power`.
+    """
     finite = np.flatnonzero(np.isfinite(values) & np.isfinite(x))
     order = finite[np.argsort(x[finite], kind="stable")]
-    parts = np.array_split(order, min(_CURVE_POINTS, len(order) // MIN_RAYS) or 1)
+    intervals = np.array_split(order, min(_CURVE_POINTS, len(order) // MIN_RAYS) or 1)
     return [
-        {"x": float(np.median(x[part]))} | Estimate.from_values(values[part]).power(power)._asdict()
-        for part in parts
-        if len(part) >= MIN_RAYS
+        {"x": float(np.median(x[interval]))}
+        | Estimate.from_values(values[interval]).power(power)._asdict()
+        for interval in intervals
+        if len(interval) >= MIN_RAYS
     ]

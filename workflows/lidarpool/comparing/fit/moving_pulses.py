@@ -188,10 +188,12 @@ class _NearestReturns(NamedTuple):
         # Of several returns of a pulse the nearest is first.
         order = np.lexsort((np.linalg.norm(points, axis=1), azimuth_deg, rings))
         bounds = np.searchsorted(rings[order], np.stack([stack.rings, stack.rings + 1], axis=1))
-        parts = [order[start:stop] for start, stop in bounds.tolist()]
-        rows = zip(cell_deg, parts, strict=True)
-        found = [cls._of_ring(cells, azimuth_deg[part], part) for cells, part in rows]
-        indices, gap_deg, sides, spacing_deg = zip(*found, strict=True)
+        indices_by_ring = [order[start:stop] for start, stop in bounds.tolist()]
+        nearest = [
+            cls._of_ring(ring_cells, azimuth_deg[ring_points], ring_points)
+            for ring_cells, ring_points in zip(cell_deg, indices_by_ring, strict=True)
+        ]
+        indices, gap_deg, sides, spacing_deg = zip(*nearest, strict=True)
         return cls(
             np.stack(indices), np.stack(gap_deg), np.stack(sides, axis=1), np.stack(spacing_deg)
         )
@@ -271,10 +273,12 @@ class _CellCaster:
             slope = distance * np.sqrt(np.maximum(1 / cosine**2 - 1, 0))
             path = distance[..., None] * directions
             scaled_normal = normal / cosine[..., None]
-            hits = positions.reshape(shape) + path
+            points = positions.reshape(shape) + path
             smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
             tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance
-            smooth &= Neighbours.from_points(hits).are_coplanar(hits, scaled_normal, tolerance_m)
+            smooth &= Neighbours.from_points(points).are_coplanar(
+                points, scaled_normal, tolerance_m
+            )
         return _SceneSurfaces(distance, slope, path, scaled_normal, smooth)
 
 

@@ -213,9 +213,10 @@ def fit_scatter(rays: SmoothRays, increase_name: str, growth: Floats, power: int
 
 
 def _variance_samples(rays: SmoothRays, growth: Floats) -> _VarianceSamples:
-    """Choose the rays whose variances are fitted, among all rays with `growth` (k,).
+    """Choose the rays whose variances are fitted.
 
-    Rays that lose many pulses are left out: only their nearer or brighter pulses return.
+    `growth` (k,) is the quantity that noise of ranges grows with, of each of the `rays` (k,). Rays
+    that lose many pulses are left out: only their nearer or brighter pulses return.
     """
     repeated = (rays.freedom > 0) & (rays.return_counts >= MIN_RETURN_SHARE * rays.trials)
     patch_columns = max(int(rays.column.max()) // _PATCHES, 1)

@@ -168,10 +168,11 @@ class RangeChanges:
 
 
 def range_scatter(stack: SweepStack, lag: int) -> float:
-    """Return the typical change of the range of a smooth surface in `lag` sweeps, metres.
+    """Return the typical size of the change of a smooth surface's range in `lag` sweeps, metres.
 
-    The result is a mean without the changes of things that move: ranges may be rounded to more
-    than their noise, so that a median is 0.
+    The size in a pair of sweeps is a mean without the changes of things that move: ranges may be
+    rounded to more than their noise, so that a median is 0. The result is the median over the
+    pairs. It is 0 if no pair has enough rays.
     """
     scatter = []
     for first in even_indices(stack.sweep_count - lag, SWEEP_PAIRS).tolist():

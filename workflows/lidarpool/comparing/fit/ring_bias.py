@@ -43,8 +43,8 @@ def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int
     if not len(rays.row):
         return {}
     chosen = _plane_rays(rays, directions)
-    rows, row_index = np.unique(rays.row[chosen.rays], return_inverse=True)
-    if len(rows) < 3:
+    row_numbers, row_index = np.unique(rays.row[chosen.rays], return_inverse=True)
+    if len(row_numbers) < 3:
         return {}
     _, plane = np.unique(chosen.plane, return_inverse=True)
     plane_count = plane.max() + 1
@@ -52,14 +52,18 @@ def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int
     distance = rays.distance[chosen.rays]
     normals = np.eye(plane_count)[plane][:, :, None] * directions[chosen.rays][:, None]
     normals = normals.reshape(len(distance), -1) * distance[:, None] ** 2
-    design = np.hstack([normals, -np.eye(len(rows))[row_index]]) / error_m[:, None]
+    design = np.hstack([normals, -np.eye(len(row_numbers))[row_index]]) / error_m[:, None]
     offsets, variances = _solve_offsets(design, distance / error_m, plane)
-    estimates = zip(rows.tolist(), offsets, variances, strict=True)
+    estimates = zip(row_numbers.tolist(), offsets, variances, strict=True)
     return {row: Estimate.from_variance(offset, variance) for row, offset, variance in estimates}
 
 
 def _plane_rays(rays: SmoothRays, directions: Floats) -> _PlaneRays:
-    """Choose rays, with directions (k, 3), of rings that cross at least two large planes."""
+    """Choose the rays on large planes, of rings that cross at least two of these planes.
+
+    `directions` (k, 3) are the unit directions of all `rays`. At most `_MAX_PLANE_POINTS` rays,
+    evenly spaced in the order of `rays`, are considered.
+    """
     indices = even_indices(len(rays.row), _MAX_PLANE_POINTS)
     plane = _segment_planes(rays.distance[indices, None] * directions[indices])
     count = np.zeros((rays.row.max() + 1, plane.max() + 2), np.int64)

@@ -209,10 +209,10 @@ class SightPair:
             (self.first.points, self.seen_first),
             (self.second.points, self.seen_second),
         ):
-            rows = [np.flatnonzero(seen_points == kind) for kind in _KNOWN]
+            indices_by_kind = [np.flatnonzero(seen_points == kind) for kind in _KNOWN]
             chosen = [
                 indices[even_indices(len(indices), round(shares[kind] * len(indices)))]
-                for kind, indices in zip(_KNOWN, rows, strict=True)
+                for kind, indices in zip(_KNOWN, indices_by_kind, strict=True)
             ]
             samples.append(points[np.concatenate(chosen)])
         return samples[0], samples[1]

@@ -45,9 +45,9 @@ class Neighbours(NamedTuple):
     @classmethod
     def from_points(cls, points: Floats) -> Neighbours:
         """Shift points (r, c, 3) along columns, which are a revolution, and rows."""
-        rows = np.arange(len(points))
+        row_numbers = np.arange(len(points))
         columns = (np.roll(points, shift, axis=1) for shift in (-1, 1, -2, 2))
-        rings = (points[np.clip(rows + shift, 0, rows[-1])] for shift in (-1, 1))
+        rings = (points[np.clip(row_numbers + shift, 0, row_numbers[-1])] for shift in (-1, 1))
         return cls(*columns, *rings)
 
     def normals(self) -> Floats:

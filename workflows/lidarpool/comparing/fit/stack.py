@@ -160,11 +160,11 @@ class _CommonCells:
             if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
                 raise LidarError(f"sweep {number} is of another sensor, or another mode.")
         self._add_rings(sweep)
-        _, sweep_rows, rows = np.intersect1d(sweep.rings, self.rings, return_indices=True)
+        _, sweep_rows, row_indices = np.intersect1d(sweep.rings, self.rings, return_indices=True)
         first_column = round(sweep.start_deg / sweep.step_deg)
         columns = first_column + np.arange(sweep.images.shape[-1])
         columns %= self.values.shape[-1]
-        self.values[:, index, rows[:, None], columns] = sweep.images[0][:, sweep_rows]
+        self.values[:, index, row_indices[:, None], columns] = sweep.images[0][:, sweep_rows]
 
     def _add_rings(self, sweep: RangeImages) -> None:
         """Append rows for the rings of a sweep that no earlier sweep had."""
@@ -303,8 +303,8 @@ def steady_cells(returned: Bools, covered: Bools) -> Bools:
         return np.asarray(np.rint(means * np.prod(_STEADY_PATCH)))
 
     pulses = sum(patch_sums(mask) for mask in covered)
-    returns = sum(patch_sums(mask) for mask in returned & covered)
-    mean_share = returns / np.maximum(pulses, 1)
+    return_counts = sum(patch_sums(mask) for mask in returned & covered)
+    mean_share = return_counts / np.maximum(pulses, 1)
     unsteady = np.zeros(mean_share.shape, bool)
     for sweep_returned, sweep_covered in zip(returned, covered, strict=True):
         trials = patch_sums(sweep_covered)

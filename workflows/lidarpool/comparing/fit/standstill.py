@@ -70,16 +70,16 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
 
     `advice` is the first of three pieces of advice.
     """
-    parts = []
+    amounts = []
     if speed.shift_m > 0:
         by_time = ""
         if speed.period_ns:
             by_time = f" ({1e9 * speed.shift_m / speed.period_ns:.2g} m/s)"
-        parts.append(f"{speed.shift_m:.2g} m{by_time}")
+        amounts.append(f"{speed.shift_m:.2g} m{by_time}")
     if speed.turn_deg > 0:
-        parts.append(f"{speed.turn_deg:.2g}°")
+        amounts.append(f"{speed.turn_deg:.2g}°")
     return (
-        f"{name} is of a sensor that moves, by {' and '.join(parts)} from sweep to sweep: give "
+        f"{name} is of a sensor that moves, by {' and '.join(amounts)} from sweep to sweep: give "
         f"{advice}, sweeps of a sensor that stands, or one sweep for the bias of its rings."
     )
 

@@ -231,7 +231,8 @@ class Cluster:
     def _is_lost(self, error: BaseException) -> bool:
         """Return True if the scheduler is gone.
 
-        Calls may fail a moment before the client knows.
+        Calls may fail a moment before the client knows. If `error` suggests a lost scheduler, wait
+        up to `LOST_S` seconds until the client knows.
         """
         deadline = time.monotonic() + LOST_S
         while (

@@ -268,7 +268,7 @@ class _OfferState:
         return min(self.free_weight, weight(group, self.per_task)) < self.per_task
 
     def add(self, task: Collection[Batch], worker: str, *, alone: bool) -> None:
-        """Count a task that is offered to a worker."""
+        """Count a task that is offered to a worker. A task `alone` reserves the worker."""
         self.free_weight -= weight(task, self.per_task)
         self.load[worker] += 1
         if alone:

@@ -87,9 +87,9 @@ def _read_array(file: BinaryIO, size: int) -> AnyArray:
 
 
 def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return the shape, the order and the type of the array in a file.
+    """Return the shape of the array in a file, whether its order is Fortran's, and its type.
 
-    Raises ValueError if broken.
+    Raises ValueError if the header is broken.
     """
     layout: Any = np.lib.format
     readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}

@@ -64,8 +64,9 @@ class ActorSurfaces:
         """
         if not trajectories:
             return _NO_ROWS, _NO_ROWS
-        rows = np.flatnonzero(triangle >= self._triangles.instance_starts[-1])
-        return rows, self._triangles.objects(triangle[rows]) - self._triangles.static_objects
+        row_indices = np.flatnonzero(triangle >= self._triangles.instance_starts[-1])
+        objects = self._triangles.objects(triangle[row_indices])
+        return row_indices, objects - self._triangles.static_objects
 
     def move_to_rest(
         self,
@@ -112,16 +113,20 @@ class ActorSurfaces:
         on_actors, actor = self._actor_rows(triangle, trajectories)
         for number in np.unique(actor).tolist():
             trajectory = trajectories[number]
-            rows = on_actors[actor == number]
+            row_indices = on_actors[actor == number]
             if trajectory.moves:
-                times_ns = times[rows].astype(np.float64)
+                times_ns = times[row_indices].astype(np.float64)
                 positions, _ = trajectory.poses(0, times_ns)
                 velocity, rate = velocities(trajectory, 0, times_ns)
-                result[rows] = velocity + np.cross(rate, points[rows] - positions)
+                result[row_indices] = velocity + np.cross(rate, points[row_indices] - positions)
         if len(deforming := trajectories.deforming(actor)):
-            rows = on_actors[deforming]
-            result[rows] += self._deformation_velocities(
-                triangle[rows], points[rows], times[rows], actor[deforming], trajectories
+            row_indices = on_actors[deforming]
+            result[row_indices] += self._deformation_velocities(
+                triangle[row_indices],
+                points[row_indices],
+                times[row_indices],
+                actor[deforming],
+                trajectories,
             )
         return result
 

@@ -140,8 +140,10 @@ class ActorTrajectories(tuple[Trajectory, ...]):
         """
         frames = np.zeros((2, len(actors)))
         for actor in np.unique(actors).tolist():
-            rows = np.flatnonzero(actors == actor)
-            frames[:, rows] = self.animated[actor].played(times_ns[rows].astype(np.float64))
+            row_indices = np.flatnonzero(actors == actor)
+            frames[:, row_indices] = self.animated[actor].played(
+                times_ns[row_indices].astype(np.float64)
+            )
         return frames
 
     @cached_property
@@ -177,12 +179,12 @@ class ActorTrajectories(tuple[Trajectory, ...]):
             self[number[outside]].poses(0, times_ns[number == number[outside]])
         not_straight = np.flatnonzero(tracks.member[number] < 0)
         for trajectory in np.unique(number[not_straight]).tolist():
-            rows = not_straight[number[not_straight] == trajectory]
-            positions, rotations = self[trajectory].poses(0, times_ns[rows])
+            row_indices = not_straight[number[not_straight] == trajectory]
+            positions, rotations = self[trajectory].poses(0, times_ns[row_indices])
             rotations = np.eye(3) if rotations is None else np.asarray(rotations)
-            table[:3, rows] = np.broadcast_to(np.asarray(positions), (len(rows), 3)).T
-            rotations = np.broadcast_to(rotations, (len(rows), 3, 3))
-            table[3:, rows] = rotations.transpose(1, 2, 0).reshape(9, -1)
+            table[:3, row_indices] = np.broadcast_to(np.asarray(positions), (len(row_indices), 3)).T
+            rotations = np.broadcast_to(rotations, (len(row_indices), 3, 3))
+            table[3:, row_indices] = rotations.transpose(1, 2, 0).reshape(9, -1)
         return table
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:

@@ -46,19 +46,19 @@ def cut(vertices: Floats, faces: Integers, planes: Floats) -> CutMesh | None:
     if not crossing.any():
         return None
     absent = np.any(np.all(is_outside, axis=1), axis=1)
-    parts = [
+    cut_triangles = [
         part
         for face in np.flatnonzero(crossing & ~absent).tolist()
         for part in _parts_of(face, [*map(tuple, vertices[faces[face]].tolist())], planes)
     ]
-    rows = np.flatnonzero(~crossing)
-    new_vertices = np.array([part.corners for part in parts], np.float64).reshape(-1, 3)
-    new_faces = len(vertices) + np.arange(3 * len(parts)).reshape(-1, 3)
-    origin = np.append(rows, np.array([part.face for part in parts], np.intp))
+    face_indices = np.flatnonzero(~crossing)
+    new_vertices = np.array([part.corners for part in cut_triangles], np.float64).reshape(-1, 3)
+    new_faces = len(vertices) + np.arange(3 * len(cut_triangles)).reshape(-1, 3)
+    origin = np.append(face_indices, np.array([part.face for part in cut_triangles], np.intp))
     order = np.argsort(origin, kind="stable")
     return CutMesh(
         np.concatenate([vertices, new_vertices]),
-        np.concatenate([faces[rows], new_faces])[order].astype(np.int64),
+        np.concatenate([faces[face_indices], new_faces])[order].astype(np.int64),
         origin[order],
     )
 

@@ -257,10 +257,10 @@ class SceneCaster:
         if tally:
             counted = self._surfaces.triangles.count(triangle)
         if keep_every > 1:
-            rows = _rows_to_keep(counts, keep_every)
-            ray = ray[rows]
-            distance = distance[rows]
-            triangle = triangle[rows]
+            row_indices = _rows_to_keep(counts, keep_every)
+            ray = ray[row_indices]
+            distance = distance[row_indices]
+            triangle = triangle[row_indices]
         instance = np.zeros(len(ray), np.int32)  # not needed: triangles tell the instance
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, instance)
 
@@ -451,15 +451,15 @@ def _shapes(actors: tuple[Actor, ...], options: dict[str, Any]) -> _ActorShapes 
     if not actors:
         return None
     meshes, shape = distinct_meshes(actors)
-    parts = [[*parts_of(mesh)] for mesh in meshes]
-    part_triangles = np.zeros((len(meshes), max(map(len, parts))), np.int32)
-    for row, mesh_parts in zip(part_triangles, parts, strict=True):
+    parts_of_meshes = [[*parts_of(mesh)] for mesh in meshes]
+    part_triangles = np.zeros((len(meshes), max(map(len, parts_of_meshes))), np.int32)
+    for row, mesh_parts in zip(part_triangles, parts_of_meshes, strict=True):
         row[1 : len(mesh_parts)] = np.cumsum([len(part.faces) for part in mesh_parts])[:-1]
     casters = tuple(
         Deforming(mesh.animation.vertices, mesh.faces)
         if mesh.animation
         else RayCaster.from_instances([Instance(mesh_of(part)) for part in mesh_parts], **options)
-        for mesh, mesh_parts in zip(meshes, parts, strict=True)
+        for mesh, mesh_parts in zip(meshes, parts_of_meshes, strict=True)
     )
     boxes = np.array([(mesh.animation or mesh).bounds for mesh in meshes])
     return _ActorShapes(casters, boxes, part_triangles, shape)

@@ -241,11 +241,11 @@ class StaticBodies:
 
     def _cut_faces(self, region: Floats) -> CutMesh | None:
         """Return the parts of the seen faces within a region (2, 3), or None if all are within."""
-        parts = cut(self._vertices, self._faces, box_planes(region))
-        if parts is None or self._sees_all_faces:
-            return parts
-        seen = np.flatnonzero((parts.faces != parts.faces[:, :1]).any(axis=1))
-        return parts._replace(faces=parts.faces[seen], origin=parts.origin[seen])
+        cut_mesh = cut(self._vertices, self._faces, box_planes(region))
+        if cut_mesh is None or self._sees_all_faces:
+            return cut_mesh
+        seen = np.flatnonzero((cut_mesh.faces != cut_mesh.faces[:, :1]).any(axis=1))
+        return cut_mesh._replace(faces=cut_mesh.faces[seen], origin=cut_mesh.origin[seen])
 
     def _build_transparent(self) -> _Trees:
         """Build the tree of a single triangle through which all rays pass: nothing is seen.
@@ -273,7 +273,7 @@ class StaticBodies:
             bodies.append(Instance(Mesh(faces.vertices, faces.faces)))
         face_bodies = len(bodies)
         meshes: dict[int, Mesh] = {}  # {index of the part: mesh}
-        rows = []
+        instance_indices = []
         for row, cut_part in _parts_in(instances, region, self._instance_is_seen):
             index = int(instances.part[row])
             if cut_part is None:
@@ -284,14 +284,18 @@ class StaticBodies:
                 origins[len(bodies)] = cut_part.origin
                 mesh = Mesh(cut_part.vertices, cut_part.faces)
             bodies.append(Instance(mesh, instances.transforms[row]))
-            rows.append(row)
+            instance_indices.append(row)
         if not bodies:
             return self._build_transparent() if region is None else self._build(None)
         caster = RayCaster.from_instances(bodies, **self._options)
         starts = len(self._faces) + np.cumsum(instances.sizes) - instances.sizes
-        first_triangles = np.append(np.zeros(face_bodies, np.int64), starts[rows])
+        first_triangles = np.append(np.zeros(face_bodies, np.int64), starts[instance_indices])
         return _Trees(
-            caster, region, first_triangles.astype(np.int32), np.array(rows, np.int64), origins
+            caster,
+            region,
+            first_triangles.astype(np.int32),
+            np.array(instance_indices, np.int64),
+            origins,
         )
 
 
@@ -304,8 +308,10 @@ def _parts_in(
     single precision of the corners' coordinates in the texture would move the mask.
     """
     if region is None:
-        rows = range(len(instances)) if is_seen is None else np.flatnonzero(is_seen).tolist()
-        yield from ((row, None) for row in rows)
+        instance_indices = (
+            range(len(instances)) if is_seen is None else np.flatnonzero(is_seen).tolist()
+        )
+        yield from ((row, None) for row in instance_indices)
         return
     lower, upper = instances.bounds.transpose(1, 0, 2)
     is_whole = ((region[0] <= lower) & (upper <= region[1])).all(axis=1)

@@ -165,8 +165,8 @@ class StoredTriangles:
         ]
         bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in self.meshes]
         if scene.instances is not None:
-            parts = scene.instances.mesh_parts
-            bodies += [(part.vertices, part.faces, part.colours) for part in parts]
+            mesh_parts = scene.instances.mesh_parts
+            bodies += [(part.vertices, part.faces, part.colours) for part in mesh_parts]
         return bodies
 
     @cached_property

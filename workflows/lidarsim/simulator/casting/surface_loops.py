@@ -173,7 +173,7 @@ def find_owners(triangle, numbers, output):
     """
     starts = numbers.instance_starts
     owners = numbers.owners
-    rows = output.row
+    row_indices = output.row
     objects = output.object
     instances = output.instance
     face_count = starts[0]
@@ -182,15 +182,15 @@ def find_owners(triangle, numbers, output):
         t = np.int64(triangle[k])
         instances[k] = -1
         if t < face_count:
-            rows[k] = t
+            row_indices[k] = t
             objects[k] = owners[t]
         elif t >= actors_start:
             owner = owners[t - (actors_start - face_count)]
-            rows[k] = t + numbers.actor_shifts[owner - numbers.static_objects]
+            row_indices[k] = t + numbers.actor_shifts[owner - numbers.static_objects]
             objects[k] = owner
         else:
             i = _instance_of(t, starts)
-            rows[k] = numbers.instance_rows[i] + t - starts[i]
+            row_indices[k] = numbers.instance_rows[i] + t - starts[i]
             objects[k] = numbers.instance_objects[i]
             instances[k] = i
 
@@ -223,7 +223,7 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
     No view of an array is made: a view would be counted, which takes five times as long as the
     rest of the loop.
     """
-    rows = hits.row
+    row_indices = hits.row
     kinds = hits.kind
     instances = hits.instance
     run = hits.run
@@ -234,8 +234,8 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
     normals = output.normals
     cosines = output.cosines
     back = output.back
-    for k in range(len(rows)):
-        row = rows[k]
+    for k in range(len(row_indices)):
+        row = row_indices[k]
         i = instances[k]
         kind = kinds[k]
         if row >= 0:
@@ -263,7 +263,10 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
 
 @inlined
 def at_right_angles(distance, extinction):
-    """Return the energy of white surfaces at normal incidence, as `materials.at_right_angles`."""
+    """Return the energy from a white surface at normal incidence, as `materials.at_right_angles`.
+
+    `distance` is in metres, `extinction` in 1/m.
+    """
     range_m = max(distance, NEAREST_M)
     nearer = REFERENCE_M / range_m
     nearer = nearer * nearer
@@ -297,20 +300,21 @@ def soak(normals_z, cosines, kinds, shares, water, film, back):
 
 
 @compiled()
-def divide_light(rows, reflected, hits, shares, optics, limits, onward_share):
-    """Write the share of light that goes on from `rows` of hits, through surfaces or reflected.
+def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_share):
+    """Write the share of light that goes on from rows of hits, through surfaces or reflected.
 
-    `hits` are `OnwardHits`, `optics` `OnwardOptics`, and `limits` `OnwardLimits`. For each of the
-    `rows` (k,), `reflected` (k,) is True for light that the surface mirrors, False for light that
-    passes the surface, and `shares` (k,) is the share of light that the surface scatters. At
-    surfaces of refracting media, light is not divided here into mirrored and transmitted light:
-    `LightInMedia.cross` divides it. Light that is too faint is dropped: overwrites `rows` and
-    `reflected` by the remaining light, and writes its `onward_share`: of the energy, since light
-    passes the surface out and back. Returns the number of remaining rows.
+    `hits` are `OnwardHits`, `optics` `OnwardOptics`, and `limits` `OnwardLimits`. `row_indices`
+    (k,) are rows of the hits. For each, `reflected` (k,) is True for light that the surface
+    mirrors, False for light that passes the surface, and `shares` (k,) is the share of light that
+    the surface scatters. At surfaces of refracting media, light is not divided here into mirrored
+    and transmitted light: `LightInMedia.cross` divides it. Light that is too faint is dropped:
+    overwrites `row_indices` and `reflected` by the remaining light, and writes its `onward_share`:
+    of the energy, since light passes the surface out and back. Returns the number of remaining
+    rows.
     """
     count = 0
-    for j in range(len(rows)):
-        k = rows[j]
+    for j in range(len(row_indices)):
+        k = row_indices[j]
         kind = hits.kind[k]
         cosine = abs(hits.cosines[k])
         specular = optics.specular[kind]
@@ -329,7 +333,7 @@ def divide_light(rows, reflected, hits, shares, optics, limits, onward_share):
         onward = hits.share[k] * (onward * onward)
         brightest = limits.brightest * at_right_angles(hits.distance[k], limits.extinction)
         if onward * brightest > limits.faintest:
-            rows[count] = k
+            row_indices[count] = k
             reflected[count] = reflected[j]
             onward_share[count] = onward
             count += 1

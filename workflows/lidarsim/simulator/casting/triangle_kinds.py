@@ -38,8 +38,8 @@ class TriangleKinds:
         """
         if self._kind_in_object is None:
             return self._triangles.objects(triangle)
-        rows, objects, _ = self._triangles.locate(triangle)
-        return self.of_rows(rows, objects)
+        triangle_indices, objects, _ = self._triangles.locate(triangle)
+        return self.of_rows(triangle_indices, objects)
 
     def of_rows(self, triangle_indices: Indices, objects: Ints32) -> Ints32:
         """Return the kinds of surfaces, from rows of stored triangles (n,) and objects (n,): (n,).
@@ -60,9 +60,9 @@ class TriangleKinds:
         if len(self.material_kinds.object) == len(self.material_kinds.names):
             return None
         scene = self._scene
-        parts = () if scene.instances is None else scene.instances.mesh_parts
+        mesh_parts = () if scene.instances is None else scene.instances.mesh_parts
         meshes = [(len(mesh.faces), mesh.materials) for mesh in self._triangles.meshes]
-        meshes += [(len(part.faces), part.materials) for part in parts]
+        meshes += [(len(part.faces), part.materials) for part in mesh_parts]
         face_materials = None if scene.materials is None else scene.materials.index
         numbers = [
             np.zeros(len(scene.faces), np.int32) if face_materials is None else face_materials
@@ -74,10 +74,10 @@ class TriangleKinds:
 
     def material_numbers(self, triangle: Integers) -> Ints32:
         """Return materials of triangles, as numbers of `Scene.material_names`, or -1 for none."""
-        rows, objects, _ = self._triangles.locate(triangle)
+        triangle_indices, objects, _ = self._triangles.locate(triangle)
         kinds = self.material_kinds.first[:-1][objects]
         if self._kind_in_object is not None:
-            kinds = kinds + self._kind_in_object[rows]
+            kinds = kinds + self._kind_in_object[triangle_indices]
         return np.where(objects < 0, np.int32(-1), self._number_of_kind[kinds])
 
     @cached_property
@@ -97,8 +97,10 @@ class TriangleKinds:
         kinds = self.material_kinds
         first = first_matches(self._materials, self.material_kinds)
         keys = np.stack([kinds.object, first], axis=1)
-        _, rows, combination = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        return rows[combination.reshape(-1)].astype(np.int32)
+        _, first_kinds, combination = np.unique(
+            keys, axis=0, return_index=True, return_inverse=True
+        )
+        return first_kinds[combination.reshape(-1)].astype(np.int32)
 
     @cached_property
     def _faces_by_object(self) -> tuple[Indices, Indices]:
@@ -111,11 +113,11 @@ class TriangleKinds:
         """Return the scene's faces of a kind of surface, (f, 3)."""
         order, starts = self._faces_by_object
         owner = int(self.material_kinds.object[kind])
-        rows = order[starts[owner] : starts[owner + 1]]
+        face_indices = order[starts[owner] : starts[owner + 1]]
         if self._scene.materials is None:
-            return self._scene.faces[rows]
-        materials = self._scene.materials.of_object(owner, rows)
-        return self.select(kind, self._scene.faces[rows], materials)
+            return self._scene.faces[face_indices]
+        materials = self._scene.materials.of_object(owner, face_indices)
+        return self.select(kind, self._scene.faces[face_indices], materials)
 
     def select(self, kind: int, faces: Integers, materials: FaceMaterials | None) -> Integers:
         """Select the faces of a kind of surface from faces of an object, (f, 3)."""

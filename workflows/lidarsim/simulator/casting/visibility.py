@@ -58,14 +58,14 @@ def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
     faces = np.flatnonzero(~unseen[scene.face_object])
     instances = scene.instances
     if instances is not None:
-        rows = np.flatnonzero(~unseen[instances.owner])
+        instance_indices = np.flatnonzero(~unseen[instances.owner])
         instances = replace(
             instances,
-            part=instances.part[rows],
-            transforms=instances.transforms[rows],
-            owner=instances.owner[rows],
+            part=instances.part[instance_indices],
+            transforms=instances.transforms[instance_indices],
+            owner=instances.owner[instance_indices],
         )
-        instances = instances if len(rows) else None
+        instances = instances if len(instance_indices) else None
     if not len(faces) and instances is None:
         return None
     return Scene(

@@ -113,7 +113,7 @@ class Grids:
         depth
             (n,): optical depth after which the light meets a leaf.
         """
-        parts = [
+        passages = [
             self._block_through(
                 instances[block],
                 starts[block],
@@ -127,9 +127,9 @@ class Grids:
                 slice(k, k + BLOCK_RAYS) for k in range(0, max(len(depth), 1), BLOCK_RAYS)
             )
         ]
-        if len(parts) == 1:
-            return parts[0]
-        return GridPassage(*map(np.concatenate, zip(*parts, strict=True)))
+        if len(passages) == 1:
+            return passages[0]
+        return GridPassage(*map(np.concatenate, zip(*passages, strict=True)))
 
     def _block_through(
         self,

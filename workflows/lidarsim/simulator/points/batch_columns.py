@@ -22,20 +22,20 @@ def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
         column.name: _joined([returns.column(column) for returns in batches])
         for column in batches[0].survey.stored_columns
     }
-    triangles, hits = batches[0].tally  # counters that are not 0, and their hits
+    triangles, hit_counts = batches[0].tally  # counters that are not 0, and their hits
     if len(batches) > 1:
         all_triangles, counts = map(
             np.concatenate, zip(*(returns.tally for returns in batches), strict=True)
         )
         triangles, row = np.unique(all_triangles, return_inverse=True)
-        hits = np.zeros(len(triangles), np.int64)
-        np.add.at(hits, row, counts)
+        hit_counts = np.zeros(len(triangles), np.int64)
+        np.add.at(hit_counts, row, counts)
     return PartColumns(
         batches[0].specs[0].scan,
         _joined([returns.counts for returns in batches]),
         columns,
         triangles.astype(np.int32),
-        hits,
+        hit_counts,
     )
 
 

@@ -338,7 +338,7 @@ class BatchPoints:
 
     @cached_property
     def _kinds(self) -> Ints32:
-        """Kinds of surfaces, rows of the table of materials."""
+        """Kind of the surface of each return, a row of the table of materials: (n,), or -1."""
         if not self.scene.has_mixed_objects:
             return self.object
         return self._surfaces.kinds(self.pulse_returns.triangle)
@@ -367,9 +367,9 @@ class BatchPoints:
             on_surface &= self.pulse_returns.cause != GHOST
         if surfaces.materials.leafy.any():
             on_surface &= ~surfaces.materials.leafy[self._kinds]
-        rows = np.flatnonzero(on_surface)
-        for begin in range(0, len(rows), BLOCK_HITS):
-            block = rows[begin : begin + BLOCK_HITS]
+        row_indices = np.flatnonzero(on_surface)
+        for begin in range(0, len(row_indices), BLOCK_HITS):
+            block = row_indices[begin : begin + BLOCK_HITS]
             facing = surfaces.normals(
                 triangle[block], self._actor_times_ns[block], self._poses.actor_trajectories
             )
@@ -517,7 +517,10 @@ class BatchPoints:
 
     @property
     def amplitude(self) -> Floats:
-        """Height of the pulse in the waveform, or the energy without waveforms."""
+        """Height of the pulse in the waveform, or `intensity` without waveforms: (n,).
+
+        Both are on the scale of `Surfaces.energy`.
+        """
         return (
             self.intensity if self.pulse_returns.amplitude is None else self.pulse_returns.amplitude
         )

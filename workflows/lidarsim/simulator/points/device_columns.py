@@ -318,11 +318,13 @@ class _ColumnTransfer:
             return
         buffers = self._buffers = self._buffers or self._start(hits.cupy)
         device_arrays = self._compute(hits, buffers)
-        rows = slice(self._count, self._count + len(hits))
-        pairs = [(device_arrays[column], host[rows]) for column, host in buffers.columns.items()]
+        row_range = slice(self._count, self._count + len(hits))
+        pairs = [
+            (device_arrays[column], host[row_range]) for column, host in buffers.columns.items()
+        ]
         hit_arrays = hits.ray, hits.distance, device_arrays[_TRIANGLE]
         pairs += [
-            (array, host[rows]) for array, host in zip(hit_arrays, buffers.hits, strict=False)
+            (array, host[row_range]) for array, host in zip(hit_arrays, buffers.hits, strict=False)
         ]
         buffers.outbox.send(pairs)
         if self._maker.needs_actor_hits:
@@ -360,14 +362,14 @@ class _ColumnTransfer:
             hits.distance[on_actors],
             hits.triangle[on_actors],
         )
-        rows, ray, distance, triangle = (array.get() for array in columns)
+        row_indices, ray, distance, triangle = (array.get() for array in columns)
         triangle += np.int32(self._seen.table[-1, 0])
-        return self._count + rows, ray, distance, triangle
+        return self._count + row_indices, ray, distance, triangle
 
     @property
     def actor_rows(self) -> Ints:
         """Rows of the hits on actors among all hits of the batch."""
-        return np.concatenate([rows for rows, *_ in self._on_actors])
+        return np.concatenate([row_indices for row_indices, *_ in self._on_actors])
 
     def finish(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
         """Wait for the values, and return {column name: values}, and the hits that NumPy needs.

@@ -291,8 +291,8 @@ class CastStep(PulseStep):
         poses = batch.subray_poses
         first, stop = batch.window
         nearest_m = self.setup.sensor.min_range_m
-        rows = 6 if self._needs_origins or poses.actor_trajectories else 3
-        rays = np.empty((rows, stop - first))
+        row_count = 6 if self._needs_origins or poses.actor_trajectories else 3
+        rays = np.empty((row_count, stop - first))
         hits = self.caster.scan(
             batch.beams,
             poses,
@@ -411,10 +411,14 @@ class CastStep(PulseStep):
 
         `triangle`, `distance` (metres) and `colour` are of all hits (n,), with those on leaves.
         """
-        rows = leaves.row_indices
-        leaf_colour = None if colour is None else colour[rows]
+        row_indices = leaves.row_indices
+        leaf_colour = None if colour is None else colour[row_indices]
         return self.surfaces.energy(
-            triangle[rows], leaves.cosines, distance[rows], self._sensor_light, leaf_colour
+            triangle[row_indices],
+            leaves.cosines,
+            distance[row_indices],
+            self._sensor_light,
+            leaf_colour,
         )
 
     def _velocities(
@@ -474,9 +478,12 @@ class CastStep(PulseStep):
         crowns[surface_hits.leaves] = False
         # Optical paths are longer than the rays that were cast.
         in_range = surface_hits.distance <= self.setup.sensor.max_range_m
-        rows = np.flatnonzero(in_range & ~crowns)
+        row_indices = np.flatnonzero(in_range & ~crowns)
         return VisibleHits(
-            hits.take(rows), normals[rows], (transmits | crowns) & in_range, mirrors & in_range
+            hits.take(row_indices),
+            normals[row_indices],
+            (transmits | crowns) & in_range,
+            mirrors & in_range,
         )
 
     # -- light that continues ----------------------------------------------------------------
@@ -495,22 +502,24 @@ class CastStep(PulseStep):
         if not self.setup.has_onward_light:
             return None
         transmitted = np.flatnonzero(visible.transmits)
-        rows = np.concatenate([transmitted, np.flatnonzero(visible.mirrors)])
-        if not len(rows):
+        row_indices = np.concatenate([transmitted, np.flatnonzero(visible.mirrors)])
+        if not len(row_indices):
             return None
-        reflected = np.arange(len(rows)) >= len(transmitted)
-        order = along_rings(light.ray[rows] // subrays_per_beam, self.setup.sensor.channels)
-        rows, reflected, share = self._divide(light, surface_hits, rows[order], reflected[order])
-        onward = light.take(rows)
+        reflected = np.arange(len(row_indices)) >= len(transmitted)
+        order = along_rings(light.ray[row_indices] // subrays_per_beam, self.setup.sensor.channels)
+        row_indices, reflected, share = self._divide(
+            light, surface_hits, row_indices[order], reflected[order]
+        )
+        onward = light.take(row_indices)
         onward.share = share
         crossings = Crossings(
-            step_m=surface_hits.step_m[rows],
-            distance=surface_hits.distance[rows],
-            triangle=surface_hits.triangle[rows],
-            normals=surface_hits.normals.T.take(rows, axis=-1).T,  # twice as fast as by rows
-            cosines=surface_hits.cosines[rows],
+            step_m=surface_hits.step_m[row_indices],
+            distance=surface_hits.distance[row_indices],
+            triangle=surface_hits.triangle[row_indices],
+            normals=surface_hits.normals.T.take(row_indices, axis=-1).T,  # twice as fast as by rows
+            cosines=surface_hits.cosines[row_indices],
             reflected=reflected,
-            velocities=None if light.range_rate is None else surface_hits.velocities[rows],
+            velocities=None if light.range_rate is None else surface_hits.velocities[row_indices],
         )
         return self._cross(onward, crossings)
 
@@ -519,9 +528,12 @@ class CastStep(PulseStep):
     ) -> OnwardRows:
         """Compute the share of light that surfaces transmit or mirror, and drop faint light.
 
-        `row_indices` are rows of the light; `reflected` says which of them are mirrored. Both are
-        overwritten. Light is dropped only if there are mirrors, and if no medium refracts: where
-        light is refracted, its energy may exceed the limit that is computed here.
+        `surface_hits` has a row for each row of `light` (n,). `row_indices` (k,) are the rows whose
+        light goes on. `reflected` (k,) is True for light that is mirrored, and False for light that
+        is transmitted. Both arrays are overwritten.
+
+        Light is dropped only if there are mirrors, and if no medium refracts: where light is
+        refracted, its energy may exceed the limit that is computed here.
         """
         from ..casting import surface_loops  # not before: numba takes half a second to import
 
@@ -570,8 +582,10 @@ class CastStep(PulseStep):
         clock = Clock(light.times, np.zeros(1), actor_trajectories)
         poses = CastPoses(np.zeros(3), clock=clock)
         hits = self.caster.scan(pattern, poses, t_max=self._reach_m)
-        rows = hits.ray
-        cast = CastLight(light.take(rows), start_m[rows], hits.distance, hits.triangle)
+        row_indices = hits.ray
+        cast = CastLight(
+            light.take(row_indices), start_m[row_indices], hits.distance, hits.triangle
+        )
         if self._leafy or max_range_m == np.inf:
             return cast
         in_range = np.flatnonzero(cast.light.optical_end(cast.step_m) <= max_range_m)
@@ -597,13 +611,13 @@ class CastStep(PulseStep):
         have several sub-rays. `rays` are all sub-rays (`_cast_first`); `first_light` is the light
         of the sub-rays that hit a surface.
         """
-        hits = joined([part.hits for part in hits_by_pass])
+        hits = joined([visible.hits for visible in hits_by_pass])
         normals = hits_by_pass[0].normals
         if hits_by_pass[1:]:
             order = np.argsort(hits.ray, kind="stable")
             hits = hits.take(order)
             if batch.subrays_per_beam > 1:
-                normals = np.concatenate([part.normals for part in hits_by_pass])[order]
+                normals = np.concatenate([visible.normals for visible in hits_by_pass])[order]
         batch.hits = hits
         if batch.subrays_per_beam > 1:
             directions = first_light.directions

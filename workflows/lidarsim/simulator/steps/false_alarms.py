@@ -73,18 +73,18 @@ def false_alarms(noise: Noise, gate_s: float, scan: Integers, ray: Integers) -> 
     the threshold: maxima of normally distributed noise of a narrow band have a Rayleigh
     distribution (Rice 1944).
     """
-    rows = np.arange(len(ray))
+    ray_indices = np.arange(len(ray))
     since_s = np.zeros(len(ray))
     alarms: list[FalseAlarms] = []
-    while len(rows) or not alarms:
+    while len(ray_indices) or not alarms:
         number = len(alarms)
         # The time until the next false alarm is exponentially distributed.
-        uniform_numbers = uniform(noise.seed, ALARM, scan[rows], ray[rows], number)
+        uniform_numbers = uniform(noise.seed, ALARM, scan[ray_indices], ray[ray_indices], number)
         in_gate = np.flatnonzero(uniform_numbers > exp(-noise.false_alarm_hz * (gate_s - since_s)))
-        rows = rows[in_gate]
+        ray_indices = ray_indices[in_gate]
         since_s = since_s[in_gate] - log(uniform_numbers[in_gate]) / noise.false_alarm_hz
         since_s = np.minimum(since_s, gate_s)
-        complement = 1 - uniform(noise.seed, PEAK, scan[rows], ray[rows], number)
+        complement = 1 - uniform(noise.seed, PEAK, scan[ray_indices], ray[ray_indices], number)
         peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(complement))
-        alarms.append(FalseAlarms(rows, since_s, noise.threshold * peak))
+        alarms.append(FalseAlarms(ray_indices, since_s, noise.threshold * peak))
     return FalseAlarms(*map(np.concatenate, zip(*alarms, strict=True)))

@@ -8,7 +8,7 @@ from raybeam.compiled import compiled
 
 
 @compiled()
-def remaining(ray, times, spans, firing, channel, rows):
+def remaining(ray, times, spans, firing, channel, row_indices):
     """Write the rows of returns that no fault takes, and return the number of rows.
 
     Rays `ray` (n,), in order, have firing times `times` (n,), nanoseconds. Each of f faults acts in
@@ -27,6 +27,6 @@ def remaining(ray, times, spans, firing, channel, rows):
         for f in range(len(spans)):
             if spans[f, 0] <= times[k] < spans[f, 1]:
                 lost |= firing[f, number] or channel[f, ray[k] - begin]
-        rows[count] = k
+        row_indices[count] = k
         count += int(not lost)
     return count

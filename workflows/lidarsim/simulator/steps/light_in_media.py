@@ -228,20 +228,20 @@ class Media:
         overlapping = ((self._bounds[:, 0] <= upper) & (self._bounds[:, 1] >= lower)).all(axis=1)
         for box_min, box_max in self._bounds[overlapping]:
             in_bounds |= ((rays.origins >= box_min) & (rays.origins <= box_max)).all(axis=1)
-        rows = np.flatnonzero(in_bounds)
-        if not len(rows):
+        ray_indices = np.flatnonzero(in_bounds)
+        if not len(ray_indices):
             return stack
         # Most rays start at the same position and time as the ray before.
-        origins = rays.origins[rows]
-        times = rays.times[rows]
-        first_of_run = np.ones(len(rows), np.bool_)
+        origins = rays.origins[ray_indices]
+        times = rays.times[ray_indices]
+        first_of_run = np.ones(len(ray_indices), np.bool_)
         first_of_run[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
         searched = self._search(
             caster, origins[first_of_run], times[first_of_run], rays.actor_trajectories
         )
         search_rows = np.cumsum(first_of_run) - 1
-        stack.kinds[rows] = searched.kinds[search_rows]
-        stack.triangles[rows] = searched.triangles[search_rows]
+        stack.kinds[ray_indices] = searched.kinds[search_rows]
+        stack.triangles[ray_indices] = searched.triangles[search_rows]
         return stack
 
     def _search(
@@ -258,20 +258,20 @@ class Media:
         surrounding = MediaStack.none(len(origins))
         entered = MediaStack.none(len(origins))
         up = UPWARDS / np.sqrt((UPWARDS**2).sum())
-        rows = np.arange(len(origins))
+        probe_indices = np.arange(len(origins))
         skip_m = caster.clear_m / up[2]
         for _ in range(MAX_PROBES):
-            if not len(rows):
+            if not len(probe_indices):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
             poses = CastPoses(np.zeros(3), clock=Clock(times, np.zeros(1), actor_trajectories))
             hits = caster.scan(light, poses)
-            rows = rows[hits.ray]
+            probe_indices = probe_indices[hits.ray]
             times = times[hits.ray]
             origins = origins[hits.ray] + (hits.distance[:, None] + skip_m) * up
             normals = self._surfaces.normals(hits.triangle, times, actor_trajectories)
             cosines = products(normals.T, up[:, None])
-            self._cross_probes(entered, surrounding, rows, hits.triangle, cosines)
+            self._cross_probes(entered, surrounding, probe_indices, hits.triangle, cosines)
         return surrounding
 
     def _cross_probes(
@@ -295,7 +295,10 @@ class Media:
     def initial_state(
         self, caster: SceneCaster, rays: MediaRays, depths: Floats | None
     ) -> LightInMedia:
-        """Return the state of light at its origin, with optical depths to a leaf `depths` (n,)."""
+        """Return the state of the light of `rays` (n,) at its origin.
+
+        `depths` (n,) are the optical depths at which light meets a leaf; None without leaves.
+        """
         stack = self.stack_at(caster, rays)
         differentials = (
             RayDifferentials.from_directions(rays.directions, self.index(stack))
@@ -431,10 +434,12 @@ class LightInMedia:
             passage = self._pass_grids(starts, directions, length, density)
             density[passage.row_indices] = passage.density
         cumulative = np.cumsum(density, axis=1)
-        rows, metres = self._advance_to_leaves(cumulative[:, -1], length, passage)
-        layer = _crown_layers(draw(CROWN, ray[rows]), cumulative[rows])
-        cosines = self.media.leaf_cosines(self.stack.kinds[rows, layer], upright[rows])
-        return Leaves(rows, metres, self.stack.triangles[rows, layer], cosines)
+        row_indices, metres = self._advance_to_leaves(cumulative[:, -1], length, passage)
+        layer = _crown_layers(draw(CROWN, ray[row_indices]), cumulative[row_indices])
+        cosines = self.media.leaf_cosines(
+            self.stack.kinds[row_indices, layer], upright[row_indices]
+        )
+        return Leaves(row_indices, metres, self.stack.triangles[row_indices, layer], cosines)
 
     def _advance_to_leaves(
         self, density: Floats, length: Floats, passage: LightInGrids | None
@@ -448,14 +453,16 @@ class LightInMedia:
         if passage is not None:
             in_grids = passage.row_indices
             depth[in_grids] = self.remaining_depth[in_grids] - passage.remaining_depth
-        rows = np.flatnonzero(depth > self.remaining_depth)
-        metres = self.remaining_depth[rows] / density[rows]
+        row_indices = np.flatnonzero(depth > self.remaining_depth)
+        metres = self.remaining_depth[row_indices] / density[row_indices]
         if passage is not None:
             metres_in_grids = np.full(len(depth), np.nan)
             metres_in_grids[passage.row_indices] = passage.metres
-            metres = np.where(np.isnan(metres_in_grids[rows]), metres, metres_in_grids[rows])
+            metres = np.where(
+                np.isnan(metres_in_grids[row_indices]), metres, metres_in_grids[row_indices]
+            )
         self.remaining_depth = self.remaining_depth - depth
-        return rows, metres
+        return row_indices, metres
 
     def _pass_grids(
         self, starts: Floats, directions: Floats, length: Floats, density: Floats
@@ -469,28 +476,28 @@ class LightInMedia:
         stack = self.stack
         assert grids is not None and self.remaining_depth is not None
         gridded = self.media.gridded[stack.kinds]
-        rows = np.flatnonzero(gridded.any(axis=1))
-        gridded = gridded[rows]
+        row_indices = np.flatnonzero(gridded.any(axis=1))
+        gridded = gridded[row_indices]
         # Columns of the stack: grids first, as many columns as the most grids around any light.
         grid_layers = np.argsort(~gridded, axis=1, kind="stable")
         grid_layers = grid_layers[:, : gridded.sum(axis=1).max(initial=1)]
         is_grid = np.take_along_axis(gridded, grid_layers, axis=1)
-        triangles = np.take_along_axis(stack.triangles[rows], grid_layers, axis=1)
-        media_density = np.where(gridded, 0, density[rows])
+        triangles = np.take_along_axis(stack.triangles[row_indices], grid_layers, axis=1)
+        media_density = np.where(gridded, 0, density[row_indices])
         metres, remaining_depth, grid_density = grids.through(
             np.where(is_grid, self.media.instances(triangles), -1),
-            starts[rows],
-            directions=directions[rows],
-            projection=np.take_along_axis(density[rows], grid_layers, axis=1),
+            starts[row_indices],
+            directions=directions[row_indices],
+            projection=np.take_along_axis(density[row_indices], grid_layers, axis=1),
             uniform_density=np.cumsum(media_density, axis=1)[:, -1],
-            length=length[rows],
-            depth=self.remaining_depth[rows],
+            length=length[row_indices],
+            depth=self.remaining_depth[row_indices],
         )
         layer_density = np.where(
             is_grid, grid_density, np.take_along_axis(media_density, grid_layers, 1)
         )
         np.put_along_axis(media_density, grid_layers, layer_density, 1)
-        return LightInGrids(rows, metres, remaining_depth, media_density)
+        return LightInGrids(row_indices, metres, remaining_depth, media_density)
 
     def advance(self, step: Floats) -> None:
         """Move the light straight on by steps (n,), metres."""
@@ -596,5 +603,5 @@ def _away_from_zero(cosine: Floats) -> Floats:
 def _first_masked(values: Floats, mask: AnyArray, default: float) -> Floats:
     """Return the first value of each row that is in the mask, or a default: (n,)."""
     column = mask.argmax(axis=1)
-    rows = np.arange(len(values))
-    return np.where(mask[rows, column], values[rows, column], default)
+    row_indices = np.arange(len(values))
+    return np.where(mask[row_indices, column], values[row_indices, column], default)

@@ -90,9 +90,9 @@ class LossStep(PulseStep):
                 lost_channels[row, required(fault.channels)] = True
             else:
                 lost_firings[row] = fault.drops(firings.numbers, seed, spec.station, fault_number)
-        rows = np.empty(len(returns.ray), np.int64)
+        row_indices = np.empty(len(returns.ray), np.int64)
         ray = owned(returns.ray, np.int64)
         count = fault_loops.remaining(
-            ray, firings.times(ray), spans, lost_firings, lost_channels, rows
+            ray, firings.times(ray), spans, lost_firings, lost_channels, row_indices
         )
-        return returns if count == len(rows) else returns.take(rows[:count])
+        return returns if count == len(row_indices) else returns.take(row_indices[:count])

@@ -198,9 +198,9 @@ class WeatherStep(PulseStep):
 
     def _in_refracting_bodies(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Return whether points at distances on rays (n,) are in water or glass: (n,)."""
-        rows = self._refracting(hits)
-        surface_ray = hits.ray[rows]
-        surface_distance = hits.distance[rows]
+        row_indices = self._refracting(hits)
+        surface_ray = hits.ray[row_indices]
+        surface_distance = hits.distance[row_indices]
         first = np.searchsorted(surface_ray, ray, side="left")
         stop = np.searchsorted(surface_ray, ray, side="right")
         count = np.zeros(len(ray), np.int64)
@@ -215,12 +215,12 @@ class WeatherStep(PulseStep):
         Fog ends at `reach`, or where the sub-ray enters water or glass that is thicker than half of
         the pulse's length: panes of glass do not end fog.
         """
-        rows = self._refracting(hits)
-        if not len(rows):
+        row_indices = self._refracting(hits)
+        if not len(row_indices):
             return reach
-        ray = hits.ray[rows]
-        surface_distance = hits.distance[rows]
-        exit_distance = np.full(len(rows), np.inf)
+        ray = hits.ray[row_indices]
+        surface_distance = hits.distance[row_indices]
+        exit_distance = np.full(len(row_indices), np.inf)
         same_ray = ray[1:] == ray[:-1]
         exit_distance[:-1][same_ray] = surface_distance[1:][same_ray]
         enters = (numbers(ray) % 2 == 0) & (
@@ -245,9 +245,9 @@ def light_reach(
     if transmits.any():
         end_distance = np.where(transmits[surfaces.kinds(hits.triangle)], np.inf, end_distance)
     if hits.cause is not None:
-        rows = np.flatnonzero(hits.cause == SURFACE)
-        ray = ray[rows]
-        end_distance = end_distance[rows]
+        row_indices = np.flatnonzero(hits.cause == SURFACE)
+        ray = ray[row_indices]
+        end_distance = end_distance[row_indices]
     reach = np.full(count, np.inf)
     reach[ray] = end_distance  # the last hit of a ray counts
     return reach
@@ -365,16 +365,16 @@ def seen_by_range(
     last = min(detectable[-1] + 1, NODES - 1)
     distance = geomspace(distance[max(detectable[0] - 1, 0)], distance[last], NODES)
     rate = air.rate(kind, min_energy, distance)
-    parts = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
-    sums = np.concatenate([[0.0], np.cumsum(parts)])
+    integrals = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
+    sums = np.concatenate([[0.0], np.cumsum(integrals)])
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
     distance = single(interp(shares, sums / sums[-1], distance))
     smallest = np.minimum(air.smallest(kind, min_energy, distance), kind.largest)
     larger = -expm1(-kind.slope * (kind.largest - smallest))
     full_beam_energy = kind.reflectance * air.white_energy(distance)
     energy_of_1_mm = full_beam_energy / (1000 * air.width(distance)) ** 2
-    rows = [smallest, larger, energy_of_1_mm, full_beam_energy]
-    return float(sums[-1]), np.stack([distance, *(single(row) for row in rows)])
+    quantities = [smallest, larger, energy_of_1_mm, full_beam_energy]
+    return float(sums[-1]), np.stack([distance, *(single(row) for row in quantities)])
 
 
 def _poisson(mean: float) -> Floats:
@@ -411,8 +411,8 @@ def _fog_cells(
     if not len(energy):
         return None
     peaks = highest_probabilities(THRESHOLD_SIGMAS * energy / threshold)
-    rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
-    return FogCells(min_range_m, cell_m, single(energy), rows.reshape(-1))
+    peak_rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
+    return FogCells(min_range_m, cell_m, single(energy), peak_rows.reshape(-1))
 
 
 def highest_probabilities(signals: Floats) -> Floats:

@@ -70,12 +70,12 @@ def scan_row(scan_starts, beam, row):
 
 
 @compiled()
-def thin_out(ray, scan_starts, keep_every, counts, rows, number, returns):
+def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, return_counts):
     """Count the returns of each scan, and write every `keep_every`-th return of a scan.
 
-    Scans begin at rays `scan_starts`; their `counts` are added to. Of kept returns, writes the
-    `rows`, the `number` in the pulse, from 1, and the number of `returns` of the pulse, both at
-    most 255. Returns the number of kept returns.
+    Scans begin at rays `scan_starts`; their `hit_counts` are added to. Of kept returns, writes the
+    `row_indices`, the `number` in the pulse, from 1, and the number of returns of the pulse,
+    `return_counts`, both at most 255. Returns the number of kept returns.
     """
     count = 0
     scan = 0
@@ -87,12 +87,12 @@ def thin_out(ray, scan_starts, keep_every, counts, rows, number, returns):
             scan = scan_row(scan_starts, ray[k], scan)
             while stop < len(ray) and ray[stop] == ray[begin]:
                 stop += 1
-        if keep_every == 1 or counts[scan] % keep_every == 0:
-            rows[count] = k
+        if keep_every == 1 or hit_counts[scan] % keep_every == 0:
+            row_indices[count] = k
             number[count] = min(k + 1 - begin, 255)
-            returns[count] = min(stop - begin, 255)
+            return_counts[count] = min(stop - begin, 255)
             count += 1
-        counts[scan] += 1
+        hit_counts[scan] += 1
     return count
 
 

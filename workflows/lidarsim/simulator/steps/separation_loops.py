@@ -163,19 +163,19 @@ def _end_of_beam(ray, size, row, end_ray):
 
 
 @inlined
-def _single_return(hits, rows, beam, receiver, count, output):
+def _single_return(hits, beam_rows, beam, receiver, count, output):
     """Write the return of a beam if its hits on surfaces are within the receiver's gap.
 
     Returns whether the hits are within the gap, and the number of returns that are written.
     """
     nearest_m = np.inf
     farthest_m = -np.inf
-    strongest = rows.start
+    strongest = beam_rows.start
     has_energy = False
     sum_energy = 0.0
     sum_distance = 0.0
     sum_velocity = 0.0
-    for k in range(rows.start, rows.stop):
+    for k in range(beam_rows.start, beam_rows.stop):
         if hits.energy[k] > 0:
             nearest_m = min(nearest_m, hits.distance[k])
             farthest_m = max(farthest_m, hits.distance[k])
@@ -200,7 +200,7 @@ def _single_return(hits, rows, beam, receiver, count, output):
 
 
 @inlined
-def _collect_hits(hits, air, rows, scratch):
+def _collect_hits(hits, air, beam_rows, scratch):
     """Write the hits of a beam that have energy to `scratch`, in the order of sub-rays.
 
     Hits in the air come first in a sub-ray. Returns the number of hits, and the distance between
@@ -209,14 +209,14 @@ def _collect_hits(hits, air, rows, scratch):
     row = scratch.hits.row
     distance = scratch.hits.distance
     energy = scratch.energy
-    surface_row = rows.start
-    air_row = rows.air_start
+    surface_row = beam_rows.start
+    air_row = beam_rows.air_start
     count = 0
     nearest_m = np.inf
     farthest_m = -np.inf
-    while surface_row < rows.stop or air_row < rows.air_stop:
-        in_air = air_row < rows.air_stop
-        if in_air and (surface_row == rows.stop or air.ray[air_row] <= hits.ray[surface_row]):
+    while surface_row < beam_rows.stop or air_row < beam_rows.air_stop:
+        in_air = air_row < beam_rows.air_stop
+        if in_air and (surface_row == beam_rows.stop or air.ray[air_row] <= hits.ray[surface_row]):
             row[count, 0] = -1 - air_row
             distance[count] = air.distance[air_row]
             energy[count] = air.energy[air_row]
@@ -478,15 +478,17 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, P
         end_ray = (beam + 1) * subrays
         stop = _end_of_beam(hits.ray, hit_count, row, end_ray)
         air_stop = _end_of_beam(air.ray, air_count, air_row, end_ray)
-        rows = _BeamRows(row, stop, air_row, air_stop)
+        beam_rows = _BeamRows(row, stop, air_row, air_stop)
         row = stop
         air_row = air_stop
         begin = count
         single = False
-        if rows.air_start == rows.air_stop:  # mostly, there is one surface, and no hit in the air
-            single, count = _single_return(hits, rows, beam, receiver, count, output)
+        if (
+            beam_rows.air_start == beam_rows.air_stop
+        ):  # mostly, there is one surface, and no hit in the air
+            single, count = _single_return(hits, beam_rows, beam, receiver, count, output)
         if not single:
-            collected, extent_m = _collect_hits(hits, air, rows, scratch)
+            collected, extent_m = _collect_hits(hits, air, beam_rows, scratch)
             exceeds_gap = extent_m > receiver.gap_m
             if exceeds_gap:  # few beams hit an edge or graze a surface
                 _sort_by_distance(scratch.hits, collected)

@@ -205,10 +205,12 @@ class SprayStep(PulseStep):
         first_ns, last_ns = trajectories.presence_ns[actor].T
         # Before a vehicle is in the scene, it is assumed to drive as when it appears.
         pose_ns = np.maximum(created_ns, np.maximum(first_ns, 0.0) + STEP_NS)
-        rows = np.flatnonzero((created_ns <= end_ns) & (pose_ns <= last_ns))
-        created_ns = created_ns[rows]
-        first_ns = first_ns[rows]
-        boxes, speed_m_s = self._boxes_of(trajectories, actor[rows], created_ns, pose_ns[rows])
+        box_indices = np.flatnonzero((created_ns <= end_ns) & (pose_ns <= last_ns))
+        created_ns = created_ns[box_indices]
+        first_ns = first_ns[box_indices]
+        boxes, speed_m_s = self._boxes_of(
+            trajectories, actor[box_indices], created_ns, pose_ns[box_indices]
+        )
         presence_ns = np.stack([np.maximum(created_ns, first_ns), created_ns + LASTS_NS], axis=1)
         fast = np.flatnonzero(speed_m_s >= MIN_SPEED_M_S)
         density = self.setup.survey.wet * np.square(speed_m_s[fast] / FULL_SPEED_M_S)

@@ -254,12 +254,13 @@ class PulseBatch:
 
     @cached_property
     def beams(self) -> Pattern:
-        """Sub-rays of the batch's beams or, without offsets, of all rays of the pattern.
+        """Sub-rays of the batch's beams or, if no beam is deflected, of all rays of the pattern.
 
-        The rows of the batch are in `window`.
+        `window` has the batch's rows in either. A pattern that is not deflected is shared by
+        batches, so it is not cut.
         """
-        rows = np.arange(self.first + self.start, self.first + self.stop)
-        pattern_rows = None if self.offsets is None else rows
+        beam_indices = np.arange(self.first + self.start, self.first + self.stop)
+        pattern_rows = None if self.offsets is None else beam_indices
         return self.emitter.subrays_of(
             self.pattern, self.offsets, pattern_rows, by_head=self.poses.by_head
         )
@@ -287,8 +288,8 @@ class PulseBatch:
 
         The first sub-ray is in the middle of the beam. In the scene frame.
         """
-        rows = np.arange(self.stop - self.start) * self.subrays_per_beam
-        origins, directions = self.subray_poses.rays(self.beams, rows, self.window[0])
+        subray_indices = np.arange(self.stop - self.start) * self.subrays_per_beam
+        origins, directions = self.subray_poses.rays(self.beams, subray_indices, self.window[0])
         return np.broadcast_to(origins, directions.shape), directions
 
 

@@ -122,9 +122,9 @@ class StrayLightStep(PulseStep):
                 triangles = self._triangles(cluster, table)
                 stray_loops.find_stray_light(cells, triangles, limits, chosen, light)
             if rotations is not None:  # back to the scene frame
-                rows = np.flatnonzero(light.new)
-                to_scene = rotations[rows].transpose(0, 2, 1)
-                light.points[rows] = into_axes(light.points[rows], to_scene)
+                row_indices = np.flatnonzero(light.new)
+                to_scene = rotations[row_indices].transpose(0, 2, 1)
+                light.points[row_indices] = into_axes(light.points[row_indices], to_scene)
         return light
 
     def _triangles(self, cluster: _RetroCluster, table: MaterialTable) -> RetroTriangles:
@@ -144,9 +144,11 @@ class StrayLightStep(PulseStep):
         last = np.searchsorted(returns.ray, ray, side="right")
         close = np.zeros(len(ray), np.bool_)
         for number in range(int((last - first).max(initial=0))):
-            rows = np.flatnonzero(first + number < last)
-            return_distance = returns.distance[first[rows] + number]
-            close[rows] |= np.abs(return_distance - distance[rows]) <= self.setup.half_pulse_m
+            row_indices = np.flatnonzero(first + number < last)
+            return_distance = returns.distance[first[row_indices] + number]
+            close[row_indices] |= (
+                np.abs(return_distance - distance[row_indices]) <= self.setup.half_pulse_m
+            )
         return close
 
 
@@ -206,8 +208,8 @@ def _retro_clusters(
 
         Triangles of the faces are numbered from `first` on.
         """
-        rows = np.flatnonzero(retro[surfaces.kinds(first + np.arange(len(faces)))])
-        return _clusters(first + rows, vertices[faces[rows]], actor)
+        face_indices = np.flatnonzero(retro[surfaces.kinds(first + np.arange(len(faces)))])
+        return _clusters(first + face_indices, vertices[faces[face_indices]], actor)
 
     if has_retro[: len(scene.names)].any():
         yield from clusters_of(scene.faces, scene.vertices, 0)
@@ -236,5 +238,5 @@ def _clusters(
     cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)
     cluster = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
     for number in range(int(cluster.max()) + 1):
-        rows = np.flatnonzero(cluster == number)
-        yield _RetroCluster(triangles[rows].astype(np.int32), corners[rows], actor)
+        row_indices = np.flatnonzero(cluster == number)
+        yield _RetroCluster(triangles[row_indices].astype(np.int32), corners[row_indices], actor)

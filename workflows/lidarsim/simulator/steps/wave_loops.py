@@ -570,15 +570,17 @@ def _has_several_surfaces(starts_surface, first, end):
 
 
 @compiled()
-def divide_into_waveforms(hits, sigma_m, neighbours, parts):
+def divide_into_waveforms(hits, sigma_m, neighbours, hit_ranges):
     """Mark where waveforms start, write the waveforms to search, and return their number.
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
     the Gaussian of the hit before. A waveform is searched if its hits are farther apart than
-    `NARROW`, and not on one surface. `hits` are `WaveHits`, whose marks `starts`, `starts_surface`
-    and `searched` are written. `sigma_m` is the standard deviation of the system waveform in range,
-    and `neighbours` are `pulse_loops.Neighbours`. `parts` (k, 2) receives the first hit, and the
-    hit after the last, of each waveform to search.
+    `NARROW` standard deviations, and not on one surface.
+
+    `hits` are `WaveHits`, whose marks `starts`, `starts_surface` and `searched` are written.
+    `sigma_m` is the standard deviation of the system waveform in range, metres, and `neighbours`
+    are `pulse_loops.Neighbours`. `hit_ranges` (k, 2) receives the first hit, and the hit after the
+    last, of each waveform to search.
     """
     beam = hits.beam
     distance = hits.pulses.distance
@@ -590,7 +592,7 @@ def divide_into_waveforms(hits, sigma_m, neighbours, parts):
     begin = 0
     while begin < len(beam):
         end = _end_of_beam(beam, begin)
-        first_part = count
+        first_waveform = count
         first = begin
         for k in range(begin, end):
             starts[k] = k == begin or distance[k] - distance[k - 1] > 2 * CUT * sigma_m
@@ -600,20 +602,22 @@ def divide_into_waveforms(hits, sigma_m, neighbours, parts):
             if k < end and not starts[k]:
                 continue
             if distance[k - 1] - distance[first] > NARROW * sigma_m:
-                parts[count, 0] = first
-                parts[count, 1] = k
+                hit_ranges[count, 0] = first
+                hit_ranges[count, 1] = k
                 count += 1
                 for hit in range(first, k):
                     searched[hit] = hits.marks.solid[hit]
             first = k
-        if count > first_part and len(neighbours.pairs):
+        if count > first_waveform and len(neighbours.pairs):
             continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
-        last_part = count
-        count = first_part
-        for part in range(first_part, last_part):
-            if _has_several_surfaces(starts_surface, parts[part, 0], parts[part, 1]):
-                parts[count, 0] = parts[part, 0]
-                parts[count, 1] = parts[part, 1]
+        stop_waveform = count
+        count = first_waveform
+        for waveform in range(first_waveform, stop_waveform):
+            if _has_several_surfaces(
+                starts_surface, hit_ranges[waveform, 0], hit_ranges[waveform, 1]
+            ):
+                hit_ranges[count, 0] = hit_ranges[waveform, 0]
+                hit_ranges[count, 1] = hit_ranges[waveform, 1]
                 count += 1
         begin = end
     return count
@@ -661,7 +665,7 @@ def _peak_of_hit(time, wave, stops, count):
 def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
     """Sample waveforms, and write the peak that each of their hits belongs to.
 
-    Waveform k has the hits `parts[k, 0]` to `parts[k, 1]` of `light`, a `WaveLight`.
+    Waveform k has the hits `hit_ranges[k, 0]` to `hit_ranges[k, 1]` of `light`, a `WaveLight`.
     `sampling` is a `WaveSampling`, and `scratch` a `SearchScratch`. Writes `peaks`, `WavePeaks`,
     and marks in `starts` (n,) the first hits of peaks.
     """
@@ -669,9 +673,9 @@ def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
     time = light.time
     first_number = 0
     pulse_samples = np.int64(2 * CUT * sigma) + 1
-    for part in range(len(hit_ranges)):
-        begin = hit_ranges[part, 0]
-        stop = hit_ranges[part, 1]
+    for waveform in range(len(hit_ranges)):
+        begin = hit_ranges[waveform, 0]
+        stop = hit_ranges[waveform, 1]
         first = np.int64(math.ceil(time[begin] - CUT * sigma)) - 1
         last_first = np.int64(math.ceil(time[stop - 1] - CUT * sigma))
         length = last_first + pulse_samples - first + 1

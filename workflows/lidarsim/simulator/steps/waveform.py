@@ -118,10 +118,12 @@ def returns_in(
     wave_hits = _wave_hits(hits, subrays)
     count = len(wave_hits.beam)
     neighbours = neighbours_of(subrays, planes)
-    parts = np.empty((count, 2), np.int64)
-    part_count = wave_loops.divide_into_waveforms(wave_hits, digitizer.sigma_m, neighbours, parts)
-    parts = parts[:part_count]
-    peaks = _search(wave_hits, digitizer, subrays, parts)
+    hit_ranges = np.empty((count, 2), np.int64)
+    range_count = wave_loops.divide_into_waveforms(
+        wave_hits, digitizer.sigma_m, neighbours, hit_ranges
+    )
+    hit_ranges = hit_ranges[:range_count]
+    peaks = _search(wave_hits, digitizer, subrays, hit_ranges)
     output = wave_loops.WaveReturnArrays(
         beam=np.empty(count, np.int64),
         row=np.empty(count, np.int64),

@@ -76,9 +76,9 @@ class RecordingStep(PulseStep):
             samples = _signal_samples(batch, digitizer, block, count)
             steps, exponents = digitised(self._received(samples, block, batch))
             first, stop = np.searchsorted(window_of_return, [start, start + size])
-            rows = window_of_return[first:stop] - start
-            records["samples"][first:stop] = steps[rows]
-            records["exponent"][first:stop] = exponents[rows]
+            window_indices = window_of_return[first:stop] - start
+            records["samples"][first:stop] = steps[window_indices]
+            records["exponent"][first:stop] = exponents[window_indices]
         return returns._replace(waveform=records)
 
     def _received(self, samples: Floats, windows: Windows, batch: PulseBatch) -> Floats:
@@ -105,9 +105,11 @@ def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, 
     last = np.ceil(time).astype(np.int64) + digitizer.reach
     begin = first.copy()
     for number in range(1, int(return_number.max(initial=0)) + 1):
-        rows = np.flatnonzero(return_number == number)
-        shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
-        begin[rows] = np.where(shared, begin[rows - 1], first[rows])
+        row_indices = np.flatnonzero(return_number == number)
+        shared = (last[row_indices] < begin[row_indices - 1] + count) & (
+            first[row_indices] >= begin[row_indices - 1]
+        )
+        begin[row_indices] = np.where(shared, begin[row_indices - 1], first[row_indices])
     return begin
 
 
@@ -134,12 +136,12 @@ def _signal_samples(
     hit_counts = windows.stop_hit - windows.first_hit
     window = np.repeat(np.arange(len(hit_counts)), hit_counts)
     first_rows = windows.first_hit - np.cumsum(hit_counts) + hit_counts
-    rows = np.arange(len(window)) + np.repeat(first_rows, hit_counts)
-    time = hits.distance[rows] * digitizer.samples_per_m
+    row_indices = np.arange(len(window)) + np.repeat(first_rows, hit_counts)
+    time = hits.distance[row_indices] * digitizer.samples_per_m
     first = np.ceil(time - CUT * digitizer.sigma).astype(np.int64)  # first sample above 0
     sample_times = first[:, None] + np.arange(int(2 * CUT * digitizer.sigma) + 1)
     height = exp(-0.5 * ((sample_times - time[:, None]) / digitizer.sigma) ** 2)
-    height *= required(hits.energy)[rows, None] / batch.subrays_per_beam
+    height *= required(hits.energy)[row_indices, None] / batch.subrays_per_beam
     sample = sample_times - windows.begin[window, None]
     inside = (sample >= 0) & (sample < count)
     sample += count * window[:, None]
