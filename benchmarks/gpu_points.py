@@ -220,9 +220,9 @@ def _written(session: Session, rig: Rig, storage: Storage, threads: int) -> dict
 
     def write(part: PartColumns, name: str) -> None:
         try:
-            data = pack(part)
-            storage.write(name, data)
-            sizes.append(len(data))
+            pieces = pack(part)
+            storage.write(name, pieces)
+            sizes.append(sum(map(len, pieces)))
         finally:
             room.release()
 

@@ -29,7 +29,7 @@ def commit(store, first, counts, triangles, hits, job=None, offset=0):
     triangles = np.int32(triangles)
     hits = np.int64(hits)
     part = PartColumns(first, counts, columns, triangles, hits, of_scans, ends)
-    data = bytes(pack(part))
+    data = b"".join(pack(part))
     name = part_name(store.db.meta["mark"], job.number, first, part.stop)
     store.storage.prepare()
     store.storage.write(name, data)

@@ -48,9 +48,9 @@ def part_of(first, counts, seed=0, columns=COLUMNS):
 @given(st.integers(0, 10**6), st.lists(st.integers(0, 7), min_size=1, max_size=6))
 def test_what_is_packed_comes_back(first, counts):
     part = part_of(first, counts)
-    data = bytes(pack(part))
+    data = b"".join(pack(part))
     again = unpack(data)
-    assert pack(again) == data
+    assert b"".join(pack(again)) == data
     assert (again.first, again.stop) == (first, first + len(counts))
     scans = again.scan_column()
     assert scans.dtype == np.int32
@@ -67,7 +67,7 @@ SMALL = part_of(3, [1, 2], columns=COLUMNS[:4])
 
 @pytest.mark.extended
 def test_damage_at_any_place_is_noticed_or_changes_nothing():
-    data = bytes(pack(SMALL))
+    data = b"".join(pack(SMALL))
     noticed = 0
     for place in range(len(data)):
         # Each bit somewhere, and digits of the headers of arrays become others.
@@ -75,7 +75,7 @@ def test_damage_at_any_place_is_noticed_or_changes_nothing():
         damaged = bytearray(data)
         damaged[place] ^= flip
         try:
-            assert pack(unpack(bytes(damaged))) == data, (place, flip)
+            assert b"".join(pack(unpack(bytes(damaged)))) == data, (place, flip)
         except LidarError as error:
             noticed += 1
             assert str(error).startswith("it is damaged (")
@@ -83,7 +83,7 @@ def test_damage_at_any_place_is_noticed_or_changes_nothing():
 
 
 def test_a_cut_part_is_noticed_wherever_it_was_cut():
-    data = bytes(pack(SMALL))
+    data = b"".join(pack(SMALL))
     for length in range(len(data)):
         with pytest.raises(LidarError, match="it is damaged"):
             unpack(data[:length])
@@ -109,7 +109,7 @@ def test_a_cut_part_is_noticed_wherever_it_was_cut():
     ids=str,
 )
 def test_arrays_that_do_not_fit_together(arrays):
-    with np.load(io.BytesIO(pack(SMALL))) as archive:
+    with np.load(io.BytesIO(b"".join(pack(SMALL)))) as archive:
         content = {name: archive[name] for name in archive.files} | arrays
     memory = io.BytesIO()
     np.savez(memory, **{name: array for name, array in content.items() if array is not None})
@@ -132,7 +132,7 @@ def storage(request, tmp_path):
 def test_a_part_that_cannot_be_read_is_named(storage, read):
     with pytest.raises(LidarError, match=r"The part .*none\.npz cannot be"):
         read(storage, "none.npz")
-    storage.write("cut.npz", bytes(pack(SMALL))[:-30])
+    storage.write("cut.npz", b"".join(pack(SMALL))[:-30])
     with pytest.raises(LidarError, match=r"The part .*cut\.npz cannot be used.*Resuming .* casts"):
         read(storage, "cut.npz")
 

@@ -8,6 +8,7 @@ import pytest
 from benchmarks import (
     beside_dask,
     control,
+    dataplane,
     decoders,
     effects,
     formats,
@@ -101,6 +102,21 @@ def test_the_picture_of_jobs(tmp_path):
 def test_bytes_of_batches(capsys):
     control.count_batches(5)
     assert "a further batch of one scan adds" in capsys.readouterr().out
+
+
+def test_dataplane(tmp_path, capsys):
+    path = tmp_path / "rounds.json"
+    figures = dataplane.main(["--quick", "--folder", str(tmp_path), "--json", str(path)])
+    (measured_round,) = json.loads(path.read_text())
+    assert measured_round == figures
+    points = dataplane.QUICK.scans * dataplane.QUICK.rays_per_scan
+    assert figures["points"] == points, "of replayed columns"
+    assert 26 < figures["sent"] < 60, "x, y, z, channel, object, range, intensity"
+    assert figures["processes"].keys() == {"driver", "casting", "collectors"}
+    assert figures["processes"]["collectors"]["written"] > 26, "parts"
+    assert figures["processes"]["driver"]["written"] > 26, "the cloud"
+    assert {path.name for path in tmp_path.iterdir()} == {"rounds.json"}
+    assert "processor time a point" in capsys.readouterr().out
 
 
 def test_effects(capsys):

@@ -9,7 +9,6 @@ multiples of the precision from the scene's local origin, so that they are round
 
 from __future__ import annotations
 
-import io
 import re
 import zipfile
 from bisect import bisect_right
@@ -20,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from lidarsim.base.archives import read_arrays, read_npy
+from lidarsim.base.archives import Piece, read_arrays, read_npy, stored_pieces
 from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Integers, Ints, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
@@ -35,7 +34,6 @@ from lidarsim.columns.waveforms import WAVEFORM
 _PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)
 _OTHER = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8})", re.ASCII)
 _AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans again."
-_DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
 
 # A run deletes only files that it wrote: their names begin with its mark, 16 random digits, and a
@@ -88,34 +86,26 @@ def _mark_of(name: str) -> str:
     return match[1] if match else ""
 
 
-def pack(part: PartColumns) -> bytearray:
-    """Encode a part: the same content gives the same bytes."""
-    arrays = {
-        ".scans": np.array([part.first, part.stop], np.int64),
-        ".counts": part.counts,
-        ".triangles": part.triangles,
-        ".hits": part.hits,
-        ".scan_hits": part.scan_hits,
-        ".samples": part.samples,
-        **part.columns,
-    }
-    memory = io.BytesIO()
-    # NumPy's savez stores the time of each file, and copies the content once more.
-    with zipfile.ZipFile(memory, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-        for name, array in arrays.items():
-            head = io.BytesIO()
-            array = np.ascontiguousarray(array)
-            np.lib.format.write_array_header_1_0(
-                head, np.lib.format.header_data_from_array_1_0(array)
-            )
-            with archive.open(zipfile.ZipInfo(f"{name}.npy", _DATE), "w", force_zip64=True) as file:
-                file.write(head.getbuffer())
-                file.write(array.data.cast("B") if array.size else b"")
-    return memory.getbuffer()  # type: ignore[return-value]
+def pack(part: PartColumns) -> list[Piece]:
+    """Encode a part, in pieces for `Storage.write`: the same content gives the same bytes.
+
+    Columns are not copied; the pieces are views of the columns.
+    """
+    return stored_pieces(
+        {
+            ".scans": np.array([part.first, part.stop], np.int64),
+            ".counts": part.counts,
+            ".triangles": part.triangles,
+            ".hits": part.hits,
+            ".scan_hits": part.scan_hits,
+            ".samples": part.samples,
+            **part.columns,
+        }
+    )
 
 
 def unpack(data: bytes) -> PartColumns:
-    """Inverse of `pack`, which compares the checksum of every array.
+    """Decode the bytes of a part, and compare the checksum of every array.
 
     LidarError if the data is not a part, or damaged; the message is a clause.
     """

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 import math
 import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,25 @@ _HEADER = re.compile(
     rb"\{'descr': '([<>|][a-zUV]\d+)', 'fortran_order': (False|True), "
     rb"'shape': \(((?:\d+, ?)*\d*)\), \} *\n"
 )
+# Records of an archive: the header of a file, a file in the directory, sizes in 64 bits, the end of
+# the directory, and the same in 64 bits with its place (PKWARE's APPNOTE.TXT, 4.3.7 to 4.5.3).
+_FILE = struct.Struct("<4s5HIIIHH")
+_ENTRY = struct.Struct("<4s6HIII5HII")
+_SIZES = struct.Struct("<HHQQ")
+_END = struct.Struct("<4s4HIIH")
+_LARGE_END = struct.Struct("<4sQHHIIQQQQ")
+_LARGE_END_PLACE = struct.Struct("<4sIQI")
+_MAX_SIZE = (1 << 31) - 1  # larger numbers need 64 bits, as zipfile has it
+_IN_64_BITS = 0xFFFFFFFF  # in place of a number that is stored in 64 bits
+_VERSION = 45  # of the format with numbers of 64 bits
+_UNIX = 3 << 8  # system whose permissions the directory has
+_PERMISSIONS = 0o600 << 16
+_UTF8 = 0x800  # flag of a file's name
+_DATE = 1 << 5 | 1  # 1980-01-01: the same arrays give the same bytes
 _ADVICE = "get it again, or read it on a machine with more memory"
+
+
+Piece = bytes | memoryview  # of a file that is written in pieces
 
 
 def packed(arrays: Mapping[str, Any]) -> bytes:
@@ -33,6 +52,88 @@ def packed(arrays: Mapping[str, Any]) -> bytes:
     memory = io.BytesIO()  # NumPy leaves a file open if writing fails
     np.savez_compressed(memory, **arrays)
     return memory.getvalue()
+
+
+class _StoredFile(NamedTuple):
+    """A file in an archive, without compression."""
+
+    name: bytes
+    flags: int
+    crc: int
+    size: int  # bytes
+    offset: int  # of its header in the archive, bytes
+
+    @property
+    def header(self) -> bytes:
+        """Header before the content, with sizes in 64 bits."""
+        named = (len(self.name), _SIZES.size)
+        numbers = (_VERSION, self.flags, zipfile.ZIP_STORED, 0, _DATE, self.crc)
+        fixed = _FILE.pack(b"PK\3\4", *numbers, _IN_64_BITS, _IN_64_BITS, *named)
+        return fixed + self.name + _SIZES.pack(1, _SIZES.size - 4, self.size, self.size)
+
+    @property
+    def entry(self) -> bytes:
+        """Entry in the directory, with 64 bits for numbers that need them."""
+        large: list[int] = []
+        size = self.size
+        offset = self.offset
+        if size > _MAX_SIZE:
+            large += [size, size]
+            size = _IN_64_BITS
+        if offset > _MAX_SIZE:
+            large.append(offset)
+            offset = _IN_64_BITS
+        extra = struct.pack(f"<HH{len(large)}Q", 1, 8 * len(large), *large) if large else b""
+        versions = (_UNIX | _VERSION, _VERSION)
+        numbers = (*versions, self.flags, zipfile.ZIP_STORED, 0, _DATE, self.crc, size, size)
+        named = (len(self.name), len(extra), 0)
+        return _ENTRY.pack(b"PK\1\2", *numbers, *named, 0, 0, _PERMISSIONS, offset) + (
+            self.name + extra
+        )
+
+
+def stored_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
+    """Return the pieces of an archive of arrays without compression.
+
+    The bytes of a contiguous array are not copied: its piece is a view, to be written before the
+    array changes. The same arrays give the same bytes, which are zipfile's. zipfile itself would
+    copy each array into a file in memory, whose growth copies its content again.
+    """
+    pieces: list[Piece] = []
+    files: list[_StoredFile] = []
+    offset = 0
+    for name, array in arrays.items():
+        array = np.ascontiguousarray(array)
+        content = array.reshape(-1).view(np.uint8).data
+        head = _npy_head(array)
+        crc = zlib.crc32(content, zlib.crc32(head))  # other threads run meanwhile
+        flags = 0 if name.isascii() else _UTF8
+        size = len(head) + len(content)
+        file = _StoredFile(f"{name}.npy".encode(), flags, crc, size, offset)
+        header = file.header
+        pieces += [header + head, content]
+        files.append(file)
+        offset += len(header) + size
+    directory = b"".join(file.entry for file in files)
+    return [*pieces, directory + _directory_end(len(files), len(directory), offset)]
+
+
+def _npy_head(array: AnyArray) -> bytes:
+    """Return the head of a file of NumPy, before the elements."""
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, np.lib.format.header_data_from_array_1_0(array))
+    return head.getvalue()
+
+
+def _directory_end(count: int, size: int, offset: int) -> bytes:
+    """Return the end of an archive, after a directory of files: its size and offset in bytes."""
+    end = b""
+    if max(size, offset) > _MAX_SIZE:
+        numbers = (_LARGE_END.size - 12, _VERSION, _VERSION, 0, 0, count, count, size, offset)
+        end = _LARGE_END.pack(b"PK\6\6", *numbers)
+        end += _LARGE_END_PLACE.pack(b"PK\6\7", 0, offset + size, 1)
+    shown = (min(size, _IN_64_BITS), min(offset, _IN_64_BITS))
+    return end + _END.pack(b"PK\5\6", 0, 0, count, count, *shown, 0)
 
 
 @contextmanager

@@ -198,14 +198,14 @@ class Storage:
             ) from error
 
     def write(self, name: str, content: Any) -> None:
-        """Write bytes, or a list of bytes, completely or not at all, and flush if durable."""
+        """Write bytes, or a list of pieces, completely or not at all, and flush if durable."""
         pieces = content if isinstance(content, list) else [content]
         if self.is_local:
             with self._replacing(self._target(name)) as file:
                 file.writelines(pieces)
             return
         with self._remote() as (system, folder):
-            system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
+            system.pipe_file(f"{folder}/{name}", b"".join(pieces))
 
     @contextmanager
     def writing(self, name: str) -> Iterator[IO[bytes]]:

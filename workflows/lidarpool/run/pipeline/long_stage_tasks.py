@@ -223,14 +223,15 @@ def _write_parts(
         start.trace("get", scans)
         try:
             with naming_scans(first, stop):
-                data = pack(batch.part)
-                receipt = Receipt.from_part(batch.part, job, name, len(data), batch.record)
+                pieces = pack(batch.part)
+                size = sum(map(len, pieces))
+                receipt = Receipt.from_part(batch.part, job, name, size, batch.record)
             start.trace("part", scans)
             if storage is None:
-                yield replace(receipt, held_at=hold_for_driver(name, data))
+                yield replace(receipt, held_at=hold_for_driver(name, b"".join(pieces)))
                 continue
             with storing(storage):
-                storage.write(name, data)
+                storage.write(name, pieces)
             start.trace("stored", scans)
             yield receipt
         except ScanError as error:

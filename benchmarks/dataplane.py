@@ -1,0 +1,435 @@
+"""From casting to the cloud, without casting: `python -m benchmarks.dataplane [--points 16e6]`.
+
+The real pipeline on a cluster that is started as by every run, in processes of this machine: the
+casting workers return columns that are in their memory already, and all else is the product's own,
+up to cloud.ply and report.json. In each round the bytes of the parts and of the cloud are also
+written plainly, file by file as large and flushed as often as the run's, twice after the run;
+copied in memory once; and packed and written by one thread, as a collector does.
+
+The first run, which is small, imports what each process needs, and is not measured. Processor times
+are of whole processes; the scheduler is in the driver's. Bytes are what system calls read and wrote
+in files, and what casting workers sent to collectors. --folder /dev/shm keeps all files in memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import statistics
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import psutil
+from distributed import Client
+
+from lidarpool import Scene, Sensor, Survey
+from lidarpool.columns.parts import pack
+from lidarpool.report.output import CLOUD, SurveyOutput
+from lidarpool.run.cluster.checks import slots_needed
+from lidarpool.run.cluster.cluster import local_client
+from lidarpool.run.job_source import OneJob
+from lidarpool.run.options import RunOptions
+from lidarpool.run.pipeline import rigs
+from lidarpool.run.pipeline.stage_messages import Receipt
+from lidarpool.run.pipeline.stage_names import GPU, INTERSECT, LIDAR
+from lidarpool.run.pipeline.task_records import Recorder
+from lidarpool.run.progress import Screen
+from lidarpool.run.run_page import RunPage
+from lidarpool.run.runner import Run
+from lidarpool.run.store.run_store import RUN_FOLDER
+from lidarpool.scenario.build import Job
+from lidarpool.scenario.sections import TaskOptions
+from lidarsim.base.storage import Storage
+from lidarsim.columns.part_columns import PartColumns
+from lidarsim.scene.actors import box
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.rig import Rig
+from poolpart.workers import worker_identities
+
+HALL = Scene.from_meshes([box("Hall", (160, 120, 30))])  # all rays hit
+_PIECE_BYTES = 1 << 25  # written at a time to the cloud, and copied at a time
+_BESIDE = {
+    "plain": "writing the same bytes",
+    "copy": "copying them in memory once",
+    "pack": "a thread packs parts",
+    "pack_and_write": "a thread packs and writes parts",
+}
+_PROCESSES = {GPU: "casting", LIDAR: "collectors"}
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a measurement."""
+
+    points: int = 16_000_000
+    rays_per_scan: int = 131_072
+    collectors: int = 2
+    casting: int = 1
+    rounds: int = 3
+
+    @property
+    def scans(self) -> int:
+        """Number of scans, at least 2."""
+        return max(2, round(self.points / self.rays_per_scan))
+
+
+QUICK = Sizes(points=16_000, rays_per_scan=1_024, rounds=1)
+
+
+def still_survey(sizes: Sizes, scans: int) -> Survey:
+    """Return a survey of revolutions of the hall, with range and intensity."""
+    layers = 64 if sizes.rays_per_scan >= 1 << 16 else 8
+    sensor = Sensor.grid(
+        rays_per_revolution=sizes.rays_per_scan // layers, layers=layers, step_deg=360
+    )
+    poses = [(0.0, 0.0, 1.0)] * scans
+    return Survey(sensor, poses, steps=1, columns=["range", "intensity"])
+
+
+# -- the casting stage that replays columns ------------------------------------------------------
+
+
+def replay_casting(dask_worker: Any) -> None:
+    """Let a casting worker return columns that it has in memory.
+
+    Only the first scan of a run is cast. The columns of several scans repeat its columns, and
+    batches are views of these.
+    """
+    dask_worker.transfer_outgoing_log = deque()  # of all transfers, not only of the last
+    cast_batch = rigs.cast_batch
+    prepared: dict[str, list[PartColumns]] = {}  # {handle of a rig: one scan, and more scans}
+
+    def replay(rig: Rig, work: rigs.CastWork, first: int, stop: int) -> rigs.CastBatch:
+        recorder = Recorder(INTERSECT, GPU)
+        scans = stop - first
+        if work.handle not in prepared:
+            prepared.clear()
+            prepared[work.handle] = [cast_batch(rig, work, 0, 1).part]
+        parts = prepared[work.handle]
+        if len(parts[-1].counts) < scans:
+            parts[1:] = [repeated(parts[0], scans)]
+        part = first_scans(parts[-1], first, scans)
+        return rigs.CastBatch(work.job, part, recorder.finish(scans))
+
+    rigs.cast_batch = replay
+
+
+def repeated(part: PartColumns, scans: int) -> PartColumns:
+    """Return a part of one scan that is repeated."""
+    return replace(
+        part,
+        counts=np.tile(part.counts, scans),
+        columns={name: np.tile(values, scans) for name, values in part.columns.items()},
+        scan_hits=np.tile(part.scan_hits, scans),
+        samples=np.tile(part.samples, (scans, 1, 1)),
+    )
+
+
+def first_scans(part: PartColumns, first: int, scans: int) -> PartColumns:
+    """Return the first scans of a part, numbered from `first`, without copying columns."""
+    rows = int(part.counts[:scans].sum())
+    return replace(
+        part,
+        first=first,
+        counts=part.counts[:scans],
+        columns={name: values[:rows] for name, values in part.columns.items()},
+        scan_hits=part.scan_hits[:scans],
+        samples=part.samples[:scans],
+    )
+
+
+# -- the run --------------------------------------------------------------------------------------
+
+
+class CountedOutput(SurveyOutput):
+    """The result of a survey, which notes the sizes of the parts."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.part_sizes: list[int] = []  # bytes of each committed part
+
+    def on_parts(self, parts: Sequence[Receipt]) -> None:
+        """Note the sizes of committed parts, and append the parts to the cloud."""
+        self.part_sizes += [part.size for part in parts]
+        super().on_parts(parts)
+
+
+@dataclass(frozen=True)
+class Usage:
+    """Sums over the processes of a kind."""
+
+    cpu_s: float  # processor time
+    read: int  # bytes that were read from files
+    written: int  # bytes that were written to files
+    peak_mb: float  # most memory so far
+
+    @classmethod
+    def of(cls, processes: Sequence[psutil.Process]) -> Usage:
+        """Read the usage of processes."""
+        times = [process.cpu_times() for process in processes]
+        counters = [process.io_counters() for process in processes]
+        return cls(
+            sum(t.user + t.system for t in times),
+            sum(c.read_chars for c in counters),
+            sum(c.write_chars for c in counters),
+            sum(_peak_bytes(process.pid) for process in processes) / 1e6,
+        )
+
+
+def _peak_bytes(pid: int) -> int:
+    lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmHWM"))
+
+
+def sent_bytes(dask_worker: Any) -> int:
+    """Return the bytes that a worker has sent with results."""
+    return sum(transfer["compressed"] for transfer in dask_worker.transfer_outgoing_log)
+
+
+class Cluster:
+    """A cluster of this machine whose casting workers replay columns."""
+
+    def __init__(self, client: Client, sizes: Sizes) -> None:
+        self._client = client
+        self._sizes = sizes
+        pids = client.run(os.getpid)
+        self._casting: list[str] = []  # addresses
+        self._processes = {"driver": [psutil.Process()]}
+        for address, worker in worker_identities(client).items():
+            (partition,) = worker["resources"]
+            process = psutil.Process(pids[address])
+            self._processes.setdefault(_PROCESSES[partition], []).append(process)
+            if partition == GPU:
+                self._casting.append(address)
+        client.run(replay_casting, workers=self._casting)
+
+    def usage(self) -> dict[str, Usage]:
+        """Return the usage of each kind of process."""
+        return {name: Usage.of(processes) for name, processes in self._processes.items()}
+
+    def sent(self) -> int:
+        """Return the bytes that casting workers have sent so far."""
+        return sum(self._client.run(sent_bytes, workers=self._casting).values())
+
+    def run(self, folder: Path, scans: int) -> tuple[int, float, CountedOutput]:
+        """Run a survey into a folder; return its points, the seconds until stage 4 has ended."""
+        survey = still_survey(self._sizes, scans)
+        output = CountedOutput(folder, survey, (), "cloud")
+        options = RunOptions(
+            client=self._client,
+            out=folder,
+            folder=folder / RUN_FOLDER,
+            collectors=self._sizes.collectors,
+        )
+        jobs = OneJob(Job(HALL, survey, None))
+        screen = Screen(lambda _: None)
+        result, _ = Run(jobs, options, output, screen, RunPage()).execute()
+        return len(result.points), result.survey_seconds, output
+
+
+@contextmanager
+def replaying_cluster(sizes: Sizes) -> Iterator[Cluster]:
+    """Start a cluster, run a small survey that imports what its processes need, and yield it."""
+    slots = slots_needed(TaskOptions(collectors=sizes.collectors), planning=False)
+    with (
+        local_client(slots, gpu_workers=sizes.casting) as client,
+        tempfile.TemporaryDirectory() as folder,
+    ):
+        cluster = Cluster(client, sizes)
+        cluster.run(Path(folder) / "first", min(sizes.scans, 20))
+        yield cluster
+
+
+def measure_run(cluster: Cluster, sizes: Sizes, folder: Path) -> tuple[dict[str, Any], list[int]]:
+    """Run a survey; return its figures, and the sizes of its files: the parts, and the cloud."""
+    before = cluster.usage()
+    sent = cluster.sent()
+    start = time.perf_counter()
+    points, survey_s, output = cluster.run(folder, sizes.scans)
+    wall_s = time.perf_counter() - start
+    after = cluster.usage()
+    processes = {
+        name: {
+            "ns": 1e9 * (usage.cpu_s - before[name].cpu_s) / points,
+            "read": (usage.read - before[name].read) / points,
+            "written": (usage.written - before[name].written) / points,
+            "peak_mb": usage.peak_mb,
+        }
+        for name, usage in after.items()
+    }
+    figures = {
+        "points": points,
+        "wall_s": wall_s,
+        "mpoints_s": points / wall_s / 1e6,
+        "survey_mpoints_s": points / survey_s / 1e6,
+        "sent": (cluster.sent() - sent) / points,
+        "ns": sum(process["ns"] for process in processes.values()),
+        "processes": processes,
+    }
+    return figures, [*output.part_sizes, (folder / CLOUD).stat().st_size]
+
+
+# -- beside it ------------------------------------------------------------------------------------
+
+
+class Spent(NamedTuple):
+    """Time that calls have taken."""
+
+    wall_s: float
+    cpu_s: float  # processor time of the thread
+
+
+def spent_in(call: Callable[[], object], count: int = 1) -> Spent:
+    """Return the time that calls of a function take in this thread."""
+    start_s = time.perf_counter()
+    start_cpu_s = time.thread_time()
+    for _ in range(count):
+        call()
+    return Spent(time.perf_counter() - start_s, time.thread_time() - start_cpu_s)
+
+
+def write_plainly(folder: Path, sizes: Sequence[int]) -> Spent:
+    """Write files of these sizes, the last in pieces, each file flushed; return the time."""
+    folder.mkdir()
+    content = memoryview(np.random.default_rng(0).bytes(max(_PIECE_BYTES, *sizes[:-1])))
+    *parts, cloud = sizes
+    pieces = [min(_PIECE_BYTES, cloud - start) for start in range(0, cloud, _PIECE_BYTES)]
+
+    def write() -> None:
+        for number, file_pieces in enumerate([*([size] for size in parts), pieces]):
+            with (folder / str(number)).open("xb", buffering=0) as file:
+                for size in file_pieces:
+                    written = 0
+                    while written < size:
+                        written += file.write(content[written:size]) or 0
+                os.fsync(file.fileno())
+
+    spent = spent_in(write)
+    shutil.rmtree(folder)
+    return spent
+
+
+def copy_plainly(total_bytes: int) -> Spent:
+    """Copy bytes within memory; return the time."""
+    source = np.ones(min(_PIECE_BYTES, total_bytes), np.uint8)
+    target = np.ones_like(source)
+    return spent_in(lambda: np.copyto(target, source), -(-total_bytes // len(source)))
+
+
+def pack_alone(part: PartColumns, folder: Path, points: int) -> dict[str, float]:
+    """Pack parts, and pack and write parts, in this thread; return rates and processor times."""
+    storage = Storage.at(folder)
+    storage.prepare()
+    count = max(1, points // len(part))
+    calls: dict[str, Callable[[], object]] = {
+        "pack": lambda: pack(part),
+        "pack_and_write": lambda: storage.write("part.npz", pack(part)),
+    }
+    figures = {}
+    for name, call in calls.items():
+        call()
+        spent = spent_in(call, count)
+        figures[f"{name}_mpoints_s"] = count * len(part) / spent.wall_s / 1e6
+        figures[f"{name}_ns"] = 1e9 * spent.cpu_s / (count * len(part))
+    storage.remove(["part.npz"], folder=True)
+    return figures
+
+
+def measure_round(
+    cluster: Cluster, sizes: Sizes, part: PartColumns, folder: Path
+) -> dict[str, Any]:
+    """Return the figures of a run and of plain writing before and after, and of copying."""
+    figures, file_sizes = measure_run(cluster, sizes, folder / "result")
+    points = figures["points"]
+    after = write_plainly(folder / "after", file_sizes)
+    (folder / "result" / CLOUD).unlink()
+    again = write_plainly(folder / "again", file_sizes)
+    copied = copy_plainly(sum(file_sizes))
+    plain_s = (after.wall_s + again.wall_s) / 2
+    figures["plain_mpoints_s"] = points / plain_s / 1e6
+    figures["plain_ns"] = 1e9 * (after.cpu_s + again.cpu_s) / 2 / points
+    figures["to_plain"] = plain_s / figures["wall_s"]
+    figures["file_bytes"] = sum(file_sizes) / points
+    figures["copy_mpoints_s"] = points / copied.wall_s / 1e6
+    figures["copy_ns"] = 1e9 * copied.cpu_s / points
+    return {**figures, **pack_alone(part, folder / "alone", points)}
+
+
+def medians(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return the median of each figure of rounds."""
+    return {
+        name: medians([row[name] for row in rows])
+        if isinstance(value, dict)
+        else statistics.median(row[name] for row in rows)
+        for name, value in rows[0].items()
+    }
+
+
+def report(figures: dict[str, Any], sizes: Sizes) -> None:
+    """Print the figures of all rounds."""
+    print(
+        f"{figures['points']:,.0f} points, {sizes.casting} casting and {sizes.collectors} "
+        f"collectors, medians of {sizes.rounds}"
+    )
+    print(
+        f"survey: {figures['mpoints_s']:.2f} million points/s from start to end, "
+        f"{figures['survey_mpoints_s']:.2f} to the last part; {figures['to_plain']:.2f} of writing "
+        f"the same {figures['file_bytes']:.1f} bytes a point plainly"
+    )
+    for name, words in _BESIDE.items():
+        print(
+            f"  {words}: {figures[f'{name}_mpoints_s']:.1f} million points/s, "
+            f"{figures[f'{name}_ns']:.1f} ns of processor time a point"
+        )
+    print(f"processor time a point: {figures['ns']:.0f} ns")
+    for name, process in figures["processes"].items():
+        print(
+            f"  {name:11} {process['ns']:6.1f} ns, bytes of files {process['read']:6.1f} read and "
+            f"{process['written']:6.1f} written, at most {process['peak_mb']:,.0f} MB"
+        )
+    print(f"  casting workers sent {figures['sent']:.1f} bytes a point")
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    """Measure, print and return the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--points", type=lambda text: int(float(text)), default=Sizes.points)
+    parser.add_argument("--collectors", type=int, default=Sizes.collectors)
+    parser.add_argument("--casting", type=int, default=Sizes.casting, help="casting workers")
+    parser.add_argument("--rounds", type=int, default=Sizes.rounds)
+    parser.add_argument("--folder", type=Path, help="where files are written: a disk or /dev/shm")
+    parser.add_argument("--quick", action="store_true", help="toy size")
+    parser.add_argument("--json", type=Path, help="also write the figures of all rounds")
+    options = parser.parse_args(arguments)
+    names = ("points", "collectors", "casting", "rounds")
+    sizes = QUICK if options.quick else Sizes(**{name: getattr(options, name) for name in names})
+    rig = Rig(HALL, still_survey(sizes, 1), "auto")
+    part = repeated(replace(columns_of(list(rig.cast(0, 1))), **_of_scans()), 7)
+    with replaying_cluster(sizes) as cluster:
+        rows = []
+        for _ in range(sizes.rounds):
+            with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+                rows.append(measure_round(cluster, sizes, part, Path(folder)))
+    figures = medians(rows)
+    report(figures, sizes)
+    if options.json:
+        options.json.write_text(json.dumps(rows, indent=1) + "\n")
+    return figures
+
+
+def _of_scans() -> dict[str, Any]:
+    """Return arrays of one scan that casting tasks add to its columns."""
+    return {"scan_hits": np.zeros(1, np.uint32), "samples": np.zeros((1, 4, 3), np.float32)}
+
+
+if __name__ == "__main__":
+    main()
