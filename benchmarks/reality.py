@@ -162,23 +162,33 @@ def _cells(world: Floats) -> Ints:
 
 
 def to_next(sweeps: RecordedSweeps, numbers: Ints) -> dict[str, float | None]:
-    """Return how far the ranges of sweeps are from the ranges of the next recorded sweep."""
+    """Return how far the ranges of sweeps are from the ranges of the next recorded sweep.
+
+    With the F1 of "no return", of cells that any of these sweeps has a return in.
+    """
+    images = {
+        n: _range_image(sweeps, n) for n in np.unique([numbers, numbers + 1]) if n < sweeps.count
+    }
+    answering = np.any([np.isfinite(image) for image in images.values()], axis=0)
     differences = []
-    overlaps = []
+    lost_in_both = 0
+    lost = 0
     for number in numbers.tolist():
         if number + 1 == sweeps.count:
             continue
-        one, following = (_range_image(sweeps, number + k) for k in (0, 1))
+        one, following = images[number], images[number + 1]
         both = np.isfinite(one) & np.isfinite(following)
         differences.append(np.abs(one - following)[both])
-        answering = np.isfinite(one) | np.isfinite(following)
-        overlaps.append(both.sum() / answering.sum())
+        is_lost, is_lost_next = (np.isnan(image) & answering for image in (one, following))
+        lost_in_both += int((is_lost & is_lost_next).sum())
+        lost += int(is_lost.sum() + is_lost_next.sum())
     if not differences:
         return {}
     difference_m = np.concatenate(differences)
     return {
         "median_size_m": float(np.median(difference_m)),
         "p90_size_m": float(np.quantile(difference_m, 0.9)),
+        "f1": 2 * lost_in_both / max(lost, 1),
     }
 
 
@@ -240,13 +250,13 @@ def _row(
     recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, answering: Bools
 ) -> dict[str, Any]:
     """Return the figures of the held-out sweeps of a recording."""
-    sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped.tolist()))
+    sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped.tolist()), answering)
     held_out = np.setdiff1d(np.arange(recorded.count), mapped)
     compared = held_out[even_indices(len(held_out), _COMPARED_SWEEPS)]
     place, reflectances = rebuild(sweeps, mapped.tolist(), DEFAULT_VOXEL_M)
     every = np.arange(recorded.count).tolist()
     standing = standing_points(sweeps, every)
-    rays = hold_out(sweeps, place, reflectances, standing, answering, compared.tolist())
+    rays = hold_out(sweeps, place, reflectances, standing, compared.tolist())
     static = static_points(sweeps, compared)
     returned = np.concatenate([static[number] for number in compared.tolist()])
     is_static = np.zeros(len(rays.range_m), bool)
@@ -280,7 +290,8 @@ def _line(row: dict[str, Any]) -> str:
         f"{[round(1000 * edge) for edge in row['interval_m'] or []]}, "
         f"90 % {1000 * standing['p90_size_m']:.0f}, median {1000 * standing['median_m']:+.0f}, "
         f"static mask {1000 * row['static']['median_size_m']:.0f} "
-        f"({100 * row['static_share']:.1f} %), next {1000 * row['next']['median_size_m']:.0f}, "
+        f"({100 * row['static_share']:.1f} %), next {1000 * row['next']['median_size_m']:.0f} "
+        f"(F1 {row['next']['f1']:.2f}), "
         f"planes {1000 * row['plane_m']:.1f}; missed {100 * standing['missed']:.2f} %, F1 "
         f"{no_return['f1']:.3f}, points {twin['points']:.3f}, by ring "
         f"{twin['points_by_ring']:.3f}; rank "

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -148,6 +149,7 @@ class AlignedSweeps:
 
     recorded: RecordedSweeps
     alignment: Alignment
+    answering: Bools  # (r, c): cells that any sweep has a return in, of `answering_cells`
 
     @property
     def name(self) -> str:
@@ -158,14 +160,14 @@ class AlignedSweeps:
         """Read a sweep, or raise LidarError if the recording cannot be read."""
         return self.aligned(self.recorded.read(number), number)
 
-    def lost(self, number: int, answering: Bools) -> AlignedSweep:
+    def lost(self, number: int) -> AlignedSweep:
         """Read a sweep and return its lost pulses in answering cells, as points a metre away."""
         step, _ = self.alignment.step(number)
         # Points as fired have no gaps by motion.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
         moved_m = float(np.linalg.norm(step.translation)) if is_compensated else 0.0
         sweep = self.recorded.read(number)
-        lost = lost_pulses(sweep, self.recorded.elevation_rad, answering, moved_m)
+        lost = lost_pulses(sweep, self.recorded.elevation_rad, self.answering, moved_m)
         return self.aligned(lost, number)
 
     def aligned(self, sweep: RecordedSweep, number: int) -> AlignedSweep:
@@ -213,36 +215,53 @@ def _motion(
 
     Surfaces that several sweeps saw at the same place share voxels. The thickness of planes does
     not tell: of a blurred wall no plane is found, and a level road stays thin.
+
+    LidarError if points fit the poses better with their y axis turned.
     """
-    if sweeps.is_compensated:
-        return Motion.COMPENSATED
     is_timed = all(sample.time_s is not None for sample in samples)
-    if is_timed:
+    if sweeps.is_compensated:
+        candidates = [Motion.COMPENSATED]
+    elif is_timed:
         candidates = [Motion.TIMED, Motion.COMPENSATED]
     elif len(sweeps.elevation_rad):
         candidates = [Motion.COMPENSATED, Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE]
     else:
-        return Motion.COMPENSATED
+        candidates = [Motion.COMPENSATED]
+    name = sweeps.recording.name
     window = _fastest(poses)
-    chosen = samples[window]
     local = poses.part(window)
-    filled = {}
-    for motion in candidates:
-        alignment = Alignment.unaligned(local, motion, sweeps.ring_count)
-        numbers = range(len(chosen))
-        alignment = _rounds(
-            sweeps.recording.name, chosen, alignment, numbers, voxel_m, _TRIAL_ROUNDS
-        )
-        filled[motion] = _filled_voxels(chosen, alignment, voxel_m)
+    trial = partial(_filled_voxels, name, samples[window], local, sweeps.ring_count, voxel_m)
+    filled = {motion: trial(motion) for motion in candidates}
     best = min(candidates, key=filled.__getitem__)
-    is_clear = filled[best] < _MAX_SHARE_OF_VOXELS * filled[candidates[0]]
-    return best if is_clear else candidates[0]
+    if filled[best] > _MAX_SHARE_OF_VOXELS * filled[candidates[0]]:
+        best = candidates[0]
+    if poses.are_given and trial(best, (1, -1, 1)) < _MAX_SHARE_OF_VOXELS * filled[best]:
+        raise LidarError(
+            f"{name}: its points fit their poses better with y turned to -y: they are mirrored, or "
+            "the poses are of other axes. Give points and poses in axes of the same hand."
+        )
+    return best
 
 
-def _filled_voxels(samples: Sequence[RecordedSweep], alignment: Alignment, voxel_m: float) -> int:
-    """Return the number of voxels that hold points: far points, which are alone, do not count."""
+def _filled_voxels(
+    name: str,
+    samples: Sequence[RecordedSweep],
+    poses: RecordedPoses,
+    ring_count: int,
+    voxel_m: float,
+    motion: Motion,
+    scale: tuple[int, int, int] = (1, 1, 1),
+) -> int:
+    """Align sweeps, with points times `scale`, and return the number of voxels that hold points.
+
+    Far points, which are alone in their voxels, do not count.
+    """
+    scaled = [replace(sample, points=sample.points * scale) for sample in samples]
+    alignment = Alignment.unaligned(poses, motion, ring_count)
+    numbers = range(len(scaled))
+    alignment = _rounds(name, scaled, alignment, numbers, voxel_m, _TRIAL_ROUNDS)
     parts = []
-    for number, sample in enumerate(samples):
+    for number, sample in enumerate(scaled):
         points, _ = alignment.compensated(sample, number)
         near = np.linalg.norm(sample.points, axis=1) < _NEAR_VOXELS * voxel_m
         parts.append(placed(points[near], alignment.poses[number]))

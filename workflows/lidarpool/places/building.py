@@ -44,7 +44,7 @@ from .charts import draw_above, draw_errors, draw_sweep
 from .free_space import standing_points
 from .held_out import HeldOut, hold_out
 from .lost_pulses import answering_cells
-from .odometry import RecordedPoses, find_poses
+from .odometry import find_poses
 from .place import Place, build_place
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_reflectances
@@ -61,7 +61,6 @@ _FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
 _COMPARED_SWEEPS = 12  # of the held-out sweeps
 _POSE_DECIMALS = 6
 _MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
-_MAX_CORRECTION_M = 0.5  # of poses by alignment: odometry is better
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -246,7 +245,7 @@ class _Building:
         poses = find_poses(recorded, trajectory)
         mapped = list(range(0, recorded.count, 2))
         self.tell(f"poses {poses.source}; aligning the sweeps")
-        sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped))
+        sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped), answering_cells(recorded))
         self.tell("finding what stands")
         standing = standing_points(sweeps, range(recorded.count))
         self.tell(f"building the place of {plural(len(mapped), 'sweep')}, to compare the others")
@@ -265,7 +264,7 @@ class _Building:
                 *recorded.recording.notes,
                 *recorded.notes,
                 *notes,
-                *_drive_notes(sweeps, poses),
+                *_drive_notes(sweeps),
             ],
         }
         pictures = {
@@ -292,8 +291,7 @@ class _Building:
         place, reflectances = rebuild(sweeps, mapped, self.voxel_m)
         others = np.setdiff1d(np.arange(self.recorded.count), mapped)
         compared = others[even_indices(len(others), _COMPARED_SWEEPS)].tolist()
-        answering = answering_cells(self.recorded)
-        held_out = hold_out(sweeps, place, reflectances, standing, answering, compared)
+        held_out = hold_out(sweeps, place, reflectances, standing, compared)
         return held_out, draw_sweep(sweeps, place, reflectances, compared[len(compared) // 2])
 
     def _sensor(
@@ -390,22 +388,11 @@ def _place_of(
     return place, fit_reflectances(seen, place.surfels, sweeps.recorded.ring_count)
 
 
-def _drive_notes(sweeps: AlignedSweeps, poses: RecordedPoses) -> list[str]:
-    """Return notes on a sensor that stood, and on poses that do not fit the points."""
-    notes = []
-    aligned = sweeps.alignment.poses[:, :3, 3]
-    if np.ptp(aligned, axis=0).max() < _MIN_DRIVE_M:
-        notes.append(
-            "the sensor stood: the place is what it saw from there, and has holes behind things"
-        )
-    moved_m = np.linalg.norm(aligned - poses.matrices[:, :3, 3], axis=1)
-    moved_m -= np.median(moved_m)
-    if np.abs(moved_m).max() > _MAX_CORRECTION_M:
-        notes.append(
-            f"poses {poses.source} were changed by up to {np.abs(moved_m).max():.1f} m, so they do "
-            "not fit the points: check their frames, and that neither is mirrored"
-        )
-    return notes
+def _drive_notes(sweeps: AlignedSweeps) -> list[str]:
+    """Return a note on a sensor that stood."""
+    if np.ptp(sweeps.alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
+        return []
+    return ["the sensor stood: the place is what it saw from there, and has holes behind things"]
 
 
 def _median(values: Floats) -> float | None:

@@ -137,7 +137,6 @@ def hold_out(
     place: Place,
     reflectances: Reflectances | None,
     standing: Mapping[int, Bools],
-    answering: Bools,
     numbers: Sequence[int],
 ) -> HeldOut:
     """Cast the rays of held-out sweeps at a place that other sweeps made.
@@ -150,15 +149,13 @@ def hold_out(
         The place, and its reflectances; None without intensities.
     standing
         Which points of the held-out sweeps stand, by all sweeps: {number: (n,)}.
-    answering
-        (r, c): cells that any sweep has a return in, of `answering_cells`.
     numbers
         Numbers of the held-out sweeps.
     """
     parts = []
     for number in numbers:
         sweep = sweeps.read(number)
-        lost = sweeps.lost(number, answering)
+        lost = sweeps.lost(number)
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)
         parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))

@@ -36,6 +36,11 @@ class RecordedPoses(NamedTuple):
     origin: Floats  # (3,): of the frame of the place in the world, whole metres
     share: float = 0.0  # of the motion of a sweep as fired, at which its pose holds
 
+    @property
+    def are_given(self) -> bool:
+        """Whether the poses are not found by registration of the points."""
+        return not self.share
+
     def part(self, window: slice) -> RecordedPoses:
         """Return the poses of some consecutive sweeps."""
         return self._replace(matrices=self.matrices[window], times_s=self.times_s[window])

@@ -2,7 +2,8 @@
 
 Surfels reach beyond edges, and single points of things that moved are left. The caster decides:
 rays of the recording that pass a surfel, although it should have stopped them, count against the
-surfel, and rays that end on it count for it.
+surfel, and rays that end on it count for it. Lost pulses count against it, too: windows and black
+cars return few pulses.
 
 Surfels overlap, and a ray meets the nearest. So the surface that rays see is above the means of the
 points: by 5 to 10 mm on a road. Each surfel is moved until its rays end on it, in the median.
@@ -94,7 +95,7 @@ class Place:
         )
 
     def refined(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Place:
-        """Return the place without surfels that more rays pass than meet, the others moved.
+        """Return the place without surfels that more rays pass, or are lost on, than meet.
 
         Each surfel moves along its normal to the median of the rays that end on it. LidarError if
         no surfel is left.
@@ -109,6 +110,7 @@ class Place:
             farther_m = seen.range_m - seen.distance_m
             votes += np.bincount(seen.surfel[ends], minlength=count)
             votes -= np.bincount(seen.surfel[~ends & (farther_m > _ON_RAY_M)], minlength=count)
+            votes -= np.bincount(self.see(sweeps.lost(number)).surfel, minlength=count)
             moving = ends | (np.abs(farther_m) < _MAX_SHIFT_M)
             surfel.append(seen.surfel[moving])
             offset_m.append((farther_m * seen.inward)[moving])
