@@ -252,14 +252,16 @@ def _filled_voxels(
     motion: Motion,
     scale: tuple[int, int, int] = (1, 1, 1),
 ) -> int:
-    """Align sweeps, with points times `scale`, and return the number of voxels that hold points.
+    """Return the number of voxels that hold points of sweeps, times `scale`, at their poses.
 
-    Far points, which are alone in their voxels, do not count.
+    Poses by registration are aligned first. Poses that are given are not: alignment would bring
+    even mirrored sweeps together. Far points, which are alone in their voxels, do not count.
     """
     scaled = [replace(sample, points=sample.points * scale) for sample in samples]
     alignment = Alignment.unaligned(poses, motion, ring_count)
     numbers = range(len(scaled))
-    alignment = _rounds(name, scaled, alignment, numbers, voxel_m, _TRIAL_ROUNDS)
+    rounds = 0 if poses.are_given else _TRIAL_ROUNDS
+    alignment = _rounds(name, scaled, alignment, numbers, voxel_m, rounds)
     parts = []
     for number, sample in enumerate(scaled):
         points, _ = alignment.compensated(sample, number)
