@@ -125,7 +125,7 @@ def main(arguments: list[str] | None = None) -> int:
         append_images=images[1:],
         duration=round(1e3 * SWEEP_S),
         loop=0,
-        quality=60,
+        quality=35,
         method=4,
     )
     options.film.write_bytes(memory.getvalue())

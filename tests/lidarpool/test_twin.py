@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from benchmarks import reality
 from benchmarks.odometry import left_turn
 from click.testing import CliRunner
 
@@ -384,3 +385,25 @@ def test_another_sensor_is_for_a_scenario_of_one_sensor(tmp_path):
     path.write_text(yaml.safe_dump({"scene": "seed", "sensors": {"a": "velodyne/vlp16"}}))
     with pytest.raises(LidarError, match=r"--sensor is for one sensor: in .* change sensors"):
         Scenario.load(path, {"sensor": "velodyne/vlp32c"})
+
+
+@pytest.mark.extended
+def test_the_benchmark_of_recordings_has_a_row_for_each_rule(drive, tmp_path, capsys):
+    """Sweeps of the simulated drive in the place of a public recording, ring by ring."""
+    folder = tmp_path / "Pointcloud-Segmentation/data/velodyne_points/good_data"
+    folder.mkdir(parents=True)
+    opened = open_recording(drive, name="drive")
+    for number in range(SWEEPS):
+        points, columns, _ = opened.read(number)
+        azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+        order = np.lexsort((azimuth, -columns["channel"].astype(int)))
+        rows = np.column_stack([points, columns["intensity"]])[order]
+        rows.astype(np.float32).tofile(folder / f"{number:06}.bin")
+    (row,) = reality.main([str(tmp_path), "kitti360", "udacity"])  # too short for blocks of 20
+    assert row["rule"] == "easy"
+    assert row["twin"]["standing"]["median_size_m"] < 0.02
+    assert row["interval_m"][0] <= row["interval_m"][1] < 0.03
+    assert row["static_share"] > 0.5
+    printed = capsys.readouterr().out
+    assert "kitti360, drive (easy, 12 sweeps" in printed
+    assert "udacity: " in printed and "is left out" in printed

@@ -9,6 +9,7 @@ import ast
 import doctest
 import importlib.util
 import inspect
+import json
 import re
 import runpy
 import shlex
@@ -522,6 +523,22 @@ def leaves(data: dict[str, Any], above: str = "") -> Iterator[str]:
             yield from leaves(value, f"{above}{key}.")
         else:
             yield f"{above}{key}"
+
+
+@pytest.mark.extended
+def test_a_twin_is_made_and_scanned_as_shown(tmp_path, lidarpool):
+    blocks = [block for block in blocks_of(ROOT / "docs/how-to/twin.md") if not block.reason]
+    for block in blocks:
+        if block.language == "yaml":
+            Path(block.title).write_text(block.code, encoding="utf-8")
+            continue
+        for words in commands(block):
+            outcome = lidarpool(*words[1:])
+            assert outcome.code == 0, outcome.err
+    figures = json.loads((tmp_path / "twin/twin.json").read_text())
+    assert figures["motion"] == "as fired, at the times of the points"
+    assert figures["held_out"]["standing"]["median_size_m"] < 0.003
+    assert (tmp_path / "again/cloud.ply").stat().st_size > 1000
 
 
 @pytest.mark.slow
