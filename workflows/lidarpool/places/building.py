@@ -292,7 +292,11 @@ class _Building:
         others = np.setdiff1d(np.arange(self.recorded.count), mapped)
         compared = others[even_indices(len(others), _COMPARED_SWEEPS)].tolist()
         held_out = hold_out(sweeps, place, reflectances, standing, compared)
-        return held_out, draw_sweep(sweeps, place, reflectances, compared[len(compared) // 2])
+        with_points = np.unique(held_out.sweep[held_out.returned])
+        if not len(with_points):
+            raise LidarError(f"{sweeps.name}: the sweeps to compare with have no points.")
+        drawn = int(with_points[len(with_points) // 2])
+        return held_out, draw_sweep(sweeps, place, reflectances, drawn)
 
     def _sensor(
         self, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None

@@ -24,7 +24,7 @@ _IMAGE_HEIGHT = 190
 _GAP = 62
 _TOP = 150
 _BOTTOM = 90
-_COLUMNS = 720  # of the images: 0.5° each
+_COLUMNS = 720  # of the images, at most: 0.5° each
 _ROWS = 64  # of the images of a sensor without rings
 _DIFFERENCE_M = 0.1  # end of the scale of differences
 _STANDING_DOTS = 150_000
@@ -100,9 +100,11 @@ def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int,
         row_count = _ROWS
         share = (high - elevation) / max(high - low, 1e-9)
         row = (share * _ROWS).astype(np.int64).clip(0, _ROWS - 1)
+    # More columns than a ring has pulses would leave stripes.
+    column_count = min(_COLUMNS, int(np.bincount(row).max()))
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
-    column = (turns * _COLUMNS).astype(np.int64) % _COLUMNS
-    return row * _COLUMNS + column, (row_count, _COLUMNS)
+    column = (turns * column_count).astype(np.int64) % column_count
+    return row * column_count + column, (row_count, column_count)
 
 
 def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats:
