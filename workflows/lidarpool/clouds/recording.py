@@ -372,6 +372,7 @@ def open_cloud(
         return np.array([saved.pose.matrix(index) for index in indices])
 
     times = saved.begins_ns[indices] + (saved.start_ns or 0)
+    # Results have energies in their column `intensity`, and may have other columns of intensities.
     fields["energies"] = intensity in (None, "intensity")
     columns = {column.name for column in cloud.table}
     if ray_columns := columns & {"time", "ray"}:
