@@ -38,7 +38,7 @@ class BinaryTree:
     ----------
     lower, upper
         float32 (3, 2n-1): boxes.
-    left, right
+    first_child, second_child
         int32 (2n-1,): children; -1 for boxes.
     rounds
         Ranges of inner nodes that were created together: children always belong to an earlier

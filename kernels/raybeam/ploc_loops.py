@@ -21,7 +21,11 @@ def _common_area(lower, upper, i, j):  # type: ignore[no-untyped-def]
 
 @compiled()
 def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
-    """Write the best partner of each cluster (m,), as `ploc._partners` chooses."""
+    """Write the position of each cluster's best partner to `best`, int64 (m,).
+
+    The best partner is the cluster, among `radius` neighbours on either side, whose common box has
+    the least area. Ties are as in `ploc._find_best_partners`.
+    """
     n = lower.shape[1]
     for i in range(n):
         partner = min(i ^ 1, n - 1)

@@ -455,9 +455,9 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     """Compute the rays of a tile in local coordinates, by their numbers in the call.
 
     `address` is of the `CAST`, `start` the number of the call's first ray in the scan, and `count`
-    the number of the call's rays. Rays outside the call are
-    neighbours of its rays, if these have one pose. Origins that all rays share are computed for the
-    first tile: `share_origin`. Rays are also written to the outputs of rays of the cast, if any.
+    the number of the call's rays. Rays outside the call are neighbours of its rays, if these have
+    one pose. An origin that all rays share is in the tile already: `share_origin`. Rays are also
+    written to the outputs of rays of the cast, if any.
     """
     cast = carray(casts_at(address), 1)[0]
     tile = cast.tile
@@ -489,7 +489,11 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
 
 @stage
 def share_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
-    """Write the origin that all rays of a cast share to the rays of a tile, for all tiles."""
+    """Write the origin that all rays of a cast share, in local coordinates, to a tile's rays.
+
+    All tiles of a cast use the same memory, where `make_rays` leaves this origin unchanged. So
+    the origin is written once, before the first tile.
+    """
     _write_origins(tile, rays, cast)
     _localise(tile, rays, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
 

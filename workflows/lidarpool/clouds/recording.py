@@ -66,7 +66,7 @@ class RecordedPoints:
         return len(self.points)
 
     def part(self, row_indices: Indices) -> RecordedPoints:
-        """Select points, without the keys of their rays."""
+        """Select points by rows (k,), without the keys of their rays."""
         return RecordedPoints(
             self.points[row_indices],
             None if self.rings is None else self.rings[row_indices],
@@ -75,7 +75,10 @@ class RecordedPoints:
 
     @classmethod
     def joined(cls, recorded: list[RecordedPoints]) -> RecordedPoints:
-        """Concatenate parts of the same recording, which have the same columns."""
+        """Concatenate parts of the same recording, without the keys of their rays.
+
+        All parts have the same columns.
+        """
         if not recorded:
             return cls(np.empty((0, 3)))
         rings = [part.rings for part in recorded if part.rings is not None]
@@ -95,13 +98,13 @@ class NoiseFilter:
     counts: dict[int, LeftOut] = field(default_factory=dict)  # {number of a sweep or part: counts}
 
     def usable(self, number: int, read: Read) -> Read:
-        """Return a sweep or part without these points."""
+        """Return a sweep or part without withheld points and points of noise, and count these."""
         points, columns, pose = read
         usable, self.counts[number] = usable_points(columns, self.noise_classes)
         if usable is None:
             return read
-        kept = {name: np.asarray(values)[usable] for name, values in columns.items()}
-        return points[usable], kept, pose
+        usable_columns = {name: np.asarray(values)[usable] for name, values in columns.items()}
+        return points[usable], usable_columns, pose
 
     def note(self) -> str:
         """Return a sentence on the points that were left out, or an empty string for none."""
@@ -332,9 +335,13 @@ def open_cloud(
     intensity: str | None,
     **fields: Any,
 ) -> Recording:
-    """Open a cloud of lidarpool, in parts or as the sweeps of a sensor.
+    """Open a cloud of lidarpool, in parts of `CHUNK_POINTS` points or as the sweeps of a sensor.
 
-    `load_sweeps` is None for a cloud without sweeps; `fields` are fields of `Recording`.
+    `name` is the name in messages, `sensor` the chosen sensor, and `intensity` the column of
+    intensities if chosen. `load_sweeps` is None for a cloud without sweeps; `fields` are further
+    fields of `Recording`.
+
+    LidarError without a choice among several sensors, or for a sensor that the cloud does not have.
     """
     if load_sweeps is None:
 
@@ -343,7 +350,9 @@ def open_cloud(
             return chunk.positions, chunk.columns, None
 
         parts = -(-len(cloud) // CHUNK_POINTS)
-        return Recording(name, parts, read_part, intensity, True, len(cloud), **fields)
+        return Recording(
+            name, parts, read_part, intensity, is_cloud=True, point_count=len(cloud), **fields
+        )
     saved = load_sweeps()
     sensor_index = saved.sensors.index(choose(name, "sensors", saved.sensors, sensor))
     indices = np.flatnonzero(saved.sensor == sensor_index).tolist()
@@ -363,6 +372,7 @@ def open_cloud(
         return np.array([saved.pose.matrix(index) for index in indices])
 
     times = saved.begins_ns[indices] + (saved.start_ns or 0)
+    # Results have energies in their column `intensity`, and may have other columns of intensities.
     fields["energies"] = intensity in (None, "intensity")
     columns = {column.name for column in cloud.table}
     if ray_columns := columns & {"time", "ray"}:

@@ -3,8 +3,9 @@
 A part is a NumPy archive without compression (``numpy.load`` opens it): an array for each column,
 rows in (scan, ray) order, and further arrays: `.scans`, first scan and one past the last; for each
 scan `.counts`, its rows, `.scan_hits`, its hits including thinned out hits, and `.samples`, ends of
-sample rays; and the hits of each triangle, `.triangles` and `.hits`. `x`, `y` and `z` are whole
-multiples of the precision from the scene's local origin, so that they are rounded only once.
+sample rays; and the hit counters that are not 0 (`Scene.counters`), `.triangles`, with their hits,
+`.hits`. `x`, `y` and `z` are whole multiples of the precision from the scene's local origin, so
+that they are rounded only once.
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
 
 def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
-    """Read only the triangles of a part and the hits of each.
+    """Read only the hits of a part: hit counters that are not 0, and their hits, (k,) each.
 
     Raises the errors of `read_part`.
     """
@@ -157,8 +158,8 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
         return part.triangles, part.hits
     try:
         with open_input(storage.local(name)) as file, zipfile.ZipFile(file) as archive:
-            triangles = read_npy(archive.read(".triangles.npy"), "triangles")
-            return triangles, read_npy(archive.read(".hits.npy"), "hits")
+            counters = read_npy(archive.read(".triangles.npy"), "triangles")
+            return counters, read_npy(archive.read(".hits.npy"), "hits")
     except Exception as error:  # `unpack` raises errors of many kinds
         raise LidarError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"

@@ -144,7 +144,11 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     def finish(
         self, run: Run[tuple[RunResult, dict[str, Any]]]
     ) -> tuple[RunResult, dict[str, Any]]:
-        """Write the result, and remove the run."""
+        """Write the result, remove the run, and return the result and its report.
+
+        LIDAR workers write formats in pieces. Without such formats, the cluster ends before the
+        result is written.
+        """
         result = run.result()
         in_pieces = any(output_format.row.in_pieces for output_format in self.formats)
         workers = None
@@ -378,14 +382,17 @@ def _move(
 
 
 def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
-    """Remove the files that a result of `files` replaces, first the report, which marks a result.
+    """Remove the files of an earlier result, before a result of `files` is moved into place.
 
-    Folders and files of formats are removed only if replaced, or listed by the earlier result. If a
-    killed run has removed the earlier report, they stay.
+    The report and the page go first, and a local folder is flushed: a report marks a whole result.
+    Then go files and folders of formats that `files` replace, or that the `earlier` result lists.
+    If a killed run has removed the earlier report, nothing is listed, and other formats stay. Of
+    the remaining `FILES`, those go that are not among `files`.
     """
     further = _known_further({*files, *earlier})
-    # A path of an earlier run would look like a path of this run.
-    for name in (REPORT, PAGE, *further, *(name for name in FILES if name not in files)):
+    # The picture of the path of an earlier result would look like a picture of this result.
+    missing = [name for name in FILES if name not in files]
+    for name in (REPORT, PAGE, *further, *missing):
         target.discard(name)
         if name == PAGE and target.is_local:
             flush(target.local())

@@ -9,12 +9,12 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from distributed import Reschedule
 
 from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.storage import TEMPORARY
+from lidarsim.base.storage import TEMPORARY, Storage
 from lidarsim.sweeps.sweeps import Sweeps
 from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
@@ -56,18 +56,33 @@ class JobFiles(NamedTuple):
 JobOutcome = JobRow | LidarError
 
 
+class Probe(NamedTuple):
+    """A file by which a worker finds out whether the worker sees a storage."""
+
+    storage: Storage
+    name: str
+    content: bytes
+
+    @property
+    def is_seen(self) -> bool:
+        """True if this process finds the file with its content."""
+        return self.storage.sees(self.name, self.content)
+
+
 def write_jobs(
-    dataset: DataSet, probes: tuple[Any, Any], jobs: Sequence[JobFiles]
+    dataset: DataSet, probes: tuple[Probe, Probe], jobs: Sequence[JobFiles]
 ) -> tuple[list[JobOutcome] | None, TaskRecord]:
     """Write the files of jobs on a LIDAR worker, and return a row or an error of each job.
 
-    None in place of the rows if the worker does not see the data set, or the parts.
+    `probes` are a file of the data set and a file among the parts. None is returned in place of
+    the rows if the worker does not see both files. The record of the task counts scans.
     """
     recorder = Recorder(EXPORT, LIDAR)
-    if not all(storage.sees(*probe) for storage, *probe in probes):
+    if not all(probe.is_seen for probe in probes):
         return None, recorder.finish()
-    written = [_write_job(dataset, job) for job in jobs]
-    return written, recorder.finish(sum(int(job.sweeps.scans[-1]) for job in jobs))
+    outcomes = [_write_job(dataset, job) for job in jobs]
+    scan_count = sum(int(job.sweeps.scans[-1]) for job in jobs)  # one past the last scan of each
+    return outcomes, recorder.finish(scan_count)
 
 
 def _write_job(dataset: DataSet, job: JobFiles) -> JobOutcome:
@@ -110,11 +125,11 @@ class JobWriter:
         mark = store.db.meta["mark"]
         self.dataset = replace(dataset, made_with=store.made_with)
         # The name of a temporary file: later writers remove the file of a killed run.
-        probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
-        self._probes = (storage, *probe), (store.storage, *parts_probe)
+        dataset_probe = Probe(storage, f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
+        self._probes = dataset_probe, Probe(store.storage, *parts_probe)
         with explained(f"{storage} cannot be written"):
             storage.prepare()
-            storage.write(*probe)
+            storage.write(dataset_probe.name, dataset_probe.content)
         self._waiting = deque[JobFiles]()
         self._due_at = 0.0  # when the waiting jobs are to be written
         self._driver_writes: dict[Future[JobOutcome], JobFiles] = {}
@@ -210,9 +225,9 @@ class JobWriter:
         with suppress(Exception):  # report the first error
             self.tasks.cancel()
         self._thread.shutdown(cancel_futures=True)
-        storage, name, _ = self._probes[0]
+        dataset_probe, _ = self._probes
         with suppress(OSError):
-            storage.remove([name])
+            dataset_probe.storage.remove([dataset_probe.name])
 
 
 LOOK_EVERY_S = 0.01

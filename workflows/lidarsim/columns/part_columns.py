@@ -28,8 +28,9 @@ class PartColumns:
     first: int  # number of the first scan
     counts: Ints  # (scans,): rows of each scan
     columns: Mapping[str, AnyArray]  # {name: (rows,)}, positions as cells
-    triangles: Ints32  # (k,): triangles that were hit
-    hits: Ints  # (k,): number of hits of each of these triangles
+    # (k,): hit counters that are not 0 (`Scene.counters`); an instance has one for all triangles
+    triangles: Ints32
+    hits: Ints  # (k,): number of hits of each of these counters
     # (scans,) and (scans, samples, 3): hits of each scan, and ends of sampled rays, metres, local
     # coordinates, NaN in unused rows; empty in a part that is not stored.
     scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))

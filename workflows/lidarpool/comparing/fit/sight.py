@@ -197,10 +197,11 @@ class SightPair:
         return cls(first, second, second.look_up(first.points), first.look_up(second.points))
 
     def sample(self, count: int) -> tuple[Floats, Floats]:
-        """Return points of the first sweep and of the second, about `count` of each kind.
+        """Sample points of the first sweep and of the second: (a, 3) and (b, 3), metres.
 
-        Points of the first kind are in empty space by the other sweep if the sensor stands, points
-        of the second kind are on surfaces.
+        Points are in the sensor frames of their sweeps. If the sensor stands, the other sweep says
+        of some points that they are in empty space, and of some that they are on surfaces. About
+        `count` points of either kind are sampled evenly from both sweeps together.
         """
         seen = np.append(self.seen_first, self.seen_second)
         shares = {kind: min(1.0, count / max((seen == kind).sum(), 1)) for kind in _KNOWN}

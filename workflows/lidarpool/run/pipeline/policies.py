@@ -290,7 +290,8 @@ def _group_key(batch: Batch) -> object:
 def _take_task(group: deque[Batch], max_weight: float, per_task: int) -> list[Batch]:
     """Remove the batches of a task from a group and return the batches.
 
-    There is at least 1 batch; further batches are added up to `max_weight`.
+    There is at least 1 batch; further batches are added while the `weight` of the task is at most
+    `max_weight`, both in small batches. `per_task` small batches fill a task.
     """
     task = [group.popleft()]
     task_weight = weight(task, per_task)

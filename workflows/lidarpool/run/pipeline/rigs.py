@@ -100,16 +100,24 @@ def rig_of(handle: str, plan: Packed | None = None, scene: Packed | None = None)
 
 
 def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig:
+    """Build the rig of a job, cache the rig for other jobs of its scene, and return the rig.
+
+    `handle` is the handle of the rig. `plan` has the handle of the scene, the actors, the survey,
+    pickled, and the name of the backend; `scene` is the scene without actors. If a rig of the scene
+    is cached, the new rig shares its trees. Rigs that were unused for long are dropped before.
+
+    Raises RigMissing and RigFailed as `rig_of` does.
+    """
     if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
-        name, actors, packed, backend = _unpickled(plan)
-        survey: Survey = pickle.loads(packed)  # noqa: S301
+        scene_handle, actors, pickled_survey, backend = _unpickled(plan)
+        survey: Survey = pickle.loads(pickled_survey)  # noqa: S301
         now_s = time.monotonic()
         unused = [h for h, cached in [*cached_rigs.items()] if now_s - cached.used_at > UNUSED_S]
-        drop([unused_handle for unused_handle in unused if unused_handle != name])
-        if (cached_scene := cached_rigs.get(name)) is not None:
-            rig = cached_scene.rig.with_survey(cached_scene.rig.scene.with_actors(actors), survey)
+        drop([unused_handle for unused_handle in unused if unused_handle != scene_handle])
+        if (of_scene := cached_rigs.get(scene_handle)) is not None:
+            rig = of_scene.rig.with_survey(of_scene.rig.scene.with_actors(actors), survey)
         elif scene is not None:
             static_scene: Scene = _unpickled(scene)
             threads = get_worker().state.nthreads
@@ -118,14 +126,14 @@ def _build(handle: str, plan: Packed | None, scene: Packed | None) -> _CachedRig
                 choose(backend).limit_memory(device, own_device_share())
             rig = Rig(static_scene.with_actors(actors), survey, backend, threads, device)
         else:
-            raise RigMissing(f"This worker has no scene {name!r}.")
+            raise RigMissing(f"This worker has no scene {scene_handle!r}.")
     except RigMissing:
         raise
     except Exception as error:
         raise RigFailed(str(error) or type(error).__name__) from error
-    cached_rigs[name] = _CachedRig(rig, name, time.monotonic())
+    cached_rigs[scene_handle] = _CachedRig(rig, scene_handle, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
-    return _CachedRig(rig, name, time.monotonic())
+    return _CachedRig(rig, scene_handle, time.monotonic())
 
 
 def _unpickled(data: Packed) -> Any:

@@ -151,11 +151,15 @@ class JobUnderWay(PipelineJob):
         return self.points().cloud_of(columns, rows)
 
     def hit_counts(self) -> Ints:
-        """Return the hits for each counter of the scene (`Scene.counters`)."""
+        """Return the committed hits by hit counters of the scene: (counters,).
+
+        A face of the scene, an instance, and a triangle of an actor have a counter each
+        (`Scene.counters`).
+        """
         counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.parts.ordered:
-            triangles, hits = read_tally(self.storage, part.name)
-            counts[triangles] += hits
+            counters, hits = read_tally(self.storage, part.name)
+            counts[counters] += hits
         return counts
 
     def sample_rays(self) -> Floats32:

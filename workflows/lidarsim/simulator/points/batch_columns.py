@@ -13,7 +13,7 @@ from .device_columns import DevicePoints
 
 
 def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
-    """Return the stored columns of a batch, with the number of hits of each triangle.
+    """Return the stored columns of a batch, with the hits of each hit counter.
 
     `batches` are the returns of consecutive scans in order, as `Rig.cast` yields them: separate for
     each sensor and station. All are of the same survey.
@@ -22,20 +22,20 @@ def columns_of(batches: Sequence[BatchPoints | DevicePoints]) -> PartColumns:
         column.name: _joined([returns.column(column) for returns in batches])
         for column in batches[0].survey.stored_columns
     }
-    triangles, hit_counts = batches[0].tally  # counters that are not 0, and their hits
+    counters, hits = batches[0].tally  # counters that are not 0, and their hits
     if len(batches) > 1:
-        all_triangles, counts = map(
+        all_counters, all_hits = map(
             np.concatenate, zip(*(returns.tally for returns in batches), strict=True)
         )
-        triangles, row = np.unique(all_triangles, return_inverse=True)
-        hit_counts = np.zeros(len(triangles), np.int64)
-        np.add.at(hit_counts, row, counts)
+        counters, row = np.unique(all_counters, return_inverse=True)
+        hits = np.zeros(len(counters), np.int64)
+        np.add.at(hits, row, all_hits)
     return PartColumns(
         batches[0].specs[0].scan,
         _joined([returns.counts for returns in batches]),
         columns,
-        triangles.astype(np.int32),
-        hit_counts,
+        counters.astype(np.int32),
+        hits,
     )
 
 

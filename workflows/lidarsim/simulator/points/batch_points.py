@@ -185,9 +185,9 @@ class BatchPoints:
         The points that a frozen sensor sends again stay fixed in the sensor frame, and move with
         the sensor.
         """
-        return self._moved_with_sensor(self._scene_positions)
+        return self._moved_with_frozen_sensor(self._scene_positions)
 
-    def _moved_with_sensor(self, points: Floats) -> Floats:
+    def _moved_with_frozen_sensor(self, points: Floats) -> Floats:
         """Move points (n, 3) with a frozen sensor from the old sweep to the sweep that it replaces.
 
         Points are in the scene frame; points of a sensor that is not frozen are returned unchanged.
@@ -205,7 +205,7 @@ class BatchPoints:
         """Starts of the rays in the coordinates of the survey's points, metres: (n, 3)."""
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
-        return self._moved_with_sensor(self.origins) + self.scene.origin
+        return self._moved_with_frozen_sensor(self.origins) + self.scene.origin
 
     @property
     def origin_x(self) -> Floats:
@@ -381,11 +381,16 @@ class BatchPoints:
 
     @cached_property
     def normals(self) -> Floats:
-        """Unit normals on the side that was hit, in the frame of the survey's points: (n, 3)."""
+        """Unit normals on the side that was hit, in the frame of the survey's points: (n, 3).
+
+        NaN for returns without a surface, leaves within a crown, and ghosts.
+        """
         normals, _ = self._facing_normals
         if self.survey.coordinates == "sensor":
             return self._world_to_sensor(normals)
-        return self._moved_with_sensor(normals) - self._moved_with_sensor(np.zeros((1, 3)))
+        return self._moved_with_frozen_sensor(normals) - self._moved_with_frozen_sensor(
+            np.zeros((1, 3))
+        )
 
     @property
     def normal_x(self) -> Floats:
