@@ -37,7 +37,7 @@ from lidarpool.places.alignment import AlignedSweeps, align
 from lidarpool.places.building import DEFAULT_VOXEL_M, rebuild
 from lidarpool.places.free_space import standing_points
 from lidarpool.places.held_out import HeldOut, hold_out
-from lidarpool.places.lost_pulses import answering_cells
+from lidarpool.places.lost_pulses import Answering
 from lidarpool.places.odometry import RecordedPoses, find_poses
 from lidarpool.places.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
@@ -220,7 +220,7 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
     source = SOURCES[name]
     rows = []
     whole = source.open(root / source.repository)
-    answering = answering_cells(RecordedSweeps.of_recording(whole))
+    answering = Answering.of_sweeps(RecordedSweeps.of_recording(whole))
     for part, chosen in source.parts.items():
         recording = part_of(whole, chosen)
         recorded = RecordedSweeps.of_recording(recording)
@@ -247,7 +247,7 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
 
 
 def _row(
-    recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, answering: Bools
+    recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, answering: Answering
 ) -> dict[str, Any]:
     """Return the figures of the held-out sweeps of a recording."""
     sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped.tolist()), answering)

@@ -26,7 +26,7 @@ from lidarpool import (
 )
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.recording import Recording
-from lidarpool.places.lost_pulses import lost_pulses
+from lidarpool.places.lost_pulses import Answering, lost_pulses
 from lidarpool.places.recorded_sweeps import RecordedSweep, RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
@@ -184,7 +184,7 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     rows = returned & received
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
     sweep = RecordedSweep(points, ring[rows], None, None, None, -np.pi)
-    answering = np.ones((16, 720), bool)
+    answering = Answering(np.ones((16, 720), bool), 50.0)
     lost = lost_pulses(sweep, elevation, answering, 0.0)
     expected = ~returned & received
     assert len(lost.ring) == pytest.approx(expected.sum(), rel=0.01)

@@ -20,7 +20,7 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 
-from .lost_pulses import lost_pulses
+from .lost_pulses import Answering, lost_pulses
 from .motion import Motion, Step
 from .odometry import RecordedPoses
 from .recorded_sweeps import MIN_RINGS, RecordedSweep, RecordedSweeps, elevations
@@ -149,7 +149,7 @@ class AlignedSweeps:
 
     recorded: RecordedSweeps
     alignment: Alignment
-    answering: Bools  # (r, c): cells that any sweep has a return in, of `answering_cells`
+    answering: Answering
 
     @property
     def name(self) -> str:

@@ -43,7 +43,7 @@ from .alignment import AlignedSweeps, align
 from .charts import draw_above, draw_errors, draw_sweep
 from .free_space import standing_points
 from .held_out import HeldOut, hold_out
-from .lost_pulses import answering_cells
+from .lost_pulses import Answering
 from .odometry import find_poses
 from .place import Place, build_place
 from .recorded_sweeps import RecordedSweeps
@@ -245,7 +245,9 @@ class _Building:
         poses = find_poses(recorded, trajectory)
         mapped = list(range(0, recorded.count, 2))
         self.tell(f"poses {poses.source}; aligning the sweeps")
-        sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped), answering_cells(recorded))
+        sweeps = AlignedSweeps(
+            recorded, align(recorded, poses, mapped), Answering.of_sweeps(recorded)
+        )
         self.tell("finding what stands")
         standing = standing_points(sweeps, range(recorded.count))
         self.tell(f"building the place of {plural(len(mapped), 'sweep')}, to compare the others")

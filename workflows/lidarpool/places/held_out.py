@@ -8,7 +8,7 @@ held-out sweeps are registered to the others' map, which hides a part of the err
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any
 
@@ -20,6 +20,7 @@ from .alignment import AlignedSweep, AlignedSweeps
 from .place import Place
 from .reflectances import Reflectances
 
+_RANGE_MARGIN_M = 0.5  # beyond the largest recorded range
 _RANGES_M = (0, 5, 10, 20, 40, 80, np.inf)  # classes of ranges
 
 
@@ -160,12 +161,15 @@ def hold_out(
         no_points = np.zeros(len(lost.points), bool)
         parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))
         parts.append(_rays(place, None, lost, number, no_ranges, no_points))
-    return HeldOut(
+    rays = HeldOut(
         *(
             np.concatenate([getattr(part, column.name) for part in parts])
             for column in fields(HeldOut)
         )
     )
+    # What was seen from nearer is out of reach here.
+    in_reach = rays.simulated_m <= sweeps.answering.max_range_m + _RANGE_MARGIN_M
+    return replace(rays, simulated_m=np.where(in_reach, rays.simulated_m, np.nan))
 
 
 def _rays(

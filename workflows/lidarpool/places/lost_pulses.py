@@ -27,7 +27,7 @@ _MIN_RINGS = 0.05  # share of the rings that return in a sector; with less, no p
 
 
 def lost_pulses(
-    sweep: RecordedSweep, elevation_rad: Floats, answering: Bools, moved_m: float
+    sweep: RecordedSweep, elevation_rad: Floats, answering: Answering, moved_m: float
 ) -> RecordedSweep:
     """Return the lost pulses of a sweep, as points a metre away without intensities.
 
@@ -39,7 +39,7 @@ def lost_pulses(
         (r,): of the rings, radians; empty for a sensor without rings, whose lost pulses are
         unknown.
     answering
-        (r, c): cells that any sweep has a return in, of `answering_cells`.
+        Where the sensor has returns at all.
     moved_m
         How far the sensor moved during the sweep, if points are compensated; else 0.
     """
@@ -59,7 +59,7 @@ def lost_pulses(
     time_s = None if sweep.time_s is None else _times_s(sweep, azimuth)
     pulses = RecordedSweep(directions, ring, None, None, time_s, sweep.start_rad)
     received = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
-    return pulses.part(received & answering[_cells(pulses)])
+    return pulses.part(received & answering.cells[_cells(pulses)])
 
 
 def _times_s(sweep: RecordedSweep, azimuth: Floats) -> Floats:
@@ -144,12 +144,23 @@ def _sectors(azimuth: Floats) -> Ints:
     return np.asarray(np.floor(azimuth / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS)
 
 
-def answering_cells(sweeps: RecordedSweeps) -> Bools:
-    """Mark the cells (r, c) in which any sweep has a return: elsewhere the carrier hides all."""
-    answering = np.zeros((sweeps.ring_count, _COLUMNS), bool)
-    for number in even_indices(sweeps.count, _ANSWERING_SWEEPS).tolist():
-        answering[_cells(sweeps.read(number))] = True
-    return answering
+class Answering(NamedTuple):
+    """Where a sensor has returns at all."""
+
+    cells: Bools  # (r, c): rings and columns; in the others the carrier hides all
+    max_range_m: float  # of a return
+
+    @classmethod
+    def of_sweeps(cls, sweeps: RecordedSweeps) -> Answering:
+        """Look where any sweep has a return; LidarError if the recording cannot be read."""
+        cells = np.zeros((sweeps.ring_count, _COLUMNS), bool)
+        max_range_m = 0.0
+        for number in even_indices(sweeps.count, _ANSWERING_SWEEPS).tolist():
+            sweep = sweeps.read(number)
+            cells[_cells(sweep)] = True
+            if len(sweep):
+                max_range_m = max(max_range_m, float(np.linalg.norm(sweep.points, axis=1).max()))
+        return cls(cells, max_range_m)
 
 
 def _cells(sweep: RecordedSweep) -> tuple[Ints, Ints]:
