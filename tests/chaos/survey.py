@@ -98,7 +98,7 @@ class GrowingOutput(StoredOutput):
         """Begin the file, with the points of an earlier run."""
         job = run.store.only_job
         assert job is not None
-        growing = GrowingCloud(self._folder / "growing.ply", job)
+        growing = GrowingCloud(self._folder / "growing.ply", job, from_above=True)
         self._set(_growing=run.stack.enter_context(growing))
 
     def on_parts(self, parts: Sequence[Receipt]) -> None:
@@ -109,7 +109,7 @@ class GrowingOutput(StoredOutput):
         """Complete the file, and return the result."""
         path = self._folder / "cloud.ply"
         points = run.store.only_job.points()
-        if self._growing.finish(path, points, from_above=True) is not None:
+        if self._growing.finish(path, points) is not None:
             self._set(ply=path.read_bytes())
         return super().finish(run)
 

@@ -8,12 +8,12 @@ import threading
 
 import numpy as np
 import pytest
+from tests.cloud_counting import counts_of
 from tests.committing import commit
 from tests.daemons import wait_until
 
 from lidarpool import Job, LidarError, Scene, Sensor, Survey, read_cloud, save_cloud
 from lidarpool.clouds import ply
-from lidarpool.report.cloud_counts import CloudCounts
 from lidarpool.report.growing_cloud import GrowingCloud, write_cloud
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.store.run_store import RunStore
@@ -66,14 +66,14 @@ def test_bytes_and_counts_are_those_of_a_cloud_written_at_once(
     firsts = sorted(parts, reverse=order == "reversed")
     if order == "shuffled":
         random.Random(3).shuffle(firsts)
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
         for first in firsts:
             add(store, growing, first, parts[first])
         points = store.only_job.points()
-        counts = growing.finish(tmp_path / "grown.ply", points, from_above=True)
+        counts = growing.finish(tmp_path / "grown.ply", points)
     save_cloud(points, tmp_path / "whole.ply")
     assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    expected = CloudCounts.from_cloud(points, len(SCENE.all_names), len(SCENE.material_names))
+    expected = counts_of(points, len(SCENE.all_names), len(SCENE.material_names))
     assert counted(counts) == counted(expected)
     sweeps = Sweeps.from_survey(SURVEY, SCENE)
     again = write_cloud(tmp_path / "again.ply", points, sweeps, SCENE, from_above=True)
@@ -83,21 +83,21 @@ def test_bytes_and_counts_are_those_of_a_cloud_written_at_once(
 
 @pytest.mark.parametrize("far_first", [0, 5, 10])
 def test_a_late_part_far_away_makes_all_positions_double(store, tmp_path, far_first):
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
         for first, counts in PARTS.items():
             add(store, growing, first, counts, offset=10**9 * (first == far_first))
         points = store.only_job.points()
-        counts = growing.finish(tmp_path / "grown.ply", points, from_above=True)
+        counts = growing.finish(tmp_path / "grown.ply", points)
     assert read_cloud(tmp_path / "grown.ply").positions.dtype == np.float64
     save_cloud(points, tmp_path / "whole.ply")
     assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    expected = CloudCounts.from_cloud(points, len(SCENE.all_names), len(SCENE.material_names))
+    expected = counts_of(points, len(SCENE.all_names), len(SCENE.material_names))
     assert counted(counts) == counted(expected)
 
 
 def test_it_grows_by_parts_whose_predecessors_are_committed(store, tmp_path):
     path = grown_at(tmp_path / "new")
-    with GrowingCloud(path, store.only_job) as growing:
+    with GrowingCloud(path, store.only_job, from_above=True) as growing:
         for first in (0, 5, 2):
             add(store, growing, first, PARTS[first])
         row_bytes = 3 * 4 + 4 + 2 + 4 + 8 + 2 + 4  # position, scan, channel, object, and COLUMNS
@@ -113,22 +113,22 @@ def test_it_grows_by_parts_whose_predecessors_are_committed(store, tmp_path):
 def test_a_resumed_run_begins_with_the_parts_that_are_there(store, tmp_path):
     for first in (0, 2, 5):
         add(store, None, first, PARTS[first])
-    with GrowingCloud(grown_at(tmp_path / "killed"), store.only_job) as growing:
+    with GrowingCloud(grown_at(tmp_path / "killed"), store.only_job, from_above=True) as growing:
         add(store, growing, 3, PARTS[3])
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
         for first in (10, 8):
             add(store, growing, first, PARTS[first])
         points = store.only_job.points()
-        assert growing.finish(tmp_path / "grown.ply", points, from_above=False) is not None
+        assert growing.finish(tmp_path / "grown.ply", points) is not None
     save_cloud(points, tmp_path / "whole.ply")
     assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
 
 
 def test_a_survey_without_points(store, tmp_path):
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
         add(store, growing, 0, [0] * 12)
         points = store.only_job.points()
-        assert growing.finish(tmp_path / "grown.ply", points, from_above=True) is None
+        assert growing.finish(tmp_path / "grown.ply", points) is None
     sweeps = Sweeps.from_survey(SURVEY, SCENE)
     counts = write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE, from_above=True)
     assert len(read_cloud(tmp_path / "cloud.ply")) == 0
@@ -137,7 +137,10 @@ def test_a_survey_without_points(store, tmp_path):
 
 def test_a_run_that_ends_early_leaves_no_file_and_no_thread(store, tmp_path):
     path = grown_at(tmp_path / "new")
-    with pytest.raises(KeyboardInterrupt), GrowingCloud(path, store.only_job) as growing:
+    with (
+        pytest.raises(KeyboardInterrupt),
+        GrowingCloud(path, store.only_job, from_above=True) as growing,
+    ):
         add(store, growing, 0, PARTS[0])
         raise KeyboardInterrupt
     assert not any(path.parent.iterdir())
@@ -160,7 +163,7 @@ def test_a_file_that_fails_is_removed_and_the_end_says_the_error(
         write(target, cloud, real)
 
     monkeypatch.setattr(ply, "write_with_open3d", faulty)
-    with GrowingCloud(path, store.only_job) as growing:
+    with GrowingCloud(path, store.only_job, from_above=True) as growing:
         if fault == "read-only":
             path.parent.rmdir()
         for first, counts in PARTS.items():
@@ -170,7 +173,7 @@ def test_a_file_that_fails_is_removed_and_the_end_says_the_error(
                 store.storage.write(part.name, b"damaged")
             growing.add([part])
         points = store.only_job.points()
-        assert growing.finish(tmp_path / "grown.ply", points, from_above=True) is None
+        assert growing.finish(tmp_path / "grown.ply", points) is None
     assert not path.exists() and not (tmp_path / "grown.ply").exists()
     if fault in ("no room for parts", "read-only"):
         return

@@ -15,11 +15,11 @@ import pytest
 import yaml
 from lxml import html
 from PIL import Image
+from tests.cloud_counting import counts_of
 
 from lidarpool import Cloud, Mounted, Noise, Planning, Result, Returns, Scene, Survey, load_sensor
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.cloud_counts import CloudCounts
 from lidarpool.report.page.rendering import MAX_ROWS, put_picture, sentence, write_page
 from lidarpool.report.report import make_report
 from lidarpool.run.pipeline.stage_names import COLLECT, GENERATE, INTERSECT, SORT
@@ -109,7 +109,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
                 "trials": trials,
                 "backend": "numpy",
                 "rays": survey.ray_count,
-                "hits": 5 * points,
+                "hit_count": 5 * points,
                 "stages": tuple(book.stages.values()),
                 "seconds": 10.0,
                 "survey_seconds": 6.2,
@@ -125,7 +125,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
         )
         drawn = PICTURES if plan else PICTURES[:4]
         page = tmp_path / "report.html"
-        numbers = CloudCounts.from_cloud(result.points, len(scene.names))
+        numbers = counts_of(result.points, len(scene.names))
         report = make_report(result, numbers)
         write_page(page, report, result, numbers, scenario)
         for name in drawn:
@@ -169,8 +169,9 @@ def test_the_points_are_shown_from_above(write):
     (source,) = html.fromstring(write(cloud=Cloud(places, columns))[0]).xpath("//image/@href")
     with Image.open(io.BytesIO(b64decode(source.partition(",")[2]))) as image:
         shade = np.asarray(image)[..., 3]
-    assert shade.shape == (26, 51)  # the north is up
-    assert (shade[25, 0], shade[25, 50], shade[0, 0]) == (255, 127, 127)
+    rows, columns = shade.shape
+    assert 25 < columns <= 50 and 1.8 < columns / rows < 2.2  # 10 by 5 m
+    assert (shade[-1, 0], shade[-1, -1], shade[0, 0]) == (255, 127, 127)  # the north is up
     assert np.count_nonzero(shade) == 3
 
 
@@ -179,9 +180,13 @@ def test_sensors_within_the_points_are_marked_from_above(write):
     columns = {name: np.zeros(3, np.int32) for name in ("scan", "channel", "object")}
     page = html.fromstring(write(cloud=Cloud(corners, columns))[0])
     marks = [(float(c.get("cx")), float(c.get("cy"))) for c in page.xpath("//circle")]
-    pixels = 5.0  # per metre
-    rows = 26
-    assert marks == [(pixels, rows - pixels), (2 * pixels, rows - pixels)]
+    (size,) = page.xpath("//image")
+    rows = int(size.get("height"))
+    pixels = 1 / 0.256  # per metre; the first row and column are of points 1 m from the marks
+    (first, y), (second, other_y) = marks
+    assert second - first == pytest.approx(pixels, abs=0.11)
+    assert pixels - 0.1 <= first <= pixels + 1.1
+    assert y == other_y and rows - pixels - 1.1 <= y <= rows - pixels + 0.1
     assert "the positions of sensors in red" in page.text_content()
 
 
@@ -336,7 +341,7 @@ def test_the_density_is_that_of_the_surfaces(each):
     zero = np.zeros_like(u)
     both = np.concatenate([np.stack([u, v, zero], axis=1), np.stack([u, zero, v], axis=1)])
     columns = {name: np.zeros(len(both), np.int32) for name in ("scan", "channel", "object")}
-    found = CloudCounts.from_cloud(Cloud(both + np.array([5e5, 0, 100]), columns), 1)
+    found = counts_of(Cloud(both + np.array([5e5, 0, 100]), columns), 1)
     assert found.density == pytest.approx(each, rel=0.3)
 
 
@@ -373,7 +378,7 @@ STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"points": 0, "hits": 0}, "has no points: no ray hit anything within range."),
+        ({"points": 0, "hit_count": 0}, "has no points: no ray hit anything within range."),
         ({"points": 1}, "1 point of them is in the cloud"),
         ({"tasks": (), "resumed": 120}, "No task ran"),
         ({"plan": ENCLOSED}, "none, the obstacles leave no way"),

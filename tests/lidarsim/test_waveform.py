@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cloud_counting import counts_of
 from tests.shapes import beam_along_x, cast, cast_between, quad, wall
 
 from lidarpool import (
@@ -22,7 +23,6 @@ from lidarpool import (
     Survey,
     save_cloud,
 )
-from lidarpool.report.cloud_counts import CloudCounts
 from lidarsim.columns.table import AXES, CAUSES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.sensor.optics import FWHM, LIGHT_M_NS, Optics
@@ -354,6 +354,6 @@ def test_other_formats_leave_waveforms_out(tmp_path):
     save_cloud(cloud, tmp_path / "cloud.ply")
     assert b"waveform" not in (tmp_path / "cloud.ply").read_bytes()[:2000]
     assert "waveform" not in cloud.to_dataframe().columns
-    numbers = CloudCounts.from_cloud(cloud, objects=60)
+    numbers = counts_of(cloud, objects=60)
     assert numbers.by_object.sum() == len(cloud)
     assert "range" in numbers.limits and WAVEFORM not in numbers.limits

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from lidarsim.base.archives import Piece, read_arrays, read_npy, stored_pieces
-from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Integers, Ints, Ints32
+from lidarsim.base.arrays import AnyArray, Floats, Integers, Ints, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.input_files import open_input
@@ -226,16 +226,6 @@ class StoredCloud(CloudDisplay):
         for i, axis in enumerate(AXES):
             cells = part.columns[axis.name][row_range]
             yield axis.name, positions_of(cells, self.precision_m, self.origin[i])
-
-    def cells_along(self, axis: int, coordinates: AnyFloats) -> Ints:
-        """Return the cells of coordinates along an axis, (n,), metres.
-
-        Coordinates in a file err by a tenth of the precision at most.
-        """
-        cells = coordinates.astype(np.float64)
-        cells -= self.origin[axis]
-        cells /= self.precision_m
-        return np.rint(cells, out=cells).astype(np.int64)
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the cloud in order, from row `first` on, in chunks of `points`.

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, AnyFloats, Floats, Ints
-from lidarsim.columns.cloud import CloudLike
+from lidarsim.base.arrays import AnyArray, Floats, Ints, Ints32
 from lidarsim.columns.part_columns import positions_of
-from lidarsim.columns.ply_format import PlyLayout, layout
-from lidarsim.columns.table import AXES, Column
+from lidarsim.columns.table import Column
 
-from ..clouds.pieces import THREADS
-from ..columns.parts import StoredCloud
-
-_CELLS = 64  # cells along an axis of the grid that counts points, a power of two
-_BLOCK_ROWS = 1 << 15  # rows whose positions are counted at a time, which fit into a cache
-_MIN_POINTS = 12  # points in a cell that suffice for an estimate of density
+_CUBES = 64  # most cubes along an axis of the grid that measures density, a power of two
+_SQUARES = 1024  # most pixels along an axis of the points from above, a power of two
+_MIN_SQUARES = 50  # pixels along an axis that are not joined, however few the points are
+_MIN_POINTS = 12  # points in a cube that suffice for an estimate of density
+# Added to coordinates, in binary 101…0101. Multiples of no power of two are near it, so that no
+# grid has a boundary at zero, where floors often are: their points would be in two layers.
+_SHIFT = 0x15555555
 
 
 class CloudCounts:
-    """Statistics of a cloud: columns are added piece by piece, and positions once bounds are known.
+    """Statistics of a cloud, whose points are added piece by piece.
 
     `by_object`, `by_class` and `by_material` are the numbers of points of each object, class and
     material, `no_surface` the points of no object, and `limits` are {column: minimum and maximum}.
-    `bounds`, `above` and `density` are as in `PositionCounts`.
 
     Parameters
     ----------
@@ -36,31 +32,34 @@ class CloudCounts:
         Columns beside the positions.
     objects, materials
         Numbers of objects and materials of the scene.
+    precision_m
+        Size of the cells of positions, metres.
+    origin
+        World position of the cell 0, 0, 0, (3,), metres.
+    from_above
+        Whether `above` is counted.
     """
 
-    def __init__(self, table: Sequence[Column], objects: int, materials: int = 0) -> None:
+    def __init__(
+        self,
+        table: Sequence[Column],
+        objects: int,
+        materials: int,
+        precision_m: float,
+        origin: Floats,
+        *,
+        from_above: bool,
+    ) -> None:
         self.table = tuple(table)
         self.by_object = np.zeros(objects, np.int64)
         self.no_surface = 0
         self.by_class = np.zeros(1 << 16, np.int64)
         self.by_material = np.zeros(materials, np.int64)
         self.limits: dict[str, tuple[float, float]] = {}
-        self._positions = PositionCounts(np.zeros((2, 3)), 0)
-
-    @classmethod
-    def from_cloud(cls, cloud: CloudLike, objects: int, materials: int = 0) -> CloudCounts:
-        """Return the statistics of a whole cloud, which is read once."""
-        counts = cls(cloud.table, objects, materials)
-        positions = PositionCounts(cloud.bounds, len(cloud))
-        for chunk in cloud.chunks():
-            counts.add(chunk.columns)
-            x, y, z = chunk.positions.T
-            cells = positions.cell_index(0, x) + positions.cell_index(1, y)
-            cells += positions.cell_index(2, z)
-            positions.add_cells(cells)
-            positions.add_pixels(positions.pixel_index(0, x) + positions.pixel_index(1, y))
-        counts._positions = positions
-        return counts
+        self._precision_m = precision_m
+        self._origin = origin
+        self._cubes = GridCounts(3, _CUBES)
+        self._squares = GridCounts(2, _SQUARES) if from_above else None
 
     def add(self, columns: Mapping[str, AnyArray]) -> None:
         """Add points: {name of a column: (n,)}, n > 0."""
@@ -83,142 +82,167 @@ class CloudCounts:
                 max(upper, np.fmax.reduce(values).item()),
             )
 
-    def add_positions(self, points: StoredCloud, path: Path, *, from_above: bool) -> None:
-        """Add the positions of all points, from their PLY file, as in `PositionCounts`.
+    def widen(self, cell_box: Ints) -> None:
+        """Make room for points between lowest and highest cells, (2, 3), before they are added."""
+        self._cubes.widen(cell_box)
+        if self._squares is not None:
+            self._squares.widen(cell_box[:, :2])
 
-        `above` is counted only if `from_above`, because it takes as long as all else.
+    def add_positions(self, cells: Sequence[Ints32]) -> None:
+        """Add points by their cells along x, y and z, (n,) each.
+
+        Intermediate arrays are as long as these: some 10⁵ points at a time stay in a cache.
         """
-        counted = partial(_counted_positions, points, path, layout(path), from_above)
-        size = -(-len(points) // THREADS) or 1
-        starts = range(0, len(points), size)
-        self._positions = PositionCounts(points.bounds, len(points))
-        with ThreadPoolExecutor(THREADS, "count") as pool:  # NumPy lets threads run
-            for positions in pool.map(counted, starts, [start + size for start in starts]):
-                self._positions.merge(positions)
+        self._cubes.add(cells)
+        if self._squares is not None:
+            self._squares.add(cells[:2])
 
     @property
     def bounds(self) -> Floats:
-        """Lowest and highest coordinates in the world, (2, 3), metres."""
-        return self._positions.bounds
+        """Lowest and highest coordinates in the world, (2, 3), metres, or zeros without points."""
+        box = self._cubes.box
+        if box is None:
+            return np.zeros((2, 3))
+        return positions_of(box, self._precision_m, self._origin)
 
     @property
     def above(self) -> Ints:
-        """Points seen from above."""
-        return self._positions.above
+        """Numbers of points seen from above, (rows, columns), the first row in the south."""
+        return self._pixels.counts.T
 
     @property
     def pixel_m(self) -> float:
         """Side of a pixel of `above`, metres."""
-        return self._positions.pixel_m
+        return self._pixels.side * self._precision_m
 
     @property
-    def density(self) -> float | None:
-        """Points per square metre."""
-        return self._positions.density
+    def corner(self) -> Floats:
+        """World position of the corner of `above` in the south-west, (2,), metres."""
+        return positions_of(self._pixels.lowest, self._precision_m, self._origin[:2])
 
-
-class PositionCounts:
-    """Numbers of points in a grid and seen from above.
-
-    The bounds of all points must be known.
-
-    `above` (rows, columns) are the numbers of points seen from above, the first row in the south.
-
-    Parameters
-    ----------
-    bounds
-        Lowest and highest coordinates in the world, (2, 3), metres.
-    count
-        Number of all points.
-    """
-
-    def __init__(self, bounds: AnyFloats, count: int) -> None:
-        self.bounds: Floats = np.asarray(bounds, dtype=np.float64)
-        # A cell that a surface crosses has about the square of its side of that surface.
-        self._side = float(np.ptp(self.bounds, axis=0).max()) / _CELLS or 1.0
-        self._cells = np.zeros(_CELLS**3, np.int64)
-        # The more points, the finer.
-        across = np.ptp(self.bounds[:, :2], axis=0)
-        self.pixel_m = float(across.max() / np.clip(count**0.5, 50, 800)) or 1.0
-        self.above = np.zeros((across[::-1] / self.pixel_m).astype(np.int64) + 1, np.int64)
-
-    def cell_index(self, axis: int, positions: AnyFloats) -> Ints:
-        """Return the part of an axis in the indices of cells of the grid, of coordinates (n,)."""
-        cells = ((positions - self.bounds[0, axis]) / self._side).astype(np.int64)
-        return cells.clip(0, _CELLS - 1) * _CELLS ** (2 - axis)
-
-    def pixel_index(self, axis: int, positions: AnyFloats) -> Ints:
-        """Return the part of x or y in the indices of pixels, of coordinates (n,)."""
-        rows, columns = self.above.shape
-        pixels = ((positions - self.bounds[0, axis]) / self.pixel_m).astype(np.int64)
-        return pixels.clip(0, columns - 1) if axis == 0 else pixels.clip(0, rows - 1) * columns
-
-    def add_cells(self, cells: Ints) -> None:
-        """Add points by the indices of their cells in the grid, (n,)."""
-        # Of few points, `bincount` would take longer to make its array than to count.
-        np.add.at(self._cells, cells, 1)
-
-    def add_pixels(self, pixels: Ints) -> None:
-        """Add points by the indices of their pixels, (n,)."""
-        np.add.at(self.above.reshape(-1), pixels, 1)
-
-    def merge(self, other: PositionCounts) -> None:
-        """Add the points of counts with the same bounds."""
-        self._cells += other._cells
-        self.above += other.above
+    @property
+    def _pixels(self) -> GridCounts:
+        """Grid of `above`: the more points, the finer, with a point or two in a pixel."""
+        assert self._squares is not None, "counted from above"
+        pixels = deepcopy(self._squares)
+        across = max(_MIN_SQUARES, (2 * pixels.total) ** 0.5)
+        while max(pixels.shape) > across:
+            pixels.coarsen()
+        return pixels
 
     @property
     def density(self) -> float | None:
         """Points per square metre, the median over the surfaces, or None without points."""
-        if not self._cells.any():
+        cubes = deepcopy(self._cubes)
+        if not cubes.total:
             return None
-        cells = self._cells.reshape(3 * (_CELLS,))
-        side = self._side
-        while (median := float(np.median(cells[cells > 0]))) < _MIN_POINTS and len(cells) > 1:
-            half = len(cells) // 2  # gaps between sparse points count in larger cells
-            cells = cells.reshape(half, 2, half, 2, half, 2).sum((1, 3, 5))
-            side = 2 * side
-        return median / side**2
+        # Gaps between sparse points are within larger cubes.
+        while (median := cubes.median) < _MIN_POINTS and max(cubes.shape) > 2:
+            cubes.coarsen()
+        # A cube that a surface crosses has about the square of its side of that surface.
+        return median / (cubes.side * self._precision_m) ** 2
 
 
-def _counted_positions(
-    points: StoredCloud, path: Path, ply: PlyLayout, from_above: bool, start: int, stop: int
-) -> PositionCounts:
-    """Return the counts of the points in the rows from `start` to `stop` of a PLY file."""
-    counts = PositionCounts(points.bounds, len(points))
-    cell_indices = [_of_cells(points, axis, partial(counts.cell_index, axis)) for axis in range(3)]
-    pixel_indices = [
-        _of_cells(points, axis, partial(counts.pixel_index, axis)) for axis in range(2)
-    ]
-    for first in range(start, min(stop, ply.points), _BLOCK_ROWS):
-        # Pages of a mapped file would count as memory of this process.
-        offset = ply.start + first * ply.row.itemsize
-        block = np.fromfile(path, ply.row, min(_BLOCK_ROWS, stop - first), offset=offset)
-        x, y, z = (points.cells_along(axis, block[AXES[axis].name]) for axis in range(3))
-        cells = cell_indices[0](x) + cell_indices[1](y)
-        cells += cell_indices[2](z)
-        counts.add_cells(cells)
-        if from_above:
-            counts.add_pixels(pixel_indices[0](x) + pixel_indices[1](y))
-    return counts
+class GridCounts:
+    """Numbers of points in a grid of squares or cubes, which are larger where points are far apart.
 
+    The grid is the finest with at most `across` squares or cubes along each axis. A side is a power
+    of two of cells of positions, and larger cubes consist of whole smaller cubes. So the numbers
+    are the same whatever the order of the points is, and no point is needed again.
 
-def _of_cells(
-    points: StoredCloud, axis: int, of_positions: Callable[[AnyFloats], Ints]
-) -> Callable[[Ints], Ints]:
-    """Return a function of cells along an axis for a function of coordinates.
+    A part of an axis has the number `(cell + _SHIFT) >> level`, and the array has the part at this
+    number modulo `across`: the array stays as it is while points spread in any direction.
 
-    If there are fewer cells than points, the function is computed once for each cell.
+    Parameters
+    ----------
+    axes
+        Number of axes, 2 or 3.
+    across
+        Largest number of squares or cubes along an axis, a power of two.
     """
-    origin_m = points.origin[axis]
 
-    def of_cells(cells: Ints) -> Ints:
-        return of_positions(positions_of(cells, points.precision_m, origin_m))
+    def __init__(self, axes: int, across: int) -> None:
+        self._across = across
+        self._level = 0
+        self.box: Ints | None = None  # lowest and highest cells, (2, axes); None without points
+        self._array = np.zeros(axes * (across,), np.int64)
 
-    if points.cells is None:
-        return of_cells
-    lower, upper = points.cells[:, axis].tolist()
-    if upper - lower >= len(points):
-        return of_cells
-    table = of_cells(np.arange(lower, upper + 1))
-    return lambda cells: table.take(cells - lower)
+    def widen(self, cell_box: Ints) -> None:
+        """Make room for points between lowest and highest cells, (2, axes)."""
+        earlier = self.box
+        if earlier is not None:
+            lowest = np.minimum(cell_box[0], earlier[0])
+            cell_box = np.stack([lowest, np.maximum(cell_box[1], earlier[1])])
+        while (np.diff(_numbers(cell_box, self._level), axis=0) >= self._across).any():
+            if earlier is None:
+                self._level += 1
+            else:
+                self.coarsen()
+        self.box = cell_box
+
+    def add(self, cells: Sequence[Ints32]) -> None:
+        """Add points by their cells along each axis, (n,), within the box of `widen`."""
+        indices = np.zeros(1, np.int32)
+        for along_axis in cells:
+            # A sum beyond 32 bits differs in bits that are not used.
+            numbers = along_axis + np.int32(_SHIFT)
+            numbers >>= self._level
+            numbers &= self._across - 1
+            numbers += indices * self._across
+            indices = numbers
+        # `bincount` would make an array of the grid's size each time.
+        np.add.at(self._array.reshape(-1), indices.astype(np.intp), 1)
+
+    def coarsen(self) -> None:
+        """Double the side."""
+        if self.box is not None:
+            lowest = _numbers(self.box[0], self._level)
+            finer = [low + np.arange(self._across) for low in lowest]
+            counts = self._array[self._indices(finer)]
+            self._array = np.zeros_like(self._array)
+            np.add.at(self._array, self._indices([numbers >> 1 for numbers in finer]), counts)
+        self._level += 1
+
+    def _indices(self, numbers: Sequence[Ints]) -> tuple[Ints, ...]:
+        """Return indices of the array of all combinations of numbers along each axis."""
+        return np.ix_(*(along_axis % self._across for along_axis in numbers))
+
+    @property
+    def total(self) -> int:
+        """Number of points."""
+        return int(self._array.sum())
+
+    @property
+    def median(self) -> float:
+        """Median of the numbers of points in squares or cubes with points."""
+        return float(np.median(self._array[self._array > 0]))
+
+    @property
+    def side(self) -> int:
+        """Side of a square or cube in cells."""
+        return 1 << self._level
+
+    @property
+    def lowest(self) -> Ints:
+        """Lowest cell of `counts` along each axis, (axes,)."""
+        box = np.zeros((2, self._array.ndim), np.int64) if self.box is None else self.box
+        return (_numbers(box[0], self._level) << self._level) - _SHIFT
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of squares or cubes along each axis, between the lowest and highest points."""
+        if self.box is None:
+            return self._array.ndim * (1,)
+        return tuple((np.diff(_numbers(self.box, self._level), axis=0)[0] + 1).tolist())
+
+    @property
+    def counts(self) -> Ints:
+        """Number of points in each square or cube between the lowest and highest points."""
+        lowest = (self.lowest + _SHIFT) >> self._level
+        numbers = [low + np.arange(n) for low, n in zip(lowest, self.shape, strict=True)]
+        return self._array[self._indices(numbers)]
+
+
+def _numbers(cells: Ints, level: int) -> Ints:
+    """Return the numbers of parts of axes that contain cells."""
+    return (cells + _SHIFT) >> level

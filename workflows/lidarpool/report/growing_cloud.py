@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.errors import LidarError
+from lidarsim.columns.table import AXES
 from lidarsim.scene.scene import Scene
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -60,6 +61,8 @@ class CloudWriter:
         Type of positions in the file (`real_type`).
     expected_count
         Expected number of points (`GrowingPly`).
+    from_above
+        Whether the points are counted as seen from above, too, which takes as long as the rest.
     """
 
     def __init__(
@@ -70,10 +73,18 @@ class CloudWriter:
         scene: Scene,
         position_type: np.dtype[np.floating],
         expected_count: int,
+        *,
+        from_above: bool,
     ) -> None:
-        self.counts = CloudCounts(points.table, len(scene.all_names), len(scene.material_names))
+        self.counts = CloudCounts(
+            points.table,
+            len(scene.all_names),
+            len(scene.material_names),
+            points.precision_m,
+            points.origin,
+            from_above=from_above,
+        )
         self.file = GrowingPly(path, points.table, position_type, sweeps, expected_count)
-        self._path = path
         self._points = points
         self._flushed_bytes = 0
 
@@ -83,11 +94,14 @@ class CloudWriter:
         LidarError if the part cannot be used, OSError if the disk is full.
         """
         part = read_part(self._points.storage, name)
-        if len(part):
+        cell_box = part.cell_box
+        if cell_box is not None:
             columns = self._points.columns_of(part)
             self.counts.add(columns)
+            self.counts.widen(cell_box)
             for first in range(0, len(part), _BLOCK_ROWS):
                 rows = slice(first, min(first + _BLOCK_ROWS, len(part)))
+                self.counts.add_positions([part.columns[axis.name][rows] for axis in AXES])
                 values = ((name, values[rows]) for name, values in columns.items())
                 positions = self._points.positions_of(part, rows)
                 self.file.append(rows.stop - first, chain(positions, values))
@@ -99,10 +113,9 @@ class CloudWriter:
             self._flushed_bytes = self.file.size
             self.file.flush()
 
-    def finish(self, points: StoredCloud, *, from_above: bool) -> CloudCounts:
-        """Complete the file, and return the counts of `points` as `CloudCounts.add_positions`."""
+    def finish(self) -> CloudCounts:
+        """Complete the file, and return the counts of its points."""
         self.file.finish()
-        self.counts.add_positions(points, self._path, from_above=from_above)
         return self.counts
 
 
@@ -111,7 +124,7 @@ def write_cloud(
 ) -> CloudCounts:
     """Write all points to a PLY file, which must not exist, and return their counts.
 
-    See `CloudCounts.add_positions` for `from_above`.
+    `from_above` is as in `CloudWriter`.
 
     Raises
     ------
@@ -121,13 +134,14 @@ def write_cloud(
         If the file cannot be written.
     """
     position_type = real_type(points.bounds, points.precision_m)
-    writer = CloudWriter(path, points, sweeps, scene, position_type, len(points))
+    count = len(points)
+    writer = CloudWriter(path, points, sweeps, scene, position_type, count, from_above=from_above)
     with writer.file:
-        writer.file.check_room(len(points))
+        writer.file.check_room(count)
         for name, rows in zip(points.names, points.rows, strict=True):
             if rows:
                 points.tell(writer.append(name))
-        return writer.finish(points, from_above=from_above)
+        return writer.finish()
 
 
 class GrowingCloud:
@@ -142,11 +156,14 @@ class GrowingCloud:
         The file, which must not exist.
     job
         The job. Parts of an earlier run are appended first.
+    from_above
+        As in `CloudWriter`.
     """
 
-    def __init__(self, path: Path, job: JobUnderWay) -> None:
+    def __init__(self, path: Path, job: JobUnderWay, *, from_above: bool) -> None:
         self._path = path
         self._job = job
+        self._from_above = from_above
         self._sweeps = Sweeps.from_survey(job.survey, job.scene)
         # With the cells of appended parts; only their bounds are used.
         self._points = replace(job.points(), cells=None)
@@ -186,11 +203,10 @@ class GrowingCloud:
         if self._thread.ident is None:
             self._thread.start()
 
-    def finish(self, path: Path, points: StoredCloud, *, from_above: bool) -> CloudCounts | None:
+    def finish(self, path: Path, points: StoredCloud) -> CloudCounts | None:
         """Move the file to a path once it has all `points`, and return their counts.
 
-        None if the file failed, or was never begun. `from_above` is as in
-        `CloudCounts.add_positions`.
+        None if the file failed, or was never begun.
 
         Raises
         ------
@@ -210,7 +226,7 @@ class GrowingCloud:
             self._discard()
             return None
         with writer.file:
-            counts = writer.finish(points, from_above=from_above)
+            counts = writer.finish()
         self._path.replace(path)
         self._writer = None
         return counts
@@ -267,7 +283,13 @@ class GrowingCloud:
         scans = self._next_scan - self._job.scans.start
         expected_count = rows * len(self._job.scans) // scans
         return CloudWriter(
-            self._path, self._points, self._sweeps, self._job.scene, position_type, expected_count
+            self._path,
+            self._points,
+            self._sweeps,
+            self._job.scene,
+            position_type,
+            expected_count,
+            from_above=self._from_above,
         )
 
     def _check_room(self, part: _Part) -> None:

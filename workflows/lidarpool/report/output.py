@@ -71,6 +71,11 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             output_format for output_format in self.formats if output_format.format != "ply"
         ]
 
+    @property
+    def _has_page(self) -> bool:
+        """True if the page, which shows the points from above, is written."""
+        return self.extent != "cloud"
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Lock the folder while the body runs."""
@@ -134,7 +139,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         job = run.store.only_job
         assert job is not None, "of a survey"
         folder = run.stack.enter_context(staging(self._folder, self.target))
-        self._growing = run.stack.enter_context(GrowingCloud(folder / CLOUD, job))
+        growing = GrowingCloud(folder / CLOUD, job, from_above=self._has_page)
+        self._growing = run.stack.enter_context(growing)
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Append parts to the cloud."""
@@ -231,7 +237,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             report = make_report(result, counts)
             for output_format in self.formats:
                 report["notes"] += output_format.notes(result.points, sweeps)
-            if self.extent != "cloud":
+            if self._has_page:
                 self._report(result, report, counts, staged, show)
             _write_report(staged, report, further)
             timeline.mark(timeline.REPORT_WRITTEN)
@@ -253,13 +259,12 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         Returns the counts of points.
         """
         points = _shown_points(result, CLOUD, show)
-        on_page = self.extent != "cloud"
         with explained(f"{path} cannot be written"):
             if self._growing is not None:
-                counts = self._growing.finish(path, points, from_above=on_page)
+                counts = self._growing.finish(path, points)
                 if counts is not None:
                     return counts
-            return write_cloud(path, points, sweeps, result.scene, from_above=on_page)
+            return write_cloud(path, points, sweeps, result.scene, from_above=self._has_page)
 
     def _report(
         self,

@@ -17,6 +17,7 @@ import numpy as np
 
 from .allowance import Allowance
 from .arrays import AnyArray
+from .checksum import crc32
 from .errors import LidarError, explained, prefixed
 from .input_files import read_input
 
@@ -106,7 +107,7 @@ def stored_pieces(arrays: Mapping[str, AnyArray]) -> list[Piece]:
         array = np.ascontiguousarray(array)
         content = array.reshape(-1).view(np.uint8).data
         head = _npy_head(array)
-        crc = zlib.crc32(content, zlib.crc32(head))  # other threads run meanwhile
+        crc = crc32(content, crc32(head))
         flags = 0 if name.isascii() else _UTF8
         size = len(head) + len(content)
         file = _StoredFile(f"{name}.npy".encode(), flags, crc, size, offset)
@@ -194,7 +195,7 @@ def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
     elif entry.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{entry.filename} is compressed by a method other than Deflate")
     same_name = data[name_start : name_start + length] == entry.orig_filename.encode()
-    if not same_name or len(content) != entry.file_size or zlib.crc32(content) != entry.CRC:
+    if not same_name or len(content) != entry.file_size or crc32(content) != entry.CRC:
         raise ValueError(f"{entry.filename} is damaged")
     return content
 

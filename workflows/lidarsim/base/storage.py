@@ -12,7 +12,6 @@ import re
 import secrets
 import shutil
 import tempfile
-import zlib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
 
+from .checksum import crc32
 from .errors import LidarError
 from .extras import install_command
 from .input_files import open_input
@@ -268,7 +268,7 @@ class Storage:
         with self._reading(name) as file:
             while piece := file.read(_BLOCK_BYTES):
                 size = size + len(piece)
-                crc = zlib.crc32(piece, crc)
+                crc = crc32(piece, crc)
         return [size, crc]
 
     def put(self, path: Path, name: str) -> None:

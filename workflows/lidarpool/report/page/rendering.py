@@ -110,7 +110,7 @@ def _sensor_pixels(result: RunResult, cloud: CloudCounts) -> Floats:
     indices = even_indices(survey.path.stations, MAX_MARKS)
     positions = np.array([survey.path.pose(int(k)).position for k in indices])
     rows, columns = cloud.above.shape
-    pixels = (positions[:, :2] + result.scene.origin[:2] - cloud.bounds[0, :2]) / cloud.pixel_m
+    pixels = (positions[:, :2] + result.scene.origin[:2] - cloud.corner) / cloud.pixel_m
     is_within = ((pixels >= 0) & (pixels <= (columns, rows))).all(axis=1)
     return np.stack([pixels[:, 0], rows - pixels[:, 1]], axis=1)[is_within]
 

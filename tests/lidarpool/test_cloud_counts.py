@@ -1,0 +1,83 @@
+"""Points are counted in a grid that becomes coarser: the counts are those of all points at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidarpool.report.cloud_counts import CloudCounts, GridCounts
+
+NEAR = np.int64(0x15555555)  # added to coordinates
+
+
+def walk(axes: int, points: int, step: int, seed: int) -> np.ndarray:
+    """Cells of points that go anywhere, (points, axes)."""
+    steps = np.random.default_rng(seed).normal(0, step, (points, axes))
+    return np.cumsum(steps, axis=0).astype(np.int32)
+
+
+def box_of(cells: np.ndarray) -> np.ndarray:
+    """Lowest and highest cells, (2, axes)."""
+    return np.stack([cells.min(axis=0), cells.max(axis=0)]).astype(np.int64)
+
+
+def grid_of(cells: np.ndarray, across: int, pieces: int) -> GridCounts:
+    """Counts of points that are added piece by piece."""
+    grid = GridCounts(cells.shape[1], across)
+    for piece in np.array_split(cells, pieces):
+        grid.widen(box_of(piece))
+        for block in np.array_split(piece, 3):
+            grid.add(list(block.T))
+    return grid
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize("across", [2, 16])
+@pytest.mark.parametrize("step", [0, 0.5, 30, 1e5])
+def test_counts_are_those_of_the_finest_grid_that_holds_all_points(axes, across, step):
+    cells = walk(axes, 3000, step, seed=axes) - 70
+    sides = (1 << level for level in range(32))
+    boxes = ((side, (box_of(cells) + NEAR) // side) for side in sides)
+    side, numbers = next((s, n) for s, n in boxes if (n[1] - n[0] < across).all())
+    expected = np.zeros(numbers[1] - numbers[0] + 1, np.int64)
+    np.add.at(expected, tuple(((cells + NEAR) // side - numbers[0]).T), 1)
+    for pieces in (1, 7, 500):
+        for order in (cells, cells[::-1]):
+            grid = grid_of(order, across, pieces)
+            assert grid.side == side
+            assert (grid.lowest == numbers[0] * side - NEAR).all()
+            assert grid.counts.tolist() == expected.tolist()
+            assert grid.total == len(cells)
+            assert (grid.box == box_of(cells)).all()
+
+
+def test_farthest_cells_are_counted():
+    limits = np.array([[-(2**31), 0, 5], [2**31 - 2**27, 0, 5]], np.int32)
+    grid = grid_of(limits, 64, 1)
+    assert grid.counts.sum() == 2 and grid.counts[0, 0, 0] == 1
+
+
+def test_a_floor_at_zero_is_in_one_layer():
+    """At any size, and if its points are a few cells above and below."""
+    for extent in (10, 1000, 10**6, 10**9):
+        floor = np.random.default_rng(1).integers(-extent, extent, (500, 3)).astype(np.int32)
+        floor[:, 2] = np.arange(500) % 3 - 1
+        grid = grid_of(floor, 64, 2)
+        if grid.side > 8:
+            assert grid.shape[2] == 1
+
+
+def test_a_picture_from_above_has_a_point_or_two_in_a_pixel():
+    cells = np.random.default_rng(2).integers(0, 40_000, (20_000, 3)).astype(np.int32)
+    counts = CloudCounts([], 1, 0, 0.001, np.array([100.0, 0, 0]), from_above=True)
+    counts.widen(box_of(cells))
+    counts.add_positions(list(cells.T))
+    rows, columns = counts.above.shape
+    assert counts.above.sum() == len(cells)
+    assert 100 <= rows <= 201 and 100 <= columns <= 201
+    assert counts.pixel_m == pytest.approx(40 / columns, rel=0.05)
+    x, y = ((cells[:, :2] * 0.001 + [100, 0] - counts.corner) // counts.pixel_m).astype(int).T
+    expected = np.zeros((rows, columns), int)
+    np.add.at(expected, (y, x), 1)
+    assert abs(expected - counts.above).sum() <= 2 * len(cells) * 0.001 / counts.pixel_m * 4
+    assert counts.bounds == pytest.approx(np.array([[100, 0, 0], [140, 40, 40]]), abs=0.1)
