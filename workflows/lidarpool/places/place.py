@@ -186,10 +186,11 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
         outward.append(sweep.origins[mask] - sweep.world[mask])
         if sweep.classes is not None:
             classes.append(sweep.classes[mask])
+    world = np.concatenate(positions)
+    # A sweep without points may have no columns.
+    classed = sum(map(len, classes)) == len(world)
     points = ScannedPoints(
-        np.concatenate(positions),
-        np.concatenate(outward),
-        np.concatenate(classes) if len(classes) == len(positions) else None,
+        world, np.concatenate(outward), np.concatenate(classes) if classes and classed else None
     )
     return points.take(_nearest_views(sweeps.name, points))
 
