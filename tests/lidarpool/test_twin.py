@@ -27,7 +27,9 @@ from lidarpool import (
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.recording import Recording
 from lidarpool.places.lost_pulses import Answering, lost_pulses
-from lidarpool.places.recorded_sweeps import RecordedSweep, RecordedSweeps
+from lidarpool.places.motion import Motion
+from lidarpool.places.odometry import find_poses
+from lidarpool.places.recorded_sweeps import PointTimes, RecordedSweep, RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -193,6 +195,12 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
         found = lost.points[lost.ring == number]
         cosines = found @ truth.T
         assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
+    # Second returns of the pulses, whose azimuths are rounded.
+    seconds = replace(sweep, points=sweep.points * 1.01 + (1e-6, -1e-6, 0))
+    both = RecordedSweep(
+        np.concatenate([sweep.points, seconds.points]), np.tile(sweep.ring, 2), *3 * [None], -np.pi
+    )
+    assert len(lost_pulses(both, elevation, answering, 0.0)) == pytest.approx(len(lost), rel=0.01)
     unknown = lost_pulses(sweep, np.empty(0), answering, 0.0)
     assert not len(unknown.points)
 
@@ -244,6 +252,75 @@ def test_rings_are_found_in_the_order_of_points(drive):
     assert f"shows {channels} rings" in sweeps.notes[0]
     rings = sweeps.read(3).ring
     assert (np.diff(rings) >= 0).all()
+
+
+def test_times_of_points_have_one_unit_and_tell_the_period(drive):
+    opened = open_recording(drive, name="drive")
+
+    def recording(times):
+        def read(number):
+            points, columns, pose = opened.read(number)
+            kept = slice({3: 0, 4: 6}.get(number))
+            found = {"ring": columns["channel"], "time": times(columns["time"] % 100_000_000)}
+            return points[kept], {key: values[kept] for key, values in found.items()}, pose
+
+        return Recording("drive", opened.count, read)
+
+    fired_s = (opened.read(4)[1]["time"][:6] % 100_000_000) * 1e-9
+    absolute_s = 1.7e9
+    for times, half_s in (
+        (lambda ns: ns * 1e-6, 1e-9),
+        (lambda ns: absolute_s + ns * 1e-9, 1e-6),
+        (lambda ns: ns.astype(np.uint64) + np.uint64(1_700_000_000_000_000_000), 1e-9),
+        (lambda ns: (ns - 50_000_000).astype(np.int32), 1e-9),
+    ):
+        sweeps = RecordedSweeps.of_recording(recording(times))
+        found_s = sweeps.read(4).time_s
+        np.testing.assert_allclose(found_s, fired_s - fired_s.min(), atol=half_s)
+        assert not len(sweeps.read(3).time_s)
+    quick = RecordedSweeps.of_recording(recording(lambda ns: ns // 2))
+    np.testing.assert_allclose(np.diff(find_poses(quick, None).times_s), 0.05, rtol=0.01)
+    coarse = recording(lambda ns: np.where(ns < 50_000_000, 0, 128).astype(np.float32))
+    assert RecordedSweeps.of_recording(coarse).times is None
+    short = PointTimes.of_sweeps([{"t": np.arange(-100, 101, dtype=np.int8)}])  # milliseconds
+    assert short.sweep_s == pytest.approx(0.2)
+
+
+def test_a_sweep_has_its_share_of_a_step_with_dropped_sweeps():
+    points = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    sweep = RecordedSweep(points, np.zeros(4, int), None, None, None, 0.0)
+    for motion, expected in (
+        (Motion.COUNTERCLOCKWISE, [0, 0.25, 0.5, 0.75]),
+        (Motion.CLOCKWISE, [0, 0.75, 0.5, 0.25]),
+    ):
+        np.testing.assert_allclose(motion.shares(sweep, 0.1, 0.1), expected)
+        np.testing.assert_allclose(motion.shares(sweep, 0.1, 0.2), np.array(expected) / 2)
+
+
+def test_few_points_and_unknown_intensities_change_no_others(drive):
+    opened = open_recording(drive, name="drive")
+
+    def read(number):
+        points, columns, pose = opened.read(number)
+        if number == 3:
+            return points[:0], {}, pose
+        intensity = columns["intensity"].copy()
+        intensity[::500] = np.nan
+        found = {"ring": columns["channel"], "intensity": intensity}
+        found["class"] = np.full(len(points), 50)
+        # Of a ring alone: the beginning of a sweep, or the rest of one with lost packets.
+        kept = columns["channel"] == 12 if number == 5 else np.ones(len(points), bool)
+        kept = np.flatnonzero(kept)[:60] if number == 5 else kept
+        return points[kept], {key: values[kept] for key, values in found.items()}, pose
+
+    found = twin(replace(opened, read=read))
+    truth = opened.poses(range(SWEEPS))
+    relative = np.linalg.inv(found.poses[4]) @ found.poses[5]
+    expected = np.linalg.inv(truth[4]) @ truth[5]
+    np.testing.assert_allclose(relative[:3, 3], expected[:3, 3], atol=0.01)
+    assert found.scene.has_colours.any()
+    assert abs(found.figures["held_out"]["standing"]["intensity_error"]) < 0.1
+    assert list(found._classes()) == [50]
 
 
 def test_a_recording_without_a_place_is_refused(drive, tmp_path):

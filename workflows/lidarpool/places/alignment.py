@@ -46,6 +46,7 @@ _RANGE_PRIOR_M = 0.05
 _ANGLE_PRIOR_RAD = 0.003
 _POINT_SIGMA_M = 0.015  # of a point's distance to its plane, for the weight of these
 _MIN_PLANE_POINTS = 500  # of a sweep on planes: fewer do not fix its pose
+_MIN_ALIGNED_POINTS = 100  # of a sweep; with fewer its pose stays
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,22 +84,27 @@ class Alignment:
         alignment = cls(poses.matrices.copy(), poses.times_s, motion, offsets)
         if motion is Motion.COMPENSATED or not poses.share:
             return alignment
-        steps = [alignment.step(number)[0] for number in range(len(poses.matrices))]
+        steps = [alignment.step(number) for number in range(len(poses.matrices))]
         return replace(
             alignment,
             poses=np.stack(
                 [
-                    pose @ step.part(-poses.share)
-                    for pose, step in zip(poses.matrices, steps, strict=True)
+                    pose @ step.part(-poses.share * alignment.sweep_s / step_s)
+                    for pose, (step, step_s) in zip(poses.matrices, steps, strict=True)
                 ]
             ),
         )
 
+    @property
+    def sweep_s(self) -> float:
+        """Seconds that a sweep takes: from most sweeps to the next, if none was dropped."""
+        return float(np.median(np.diff(self.times_s)))
+
     def step(self, number: int) -> tuple[Step, float]:
         """Return the motion from a sweep to the next, and its seconds; of the last, from before."""
         first = min(number, len(self.poses) - 2)
-        period_s = float(self.times_s[first + 1] - self.times_s[first])
-        return Step.between(self.poses[first], self.poses[first + 1]), period_s
+        step_s = float(self.times_s[first + 1] - self.times_s[first])
+        return Step.between(self.poses[first], self.poses[first + 1]), step_s
 
     def compensated(self, sweep: RecordedSweep, number: int) -> tuple[Floats, Floats]:
         """Return the points (n, 3) of a sweep in the sensor frame of its start, calibrated.
@@ -106,8 +112,8 @@ class Alignment:
         The second array (n, 3) has the positions of the sensor when it fired, in the same frame.
         """
         points = self._calibrated(sweep)
-        step, period_s = self.step(number)
-        shares = self.motion.shares(sweep, period_s)
+        step, step_s = self.step(number)
+        shares = self.motion.shares(sweep, self.sweep_s, step_s)
         if shares is None:
             return points, np.zeros_like(points)
         return step.compensated(points, shares), shares[:, None] * step.translation
@@ -162,10 +168,11 @@ class AlignedSweeps:
 
     def lost(self, number: int) -> AlignedSweep:
         """Read a sweep and return its lost pulses in answering cells, as points a metre away."""
-        step, _ = self.alignment.step(number)
+        step, step_s = self.alignment.step(number)
         # Points as fired have no gaps by motion.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
-        moved_m = float(np.linalg.norm(step.translation)) if is_compensated else 0.0
+        share = self.alignment.sweep_s / step_s if is_compensated else 0.0
+        moved_m = share * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
         lost = lost_pulses(sweep, self.recorded.elevation_rad, self.answering, moved_m)
         return self.aligned(lost, number)
@@ -361,7 +368,8 @@ def _registered(
     pose = alignment.poses[number].copy()
     for _ in range(_STEPS):
         on_planes = _PlanePoints.of_sweep(points, pose, planes, voxel_m)
-        if on_planes.weights.sum() < min(_MIN_PLANE_POINTS, len(points) / 10):
+        enough = min(_MIN_PLANE_POINTS, len(points) / 10)
+        if len(points) < _MIN_ALIGNED_POINTS or on_planes.weights.sum() < enough:
             return pose, on_planes  # too few surfaces: odometry knows better
         arms = on_planes.points @ pose[:3, :3].T
         design = np.hstack([np.cross(arms, on_planes.normals), on_planes.normals])

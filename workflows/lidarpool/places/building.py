@@ -255,7 +255,7 @@ class _Building:
         self.tell("building the place of all sweeps")
         place, reflectances = _place_of(sweeps, standing, self.voxel_m)
         self.tell("fitting the sensor")
-        model, notes = self._sensor(sweeps, place, reflectances)
+        model, notes = self._sensor(sweeps, standing, place, reflectances)
         figures = self._figures(sweeps, standing, place) | {
             "poses": poses.source,
             "motion": sweeps.alignment.motion.value,
@@ -301,13 +301,20 @@ class _Building:
         return held_out, draw_sweep(sweeps, place, reflectances, drawn)
 
     def _sensor(
-        self, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None
+        self,
+        sweeps: AlignedSweeps,
+        standing: Mapping[int, Bools],
+        place: Place,
+        reflectances: Reflectances | None,
     ) -> tuple[SensorModel, list[str]]:
         """Return the sensor with the noise of its pulses on the place, and notes."""
         if not len(self.recorded.elevation_rad):
             assert self.base is not None
             return self.base, ["without rings, the noise of the sensor is that of its model"]
-        chosen = even_indices(self.recorded.count, _FIT_SWEEPS).tolist()
+        # A sweep with few points, as with lost packets, looks like one of another sensor.
+        counts = np.array([len(mask) for mask in standing.values()])
+        whole = np.fromiter(standing, np.int64)[counts >= np.median(counts) / 2]
+        chosen = whole[even_indices(len(whole), _FIT_SWEEPS)].tolist()
 
         def read(index: int) -> Read:
             sweep = sweeps.read(chosen[index])

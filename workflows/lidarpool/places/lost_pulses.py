@@ -19,6 +19,7 @@ from .recorded_sweeps import RecordedSweep, RecordedSweeps, elevations
 
 _MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep stretches steps
 _MAX_STEPS = 3.0  # of a ring's own step, over the typical step
+_MIN_STEP_RAD = np.radians(0.02)  # closer returns are of one pulse
 _MIN_RETURNS = 8  # of a ring whose steps are known
 _COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
 _ANSWERING_SWEEPS = 100  # that show these cells
@@ -107,9 +108,7 @@ class _Gaps(NamedTuple):
         gap_rad[lasts] += 2 * np.pi
         # Rings of some sensors fire half as often as others. A ring with few returns tells nothing.
         parts = np.split(gap_rad, starts[1:])
-        steps_rad = np.array(
-            [np.median(part[part > 0]) if part.any() else np.inf for part in parts]
-        )
+        steps_rad = np.array([_step_rad(part) for part in parts])
         typical_rad = float(np.median(steps_rad[counts >= counts.max() / 2]))
         is_known = (counts >= _MIN_RETURNS) & (steps_rad < _MAX_STEPS * typical_rad)
         step_rad = np.where(is_known, steps_rad, typical_rad).repeat(counts)
@@ -130,6 +129,11 @@ class _Gaps(NamedTuple):
         elevation = self.elevation[before]
         elevation = elevation + share * (self.elevation[self.following[before]] - elevation)
         return _Lost(azimuth, elevation, self.ring[before])
+
+
+def _step_rad(gap_rad: Floats) -> float:
+    """Return the median of the gaps (k,) of a ring that are between pulses, not within one."""
+    return float(np.median(gap_rad[gap_rad > _MIN_STEP_RAD]))
 
 
 def _received(gaps: _Gaps, ring_count: int) -> Bools:

@@ -25,14 +25,19 @@ class Motion(StrEnum):
     COUNTERCLOCKWISE = "as fired, counter-clockwise"
     CLOCKWISE = "as fired, clockwise"
 
-    def shares(self, sweep: RecordedSweep, period_s: float) -> Floats | None:
-        """Return the shares (n,) of the motion of a sweep of `period_s`; None if compensated."""
+    def shares(self, sweep: RecordedSweep, sweep_s: float, step_s: float) -> Floats | None:
+        """Return the shares (n,) of a step of `step_s`; None if compensated.
+
+        A sweep takes `sweep_s`, and a step is longer where sweeps were dropped.
+        """
         if self is Motion.TIMED:
-            return None if sweep.time_s is None else sweep.time_s / period_s
+            return None if sweep.time_s is None else sweep.time_s / step_s
         if self is Motion.COMPENSATED:
             return None
         turn = sweep.turn
-        return turn if self is Motion.COUNTERCLOCKWISE else 1 - turn
+        if self is Motion.CLOCKWISE:
+            turn = -turn % 1  # the first points are at 0, and not at 1
+        return turn * sweep_s / step_s
 
 
 class Step(NamedTuple):

@@ -98,12 +98,16 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
 
 
 def _times_s(sweeps: RecordedSweeps) -> Floats:
-    """Return the times (s,) of the sweeps, seconds, at 10 Hz from 0 if unknown."""
+    """Return the times (s,) of the sweeps, seconds.
+
+    If unknown, they are from 0, and as far apart as the times of points tell, or at 10 Hz.
+    """
     times = sweeps.recording.times
     if times is None:
-        return DEFAULT_PERIOD_S * np.arange(sweeps.count, dtype=np.float64)
+        period_s = DEFAULT_PERIOD_S if sweeps.times is None else sweeps.times.sweep_s
+        return period_s * np.arange(sweeps.count, dtype=np.float64)
     seconds = 1e-9 * np.fromiter(times(), np.float64)
-    if len(seconds) != sweeps.count or (np.diff(seconds) <= 0).any():
+    if len(seconds) != sweeps.count or not (np.diff(seconds) > 0).all():
         raise LidarError(f"{sweeps.recording.name} has times of sweeps that do not ascend.")
     return np.asarray(seconds)
 

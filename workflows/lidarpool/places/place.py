@@ -47,6 +47,16 @@ class Observations(NamedTuple):
     cosine: Floats  # (k,): of the incidence
     intensity: Floats  # (k,): NaN where the recording has none
 
+    def part(self, rays: Bools) -> Observations:
+        """Return selected rays."""
+        return Observations(
+            self.surfel[rays],
+            self.ring[rays],
+            self.range_m[rays],
+            self.cosine[rays],
+            self.intensity[rays],
+        )
+
 
 class Seen(NamedTuple):
     """Surfels that the rays of a sweep meet, as arrays of the k rays that meet a surfel."""
@@ -186,10 +196,11 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
         outward.append(sweep.origins[mask] - sweep.world[mask])
         if sweep.classes is not None:
             classes.append(sweep.classes[mask])
+    world = np.concatenate(positions)
+    # A sweep without points may have no columns.
+    classed = sum(map(len, classes)) == len(world)
     points = ScannedPoints(
-        np.concatenate(positions),
-        np.concatenate(outward),
-        np.concatenate(classes) if len(classes) == len(positions) else None,
+        world, np.concatenate(outward), np.concatenate(classes) if classes and classed else None
     )
     return points.take(_nearest_views(sweeps.name, points))
 

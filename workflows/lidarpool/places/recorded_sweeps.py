@@ -7,6 +7,7 @@ ring begins where the azimuth falls back to 0°, and the points show their rings
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,7 @@ _TIME_COLUMNS = ("t", "time", "time_s", "timestamp", "offset_time", "time_offset
 _TIME_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 _MIN_SWEEP_S = 0.01
 _MAX_SWEEP_S = 2.0
+_MIN_TIMES = 8  # different times of a sweep; fewer are times of packets, or lack precision
 _MAX_CONE_SPREAD = 0.25  # of a ring, over all elevations: lines of a Livox are no cones
 _MIN_IN_ORDER = 0.95  # share of runs whose elevations go on in one direction
 
@@ -64,6 +66,52 @@ class RecordedSweep:
         )
 
 
+class PointTimes(NamedTuple):
+    """Column of the times of points, the same for all sweeps.
+
+    Sweeps last 0.01 to 2 s, so the span of the column tells its unit: s, ms, µs or ns. A sweep of
+    few points, with a short span, has the unit of the others.
+    """
+
+    unit_s: float
+    sweep_s: float  # median span of the times of a sweep
+
+    @classmethod
+    def of_sweeps(cls, sweeps: list[dict[str, AnyArray]]) -> PointTimes | None:
+        """Find the unit of the times in columns of sweeps, or return None without times."""
+        parts = [_since_first(columns) for columns in sweeps]
+        spans = [float(part.max()) for part in parts if len(np.unique(part)) >= _MIN_TIMES]
+        if len(spans) <= len(sweeps) / 2:
+            return None
+        span = float(np.median(spans))
+        for unit_s in _TIME_UNITS_S:
+            if _MIN_SWEEP_S <= span * unit_s <= _MAX_SWEEP_S:
+                return cls(unit_s, span * unit_s)
+        return None
+
+    def of_points(self, columns: Columns) -> Floats | None:
+        """Return the times (n,) of the points of a sweep since the first, seconds.
+
+        None if a time is missing, or the times span no sweep.
+        """
+        times_s = _since_first(columns) * self.unit_s
+        is_known = len(times_s) == len(next(iter(columns.values()), ()))
+        if not is_known or (len(times_s) and times_s.max() > _MAX_SWEEP_S):
+            return None
+        return times_s
+
+
+def _since_first(columns: Columns) -> Floats:
+    """Return the times (n,) of points since the first, in their unit; empty without times."""
+    values = next((columns[name] for name in _TIME_COLUMNS if name in columns), ())
+    times = np.asarray(values)
+    if not len(times) or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+        return np.empty(0)
+    if times.dtype.kind == "i":  # differences of short integers overflow
+        times = times.astype(np.int64)
+    return np.asarray((times - times.min()).astype(np.float64))
+
+
 @dataclass(frozen=True, eq=False)
 class RecordedSweeps:
     """The sweeps of a recording, which are read one by one.
@@ -78,12 +126,15 @@ class RecordedSweeps:
         rings.
     notes
         Sentences on what the recording lacks.
+    times
+        The times of points; None if the recording has none.
     """
 
     recording: Recording
     elevation_rad: Floats
     ring_numbers: Ints | None
     notes: tuple[str, ...]
+    times: PointTimes | None = None
 
     @classmethod
     def of_recording(cls, recording: Recording) -> RecordedSweeps:
@@ -93,19 +144,21 @@ class RecordedSweeps:
         references = []
         for number in even_indices(recording.count, _REFERENCE_SWEEPS).tolist():
             points, columns = _returns(recording, number)
-            references.append((points, columns))
-        if not any(len(points) for points, _ in references):
+            if len(points):
+                references.append((points, columns))
+        if not references:
             raise LidarError(f"{recording.name} has no points: there is no place to rebuild.")
+        times = PointTimes.of_sweeps([columns for _, columns in references])
         if all(rings_of(columns) is not None for _, columns in references):
             rings = np.concatenate([np.asarray(rings_of(columns)) for _, columns in references])
             elevation = np.concatenate([elevations(points) for points, _ in references])
             numbers, medians, spread_rad = _cones(rings.astype(np.int64), elevation)
             if len(numbers) < MIN_RINGS:
-                return cls(recording, np.empty(0), None, ())
+                return cls(recording, np.empty(0), None, (), times)
             if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
                 note = f"The rings of {recording.name} are no cones: its rays are not calibrated."
-                return cls(recording, np.empty(0), None, (note,))
-            return cls(recording, medians, numbers, ())
+                return cls(recording, np.empty(0), None, (note,), times)
+            return cls(recording, medians, numbers, (), times)
         found = [_runs_in_order(points) for points, _ in references]
         runs = [run for run in found if run is not None]
         if not runs:
@@ -113,13 +166,13 @@ class RecordedSweeps:
                 f"{recording.name} has no rings, and the order of its points shows none: the rays "
                 "of the sensor are not calibrated."
             )
-            return cls(recording, np.empty(0), None, (note,))
+            return cls(recording, np.empty(0), None, (note,), times)
         medians = max(runs, key=len)
         note = (
             f"{recording.name} has no column of rings: the order of its points shows "
             f"{len(medians)} rings."
         )
-        return cls(recording, np.sort(medians)[::-1], None, (note,))
+        return cls(recording, np.sort(medians)[::-1], None, (note,), times)
 
     @property
     def count(self) -> int:
@@ -154,7 +207,7 @@ class RecordedSweeps:
             ring,
             None if intensities is None else np.asarray(intensities, np.float64),
             None if classes is None else np.asarray(classes).astype(np.int64),
-            None if self.is_compensated else _times_s(columns),
+            None if self.is_compensated or self.times is None else self.times.of_points(columns),
             _start_rad(points, ring),
         )
         return sweep if known.all() else sweep.part(known)
@@ -165,7 +218,13 @@ class RecordedSweeps:
         if not len(self.elevation_rad) or not count:
             return np.zeros(count, np.int64), np.ones(count, bool)
         if self.ring_numbers is not None:
-            numbers = np.asarray(rings_of(columns)).astype(np.int64)
+            rings = rings_of(columns)
+            if rings is None:
+                raise LidarError(
+                    f"{self.recording.name} has sweeps with a column of rings, and others without: "
+                    "give the sweeps of one sensor."
+                )
+            numbers = rings.astype(np.int64)
             order = np.argsort(self.ring_numbers)
             place = np.searchsorted(self.ring_numbers, numbers, sorter=order)
             ring = order[np.minimum(place, len(order) - 1)]
@@ -193,25 +252,6 @@ class RecordedSweeps:
 def elevations(points: Floats) -> Floats:
     """Return the elevations (n,) of points (n, 3) in the sensor frame, radians."""
     return np.asarray(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
-
-
-def _times_s(columns: Columns) -> Floats | None:
-    """Return the times (n,) of points since the first, seconds; None without a column of times.
-
-    Sweeps last 0.01 to 2 s, so the span of the column tells its unit: s, ms, µs or ns.
-    """
-    values = next((columns[name] for name in _TIME_COLUMNS if name in columns), None)
-    if values is None or not len(values):
-        return None
-    times = np.asarray(values)
-    if times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-        return None
-    since = (times - times.min()).astype(np.float64)
-    span = float(since.max())
-    for unit_s in _TIME_UNITS_S:
-        if _MIN_SWEEP_S <= span * unit_s <= _MAX_SWEEP_S:
-            return since * unit_s
-    return None
 
 
 def _start_rad(points: Floats, ring: Ints) -> float:

@@ -73,8 +73,7 @@ def fit_reflectances(seen: Observations, surfels: Surfels, ring_count: int) -> R
     Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
     Sums, not logarithms, are compared: many sensors report dark surfaces as 0.
     """
-    if not len(seen.intensity) or not np.isfinite(seen.intensity).all():
-        return None
+    seen = seen.part(np.isfinite(seen.intensity))
     if not (seen.intensity > 0).any():
         return None
     from scipy.spatial import cKDTree
