@@ -185,7 +185,7 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     received = (column < 200) | (column >= 300)  # packets of 40 degrees did not come
     rows = returned & received
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
-    sweep = RecordedSweep(points, ring[rows], None, None, None, -np.pi)
+    sweep = RecordedSweep(points, ring[rows], None, None, None, np.full(16, -np.pi))
     answering = Answering(np.ones((16, 720), bool), 50.0)
     lost = lost_pulses(sweep, elevation, answering, 0.0)
     expected = ~returned & received
@@ -198,11 +198,38 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     # Second returns of the pulses, whose azimuths are rounded.
     seconds = replace(sweep, points=sweep.points * 1.01 + (1e-6, -1e-6, 0))
     both = RecordedSweep(
-        np.concatenate([sweep.points, seconds.points]), np.tile(sweep.ring, 2), *3 * [None], -np.pi
+        np.concatenate([sweep.points, seconds.points]),
+        np.tile(sweep.ring, 2),
+        *3 * [None],
+        sweep.start_rad,
     )
     assert len(lost_pulses(both, elevation, answering, 0.0)) == pytest.approx(len(lost), rel=0.01)
     unknown = lost_pulses(sweep, np.empty(0), answering, 0.0)
     assert not len(unknown.points)
+
+
+def test_rings_start_where_their_first_pulses_are():
+    """Lasers point to either side, and the first pulses of some rings are lost in the sky."""
+    rings = np.arange(16)
+    staggered = np.radians(np.where(rings % 2, 4.0, -4.0))
+    share = np.arange(900) / 900
+    ring, column = (index.ravel() for index in np.indices((16, 900)))
+    azimuth = 1.0 + staggered[ring] + 2 * np.pi * share[column]
+    elevation = np.radians(np.linspace(10, -10, 16))[ring]
+    level = 20 * np.cos(elevation)
+    points = np.stack(
+        [level * np.cos(azimuth), level * np.sin(azimuth), 20 * np.sin(elevation)], axis=1
+    )
+    returned = (ring >= 5) | (column >= 80)
+    order = np.flatnonzero(returned)
+    columns = {"ring": ring[order]}
+    recording = Recording("drive", 4, lambda _: (points[order], columns, None))
+    turn = RecordedSweeps.of_recording(recording).read(1).turn
+    known = ring[order] >= 5
+    np.testing.assert_allclose(turn[known], share[column[order]][known], atol=1e-6)
+    # Where the first pulses are lost, the start is that of the other rings, to their stagger.
+    wrong = np.abs(turn - share[column[order]])
+    assert wrong.max() < 8.1 / 360
 
 
 def test_what_moved_is_no_part_of_the_place(place):
@@ -288,7 +315,7 @@ def test_times_of_points_have_one_unit_and_tell_the_period(drive):
 
 def test_a_sweep_has_its_share_of_a_step_with_dropped_sweeps():
     points = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
-    sweep = RecordedSweep(points, np.zeros(4, int), None, None, None, 0.0)
+    sweep = RecordedSweep(points, np.zeros(4, int), None, None, None, np.zeros(1))
     for motion, expected in (
         (Motion.COUNTERCLOCKWISE, [0, 0.25, 0.5, 0.75]),
         (Motion.CLOCKWISE, [0, 0.75, 0.5, 0.25]),

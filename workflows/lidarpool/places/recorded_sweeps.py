@@ -29,6 +29,7 @@ _TIME_COLUMNS = ("t", "time", "time_s", "timestamp", "offset_time", "time_offset
 _TIME_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
 _MIN_SWEEP_S = 0.01
 _MAX_SWEEP_S = 2.0
+_MAX_START_RAD = np.radians(12)  # between the first pulses of rings
 _MIN_TIMES = 8  # different times of a sweep; fewer are times of packets, or lack precision
 _MAX_CONE_SPREAD = 0.25  # of a ring, over all elevations: lines of a Livox are no cones
 _MIN_IN_ORDER = 0.95  # share of runs whose elevations go on in one direction
@@ -43,16 +44,16 @@ class RecordedSweep:
     intensities: Floats | None  # (n,): in the scale of the recording
     classes: Ints | None  # (n,)
     time_s: Floats | None  # (n,): since the first of its points
-    start_rad: float  # azimuth at which the sweep starts
+    start_rad: Floats  # (r,): azimuths at which the rings start
 
     def __len__(self) -> int:
         return len(self.points)
 
     @property
     def turn(self) -> Floats:
-        """Share of a counter-clockwise revolution from the start of the sweep to points (n,)."""
+        """Share of a counter-clockwise revolution from the start of its ring to points (n,)."""
         azimuth = np.arctan2(self.points[:, 1], self.points[:, 0])
-        return np.asarray(((azimuth - self.start_rad) / (2 * np.pi)) % 1)
+        return np.asarray(((azimuth - self.start_rad[self.ring]) / (2 * np.pi)) % 1)
 
     def part(self, rows: Bools | Ints) -> RecordedSweep:
         """Return selected points."""
@@ -208,7 +209,7 @@ class RecordedSweeps:
             None if intensities is None else np.asarray(intensities, np.float64),
             None if classes is None else np.asarray(classes).astype(np.int64),
             None if self.is_compensated or self.times is None else self.times.of_points(columns),
-            _start_rad(points, ring),
+            _start_rad(points, ring, self.ring_count),
         )
         return sweep if known.all() else sweep.part(known)
 
@@ -254,12 +255,22 @@ def elevations(points: Floats) -> Floats:
     return np.asarray(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
 
 
-def _start_rad(points: Floats, ring: Ints) -> float:
-    """Return the azimuth at which a sweep starts: the mean of the first points of all rings."""
-    _, firsts = np.unique(ring, return_index=True)
-    x, y = points[firsts, :2].T
-    azimuth = np.arctan2(y, x)
-    return float(np.arctan2(np.sin(azimuth).sum(), np.cos(azimuth).sum()))
+def _start_rad(points: Floats, ring: Ints, ring_count: int) -> Floats:
+    """Return the azimuths (r,) at which the rings of a sweep start: of their first points.
+
+    The lasers of some sensors point to azimuths that differ by several degrees. A ring whose first
+    pulses are lost, as in the sky, starts where most rings do.
+    """
+    if not len(points):
+        return np.zeros(ring_count)
+    numbers, firsts = np.unique(ring, return_index=True)
+    azimuth = np.arctan2(points[firsts, 1], points[firsts, 0])
+    apart = np.abs((azimuth[:, None] - azimuth + np.pi) % (2 * np.pi) - np.pi)
+    together = apart < _MAX_START_RAD
+    common = int(together.sum(axis=1).argmax())
+    starts = np.full(ring_count, azimuth[common])
+    starts[numbers[together[common]]] = azimuth[together[common]]
+    return starts
 
 
 def _cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
