@@ -44,12 +44,12 @@ def cast(sweeps: int, triangles: int, connection: Connection) -> None:
 def frame(camera: Camera, points: Any) -> Image.Image:
     """Draw the points of a sweep, by height."""
     pixels, distance = camera.project(points)
-    inside = np.flatnonzero(((pixels >= 0) & (pixels < SIZE)).all(axis=1))
+    inside = np.flatnonzero(((pixels >= 0) & (pixels < camera.size)).all(axis=1))
     rows = inside[np.argsort(-distance[inside])]
     share = np.clip(points[rows, 2] / RAISED, 0, 1)
     paint = np.pad(TURBO[(24 + 231 * np.sqrt(share)).astype(int)], ((0, 0), (0, 1)), mode="edge")
     paint[:, 3] = 1
-    empty = np.tile(BACK.astype(np.float32), (*SIZE[::-1], 1))
+    empty = np.tile(BACK.astype(np.float32), (*camera.size[::-1], 1))
     image = splat(empty, pixels[rows], paint, 1.6)
     return Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 from benchmarks.odometry import SWEEP_S, left_turn
+from docs.pictures.film import frame
 from PIL import Image, ImageDraw
 
 from lidarpool import Actor, Mounted, Pose, Scanner, Survey, Track, load_sensor, twin
 from lidarpool.places.building import Twin
 from lidarscenes.procedural.city import city
-from lidarsim.base.arrays import Floats
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.actors import box
@@ -27,15 +27,11 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.render.camera import Camera
-from lidarview.render.colouring import TURBO
-from lidarview.render.pictures import splat
 from lidarview.render.surface import unit
 
 SIZE = (560, 420)  # of each half
-BACK = np.array([14, 17, 22, 255]) / 255
 EYE = np.array([-46.0, -34.0, 34.0])
 TARGET = np.array([-6.0, 2.0, 0.0])
-RAISED_M = 12.0  # height above the ground with the last colour
 HEIGHT_M = 1.9  # of the sensor
 TRIANGLES = 20_000
 # Start and end of the cars that move.
@@ -77,20 +73,6 @@ def camera() -> Camera:
     return Camera(EYE, axes, 470.0, np.array(SIZE) / 2, SIZE)
 
 
-def draw(points: Floats, view: Camera, caption: str) -> Image.Image:
-    """Draw the points (n, 3) of a sweep by height."""
-    pixels, distance = view.project(points)
-    inside = np.flatnonzero(((pixels >= 0) & (pixels < SIZE)).all(axis=1))
-    rows = inside[np.argsort(-distance[inside])]
-    share = np.clip(points[rows, 2] / RAISED_M, 0, 1)
-    paint = np.pad(TURBO[(24 + 231 * np.sqrt(share)).astype(int)], ((0, 0), (0, 1)), mode="edge")
-    paint[:, 3] = 1
-    image = splat(np.tile(BACK.astype(np.float32), (*SIZE[::-1], 1)), pixels[rows], paint, 1.5)
-    half = Image.fromarray(np.round(255 * image[..., :3]).astype(np.uint8))
-    ImageDraw.Draw(half).text((12, 10), caption, fill=(235, 238, 242), font_size=17)
-    return half
-
-
 def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
     """Draw the sweeps of the recording beside sweeps of another sensor in the twin."""
     view = camera()
@@ -103,7 +85,9 @@ def frames(cloud: Cloud, place: Twin, sweeps: int) -> list[Image.Image]:
         ).positions
         image = Image.new("RGB", (2 * SIZE[0], SIZE[1]))
         for index, points in enumerate((recorded, simulated)):
-            image.paste(draw(points, view, CAPTIONS[index]), (index * SIZE[0], 0))
+            half = frame(view, points)
+            ImageDraw.Draw(half).text((12, 10), CAPTIONS[index], fill=(235, 238, 242), font_size=17)
+            image.paste(half, (index * SIZE[0], 0))
         images.append(image)
     return images
 

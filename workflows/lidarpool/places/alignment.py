@@ -166,8 +166,8 @@ class AlignedSweeps:
         """Read a sweep, or raise LidarError if the recording cannot be read."""
         return self.aligned(self.recorded.read(number), number)
 
-    def lost(self, number: int) -> AlignedSweep:
-        """Read a sweep and return its lost pulses in answering cells, as points a metre away."""
+    def read_with_lost(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
+        """Read a sweep, and return it and its lost pulses, as points a metre away."""
         step, step_s = self.alignment.step(number)
         # Points as fired have no gaps by motion.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
@@ -175,7 +175,7 @@ class AlignedSweeps:
         moved_m = share * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
         lost = lost_pulses(sweep, self.recorded.elevation_rad, self.answering, moved_m)
-        return self.aligned(lost, number)
+        return self.aligned(sweep, number), self.aligned(lost, number)
 
     def aligned(self, sweep: RecordedSweep, number: int) -> AlignedSweep:
         """Return points of a sweep at their places."""

@@ -155,8 +155,7 @@ def hold_out(
     """
     parts = []
     for number in numbers:
-        sweep = sweeps.read(number)
-        lost = sweeps.lost(number)
+        sweep, lost = sweeps.read_with_lost(number)
         no_ranges = np.full(len(lost.points), np.nan)
         no_points = np.zeros(len(lost.points), bool)
         parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))

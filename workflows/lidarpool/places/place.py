@@ -115,12 +115,13 @@ class Place:
         surfel = []
         offset_m = []
         for number in _some(standing):
-            seen = self.see(sweeps.read(number), standing[number])
+            sweep, lost = sweeps.read_with_lost(number)
+            seen = self.see(sweep, standing[number])
             ends = seen.ends
             farther_m = seen.range_m - seen.distance_m
             votes += np.bincount(seen.surfel[ends], minlength=count)
             votes -= np.bincount(seen.surfel[~ends & (farther_m > _ON_RAY_M)], minlength=count)
-            votes -= np.bincount(self.see(sweeps.lost(number)).surfel, minlength=count)
+            votes -= np.bincount(self.see(lost).surfel, minlength=count)
             moving = ends | (np.abs(farther_m) < _MAX_SHIFT_M)
             surfel.append(seen.surfel[moving])
             offset_m.append((farther_m * seen.inward)[moving])
