@@ -33,13 +33,15 @@ import numpy as np
 from PIL import Image
 
 from lidarpool.clouds.recording import Read, Recording
-from lidarpool.places.alignment import AlignedSweeps, align
-from lidarpool.places.building import DEFAULT_VOXEL_M, rebuild
+from lidarpool.places.alignment import AlignedSweeps, first_alignment
+from lidarpool.places.building import DEFAULT_VOXEL_M
 from lidarpool.places.free_space import standing_points
-from lidarpool.places.held_out import HeldOut, hold_out
+from lidarpool.places.held_out import HeldOut
 from lidarpool.places.lost_pulses import Answering
 from lidarpool.places.odometry import RecordedPoses, find_poses
 from lidarpool.places.recorded_sweeps import RecordedSweeps
+from lidarpool.places.stretch_tasks import BuildTask, align_stretch, compared_sweeps
+from lidarpool.places.stretches import divide, joined
 from lidarpool.recordings.opening import open_recording
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.even_samples import even_indices
@@ -250,13 +252,24 @@ def _row(
     recorded: RecordedSweeps, poses: RecordedPoses, mapped: Ints, answering: Answering
 ) -> dict[str, Any]:
     """Return the figures of the held-out sweeps of a recording."""
-    sweeps = AlignedSweeps(recorded, align(recorded, poses, mapped.tolist()), answering)
-    held_out = np.setdiff1d(np.arange(recorded.count), mapped)
+    first = first_alignment(recorded, poses)
+    stretches = divide(first.poses[:, :3, 3])
+    counting = np.concatenate([stretch.own_numbers for stretch in stretches])
+    held_out = np.setdiff1d(counting, mapped)
     compared = held_out[even_indices(len(held_out), _COMPARED_SWEEPS)]
-    place, reflectances = rebuild(sweeps, mapped.tolist(), DEFAULT_VOXEL_M)
-    every = np.arange(recorded.count).tolist()
-    standing = standing_points(sweeps, every)
-    rays = hold_out(sweeps, place, reflectances, standing, compared.tolist())
+    task = BuildTask(
+        recorded, first, stretches[0], mapped, answering, compared, DEFAULT_VOXEL_M, drawn_share=0.0
+    )
+    aligned = [align_stretch(replace(task, stretch=stretch))[0] for stretch in stretches]
+    task = replace(task, alignment=joined(first, stretches, aligned))
+    sweeps = AlignedSweeps(recorded, task.alignment, answering)
+    rays = HeldOut.joined(
+        [
+            part
+            for stretch in stretches
+            if (part := _compared(replace(task, stretch=stretch))) is not None
+        ]
+    )
     static = static_points(sweeps, compared)
     returned = np.concatenate([static[number] for number in compared.tolist()])
     is_static = np.zeros(len(rays.range_m), bool)
@@ -273,8 +286,16 @@ def _row(
         "next": to_next(recorded, compared),
         "motion": sweeps.alignment.motion.value,
         "plane_m": float(np.nanmedian(plane_m)),
-        "surfels": len(place.surfels),
+        "stretches": len(stretches),
     }
+
+
+def _compared(task: BuildTask) -> HeldOut | None:
+    """Return the rays of the held-out sweeps of a stretch."""
+    sweeps = task.read()
+    standing = standing_points(sweeps, task.stretch.numbers.tolist())
+    rays, _ = compared_sweeps(sweeps, task, standing)
+    return rays
 
 
 def _line(row: dict[str, Any]) -> str:

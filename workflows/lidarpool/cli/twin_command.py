@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,6 +14,9 @@ from lidarsim.base.errors import LidarError
 from . import completion
 from . import shared_options as options
 from .shared_options import overwrite
+
+if TYPE_CHECKING:
+    from ..base.tls_files import TlsFiles
 
 
 @click.command()
@@ -32,9 +36,21 @@ from .shared_options import overwrite
 )
 @click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
 @click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
+@options.scheduler
+@options.flag("--resume", help="Go on with an unfinished twin, if there is one.")
 @overwrite
 @options.as_json
-def twin(recording: Path, out: Path, *, overwrite: bool, as_json: bool, **settings: Any) -> None:
+def twin(
+    recording: Path,
+    out: Path,
+    *,
+    scheduler: str | None,
+    files: TlsFiles,
+    resume: bool,
+    overwrite: bool,
+    as_json: bool,
+    **settings: Any,
+) -> None:
     """Rebuild the place of a drive from its recording, without what moved.
 
     Writes the scene (place.glb), the drive (trajectory.csv), the sensor (sensor.yaml), a scenario
@@ -46,22 +62,31 @@ def twin(recording: Path, out: Path, *, overwrite: bool, as_json: bool, **settin
       lidarpool twin drive.mcap --out twin
       lidarpool twin sweeps --trajectory poses.txt --out twin
       lidarpool twin mid360.mcap --model livox/mid360 --out twin
+      lidarpool twin hour.mcap --out twin --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run twin/scenario.yaml --sensor hesai/pandar128 --out again
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..places.building import SCENARIO_FILE
     from ..places.building import twin as build
+    from ..places.finished_steps import STEPS_FOLDER, FinishedSteps
+    from ..run.cluster.connection import connected
 
+    if resume and overwrite:
+        raise click.UsageError("--resume continues what --overwrite deletes: give one of them.")
     if (out / SCENARIO_FILE).exists() and not overwrite:
         raise LidarError(f"{out} holds {SCENARIO_FILE}: give another folder, or --overwrite.")
+    steps = out / STEPS_FOLDER
+    if overwrite:
+        FinishedSteps(steps).remove()
     keep_freed_memory()
 
     def tell(line: str) -> None:
         if not as_json:
             click.echo(f"{line} …", err=True)
 
-    built = build(recording, tell=tell, **settings)
-    files = [click.format_filename(path) for path in built.save(out)]
+    with nullcontext() if scheduler is None else connected(scheduler, files) as client:
+        built = build(recording, client=client, folder=steps, resume=resume, tell=tell, **settings)
+    paths = [click.format_filename(path) for path in built.save(out)]
     scenario = shlex.quote(str(out / SCENARIO_FILE))
     following = f"next: lidarpool run {scenario} [--sensor MODEL]"
-    options.show(built.figures, [repr(built), *files, following], as_json)
+    options.show(built.figures, [repr(built), *paths, following], as_json)

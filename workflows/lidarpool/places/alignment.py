@@ -10,7 +10,7 @@ Arrays have s sweeps, r rings and n points.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
@@ -19,6 +19,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
+from lidarsim.base.even_samples import even_indices
 
 from .lost_pulses import Answering, lost_pulses
 from .motion import Motion, Step
@@ -34,6 +35,7 @@ _MAX_VOXEL_M = 0.3
 _ROUNDS = 4  # of a map and an alignment to this map
 _TRIAL_ROUNDS = 2  # of each way in which points may be stored
 _TRIAL_SWEEPS = 24  # consecutive
+_RANGE_SWEEPS = 48  # that tell the ranges of the sensor
 _TURN_M = 10.0  # motion that blurs as much as a turn by a radian
 _NEAR_VOXELS = 160  # twice the median range
 _MAX_SHARE_OF_VOXELS = 0.99  # of those of the usual way, filled in another way that is right
@@ -59,6 +61,10 @@ class Alignment:
         float64 (s, 4, 4): from the sensor frame at the start of each sweep to the world.
     times_s
         float64 (s,): starts of the sweeps.
+    sweep_s
+        Seconds that a sweep takes: from most sweeps to the next, if none was dropped.
+    voxel_m
+        Edge of the voxels of the map, metres.
     motion
         How the points of a sweep are compensated.
     ring_offsets
@@ -72,16 +78,21 @@ class Alignment:
 
     poses: Floats
     times_s: Floats
+    sweep_s: float
+    voxel_m: float
     motion: Motion
     ring_offsets: Floats
     thickness_m: tuple[float, ...] = ()
     plane_distance_m: Floats = field(default_factory=lambda: np.empty(0))
 
     @classmethod
-    def unaligned(cls, poses: RecordedPoses, motion: Motion, ring_count: int) -> Alignment:
+    def unaligned(
+        cls, poses: RecordedPoses, voxel_m: float, motion: Motion, ring_count: int
+    ) -> Alignment:
         """Return the alignment of poses, moved to the starts of sweeps, without corrections."""
         offsets = np.zeros((ring_count, 3))
-        alignment = cls(poses.matrices.copy(), poses.times_s, motion, offsets)
+        sweep_s = float(np.median(np.diff(poses.times_s)))
+        alignment = cls(poses.matrices.copy(), poses.times_s, sweep_s, voxel_m, motion, offsets)
         if motion is Motion.COMPENSATED or not poses.share:
             return alignment
         steps = [alignment.step(number) for number in range(len(poses.matrices))]
@@ -95,10 +106,9 @@ class Alignment:
             ),
         )
 
-    @property
-    def sweep_s(self) -> float:
-        """Seconds that a sweep takes: from most sweeps to the next, if none was dropped."""
-        return float(np.median(np.diff(self.times_s)))
+    def part(self, numbers: Ints) -> Alignment:
+        """Return the poses and times of some sweeps, ascending."""
+        return replace(self, poses=self.poses[numbers], times_s=self.times_s[numbers])
 
     def step(self, number: int) -> tuple[Step, float]:
         """Return the motion from a sweep to the next, and its seconds; of the last, from before."""
@@ -191,33 +201,49 @@ class AlignedSweeps:
         )
 
 
-def align(sweeps: RecordedSweeps, poses: RecordedPoses, mapped: Sequence[int]) -> Alignment:
-    """Align all sweeps to a map of some.
+def first_alignment(sweeps: RecordedSweeps, poses: RecordedPoses) -> Alignment:
+    """Return the poses of all sweeps before these are aligned, and how points were stored.
+
+    LidarError if the recording shows hardly any planes, or is mirrored.
+    """
+    numbers = even_indices(sweeps.count, _RANGE_SWEEPS).tolist()
+    voxel_m = _voxel_m([_sample(sweeps.read(number), number) for number in numbers])
+    motion = _motion(sweeps, poses, voxel_m)
+    return Alignment.unaligned(poses, voxel_m, motion, sweeps.ring_count)
+
+
+def align(
+    sweeps: RecordedSweeps, first: Alignment, numbers: Ints, mapped: Collection[int]
+) -> Alignment:
+    """Align some sweeps to a map of those that are `mapped`.
 
     Parameters
     ----------
     sweeps
         The sweeps.
-    poses
-        First estimates of the poses.
+    first
+        First estimates of the poses of all sweeps.
+    numbers
+        (k,): of the sweeps that are aligned, ascending.
     mapped
         Numbers of the sweeps whose points make the map, and calibrate the rings.
+
+    Returns
+    -------
+    Alignment
+        Of the k sweeps.
 
     Raises
     ------
     LidarError
-        If the recording shows hardly any planes.
+        If the sweeps show hardly any planes.
     """
-    samples = [_sample(sweeps.read(number), number) for number in range(sweeps.count)]
-    voxel_m = _voxel_m(samples)
-    motion = _motion(sweeps, samples, poses, voxel_m)
-    alignment = Alignment.unaligned(poses, motion, sweeps.ring_count)
-    return _rounds(sweeps.recording.name, samples, alignment, mapped, voxel_m, _ROUNDS)
+    samples = [_sample(sweeps.read(number), number) for number in numbers.tolist()]
+    rows = [row for row, number in enumerate(numbers.tolist()) if number in mapped]
+    return _rounds(sweeps.recording.name, samples, first.part(numbers), rows, _ROUNDS)
 
 
-def _motion(
-    sweeps: RecordedSweeps, samples: list[RecordedSweep], poses: RecordedPoses, voxel_m: float
-) -> Motion:
+def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Motion:
     """Return how points are stored: the way in which some consecutive sweeps fill few voxels.
 
     Surfaces that several sweeps saw at the same place share voxels. The thickness of planes does
@@ -225,6 +251,9 @@ def _motion(
 
     LidarError if points fit the poses better with their y axis turned.
     """
+    window = _fastest(poses)
+    numbers = range(sweeps.count)[window]
+    samples = [_sample(sweeps.read(number), number) for number in numbers]
     is_timed = all(sample.time_s is not None for sample in samples)
     if sweeps.is_compensated:
         candidates = [Motion.COMPENSATED]
@@ -235,9 +264,8 @@ def _motion(
     else:
         candidates = [Motion.COMPENSATED]
     name = sweeps.recording.name
-    window = _fastest(poses)
     local = poses.part(window)
-    trial = partial(_filled_voxels, name, samples[window], local, sweeps.ring_count, voxel_m)
+    trial = partial(_filled_voxels, name, samples, local, sweeps.ring_count, voxel_m)
     filled = {motion: trial(motion) for motion in candidates}
     best = min(candidates, key=filled.__getitem__)
     if filled[best] > _MAX_SHARE_OF_VOXELS * filled[candidates[0]]:
@@ -265,10 +293,10 @@ def _filled_voxels(
     even mirrored sweeps together. Far points, which are alone in their voxels, do not count.
     """
     scaled = [replace(sample, points=sample.points * scale) for sample in samples]
-    alignment = Alignment.unaligned(poses, motion, ring_count)
+    alignment = Alignment.unaligned(poses, voxel_m, motion, ring_count)
     numbers = range(len(scaled))
     rounds = 0 if poses.are_given else _TRIAL_ROUNDS
-    alignment = _rounds(name, scaled, alignment, numbers, voxel_m, rounds)
+    alignment = _rounds(name, scaled, alignment, numbers, rounds)
     parts = []
     for number, sample in enumerate(scaled):
         points, _ = alignment.compensated(sample, number)
@@ -293,13 +321,12 @@ def _rounds(
     samples: Sequence[RecordedSweep],
     alignment: Alignment,
     mapped: Sequence[int],
-    voxel_m: float,
     rounds: int,
 ) -> Alignment:
     """Make a map and align all sweeps to it, several times; LidarError without planes."""
     for _ in range(rounds):
-        planes = _planes(name, samples, alignment, mapped, voxel_m)
-        alignment = _aligned(alignment, samples, planes, mapped, voxel_m)
+        planes = _planes(name, samples, alignment, mapped)
+        alignment = _aligned(alignment, samples, planes, mapped)
     return alignment
 
 
@@ -320,14 +347,13 @@ def _planes(
     samples: Sequence[RecordedSweep],
     alignment: Alignment,
     mapped: Sequence[int],
-    voxel_m: float,
 ) -> VoxelPlanes:
     """Return the planes of the map of some sweeps, or raise LidarError without planes."""
     parts = [
         placed(alignment.compensated(samples[number], number)[0], alignment.poses[number])
         for number in mapped
     ]
-    planes = VoxelPlanes.of_points(name, np.concatenate(parts), voxel_m)
+    planes = VoxelPlanes.of_points(name, np.concatenate(parts), alignment.voxel_m)
     if planes is None:
         raise LidarError(
             f"{name} shows no planes, such as a floor or walls: a place is rebuilt of surfaces."
@@ -358,7 +384,7 @@ class _PlanePoints:
 
 
 def _registered(
-    alignment: Alignment, sample: RecordedSweep, planes: VoxelPlanes, number: int, voxel_m: float
+    alignment: Alignment, sample: RecordedSweep, planes: VoxelPlanes, number: int
 ) -> tuple[Floats, _PlanePoints]:
     """Return the pose of a sweep that brings its points to planes, and these points."""
     from scipy.spatial.transform import Rotation
@@ -366,6 +392,7 @@ def _registered(
     some = sample.part(np.arange(min(len(sample), _SWEEP_POINTS)))
     points, _ = alignment.compensated(some, number)
     pose = alignment.poses[number].copy()
+    voxel_m = alignment.voxel_m
     for _ in range(_STEPS):
         on_planes = _PlanePoints.of_sweep(points, pose, planes, voxel_m)
         enough = min(_MIN_PLANE_POINTS, len(points) / 10)
@@ -387,7 +414,6 @@ def _aligned(
     samples: Sequence[RecordedSweep],
     planes: VoxelPlanes,
     mapped: Sequence[int],
-    voxel_m: float,
 ) -> Alignment:
     """Return poses and offsets of rings that bring points to planes."""
     poses = alignment.poses.copy()
@@ -397,7 +423,7 @@ def _aligned(
     distance_m = np.full(len(samples), np.nan)
     calibrating = set(mapped)
     for number, sample in enumerate(samples):
-        poses[number], on_planes = _registered(alignment, sample, planes, number, voxel_m)
+        poses[number], on_planes = _registered(alignment, sample, planes, number)
         if len(on_planes.distances):
             distance_m[number] = np.median(np.abs(on_planes.distances))
         if number in calibrating and ring_count >= MIN_RINGS:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import yaml
+from distributed import Client
 from pydantic import Field
 
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
-from lidarsim.base.arrays import Bools, Floats
+from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import need
@@ -28,7 +31,6 @@ from lidarsim.scene.colours import Colours, as_srgb
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.models import SensorModel, read_model
-from lidarview.render.picture_page import Page
 
 from ..clouds.folder import result_folder, staging
 from ..clouds.recording import Read, Recording
@@ -39,15 +41,25 @@ from ..comparing.fit.stack import SweepStack
 from ..recordings.opening import open_recording
 from ..report.page.rendering import rendered
 from ..scenario.point_scene import CLASS_MATERIAL
-from .alignment import AlignedSweeps, align
-from .charts import draw_above, draw_errors, draw_sweep
-from .free_space import standing_points
-from .held_out import HeldOut, hold_out
+from .alignment import AlignedSweeps, Alignment, first_alignment
+from .charts import STANDING_DOTS, Above, SweepImages, draw_above, draw_errors, draw_sweep
+from .finished_steps import FinishedSteps, Map, Step
+from .held_out import HeldOut
 from .lost_pulses import Answering
-from .odometry import find_poses
-from .place import Place, build_place
-from .recorded_sweeps import RecordedSweeps
-from .reflectances import Reflectances, fit_reflectances
+from .odometry import RecordedPoses, find_poses
+from .place import Observations
+from .processes import mapping
+from .recorded_sweeps import RecordedSweeps, RecordingChoice
+from .reflectances import Reflectances, Response, fit_response
+from .stretch_tasks import (
+    BuildTask,
+    StretchSurfels,
+    StretchTask,
+    align_stretch,
+    build_stretch,
+)
+from .stretches import AlignedStretch, Stretch, divide, joined
+from .surfels import Surfels
 
 MIN_SWEEPS = 4
 SCENE_FILE = "place.glb"
@@ -60,6 +72,10 @@ DEFAULT_VOXEL_M = 0.1
 _FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
 _COMPARED_SWEEPS = 12  # of the held-out sweeps
 _POSE_DECIMALS = 6
+_RESPONSE_STRETCHES = 4  # that tell the response of the sensor
+_POSES = Step("poses", (RecordedPoses,))
+_ALIGN = Step("align", (AlignedStretch,))
+_BUILD = Step("build", (StretchSurfels, Observations, HeldOut, SweepImages, Above))
 _MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
 
 
@@ -175,12 +191,16 @@ def twin(
     voxel_m: Annotated[float, Field(gt=0, le=10)] = DEFAULT_VOXEL_M,
     sensor: str | None = None,
     intensity: str | None = None,
+    client: Client | None = None,
+    folder: str | Path | None = None,
+    resume: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Twin:
     """Rebuild the place of a recording without what moved, to scan it again.
 
-    Every second sweep is held out first, and its rays are compared with the place that the other
-    sweeps make: these are the figures. The place is then made of all sweeps.
+    The drive is divided into stretches, which processes rebuild one by one. Every second sweep is
+    held out first, and the rays of some are cast at the place that the other sweeps make: these are
+    the figures. The place is then made of all sweeps.
 
     Parameters
     ----------
@@ -198,6 +218,14 @@ def twin(
     sensor, intensity
         Name of the sensor, or topic of a bag, if the recording has several; column with the
         intensities, if not ``intensity``.
+    client
+        Of a cluster whose OTHER workers see the recording, by the same path. By default processes
+        of this machine rebuild the stretches; of a recording in memory this process does.
+    folder
+        Folder for the results of finished steps, which is removed in the end. By default a
+        temporary folder.
+    resume
+        Whether to go on with the finished steps that the folder holds.
     tell
         Called with a line on each step.
 
@@ -205,28 +233,60 @@ def twin(
     ------
     LidarError
         If the recording cannot be read, has less than four sweeps, no planes or no rings and no
-        `model`; or an extra is missing.
+        `model`; an extra is missing; or the folder holds the steps of another twin.
     """
     need("scipy", "twin", "Places are rebuilt")
-    if not isinstance(recording, Recording):
-        recording = open_recording(recording, sensor, intensity, name="the recording")
+    if isinstance(recording, (str, Path)):
+        recorded = RecordedSweeps.of_choice(RecordingChoice(Path(recording), sensor, intensity))
+    else:
+        if client is not None:
+            raise LidarError(
+                "A recording in memory is rebuilt in this process: give the path of a recording "
+                "for a cluster, or leave out the client."
+            )
+        if not isinstance(recording, Recording):
+            recording = open_recording(recording, sensor, intensity, name="the recording")
+        recorded = RecordedSweeps.of_recording(recording)
+    _check(recorded)
+    base = None if model is None else read_model(model)
+    if base is None and not len(recorded.elevation_rad):
+        reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
+        raise LidarError(f"{reason} Name its sensor, for example --model livox/mid360.")
+    track = None if trajectory is None else Path(trajectory)
+    tell = tell or (lambda line: None)
+    with ExitStack() as stack:
+        if folder is None:
+            folder = stack.enter_context(TemporaryDirectory(prefix="lidarpool-"))
+        made_of = (_stated(recorded, track), voxel_m)
+        steps = FinishedSteps.begin(Path(folder), made_of, resume=resume)
+        built = _Building(recorded, base, voxel_m, steps, client, tell).twin(track)
+        steps.remove()
+    return built
+
+
+def _check(recorded: RecordedSweeps) -> None:
+    """Raise LidarError if a place cannot be made of the sweeps."""
+    recording = recorded.recording
     if recording.thinned:
         raise LidarError(f"{recording.notes[0]}.")
-    sweeps = RecordedSweeps.of_recording(recording)
-    if sweeps.count < MIN_SWEEPS:
+    if recorded.count < MIN_SWEEPS:
         raise LidarError(
-            f"{recording.name} has {plural(sweeps.count, 'sweep')}, and a twin needs at least "
+            f"{recording.name} has {plural(recorded.count, 'sweep')}, and a twin needs at least "
             f"{MIN_SWEEPS}: a place shows what stands by sweeps that agree."
         )
-    base = None if model is None else read_model(model)
-    if base is None and not len(sweeps.elevation_rad):
-        raise LidarError(
-            f"{' '.join(sweeps.notes) or f'{recording.name} has no rings.'} Name its sensor, for "
-            "example --model livox/mid360."
-        )
-    return _Building(sweeps, base, voxel_m, tell or (lambda line: None)).twin(
-        None if trajectory is None else Path(trajectory)
-    )
+
+
+def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[tuple[str, int, int]]:
+    """Return names, sizes and times of change of the files that a twin is made of."""
+    source = recorded.source
+    chosen = [source.path] if isinstance(source, RecordingChoice) else []
+    files = [*chosen, *([] if trajectory is None else [trajectory])]
+    inner = chain.from_iterable(sorted(file.rglob("*")) for file in files if file.is_dir())
+    return [
+        (str(file), status.st_size, status.st_mtime_ns)
+        for file in chain(files, inner)
+        if (status := file.stat()) and not file.is_dir()
+    ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,49 +296,117 @@ class _Building:
     recorded: RecordedSweeps
     base: SensorModel | None
     voxel_m: float
+    steps: FinishedSteps
+    client: Client | None
     tell: Callable[[str], None]
 
     def twin(self, trajectory: Path | None) -> Twin:
         """Build the twin."""
         recorded = self.recorded
         self.tell(f"{plural(recorded.count, 'sweep')}: finding poses")
-        poses = find_poses(recorded, trajectory)
-        mapped = list(range(0, recorded.count, 2))
-        self.tell(f"poses {poses.source}; aligning the sweeps")
-        sweeps = AlignedSweeps(
-            recorded, align(recorded, poses, mapped), Answering.of_sweeps(recorded)
+        poses = self._poses(trajectory)
+        self.tell(f"poses {poses.source}; finding how points were stored")
+        first = first_alignment(recorded, poses)
+        stretches = divide(first.poses[:, :3, 3])
+        counting = np.concatenate([stretch.own_numbers for stretch in stretches])
+        others = counting[1::2]
+        compared = others[even_indices(len(others), _COMPARED_SWEEPS)]
+        task = BuildTask(
+            recorded=recorded,
+            alignment=first,
+            stretch=stretches[0],
+            mapped=counting[::2],
+            answering=Answering.of_sweeps(recorded),
+            compared=compared,
+            voxel_m=self.voxel_m,
+            drawn_share=0.0,
         )
-        self.tell("finding what stands")
-        standing = standing_points(sweeps, range(recorded.count))
-        self.tell(f"building the place of {plural(len(mapped), 'sweep')}, to compare the others")
-        held_out, picture = self._hold_out(sweeps, standing, mapped)
-        self.tell("building the place of all sweeps")
-        place, reflectances = _place_of(sweeps, standing, self.voxel_m)
+        is_shared = isinstance(recorded.source, RecordingChoice)
+        with mapping(self.client, len(stretches) if is_shared else 1) as run:
+            task = replace(task, alignment=self._aligned(run, task, stretches))
+            built = self._built(run, task, stretches)
+            sweeps = AlignedSweeps(recorded, task.alignment, task.answering)
+            return self._finished(built, sweeps, poses)
+
+    def _poses(self, trajectory: Path | None) -> RecordedPoses:
+        """Return the poses of all sweeps."""
+
+        def find() -> tuple[RecordedPoses]:
+            return (find_poses(self.recorded, trajectory),)
+
+        (poses,) = self.steps.once(_POSES, find)
+        return RecordedPoses(
+            poses.matrices, poses.times_s, str(poses.source), poses.origin, float(poses.share)
+        )
+
+    def _aligned(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> Alignment:
+        """Align all sweeps."""
+        self.tell(f"aligning the sweeps of {plural(len(stretches), 'stretch', 'stretches')}")
+        tasks = [
+            StretchTask(task.recorded, task.alignment, stretch, task.mapped)
+            for stretch in stretches
+        ]
+        aligned = [one for (one,) in self.steps.each(_ALIGN, run, align_stretch, tasks)]
+        return joined(task.alignment, stretches, aligned)
+
+    def _built(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> _Built:
+        """Build the places of all stretches."""
+        sizes = [len(task.recorded.read(int(one.numbers[0]))) for one in stretches]
+        count = sum(sizes) / len(sizes) * sum(len(one.own_numbers) for one in stretches)
+        share = STANDING_DOTS / max(count, 1.0)
+        tasks = [replace(task, stretch=one, drawn_share=share) for one in stretches]
+        parts = []
+        for number, part in enumerate(self.steps.each(_BUILD, run, build_stretch, tasks), 1):
+            self.tell(f"built {number} of {plural(len(stretches), 'stretch', 'stretches')}")
+            surfels, _, *others = part
+            parts.append(_BuiltStretch(surfels, *others))
+        return _Built(parts, stretches)
+
+    def _seen(self, index: int) -> Observations:
+        """Return the rays that end on surfels of a stretch."""
+        seen: Observations = self.steps.load(_BUILD, index)[1]
+        return seen
+
+    def _finished(self, built: _Built, sweeps: AlignedSweeps, poses: RecordedPoses) -> Twin:
+        """Fit the response and the noise of the sensor, and make the twin."""
+        recorded = self.recorded
+        alignment = sweeps.alignment
         self.tell("fitting the sensor")
-        model, notes = self._sensor(sweeps, standing, place, reflectances)
-        figures = self._figures(sweeps, standing, place) | {
+        some = even_indices(len(built.parts), _RESPONSE_STRETCHES).tolist()
+        response = fit_response([self._seen(index) for index in some], recorded.ring_count)
+        name = Path(recorded.recording.name).name
+        meshes = [
+            part.surfels.mesh(name if len(built.parts) == 1 else f"{name} {index}")
+            for index, part in enumerate(built.parts)
+        ]
+        model, notes = self._sensor(built, sweeps, meshes, response)
+        held_out = built.held_out()
+        figures = self._figures(built, alignment) | {
             "poses": poses.source,
-            "motion": sweeps.alignment.motion.value,
+            "motion": alignment.motion.value,
             "held_out": held_out.figures(),
-            "response": None if reflectances is None else reflectances.figures(),
+            "response": None if response is None else response.figures(),
             "model": model.name,
             "notes": [
                 *recorded.recording.notes,
                 *recorded.notes,
                 *notes,
-                *_drive_notes(sweeps),
+                *_drive_notes(alignment),
             ],
         }
         pictures = {
-            "sweep": picture,
-            "above": draw_above(sweeps, standing),
+            "sweep": draw_sweep(built.images()),
+            "above": draw_above([part.above for part in built.parts], alignment.poses[:, :3, 3]),
             "errors": draw_errors(figures),
         }
-        mesh = _coloured(place.surfels.mesh, reflectances)
-        scene = Scene.from_meshes([mesh])
+        if response is not None:
+            meshes = [
+                _coloured(mesh, response.reflectances(self._seen(index), Surfels(mesh).centres))
+                for index, mesh in enumerate(meshes)
+            ]
         return Twin(
-            scene=scene,
-            poses=sweeps.alignment.poses,
+            scene=Scene.from_meshes([mesh for mesh in meshes if len(mesh.faces)]),
+            poses=alignment.poses,
             times_s=poses.times_s,
             origin=poses.origin,
             model=model,
@@ -286,34 +414,21 @@ class _Building:
             pictures=pictures,
         )
 
-    def _hold_out(
-        self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], mapped: list[int]
-    ) -> tuple[HeldOut, Page]:
-        """Compare held-out sweeps with the place of the mapped sweeps, and draw a sweep."""
-        place, reflectances = rebuild(sweeps, mapped, self.voxel_m)
-        others = np.setdiff1d(np.arange(self.recorded.count), mapped)
-        compared = others[even_indices(len(others), _COMPARED_SWEEPS)].tolist()
-        held_out = hold_out(sweeps, place, reflectances, standing, compared)
-        with_points = np.unique(held_out.sweep[held_out.returned])
-        if not len(with_points):
-            raise LidarError(f"{sweeps.name}: the sweeps to compare with have no points.")
-        drawn = int(with_points[len(with_points) // 2])
-        return held_out, draw_sweep(sweeps, place, reflectances, drawn)
-
     def _sensor(
         self,
+        built: _Built,
         sweeps: AlignedSweeps,
-        standing: Mapping[int, Bools],
-        place: Place,
-        reflectances: Reflectances | None,
+        meshes: Sequence[SceneMesh],
+        response: Response | None,
     ) -> tuple[SensorModel, list[str]]:
-        """Return the sensor with the noise of its pulses on the place, and notes."""
+        """Return the sensor with the noise of its pulses on a part of the place, and notes."""
         if not len(self.recorded.elevation_rad):
             assert self.base is not None
             return self.base, ["without rings, the noise of the sensor is that of its model"]
+        middle = len(built.parts) // 2
         # A sweep with few points, as with lost packets, looks like one of another sensor.
-        counts = np.array([len(mask) for mask in standing.values()])
-        whole = np.fromiter(standing, np.int64)[counts >= np.median(counts) / 2]
+        counts = built.parts[middle].surfels.points
+        whole = built.stretches[middle].own_numbers[counts >= np.median(counts) / 2]
         chosen = whole[even_indices(len(whole), _FIT_SWEEPS)].tolist()
 
         def read(index: int) -> Read:
@@ -324,8 +439,9 @@ class _Building:
             return sweep.points, columns, None
 
         aligned = Recording(sweeps.name, len(chosen), read)
-        scene = Scene.from_meshes([place.surfels.mesh])
-        white = None if reflectances is None else reflectances.white
+        near = meshes[max(middle - 1, 0) : middle + 2]
+        scene = Scene.from_meshes([mesh for mesh in near if len(mesh.faces)])
+        white = None if response is None else response.white
         poses = sweeps.alignment.poses[chosen]
         try:
             fitted = fit(aligned, scene=scene, pose=poses, white=white).model
@@ -341,21 +457,20 @@ class _Building:
         }
         return SensorModel.model_validate(self.base.model_dump() | changes), []
 
-    def _figures(
-        self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], place: Place
-    ) -> dict[str, Any]:
+    def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
         """Return the figures of the place and of the drive."""
-        alignment = sweeps.alignment
         path = alignment.poses[:, :3, 3]
-        moved = sum(int((~mask).sum()) for mask in standing.values())
+        surfels = [part.surfels for part in built.parts]
         return {
             "versions": {"lidarpool": __version__},
-            "name": Path(sweeps.name).name,
+            "name": Path(self.recorded.recording.name).name,
             "sweeps": self.recorded.count,
+            "counting_sweeps": sum(len(one.points) for one in surfels),
+            "stretches": len(surfels),
             "rings": len(self.recorded.elevation_rad),
-            "points": sum(len(mask) for mask in standing.values()),
-            "moved": moved,
-            "surfels": len(place.surfels),
+            "points": sum(int(one.points.sum()) for one in surfels),
+            "moved": sum(int(one.moved.sum()) for one in surfels),
+            "surfels": sum(len(one.corners) for one in surfels),
             "voxel_m": self.voxel_m,
             "length_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
             "thickness_m": list(alignment.thickness_m),
@@ -365,45 +480,37 @@ class _Building:
         }
 
 
-def rebuild(
-    sweeps: AlignedSweeps, numbers: Sequence[int], voxel_m: float
-) -> tuple[Place, Reflectances | None]:
-    """Build the place of some sweeps alone, without what moved.
+class _BuiltStretch(NamedTuple):
+    """What is kept of a stretch in memory."""
 
-    Parameters
-    ----------
-    sweeps
-        The sweeps, all at their places.
-    numbers
-        Numbers of the sweeps whose points make the place, ascending.
-    voxel_m
-        Edge of the cubes in each of which all points become their mean.
-
-    Returns
-    -------
-    tuple
-        The place, and its reflectances; None without intensities.
-
-    Raises
-    ------
-    LidarError
-        If too few points stand.
-    """
-    return _place_of(sweeps, standing_points(sweeps, numbers), voxel_m)
+    surfels: StretchSurfels
+    held_out: HeldOut | None
+    images: SweepImages | None
+    above: Above
 
 
-def _place_of(
-    sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float
-) -> tuple[Place, Reflectances | None]:
-    """Build the place of the points that stand, and fit its reflectances."""
-    place = build_place(sweeps, standing, voxel_m)
-    seen = place.observations(sweeps, standing)
-    return place, fit_reflectances(seen, place.surfels, sweeps.recorded.ring_count)
+@dataclass(frozen=True, eq=False)
+class _Built:
+    """The places of all stretches."""
+
+    parts: Sequence[_BuiltStretch]
+    stretches: Sequence[Stretch]
+
+    def held_out(self) -> HeldOut:
+        """Return the rays of all held-out sweeps that were compared."""
+        return HeldOut.joined([part.held_out for part in self.parts if part.held_out is not None])
+
+    def images(self) -> SweepImages:
+        """Return the images of a held-out sweep in the middle, or raise LidarError without one."""
+        images = [part.images for part in self.parts if part.images is not None]
+        if not images:
+            raise LidarError("The sweeps to compare with have no points: give a whole recording.")
+        return images[len(images) // 2]
 
 
-def _drive_notes(sweeps: AlignedSweeps) -> list[str]:
+def _drive_notes(alignment: Alignment) -> list[str]:
     """Return a note on a sensor that stood."""
-    if np.ptp(sweeps.alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
+    if np.ptp(alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
         return []
     return ["the sensor stood: the place is what it saw from there, and has holes behind things"]
 
@@ -414,9 +521,7 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def _coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
+def _coloured(mesh: SceneMesh, reflectances: Reflectances) -> SceneMesh:
     """Return the mesh of surfels, whose colours are their reflectances."""
-    if reflectances is None:
-        return mesh
     light = reflectances.surfels[:, None].repeat(3, axis=1)
     return replace(mesh, colours=Colours.of_faces(as_srgb(light).repeat(2, axis=0)))

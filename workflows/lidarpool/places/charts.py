@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 from lidarview.render import theme
 from lidarview.render.picture_page import Page
 
 from .alignment import AlignedSweep, AlignedSweeps
-from .place import Place, Seen
+from .place import Place
 from .recorded_sweeps import elevations
 from .reflectances import Reflectances
 
@@ -27,7 +27,7 @@ _BOTTOM = 90
 _COLUMNS = 720  # of the images, at most: 0.5° each
 _ROWS = 64  # of the images of a sensor without rings
 _DIFFERENCE_M = 0.1  # end of the scale of differences
-_STANDING_DOTS = 150_000
+STANDING_DOTS = 150_000
 _MOVED_DOTS = 40_000
 _NO_RETURN = theme.rgb("#c8cbd0")
 _MOVED_COLOUR = "#d7301f"
@@ -35,59 +35,100 @@ _PATH_COLOUR = "#08519c"
 
 
 class _Image(NamedTuple):
-    """A picture of the values of the rays of a sweep."""
+    """A picture of the values of a sweep."""
 
     words: str
-    values: Floats  # (n,)
+    values: Floats32  # (r, c)
     scale: Any  # of Matplotlib
     colours: str  # name of a colour map
 
 
-def draw_sweep(
-    sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None, number: int
-) -> Page:
+class SweepImages(NamedTuple):
+    """Images (r, c) of a sweep by ring and azimuth, recorded and in the twin; NaN for no return."""
+
+    number: Ints  # (1,): of the sweep
+    range_m: Floats32
+    simulated_m: Floats32
+    intensity: Floats32 | None
+    simulated_intensity: Floats32 | None
+
+    @classmethod
+    def of_sweep(
+        cls, sweeps: AlignedSweeps, place: Place, reflectances: Reflectances | None, number: int
+    ) -> SweepImages:
+        """Make the images of a sweep and of its rays in a place."""
+        sweep = sweeps.read(number)
+        cells = _cells(sweep, sweeps)
+        seen = place.see(sweep)
+        simulated_m = np.full(len(sweep.points), np.nan)
+        simulated_m[seen.rays] = seen.distance_m
+        range_m, in_twin_m = (_image(values, cells) for values in (sweep.range_m, simulated_m))
+        if reflectances is None or sweep.intensities is None:
+            return cls(np.array([number]), range_m, in_twin_m, None, None)
+        simulated = reflectances.intensities(sweep, seen)
+        intensity, in_twin = (_image(values, cells) for values in (sweep.intensities, simulated))
+        return cls(np.array([number]), range_m, in_twin_m, intensity, in_twin)
+
+    def pictures(self) -> list[_Image]:
+        """Return the pictures to draw."""
+        near_m, far_m = np.nanquantile(self.range_m, (0.01, 0.98)).tolist()
+        ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
+        differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
+        words = f"difference, red where the twin is farther, to {1000 * _DIFFERENCE_M:.0f} mm"
+        images = [
+            _Image("range, recorded", self.range_m, ranges, "viridis"),
+            _Image("range, in the twin", self.simulated_m, ranges, "viridis"),
+            _Image(words, self.simulated_m - self.range_m, differences, "RdBu_r"),
+        ]
+        if self.intensity is not None and self.simulated_intensity is not None:
+            scale = Normalize(0, max(float(np.nanquantile(self.intensity, 0.98)), 1e-9))
+            images.append(_Image("intensity, recorded", self.intensity, scale, "gray"))
+            images.append(_Image("intensity, in the twin", self.simulated_intensity, scale, "gray"))
+        return images
+
+
+class Above(NamedTuple):
+    """Some points of some sweeps, in the world."""
+
+    still: Floats32  # (n, 2): of what stands, metres
+    moved: Floats32  # (k, 2)
+
+    @classmethod
+    def of_sweeps(
+        cls, sweeps: AlignedSweeps, standing: Mapping[int, Bools], numbers: Ints, share: float
+    ) -> Above:
+        """Choose a share of the points of some sweeps."""
+        still: list[Floats] = []
+        moved: list[Floats] = []
+        for number in numbers.tolist():
+            mask = standing[number]
+            world = sweeps.read(number).world[:, :2]
+            chosen = np.random.default_rng(number).random(len(world)) < share
+            still.append(world[mask & chosen])
+            moved.append(world[~mask][:_MOVED_DOTS])
+        parts = (np.concatenate(points).astype(np.float32) for points in (still, moved))
+        return cls(*parts)
+
+
+def draw_sweep(sweep: SweepImages) -> Page:
     """Draw ranges and intensities of a sweep, recorded and in the twin, and their differences."""
-    sweep = sweeps.read(number)
-    images = _images(sweep, place.see(sweep), reflectances)
-    cells = _cells(sweep, sweeps)
+    images = sweep.pictures()
     height = _TOP + len(images) * _IMAGE_HEIGHT + (len(images) - 1) * _GAP + _BOTTOM
     page = Page((_WIDTH, height))
-    page.title(f"Sweep {number}", "which was held out when the place was made")
+    page.title(f"Sweep {int(sweep.number[0])}", "which was held out when the place was made")
     for index, one in enumerate(images):
         bottom = height - _TOP - (index + 1) * _IMAGE_HEIGHT - index * _GAP
         frame = (_LEFT, bottom / height, _CHART_WIDTH, _IMAGE_HEIGHT / height)
         axes = page.chart(frame, ylabel="ring")
-        image = _image(one.values, cells)
-        drawn = theme.mapped(one.colours, np.asarray(one.scale(np.nan_to_num(image, nan=1.0)).data))
-        drawn[~np.isfinite(image)] = _NO_RETURN
-        extent = (180, -180, image.shape[0] - 0.5, -0.5)
+        known = np.nan_to_num(one.values, nan=1.0)
+        drawn = theme.mapped(one.colours, np.asarray(one.scale(known).data))
+        drawn[~np.isfinite(one.values)] = _NO_RETURN
+        extent = (180, -180, one.values.shape[0] - 0.5, -0.5)
         axes.imshow(drawn[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)
         axes.grid(False)
         page.heading(axes, one.words)
     axes.set_xlabel("azimuth, °")
     return page
-
-
-def _images(sweep: AlignedSweep, seen: Seen, reflectances: Reflectances | None) -> list[_Image]:
-    """Return the images of a sweep and of its rays in the twin."""
-    range_m = sweep.range_m
-    simulated_m = np.full(len(range_m), np.nan)
-    simulated_m[seen.rays] = seen.distance_m
-    near_m, far_m = np.quantile(range_m, (0.01, 0.98)).tolist()
-    ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
-    differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
-    words = f"difference, red where the twin is farther, to {1000 * _DIFFERENCE_M:.0f} mm"
-    images = [
-        _Image("range, recorded", range_m, ranges, "viridis"),
-        _Image("range, in the twin", simulated_m, ranges, "viridis"),
-        _Image(words, simulated_m - range_m, differences, "RdBu_r"),
-    ]
-    if reflectances is not None and sweep.intensities is not None:
-        simulated = reflectances.intensities(sweep, seen)
-        scale = Normalize(0, max(float(np.quantile(sweep.intensities, 0.98)), 1e-9))
-        images.append(_Image("intensity, recorded", sweep.intensities, scale, "gray"))
-        images.append(_Image("intensity, in the twin", simulated, scale, "gray"))
-    return images
 
 
 def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int, int]]:
@@ -107,39 +148,30 @@ def _cells(sweep: AlignedSweep, sweeps: AlignedSweeps) -> tuple[Ints, tuple[int,
     return row * column_count + column, (row_count, column_count)
 
 
-def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats:
+def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
     """Return the image (r, c) of values (n,): the last value of each cell, or NaN."""
     cell, shape = cells
-    image = np.full(shape[0] * shape[1], np.nan)
+    image = np.full(shape[0] * shape[1], np.nan, np.float32)
     image[cell] = values
     return image.reshape(shape)
 
 
-def draw_above(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Page:
-    """Draw from above what stands and what moved, and the drive."""
-    still: list[Floats] = []
-    moved: list[Floats] = []
-    share = _STANDING_DOTS / max(sum(map(len, standing.values())), 1)
-    for number, mask in standing.items():
-        world = sweeps.read(number).world
-        chosen = np.random.default_rng(number).random(len(world)) < share
-        still.append(world[mask & chosen])
-        moved.append(world[~mask])
+def draw_above(parts: Sequence[Above], path: Floats) -> Page:
+    """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
     page = Page((_WIDTH, 1000))
     page.title("From above", "grey: what stands; red: left out, because rays passed it")
     axes = page.chart((_LEFT, 0.09, 0.86, 0.76), xlabel="x, m", ylabel="y, m")
-    for parts, colour, size, most in (
-        (still, theme.UNSEEN, 1.0, _STANDING_DOTS),
+    near = np.concatenate([part.still for part in parts])
+    moved = np.concatenate([part.moved for part in parts])
+    for points, colour, size, most in (
+        (near, theme.UNSEEN, 1.0, STANDING_DOTS),
         (moved, _MOVED_COLOUR, 1.6, _MOVED_DOTS),
     ):
-        points = np.concatenate(parts)
-        points = points[:: max(-(-len(points) // most), 1)]
+        some = points[:: max(-(-len(points) // most), 1)]
         dots = size * page.unit**2
-        axes.scatter(points[:, 0], points[:, 1], c=colour, s=dots, lw=0, rasterized=True)
-    path = sweeps.alignment.poses[:, :3, 3]
+        axes.scatter(some[:, 0], some[:, 1], c=colour, s=dots, lw=0, rasterized=True)
     axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, lw=1.6 * page.unit)
-    near = np.concatenate(still)
-    low, high = np.quantile(near[:, :2], (0.01, 0.99), axis=0)
+    low, high = np.quantile(near, (0.01, 0.99), axis=0)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     axes.set_aspect("equal", adjustable="datalim")
     return page

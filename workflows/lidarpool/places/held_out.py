@@ -50,6 +50,16 @@ class HeldOut:
     simulated_intensity: Floats
     standing: Bools
 
+    @classmethod
+    def joined(cls, parts: Sequence[HeldOut]) -> HeldOut:
+        """Join rays."""
+        return cls(
+            *(
+                np.concatenate([getattr(part, column.name) for part in parts])
+                for column in fields(cls)
+            )
+        )
+
     @property
     def returned(self) -> Bools:
         """Mask (n,) of the rays that returned in the recording."""
@@ -160,12 +170,7 @@ def hold_out(
         no_points = np.zeros(len(lost.points), bool)
         parts.append(_rays(place, reflectances, sweep, number, sweep.range_m, standing[number]))
         parts.append(_rays(place, None, lost, number, no_ranges, no_points))
-    rays = HeldOut(
-        *(
-            np.concatenate([getattr(part, column.name) for part in parts])
-            for column in fields(HeldOut)
-        )
-    )
+    rays = HeldOut.joined(parts)
     # What was seen from nearer is out of reach here.
     in_reach = rays.simulated_m <= sweeps.answering.max_range_m + _RANGE_MARGIN_M
     return replace(rays, simulated_m=np.where(in_reach, rays.simulated_m, np.nan))

@@ -11,29 +11,30 @@ points: by 5 to 10 mm on a road. Each surfel is moved until its rays end on it, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.arrays import AnyFloats, Bools, Floats, Integers, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
 from raybeam import RayCaster
 
 from ..scenario.point_files import ScannedPoints
-from ..scenario.point_scene import Voxels
 from .alignment import AlignedSweep, AlignedSweeps
 from .surfels import Surfels
 
 _ROUNDS = 3  # of casting, leaving surfels out, and moving them
 _MAX_SHIFT_M = 0.3  # difference of ranges beyond which a ray moves no surfel
 _SHIFT_PRIOR = 1.0  # rays that would leave a surfel where it is
-_VOTING_SWEEPS = 48  # at most, evenly chosen
+_VOTING_SWEEPS = 40  # of a stretch at most, evenly chosen
 _ON_SURFEL_M = 0.06  # distance to the plane of a surfel within which a point is on it
 _VIEW_CELL_M = 0.5  # edge of the cells in which ranges of points are compared
+_CELL_BITS = 21  # of a coordinate of a cell: places repeat every million metres
+_CELL_MASK = (1 << _CELL_BITS) - 1
 _MAX_VIEW_FACTOR = 1.5  # of the shortest range in a cell, beyond which points are left out
 _ON_RAY_M = 0.15  # difference of ranges within which a ray ends on a surfel
 
@@ -41,11 +42,28 @@ _ON_RAY_M = 0.15  # difference of ranges within which a ray ends on a surfel
 class Observations(NamedTuple):
     """Rays of the recording that end on surfels."""
 
-    surfel: Ints  # (k,)
-    ring: Ints  # (k,)
-    range_m: Floats  # (k,)
-    cosine: Floats  # (k,): of the incidence
-    intensity: Floats  # (k,): NaN where the recording has none
+    surfel: Integers  # (k,)
+    ring: Integers  # (k,)
+    range_m: AnyFloats  # (k,)
+    cosine: AnyFloats  # (k,): of the incidence
+    intensity: AnyFloats  # (k,): NaN where the recording has none
+
+    @classmethod
+    def joined(cls, parts: Sequence[Observations]) -> Observations:
+        """Join rays at different surfels, which are numbered in turn."""
+        counts = [int(part.surfel.max(initial=-1)) + 1 for part in parts]
+        starts = np.cumsum(counts) - counts
+        shifted = [
+            part._replace(surfel=part.surfel + start)
+            for part, start in zip(parts, starts, strict=True)
+        ]
+        return cls(*map(np.concatenate, zip(*shifted, strict=True)))
+
+    def of_surfels(self, chosen: Bools) -> Observations:
+        """Return the rays of chosen surfels (m,), which are numbered anew."""
+        numbers = (np.cumsum(chosen) - 1).astype(np.int32)
+        rays = self.part(chosen[self.surfel])
+        return rays._replace(surfel=numbers[rays.surfel])
 
     def part(self, rays: Bools) -> Observations:
         """Return selected rays."""
@@ -141,13 +159,13 @@ class Place:
             rays = seen.rays[ends]
             parts.append(
                 Observations(
-                    seen.surfel[ends],
-                    sweep.ring[rays],
-                    seen.range_m[ends],
-                    seen.cosine[ends],
-                    np.full(len(rays), np.nan)
+                    seen.surfel[ends].astype(np.int32),
+                    sweep.ring[rays].astype(np.int32),
+                    seen.range_m[ends].astype(np.float32),
+                    seen.cosine[ends].astype(np.float32),
+                    np.full(len(rays), np.nan, np.float32)
                     if sweep.intensities is None
-                    else sweep.intensities[rays],
+                    else sweep.intensities[rays].astype(np.float32),
                 )
             )
         return Observations(*map(np.concatenate, zip(*parts, strict=True)))
@@ -187,33 +205,54 @@ def _some(standing: Mapping[int, Bools]) -> list[int]:
 
 
 def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPoints:
-    """Return the points that stand in the world, with the directions to the sensor."""
+    """Return the points that stand in the world, with the directions to the sensor.
+
+    Points that were seen from much closer elsewhere are left out: rays that come from far away are
+    far apart, and their errors of direction are large.
+    """
+    cells, closest_m = _closest(sweeps, standing)
     positions = []
     outward = []
     classes = []
     for number, mask in standing.items():
         sweep = sweeps.read(number)
-        positions.append(sweep.world[mask])
-        outward.append(sweep.origins[mask] - sweep.world[mask])
+        rows = np.flatnonzero(mask)
+        limit_m = (
+            _MAX_VIEW_FACTOR * closest_m[np.searchsorted(cells, _view_cells(sweep.world[rows]))]
+        )
+        kept = rows[sweep.range_m[rows] <= limit_m]
+        positions.append(sweep.world[kept])
+        outward.append((sweep.origins[kept] - sweep.world[kept]).astype(np.float32))
         if sweep.classes is not None:
-            classes.append(sweep.classes[mask])
+            classes.append(sweep.classes[kept])
     world = np.concatenate(positions)
     # A sweep without points may have no columns.
     classed = sum(map(len, classes)) == len(world)
-    points = ScannedPoints(
+    return ScannedPoints(
         world, np.concatenate(outward), np.concatenate(classes) if classes and classed else None
     )
-    return points.take(_nearest_views(sweeps.name, points))
 
 
-def _nearest_views(name: str, points: ScannedPoints) -> Ints:
-    """Return the indices of points that were not seen from much closer elsewhere.
+def _closest(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Ints, Floats]:
+    """Return cells (c,), ascending, and the shortest range (c,) of the points in each."""
+    cells = []
+    shortest_m = []
+    for number, mask in standing.items():
+        sweep = sweeps.read(number)
+        found, closest_m = _shortest(_view_cells(sweep.world[mask]), sweep.range_m[mask])
+        cells.append(found)
+        shortest_m.append(closest_m)
+    return _shortest(np.concatenate(cells), np.concatenate(shortest_m))
 
-    Rays that come from far away are far apart, and their errors of direction are large.
-    """
-    assert points.outward is not None
-    range_m = np.linalg.norm(points.outward, axis=1)
-    cells = Voxels.of_points(Path(name), points.positions, _VIEW_CELL_M)
-    ordered_m = range_m[cells.order]
-    closest_m = np.minimum.reduceat(ordered_m, cells.starts).repeat(cells.counts)
-    return np.sort(cells.order[ordered_m <= _MAX_VIEW_FACTOR * closest_m])
+
+def _shortest(cells: Ints, range_m: Floats) -> tuple[Ints, Floats]:
+    """Return the distinct cells, ascending, and the shortest of the ranges (n,) in each."""
+    order = np.lexsort((range_m, cells))
+    found, firsts = np.unique(cells[order], return_index=True)
+    return found, range_m[order][firsts]
+
+
+def _view_cells(points: Floats) -> Ints:
+    """Return the numbers (n,) of the cells of points, in which ranges are compared."""
+    cells = np.floor(points / _VIEW_CELL_M).astype(np.int64) & _CELL_MASK
+    return np.asarray((cells[:, 0] << 2 * _CELL_BITS) | (cells[:, 1] << _CELL_BITS) | cells[:, 2])

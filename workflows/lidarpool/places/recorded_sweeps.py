@@ -6,8 +6,11 @@ ring begins where the azimuth falls back to 0°, and the points show their rings
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +20,7 @@ from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import reading
 
 from ..clouds.recording import Columns, Recording, intensities_of, rings_of
+from ..recordings.opening import open_recording
 from ..scenario.point_files import CLASSES
 
 MIN_RINGS = 4  # a sensor with fewer rings is treated as a sensor without rings
@@ -65,6 +69,43 @@ class RecordedSweep:
             None if self.time_s is None else self.time_s[rows],
             self.start_rad,
         )
+
+    def compact(self) -> RecordedSweep:
+        """Return the sweep in half the memory."""
+        return replace(
+            self,
+            points=_exact32(self.points),
+            ring=self.ring.astype(np.int16),
+            intensities=None if self.intensities is None else _exact32(self.intensities),
+        )
+
+    def wide(self) -> RecordedSweep:
+        """Return the sweep in double precision."""
+        return replace(
+            self,
+            points=self.points.astype(np.float64),
+            ring=self.ring.astype(np.int64),
+            intensities=None if self.intensities is None else self.intensities.astype(np.float64),
+        )
+
+
+def _exact32(values: Floats) -> Any:
+    """Return values in single precision, if it has all of their digits."""
+    single = values.astype(np.float32)
+    return single if np.array_equal(single, values, equal_nan=True) else values
+
+
+class RecordingChoice(NamedTuple):
+    """A file or folder, and the sensor or topic, and the column of intensities, in it."""
+
+    path: Path
+    sensor: str | None = None
+    intensity: str | None = None
+
+
+@lru_cache(maxsize=1)
+def _opened(choice: RecordingChoice) -> Recording:
+    return open_recording(*choice, name="the recording")
 
 
 class PointTimes(NamedTuple):
@@ -119,6 +160,8 @@ class RecordedSweeps:
 
     Attributes
     ----------
+    source
+        What other processes open again; or a recording in memory, which stays in this process.
     elevation_rad
         float64 (r,): median elevations of the rings, the highest first; empty for a sensor without
         rings.
@@ -131,11 +174,22 @@ class RecordedSweeps:
         The times of points; None if the recording has none.
     """
 
-    recording: Recording
+    source: RecordingChoice | Recording
     elevation_rad: Floats
     ring_numbers: Ints | None
     notes: tuple[str, ...]
     times: PointTimes | None = None
+    _kept: dict[int, RecordedSweep] = field(default_factory=dict)
+
+    @property
+    def recording(self) -> Recording:
+        """The recording, which each process opens once."""
+        return self.source if isinstance(self.source, Recording) else _opened(self.source)
+
+    @classmethod
+    def of_choice(cls, choice: RecordingChoice) -> RecordedSweeps:
+        """Open a recording, or raise LidarError if it cannot be read."""
+        return replace(cls.of_recording(_opened(choice)), source=choice)
 
     @classmethod
     def of_recording(cls, recording: Recording) -> RecordedSweeps:
@@ -197,8 +251,14 @@ class RecordedSweeps:
         """Whether points are known to be compensated for the motion, as in results."""
         return self.recording.fired is not None
 
+    def keeping(self, numbers: Iterable[int]) -> RecordedSweeps:
+        """Read some sweeps, ascending, and keep these: bags are read from their start only."""
+        return replace(self, _kept={number: self.read(number).compact() for number in numbers})
+
     def read(self, number: int) -> RecordedSweep:
         """Read a sweep, or raise LidarError if the recording cannot be read."""
+        if number in self._kept:
+            return self._kept[number].wide()
         points, columns = _returns(self.recording, number)
         ring, known = self._rings(points, columns)
         intensities = intensities_of(self.recording, columns)

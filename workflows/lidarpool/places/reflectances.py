@@ -8,16 +8,16 @@ intensities of surfels that were seen from several places.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.arrays import AnyFloats, Floats, Integers, Ints
 
 from .alignment import AlignedSweep
 from .place import Observations, Seen
-from .surfels import Surfels
 
 _ROUNDS = 12  # of factors and reflectances in turn
 _RANGE_EDGES_M = (0, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 65, 80, 100, 130, 200, np.inf)
@@ -28,34 +28,53 @@ _MIN_REFLECTANCE = 0.01  # surfaces that were recorded as black
 
 
 @dataclass(frozen=True, eq=False)
-class Reflectances:
-    """Reflectances of surfels, and the response of the sensor, by which intensities follow.
+class Response:
+    """How the intensities of a sensor follow from reflectances.
 
     Attributes
     ----------
-    surfels
-        float64 (m,): reflectances, 0.01 to 1.
     by_range, by_incidence, by_ring
         float64: factors of intensities, of the ranges between `_RANGE_EDGES_M`, of evenly spaced
         cosines, and of each ring.
     white
         Intensity of a white surface.
+    brightest
+        Intensity as which all that is brighter counts, such as a reflector.
+    typical
+        Median reflectance.
     """
 
-    surfels: Floats
     by_range: Floats
     by_incidence: Floats
     by_ring: Floats
     white: float
+    brightest: float
+    typical: float
 
-    def intensities(self, sweep: AlignedSweep, seen: Seen) -> Floats:
-        """Return the intensities (n,) of the rays of a sweep, NaN for a ray that meets nothing."""
-        factors = self.by_range[_range_bin(seen.distance_m)]
-        factors = factors * self.by_incidence[_incidence_bin(seen.cosine)]
-        factors *= self.by_ring[sweep.ring[seen.rays]] * self.white
-        intensities = np.full(len(sweep.points), np.nan)
-        intensities[seen.rays] = self.surfels[seen.surfel] * factors
-        return intensities
+    def factors(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
+        """Return the intensities (k,) of white surfaces."""
+        factors = self.by_range[_range_bin(range_m)] * self.by_incidence[_incidence_bin(cosine)]
+        return np.asarray(factors * self.by_ring[ring] * self.white)
+
+    def reflectances(self, seen: Observations, centres: Floats) -> Reflectances:
+        """Return the reflectances of surfels with centres (m, 3).
+
+        Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
+        """
+        from scipy.spatial import cKDTree
+
+        seen = seen.part(np.isfinite(seen.intensity))
+        count = len(centres)
+        expected = self.factors(seen.range_m, seen.cosine, seen.ring)
+        intensity = np.minimum(seen.intensity, self.brightest)
+        surfels = _ratios(seen.surfel, intensity, expected, np.full(count, np.nan))
+        known = np.isfinite(surfels)
+        if known.any():
+            _, nearest = cKDTree(centres[known]).query(centres[~known])
+            surfels[~known] = surfels[known][nearest]
+        else:
+            surfels[:] = self.typical
+        return Reflectances(np.clip(surfels, _MIN_REFLECTANCE, 1.0), self)
 
     def figures(self) -> dict[str, Any]:
         """Return the response of the sensor for the report."""
@@ -67,26 +86,51 @@ class Reflectances:
         }
 
 
-def fit_reflectances(seen: Observations, surfels: Surfels, ring_count: int) -> Reflectances | None:
-    """Fit reflectances of surfels and the sensor's response, or return None without intensities.
+@dataclass(frozen=True, eq=False)
+class Reflectances:
+    """Reflectances of surfels, and the response of the sensor, by which intensities follow."""
 
-    Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
-    Sums, not logarithms, are compared: many sensors report dark surfaces as 0.
+    surfels: Floats  # (m,): 0.01 to 1
+    response: Response
+
+    def intensities(self, sweep: AlignedSweep, seen: Seen) -> Floats:
+        """Return the intensities (n,) of the rays of a sweep, NaN for a ray that meets nothing."""
+        factors = self.response.factors(seen.distance_m, seen.cosine, sweep.ring[seen.rays])
+        intensities = np.full(len(sweep.points), np.nan)
+        intensities[seen.rays] = self.surfels[seen.surfel] * factors
+        return intensities
+
+
+def fit_response(parts: Sequence[Observations], ring_count: int) -> Response | None:
+    """Fit the response of a sensor to rays that end on surfels, or return None without intensities.
+
+    Each of the `parts` has surfels of its own. Sums, not logarithms, are compared: many sensors
+    report dark surfaces as 0.
     """
+    seen = Observations.joined(parts)
     seen = seen.part(np.isfinite(seen.intensity))
     if not (seen.intensity > 0).any():
         return None
-    from scipy.spatial import cKDTree
+    brightest = float(np.quantile(seen.intensity, _WHITE_QUANTILE))
+    intensity = np.minimum(seen.intensity / brightest, 1.0)
+    (by_range, by_incidence, by_ring), reflectance = _factors(seen, intensity, ring_count)
+    # Reflectances of 1 are white: the factors take what is above.
+    scale = max(float(np.quantile(reflectance, _WHITE_QUANTILE)), 1e-6)
+    typical = float(np.median(reflectance)) / scale
+    return Response(by_range, by_incidence, by_ring, brightest * scale, brightest, typical)
 
-    surfel_count = len(surfels)
-    white = float(np.quantile(seen.intensity, _WHITE_QUANTILE))
-    intensity = np.minimum(seen.intensity / white, 1.0)
-    rows = (_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring)
+
+def _factors(
+    seen: Observations, intensity: AnyFloats, ring_count: int
+) -> tuple[list[Floats], Floats]:
+    """Return the factors by range, incidence and ring, and the reflectances of surfels seen."""
+    count = int(seen.surfel.max()) + 1
+    rows: list[Integers] = [_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring]
     factors = [np.ones(len(_RANGE_EDGES_M) - 1), np.ones(_INCIDENCE_BINS), np.ones(ring_count)]
-    reflectance = np.ones(surfel_count)
+    reflectance = np.ones(count)
     for _ in range(_ROUNDS):
         product = np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
-        reflectance = _ratios(seen.surfel, intensity, product, np.full(surfel_count, np.nan))
+        reflectance = _ratios(seen.surfel, intensity, product, np.full(count, np.nan))
         for index, row in enumerate(rows):
             others = product / factors[index][row]
             expected = others * reflectance[seen.surfel]
@@ -95,16 +139,10 @@ def fit_reflectances(seen: Observations, surfels: Surfels, ring_count: int) -> R
                 factors[index], weights=np.bincount(row, minlength=len(factors[index]))
             )
             product = others * factors[index][row]
-    known = np.isfinite(reflectance)
-    _, nearest = cKDTree(surfels.centres[known]).query(surfels.centres[~known])
-    reflectance[~known] = reflectance[known][nearest]
-    # Reflectances of 1 are white: the factors take what is above.
-    scale = max(float(np.quantile(reflectance, _WHITE_QUANTILE)), 1e-6)
-    reflectance = np.clip(reflectance / scale, _MIN_REFLECTANCE, 1.0)
-    return Reflectances(reflectance, factors[0], factors[1], factors[2], white * scale)
+    return factors, reflectance[np.isfinite(reflectance)]
 
 
-def _ratios(row: Ints, values: Floats, expected: Floats, before: Floats) -> Floats:
+def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Floats) -> Floats:
     """Return ratios of sums of values (k,) to sums of expected values, by row, or `before`."""
     count = len(before)
     sums = np.bincount(row, values, count)
@@ -115,9 +153,9 @@ def _ratios(row: Ints, values: Floats, expected: Floats, before: Floats) -> Floa
     return np.divide(sums, sums_expected, out=before.copy(), where=enough)
 
 
-def _range_bin(range_m: Floats) -> Ints:
+def _range_bin(range_m: AnyFloats) -> Ints:
     return np.asarray(np.searchsorted(_RANGE_EDGES_M, range_m, side="right") - 1)
 
 
-def _incidence_bin(cosine: Floats) -> Ints:
+def _incidence_bin(cosine: AnyFloats) -> Ints:
     return np.asarray((cosine * _INCIDENCE_BINS).astype(np.int64).clip(0, _INCIDENCE_BINS - 1))

@@ -1,0 +1,169 @@
+"""A long drive is rebuilt stretch by stretch: anywhere, in any order, and on after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from distributed import Client
+
+import poolpart.deploy
+from lidarpool import Mounted, Pose, Sensor, Survey, Track, save_cloud, twin
+from lidarpool.cli.commands import cli
+from lidarpool.places.alignment import Alignment
+from lidarpool.places.motion import Motion, Step
+from lidarpool.places.stretches import AlignedStretch, divide, joined
+from lidarscenes.procedural.city import city
+from lidarsim.columns.table import SCAN
+from lidarsim.simulator.points.batch_columns import columns_of
+from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweeps import Sweeps
+
+pytest.importorskip("scipy")
+
+SWEEPS = 130
+SPEED_M_S = 4.0
+
+
+def straight(count, step_m):
+    """Positions of a straight drive."""
+    return np.arange(count)[:, None] * np.array([step_m, 0.0, 0.0])
+
+
+def test_each_sweep_of_a_drive_is_of_one_stretch_and_sees_those_around():
+    positions = straight(400, 0.5)
+    stretches = divide(positions)
+    assert len(stretches) == 5
+    own = np.concatenate([stretch.own_numbers for stretch in stretches])
+    np.testing.assert_array_equal(own, np.arange(400))
+    middle = stretches[2]
+    assert middle.own_numbers[0] - middle.numbers[0] == pytest.approx(40, abs=2)
+    assert middle.numbers[-1] - middle.own_numbers[-1] == pytest.approx(40, abs=2)
+    # Surfaces are of the stretch whose sensor came nearest.
+    poses = np.tile(np.eye(4), (400, 1, 1))
+    poses[:, :3, 3] = positions
+    points = positions[::7] + np.array([0.1, 15.0, 2.0])
+    owners = np.array([stretch.owns(points, poses) for stretch in stretches])
+    near = np.array([np.isin(np.arange(0, 400, 7), stretch.numbers) for stretch in stretches])
+    assert ((owners & near).sum(axis=0) == 1).all()
+
+
+def test_a_sensor_that_stands_for_long_is_one_stretch_of_some_sweeps():
+    random = np.random.default_rng(3)
+    standing = random.normal(0, 0.02, (3000, 3))
+    positions = np.concatenate([straight(50, 0.5) - [25, 0, 0], standing, straight(50, 0.5)])
+    stretches = divide(positions)
+    own = np.concatenate([stretch.own_numbers for stretch in stretches])
+    assert 150 < len(own) < 200
+    assert len(stretches) <= 3
+    assert (np.diff(own) > 0).all()
+    assert len(divide(standing)) == 1
+    assert len(divide(straight(4, 0.0))[0].numbers) == 4
+
+
+def test_poses_go_over_from_one_stretch_to_the_next():
+    count = 200
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, 3] = straight(count, 0.5)
+    first = Alignment(poses, 0.1 * np.arange(count), 0.1, 0.2, Motion.COMPENSATED, np.zeros((4, 3)))
+    stretches = divide(poses[:, :3, 3])
+    assert len(stretches) == 2
+    apart = 0.02
+    aligned = []
+    for index, stretch in enumerate(stretches):
+        own = poses[stretch.numbers].copy()
+        own[:, 1, 3] += index * apart
+        distances = np.full(len(own), 0.01 * (index + 1))
+        aligned.append(AlignedStretch(own, np.full((4, 3), index), np.array([0.1]), distances))
+    found = joined(first, stretches, aligned)
+    y = found.poses[:, 1, 3]
+    assert y[0] == 0 and y[-1] == pytest.approx(apart)
+    assert np.abs(np.diff(y)).max() < 0.1 * apart
+    assert (np.diff(y) > -1e-12).all()
+    np.testing.assert_allclose(found.ring_offsets, 0.5)
+    border = stretches[1].own_numbers[0]
+    assert found.plane_distance_m[border - 1] == 0.01
+    assert found.plane_distance_m[border] == 0.02
+    # A single stretch is as it was aligned, and a sweep that does not count moves with the next.
+    turn = Step(np.array([0, 0, 0.01]), np.array([0, 0.1, 0])).part(1.0)
+    (whole,) = divide(poses[:60, :3, 3])
+    some = replace(whole, numbers=whole.numbers[:-1], own=slice(0, 59))
+    moved = np.array([pose @ turn for pose in poses[:59]])
+    offsets = AlignedStretch(moved, np.zeros((4, 3)), np.array([0.1]), np.zeros(59))
+    one = joined(first.part(np.arange(60)), [some], [offsets])
+    np.testing.assert_array_equal(one.poses[:59], moved)
+    expected = moved[58] @ np.linalg.inv(poses[58]) @ poses[59]
+    np.testing.assert_allclose(one.poses[59], expected)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    """Return a bag of a drive of 52 m through a city, which makes two stretches."""
+    scene = city(5_000)
+    end_s = 0.1 * (SWEEPS + 1)
+    survey = Survey(
+        sensors=[Mounted(Sensor.grid(320, 24, vertical_fov_deg=40), Pose((0, 0, 1.9)), "lidar")],
+        trajectory=Track([0, end_s], [[-34, -3, 0], [SPEED_M_S * end_s - 34, -3, 0]]),
+        steps=36 * SWEEPS,
+        columns=["time", "intensity", "class", "ray", "range"],
+        precision_m=1e-3,
+    )
+    part = columns_of(list(Rig(scene, survey, "auto").cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
+    sweeps = Sweeps.from_survey(survey, scene)
+    path = tmp_path_factory.mktemp("drive") / "drive.mcap"
+    save_cloud(replace(cloud, sweeps=lambda: sweeps), path)
+    return path
+
+
+def written(folder):
+    """Return the files of a twin, without the pictures of the page."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".html"}
+
+
+@pytest.mark.extended
+def test_the_same_place_by_any_number_of_workers_and_after_a_kill(bag, tmp_path):
+    folder = tmp_path / "killed"
+    command = [sys.executable, "-m", "lidarpool", "twin", str(bag), "--out", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    for line in process.stderr:
+        if line.startswith("built 1 of 2"):
+            break
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    runner = CliRunner()
+    again = runner.invoke(cli, ["twin", str(bag), "--out", str(folder)])
+    assert "holds an unfinished twin: continue it with --resume" in str(again.exception)
+    other = runner.invoke(
+        cli, ["twin", str(bag), "--out", str(folder), "--voxel-m", "0.2", "--resume"]
+    )
+    assert "an unfinished twin of another recording, of other options" in str(other.exception)
+    start = time.perf_counter()
+    resumed = runner.invoke(cli, ["twin", str(bag), "--out", str(folder), "--resume"])
+    resumed_s = time.perf_counter() - start
+    assert resumed.exit_code == 0, resumed.output
+    with (
+        poolpart.deploy.local_cluster({"OTHER": (1, 1)}, dashboard_port=None) as cluster,
+        Client(cluster) as client,
+    ):
+        start = time.perf_counter()
+        found = twin(bag, client=client)
+        whole_s = time.perf_counter() - start
+    found.save(tmp_path / "one")
+    assert written(folder) == written(tmp_path / "one")
+    assert resumed_s < whole_s
+    figures = json.loads((folder / "twin.json").read_text())
+    assert figures["stretches"] == 2
+    assert figures["held_out"]["standing"]["median_size_m"] < 0.005
+    assert found.scene.names == ("drive.mcap 0", "drive.mcap 1")
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "place.glb", "report.html", "scenario.yaml", "sensor.yaml", "trajectory.csv", "twin.json",
+    ]  # fmt: skip
