@@ -122,8 +122,8 @@ class Place:
             rows[met], surfel, hits.distance[met], range_m, off_plane_m, np.abs(inward), inward
         )
 
-    def refined(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Place:
-        """Return the place without surfels that more rays pass, or are lost on, than meet.
+    def refined(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Surfels:
+        """Return the surfels without those that more rays pass, or are lost on, than meet.
 
         Each surfel moves along its normal to the median of the rays that end on it. LidarError if
         no surfel is left.
@@ -147,7 +147,7 @@ class Place:
         supported = votes >= 0
         if not supported.any():
             raise LidarError(f"{sweeps.name}: its sweeps contradict each other.")
-        return Place.of_surfels(self.surfels.moved(shifts_m).part(supported))
+        return self.surfels.moved(shifts_m).part(supported)
 
     def observations(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Observations:
         """Return the rays that end on surfels."""
@@ -178,10 +178,9 @@ def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: f
         raise LidarError(f"{sweeps.name} has no points that stand: nothing is left.")
     name = Path(sweeps.name).name
     surfels = Surfels.of_points(name, points, voxel_m, sweeps.recorded.gap_rad)
-    place = Place.of_surfels(surfels)
-    for _ in range(_ROUNDS):
-        place = place.refined(sweeps, standing)
-    return place
+    for _ in range(_ROUNDS):  # of two trees, the second would take as much memory again
+        surfels = Place.of_surfels(surfels).refined(sweeps, standing)
+    return Place.of_surfels(surfels)
 
 
 def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
