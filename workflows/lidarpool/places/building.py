@@ -43,6 +43,7 @@ from .alignment import AlignedSweeps, align
 from .charts import draw_above, draw_errors, draw_sweep
 from .free_space import standing_points
 from .held_out import HeldOut, hold_out
+from .labels import divided
 from .lost_pulses import Answering
 from .odometry import find_poses
 from .place import Place, build_place
@@ -275,7 +276,7 @@ class _Building:
             "errors": draw_errors(figures),
         }
         mesh = _coloured(place.surfels.mesh, reflectances)
-        scene = Scene.from_meshes([mesh])
+        scene = Scene.from_meshes(divided(mesh))
         return Twin(
             scene=scene,
             poses=sweeps.alignment.poses,

@@ -190,18 +190,18 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
     """Return the points that stand in the world, with the directions to the sensor."""
     positions = []
     outward = []
-    classes = []
+    labels = []
     for number, mask in standing.items():
         sweep = sweeps.read(number)
         positions.append(sweep.world[mask])
         outward.append(sweep.origins[mask] - sweep.world[mask])
-        if sweep.classes is not None:
-            classes.append(sweep.classes[mask])
+        if sweep.labels is not None:
+            labels.append(sweep.labels[mask])
     world = np.concatenate(positions)
     # A sweep without points may have no columns.
-    classed = sum(map(len, classes)) == len(world)
+    labelled = sum(map(len, labels)) == len(world)
     points = ScannedPoints(
-        world, np.concatenate(outward), np.concatenate(classes) if classes and classed else None
+        world, np.concatenate(outward), np.concatenate(labels) if labels and labelled else None
     )
     return points.take(_nearest_views(sweeps.name, points))
 
