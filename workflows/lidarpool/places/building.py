@@ -256,7 +256,7 @@ class _Building:
         self.tell("building the place of all sweeps")
         place, reflectances = _place_of(sweeps, standing, self.voxel_m)
         self.tell("fitting the sensor")
-        model, notes = self._sensor(sweeps, standing, place, reflectances)
+        model, notes = fit_sensor(sweeps, standing, place, reflectances, self.base)
         figures = self._figures(sweeps, standing, place) | {
             "poses": poses.source,
             "motion": sweeps.alignment.motion.value,
@@ -275,7 +275,7 @@ class _Building:
             "above": draw_above(sweeps, standing),
             "errors": draw_errors(figures),
         }
-        mesh = _coloured(place.surfels.mesh, reflectances)
+        mesh = coloured(place.surfels.mesh, reflectances)
         scene = Scene.from_meshes(divided(mesh))
         return Twin(
             scene=scene,
@@ -300,47 +300,6 @@ class _Building:
             raise LidarError(f"{sweeps.name}: the sweeps to compare with have no points.")
         drawn = int(with_points[len(with_points) // 2])
         return held_out, draw_sweep(sweeps, place, reflectances, drawn)
-
-    def _sensor(
-        self,
-        sweeps: AlignedSweeps,
-        standing: Mapping[int, Bools],
-        place: Place,
-        reflectances: Reflectances | None,
-    ) -> tuple[SensorModel, list[str]]:
-        """Return the sensor with the noise of its pulses on the place, and notes."""
-        if not len(self.recorded.elevation_rad):
-            assert self.base is not None
-            return self.base, ["without rings, the noise of the sensor is that of its model"]
-        # A sweep with few points, as with lost packets, looks like one of another sensor.
-        counts = np.array([len(mask) for mask in standing.values()])
-        whole = np.fromiter(standing, np.int64)[counts >= np.median(counts) / 2]
-        chosen = whole[even_indices(len(whole), _FIT_SWEEPS)].tolist()
-
-        def read(index: int) -> Read:
-            sweep = sweeps.read(chosen[index])
-            columns: dict[str, Any] = {"ring": self.recorded.ring_count - 1 - sweep.ring}
-            if sweep.intensities is not None:
-                columns["intensity"] = sweep.intensities
-            return sweep.points, columns, None
-
-        aligned = Recording(sweeps.name, len(chosen), read)
-        scene = Scene.from_meshes([place.surfels.mesh])
-        white = None if reflectances is None else reflectances.white
-        poses = sweeps.alignment.poses[chosen]
-        try:
-            fitted = fit(aligned, scene=scene, pose=poses, white=white).model
-        except LidarError as error:  # the place is there, and a scan of it needs no noise
-            sensor = self.base or recorded_sensor(SweepStack.read(aligned))
-            return sensor, [f"the noise of the sensor is unknown: {error}"]
-        if self.base is None or fitted.performance is None:
-            return self.base or fitted, []
-        source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"
-        changes = {
-            "performance": fitted.performance.model_dump(exclude_defaults=True),
-            "sources": {**self.base.sources, "performance": source},
-        }
-        return SensorModel.model_validate(self.base.model_dump() | changes), []
 
     def _figures(
         self, sweeps: AlignedSweeps, standing: Mapping[int, Bools], place: Place
@@ -393,6 +352,51 @@ def rebuild(
     return _place_of(sweeps, standing_points(sweeps, numbers), voxel_m)
 
 
+def fit_sensor(
+    sweeps: AlignedSweeps,
+    standing: Mapping[int, Bools],
+    place: Place,
+    reflectances: Reflectances | None,
+    base: SensorModel | None,
+) -> tuple[SensorModel, list[str]]:
+    """Fit the noise of a sensor to its pulses on a place; return the sensor, and notes.
+
+    By default the sensor has the recorded rings. A sensor without rings is `base` itself.
+    """
+    if not len(sweeps.recorded.elevation_rad):
+        assert base is not None
+        return base, ["without rings, the noise of the sensor is that of its model"]
+    # A sweep with few points, as with lost packets, looks like one of another sensor.
+    counts = np.array([len(mask) for mask in standing.values()])
+    whole = np.fromiter(standing, np.int64)[counts >= np.median(counts) / 2]
+    chosen = whole[even_indices(len(whole), _FIT_SWEEPS)].tolist()
+
+    def read(index: int) -> Read:
+        sweep = sweeps.read(chosen[index])
+        columns: dict[str, Any] = {"ring": sweeps.recorded.ring_count - 1 - sweep.ring}
+        if sweep.intensities is not None:
+            columns["intensity"] = sweep.intensities
+        return sweep.points, columns, None
+
+    aligned = Recording(sweeps.name, len(chosen), read)
+    scene = Scene.from_meshes([place.surfels.mesh])
+    white = None if reflectances is None else reflectances.white
+    poses = sweeps.alignment.poses[chosen]
+    try:
+        fitted = fit(aligned, scene=scene, pose=poses, white=white).model
+    except LidarError as error:  # the place is there, and a scan of it needs no noise
+        sensor = base or recorded_sensor(SweepStack.read(aligned))
+        return sensor, [f"the noise of the sensor is unknown: {error}"]
+    if base is None or fitted.performance is None:
+        return base or fitted, []
+    source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"
+    changes = {
+        "performance": fitted.performance.model_dump(exclude_defaults=True),
+        "sources": {**base.sources, "performance": source},
+    }
+    return SensorModel.model_validate(base.model_dump() | changes), []
+
+
 def _place_of(
     sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float
 ) -> tuple[Place, Reflectances | None]:
@@ -415,7 +419,7 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def _coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
+def coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
     """Return the mesh of surfels, whose colours are their reflectances."""
     if reflectances is None:
         return mesh
