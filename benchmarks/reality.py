@@ -24,7 +24,7 @@ import argparse
 import json
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,14 +33,16 @@ import numpy as np
 from PIL import Image
 
 from lidarpool.clouds.recording import Read, Recording
-from lidarpool.places.alignment import AlignedSweeps, first_alignment
+from lidarpool.places.alignment import AlignedSweeps, align, first_alignment
 from lidarpool.places.building import DEFAULT_VOXEL_M
 from lidarpool.places.free_space import standing_points
-from lidarpool.places.held_out import HeldOut
+from lidarpool.places.held_out import HeldOut, hold_out
 from lidarpool.places.lost_pulses import Answering
 from lidarpool.places.odometry import RecordedPoses, find_poses
+from lidarpool.places.place import Place
 from lidarpool.places.recorded_sweeps import RecordedSweeps
-from lidarpool.places.stretch_tasks import BuildTask, align_stretch, compared_sweeps
+from lidarpool.places.reflectances import Reflectances
+from lidarpool.places.stretch_tasks import BuildTask, align_stretch, compared_sweeps, rebuild
 from lidarpool.places.stretches import divide, joined
 from lidarpool.recordings.opening import open_recording
 from lidarsim.base.arrays import Bools, Floats, Ints
@@ -48,6 +50,7 @@ from lidarsim.base.even_samples import even_indices
 
 _COMPARED_SWEEPS = 24
 _BLOCK_SWEEPS = 20
+_HALF_SWEEPS = 80  # of a `HalfPlace`
 _STATIC_VOXEL_M = 0.4
 _STATIC_SWEEPS = 10  # between sweeps that have points at the same place: a second
 _RESAMPLES = 400  # of sweeps, for intervals
@@ -128,6 +131,37 @@ def mapped_sweeps(count: int, rule: str) -> Ints:
     block = numbers // _BLOCK_SWEEPS
     held_out = (block % 2 == 1) & ((block + 1) * _BLOCK_SWEEPS < count)
     return numbers[~held_out]
+
+
+class HalfPlace(NamedTuple):
+    """The place of every second sweep of a recording, to compare the others with."""
+
+    sweeps: AlignedSweeps
+    mapped: list[int]  # numbers of the sweeps that make the place
+    compared: list[int]  # numbers of some of the others
+    place: Place
+    reflectances: Reflectances | None
+    standing: dict[int, Bools]  # {number of any sweep: mask of its points that stand}
+
+    @classmethod
+    def of_recording(
+        cls, recording: Recording, compared_sweeps: int, answering: Answering | None = None
+    ) -> HalfPlace:
+        """Build the place of the last sweeps of a recording."""
+        recorded = RecordedSweeps.of_recording(part_of(recording, slice(-_HALF_SWEEPS, None)))
+        mapped = mapped_sweeps(recorded.count, "easy").tolist()
+        first = first_alignment(recorded, find_poses(recorded, None))
+        alignment = align(recorded, first, np.arange(recorded.count), mapped)
+        sweeps = AlignedSweeps(recorded, alignment, answering or Answering.of_sweeps(recorded))
+        held_out = np.arange(1, recorded.count - 1, 2)  # a mapped sweep follows each
+        compared = held_out[even_indices(len(held_out), compared_sweeps)].tolist()
+        place, reflectances = rebuild(sweeps, mapped, DEFAULT_VOXEL_M)
+        standing = standing_points(sweeps, range(recorded.count))
+        return cls(sweeps, mapped, compared, place, reflectances, standing)
+
+    def rays(self, numbers: Sequence[int], reflectances: Reflectances | None) -> HeldOut:
+        """Cast the rays of held-out sweeps at the place."""
+        return hold_out(self.sweeps, self.place, reflectances, self.standing, numbers)
 
 
 def static_points(sweeps: AlignedSweeps, numbers: Ints) -> dict[int, Bools]:

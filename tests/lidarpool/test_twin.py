@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from benchmarks import reality
+from benchmarks import reality, reality_effects
 from benchmarks.odometry import left_turn
 from click.testing import CliRunner
+from scipy.spatial import cKDTree
 
 from lidarpool import (
     LidarError,
@@ -357,7 +358,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     shuffled = without_poses(
         drive, lambda points, _: np.random.default_rng(1).permutation(len(points))
     )
-    with pytest.raises(LidarError, match=r"the order of its points shows none.* Name its sensor"):
+    with pytest.raises(LidarError, match=r"the order of its points shows none, .* Name its sensor"):
         twin(shuffled)
     with pytest.raises(LidarError, match="has no column 'nope' to compare as intensity"):
         twin(replace(recording, intensity_column="nope"))
@@ -388,6 +389,76 @@ def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
     high = height > np.median(height) + 0.5
     assert (cloud["class"][low] == 11).mean() > 0.95
     assert (cloud["class"][high] == 50).mean() > 0.95
+
+
+def scanned(folder):
+    """Return the scan of a twin that was saved, and the names of its objects."""
+    job = build(Scenario.load(folder / "scenario.yaml"))
+    scans = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
+    table = (SCAN, *job.survey.stored_columns[3:])
+    cloud = scans.cloud(table, job.survey.precision_m, job.scene.origin)
+    return cloud, np.array(job.scene.names)
+
+
+CLASSES = {10: "car", 11: "floor", 50: "house", 51: "wall", 52: "shed", 80: "post"}
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("file", ["kitti", "nuscenes"])
+def test_labels_of_exports_are_labels_of_simulated_points(street, survey, file, tmp_path):
+    materials = [
+        Material(f"{name}*", FLOOR if name == "floor" else WALLS, number)
+        for number, name in CLASSES.items()
+    ]
+    columns = ["time", "intensity", "class", "reflectivity"]
+    labelled = replace(survey, columns=columns, materials=materials, classes=CLASSES)
+    part = columns_of(list(Rig(street, labelled, "auto").cast(0, labelled.scan_count)))
+    table = (SCAN, *labelled.stored_columns[3:])
+    sweeps = Sweeps.from_survey(labelled, street)
+    cloud = part.cloud(table, labelled.precision_m, street.origin)
+    recorded = replace(cloud, sweeps=lambda: sweeps)
+    save_cloud(recorded, tmp_path / file, format=file)
+    # Sweeps of KITTI are compensated and have no rings.
+    model = tmp_path / "sensor.yaml"
+    elevation_deg = np.degrees(survey.sensor.beams.elevation).tolist()
+    model.write_text(
+        yaml.safe_dump(
+            {"name": "Grid", "firings_per_turn": 480, "beams": {"elevation_deg": elevation_deg}}
+        )
+    )
+    found = twin(tmp_path / file, model=model if file == "kitti" else None)
+    found.save(tmp_path / "twin")
+    scan, names = scanned(tmp_path / "twin")
+    # The nearest recorded point of what stands has the label of a simulated point. Poses of KITTI
+    # are from the first.
+    first = open_recording(recorded, name="drive").poses([0])[0]
+    static = recorded["object"] < len(street.names)
+    stands = recorded.positions[static] + found.poses[0, :3, 3] - first[:3, 3]
+    _, nearest = cKDTree(stands).query(scan.positions)
+    assert (scan["class"] == recorded["class"][static][nearest]).mean() > 0.97
+    if file == "kitti":
+        numbers = np.array([int(name.removeprefix("object ")) for name in names])
+        same = numbers[scan["object"]] == recorded["object"][static][nearest]
+        assert same.mean() > 0.97
+    else:
+        assert len(names) == 1  # labels of nuScenes-lidarseg are classes alone
+
+
+def test_rings_are_found_by_elevations_in_any_order(street, survey):
+    standing = replace(survey, trajectory=None, poses=[(0, 0, 0)], steps=36 * 4)
+    part = columns_of(list(Rig(street, standing, "auto").cast(0, standing.scan_count)))
+    order = np.random.default_rng(3).permutation(len(part.columns["channel"]))
+    points = part.cloud((SCAN,), 1e-4, street.origin).positions[order] - (0, 0, 1.8)
+    channel = part.columns["channel"][order]
+    recording = Recording("drive", 4, lambda number: (points[number::4], {}, None))
+    sweeps = RecordedSweeps.of_recording(recording)
+    assert "the elevations of its points show 24 rings" in sweeps.notes[0]
+    highest = channel.max()
+    np.testing.assert_array_equal(sweeps.read(2).ring, highest - channel[2::4])
+    moved = points + np.outer(np.linspace(0, 0.5, len(points)), [1, 0, 0])
+    compensated = Recording("drive", 4, lambda number: (moved[number::4], {}, None))
+    notes = RecordedSweeps.of_recording(compensated).notes
+    assert "their elevations are not those of a few cones" in notes[0]
 
 
 @pytest.mark.extended
@@ -511,3 +582,9 @@ def test_the_benchmark_of_recordings_has_a_row_for_each_rule(drive, tmp_path, ca
     printed = capsys.readouterr().out
     assert "kitti360, drive (easy, 12 sweeps" in printed
     assert "udacity: " in printed and "is left out" in printed
+    rows = {row["effect"]: row for row in reality_effects.main([str(tmp_path), "kitti360"])}
+    assert len(rows) >= 6
+    everything = rows["all effects"]
+    assert everything["f1"] > 0.7
+    assert rows["without reflectances"]["rank"] < everything["rank"]
+    assert rows["bare rays"]["median_size_m"] < 0.02

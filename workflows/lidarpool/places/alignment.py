@@ -151,7 +151,7 @@ class AlignedSweep(NamedTuple):
     origins: Floats  # (n, 3): of the rays, in the world
     ring: Ints  # (n,)
     intensities: Floats | None  # (n,)
-    classes: Ints | None  # (n,)
+    labels: Ints | None  # (n,): of class and object
 
     @property
     def range_m(self) -> Floats:
@@ -197,7 +197,7 @@ class AlignedSweeps:
             origins=placed(origins, pose),
             ring=sweep.ring,
             intensities=sweep.intensities,
-            classes=sweep.classes,
+            labels=sweep.labels,
         )
 
 

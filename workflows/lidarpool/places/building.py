@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -45,6 +45,7 @@ from .alignment import AlignedSweeps, Alignment, first_alignment
 from .charts import STANDING_DOTS, Above, SweepImages, draw_above, draw_errors, draw_sweep
 from .finished_steps import FinishedSteps, Map, Step
 from .held_out import HeldOut
+from .labels import divided
 from .lost_pulses import Answering
 from .odometry import RecordedPoses, find_poses
 from .place import Observations
@@ -59,7 +60,7 @@ from .stretch_tasks import (
     build_stretch,
 )
 from .stretches import AlignedStretch, Stretch, divide, joined
-from .surfels import Surfels
+from .surfels import Surfels, joined_surfels
 
 MIN_SWEEPS = 4
 SCENE_FILE = "place.glb"
@@ -375,10 +376,7 @@ class _Building:
         some = even_indices(len(built.parts), _RESPONSE_STRETCHES).tolist()
         response = fit_response([self._seen(index) for index in some], recorded.ring_count)
         name = Path(recorded.recording.name).name
-        meshes = [
-            part.surfels.mesh(name if len(built.parts) == 1 else f"{name} {index}")
-            for index, part in enumerate(built.parts)
-        ]
+        meshes = [part.surfels.mesh(name) for part in built.parts]
         model, notes = self._sensor(built, sweeps, meshes, response)
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
@@ -401,11 +399,11 @@ class _Building:
         }
         if response is not None:
             meshes = [
-                _coloured(mesh, response.reflectances(self._seen(index), Surfels(mesh).centres))
+                coloured(mesh, response.reflectances(self._seen(index), Surfels(mesh).centres))
                 for index, mesh in enumerate(meshes)
             ]
         return Twin(
-            scene=Scene.from_meshes([mesh for mesh in meshes if len(mesh.faces)]),
+            scene=Scene.from_meshes(divided(joined_surfels(meshes))),
             poses=alignment.poses,
             times_s=poses.times_s,
             origin=poses.origin,
@@ -422,40 +420,18 @@ class _Building:
         response: Response | None,
     ) -> tuple[SensorModel, list[str]]:
         """Return the sensor with the noise of its pulses on a part of the place, and notes."""
-        if not len(self.recorded.elevation_rad):
-            assert self.base is not None
-            return self.base, ["without rings, the noise of the sensor is that of its model"]
         middle = len(built.parts) // 2
-        # A sweep with few points, as with lost packets, looks like one of another sensor.
-        counts = built.parts[middle].surfels.points
-        whole = built.stretches[middle].own_numbers[counts >= np.median(counts) / 2]
-        chosen = whole[even_indices(len(whole), _FIT_SWEEPS)].tolist()
-
-        def read(index: int) -> Read:
-            sweep = sweeps.read(chosen[index])
-            columns: dict[str, Any] = {"ring": self.recorded.ring_count - 1 - sweep.ring}
-            if sweep.intensities is not None:
-                columns["intensity"] = sweep.intensities
-            return sweep.points, columns, None
-
-        aligned = Recording(sweeps.name, len(chosen), read)
+        numbers = built.stretches[middle].own_numbers
+        sizes = built.parts[middle].surfels.points
         near = meshes[max(middle - 1, 0) : middle + 2]
-        scene = Scene.from_meshes([mesh for mesh in near if len(mesh.faces)])
         white = None if response is None else response.white
-        poses = sweeps.alignment.poses[chosen]
-        try:
-            fitted = fit(aligned, scene=scene, pose=poses, white=white).model
-        except LidarError as error:  # the place is there, and a scan of it needs no noise
-            sensor = self.base or recorded_sensor(SweepStack.read(aligned))
-            return sensor, [f"the noise of the sensor is unknown: {error}"]
-        if self.base is None or fitted.performance is None:
-            return self.base or fitted, []
-        source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"
-        changes = {
-            "performance": fitted.performance.model_dump(exclude_defaults=True),
-            "sources": {**self.base.sources, "performance": source},
-        }
-        return SensorModel.model_validate(self.base.model_dump() | changes), []
+        return fit_sensor(
+            sweeps,
+            dict(zip(numbers.tolist(), sizes.tolist(), strict=True)),
+            Scene.from_meshes([joined_surfels(near)]),
+            white,
+            self.base,
+        )
 
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
         """Return the figures of the place and of the drive."""
@@ -508,6 +484,65 @@ class _Built:
         return images[len(images) // 2]
 
 
+def fit_sensor(
+    sweeps: AlignedSweeps,
+    sizes: Mapping[int, int],
+    scene: Scene,
+    white: float | None,
+    base: SensorModel | None,
+) -> tuple[SensorModel, list[str]]:
+    """Fit the noise of a sensor to its pulses on a place.
+
+    Parameters
+    ----------
+    sweeps
+        Sweeps, at their places.
+    sizes
+        Numbers of points of the sweeps that may be read: {number of the sweep: points}.
+    scene
+        The place.
+    white
+        Intensity of a white surface; None if unknown.
+    base
+        The sensor, by default one with the recorded rings. Without rings it is returned.
+
+    Returns
+    -------
+    tuple
+        The sensor, and notes.
+    """
+    if not len(sweeps.recorded.elevation_rad):
+        assert base is not None
+        return base, ["without rings, the noise of the sensor is that of its model"]
+    # A sweep with few points, as with lost packets, looks like one of another sensor.
+    counts = np.array([*sizes.values()])
+    whole = np.array([*sizes])[counts >= np.median(counts) / 2]
+    chosen = whole[even_indices(len(whole), _FIT_SWEEPS)].tolist()
+
+    def read(index: int) -> Read:
+        sweep = sweeps.read(chosen[index])
+        columns: dict[str, Any] = {"ring": sweeps.recorded.ring_count - 1 - sweep.ring}
+        if sweep.intensities is not None:
+            columns["intensity"] = sweep.intensities
+        return sweep.points, columns, None
+
+    aligned = Recording(sweeps.name, len(chosen), read)
+    poses = sweeps.alignment.poses[chosen]
+    try:
+        fitted = fit(aligned, scene=scene, pose=poses, white=white).model
+    except LidarError as error:  # the place is there, and a scan of it needs no noise
+        sensor = base or recorded_sensor(SweepStack.read(aligned))
+        return sensor, [f"the noise of the sensor is unknown: {error}"]
+    if base is None or fitted.performance is None:
+        return base or fitted, []
+    source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"
+    changes = {
+        "performance": fitted.performance.model_dump(exclude_defaults=True),
+        "sources": {**base.sources, "performance": source},
+    }
+    return SensorModel.model_validate(base.model_dump() | changes), []
+
+
 def _drive_notes(alignment: Alignment) -> list[str]:
     """Return a note on a sensor that stood."""
     if np.ptp(alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
@@ -521,7 +556,9 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def _coloured(mesh: SceneMesh, reflectances: Reflectances) -> SceneMesh:
+def coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
     """Return the mesh of surfels, whose colours are their reflectances."""
+    if reflectances is None:
+        return mesh
     light = reflectances.surfels[:, None].repeat(3, axis=1)
     return replace(mesh, colours=Colours.of_faces(as_srgb(light).repeat(2, axis=0)))

@@ -212,7 +212,7 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
     cells, closest_m = _closest(sweeps, standing)
     positions = []
     outward = []
-    classes = []
+    labels = []
     for number, mask in standing.items():
         sweep = sweeps.read(number)
         rows = np.flatnonzero(mask)
@@ -222,13 +222,13 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
         kept = rows[sweep.range_m[rows] <= limit_m]
         positions.append(sweep.world[kept])
         outward.append((sweep.origins[kept] - sweep.world[kept]).astype(np.float32))
-        if sweep.classes is not None:
-            classes.append(sweep.classes[kept])
+        if sweep.labels is not None:
+            labels.append(sweep.labels[kept])
     world = np.concatenate(positions)
     # A sweep without points may have no columns.
-    classed = sum(map(len, classes)) == len(world)
+    labelled = sum(map(len, labels)) == len(world)
     return ScannedPoints(
-        world, np.concatenate(outward), np.concatenate(classes) if classes and classed else None
+        world, np.concatenate(outward), np.concatenate(labels) if labels and labelled else None
     )
 
 

@@ -1,7 +1,8 @@
 """Sweeps of a recording as a twin needs them: points in the sensor frame, rings, and intensities.
 
 A KITTI `.bin` and many PCD files have no column of rings. Where points are stored ring by ring, a
-ring begins where the azimuth falls back to 0°, and the points show their rings by their order.
+ring begins where the azimuth falls back to 0°, and the points show their rings by their order. In
+any order, points as fired by a sensor whose beams sweep cones show their rings by few elevations.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from lidarsim.base.extras import reading
 
 from ..clouds.recording import Columns, Recording, intensities_of, rings_of
 from ..recordings.opening import open_recording
-from ..scenario.point_files import CLASSES
+from .labels import labels_of
 
 MIN_RINGS = 4  # a sensor with fewer rings is treated as a sensor without rings
 _MAX_RINGS = 512
@@ -37,6 +38,9 @@ _MAX_START_RAD = np.radians(12)  # between the first pulses of rings
 _MIN_TIMES = 8  # different times of a sweep; fewer are times of packets, or lack precision
 _MAX_CONE_SPREAD = 0.25  # of a ring, over all elevations: lines of a Livox are no cones
 _MIN_IN_ORDER = 0.95  # share of runs whose elevations go on in one direction
+_MAX_CLUSTERS = 128  # of elevations
+_MIN_GAP_RATIO = 3.0  # of the smallest gap between clusters, over the largest gap within one
+_MIN_CLUSTER = 1e-3  # share of the points in a cluster: fewer are stray points
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +50,7 @@ class RecordedSweep:
     points: Floats  # (n, 3): metres
     ring: Ints  # (n,): row in `RecordedSweeps.elevation_rad`; 0 for a sensor without rings
     intensities: Floats | None  # (n,): in the scale of the recording
-    classes: Ints | None  # (n,)
+    labels: Ints | None  # (n,): of class and object
     time_s: Floats | None  # (n,): since the first of its points
     start_rad: Floats  # (r,): azimuths at which the rings start
 
@@ -65,7 +69,7 @@ class RecordedSweep:
             self.points[rows],
             self.ring[rows],
             None if self.intensities is None else self.intensities[rows],
-            None if self.classes is None else self.classes[rows],
+            None if self.labels is None else self.labels[rows],
             None if self.time_s is None else self.time_s[rows],
             self.start_rad,
         )
@@ -166,12 +170,13 @@ class RecordedSweeps:
         float64 (r,): median elevations of the rings, the highest first; empty for a sensor without
         rings.
     ring_numbers
-        int64 (r,): numbers of the rings in the recording; None if the order of points shows the
-        rings.
+        int64 (r,): numbers of the rings in the recording; None without a column of rings.
     notes
         Sentences on what the recording lacks.
     times
         The times of points; None if the recording has none.
+    are_cones
+        Whether elevations show the rings, not the order of points.
     """
 
     source: RecordingChoice | Recording
@@ -179,6 +184,7 @@ class RecordedSweeps:
     ring_numbers: Ints | None
     notes: tuple[str, ...]
     times: PointTimes | None = None
+    are_cones: bool = False
     _kept: dict[int, RecordedSweep] = field(default_factory=dict)
 
     @property
@@ -217,9 +223,17 @@ class RecordedSweeps:
         found = [_runs_in_order(points) for points, _ in references]
         runs = [run for run in found if run is not None]
         if not runs:
+            clusters = _clusters(np.concatenate([points for points, _ in references]))
+            if clusters is not None:
+                note = (
+                    f"{recording.name} has no column of rings: the elevations of its points show "
+                    f"{len(clusters)} rings."
+                )
+                return cls(recording, clusters, None, (note,), times, are_cones=True)
             note = (
-                f"{recording.name} has no rings, and the order of its points shows none: the rays "
-                "of the sensor are not calibrated."
+                f"{recording.name} has no column of rings, the order of its points shows none, and "
+                "their elevations are not those of a few cones: its points are compensated for the "
+                "motion, or its rays are not calibrated."
             )
             return cls(recording, np.empty(0), None, (note,), times)
         medians = max(runs, key=len)
@@ -262,12 +276,11 @@ class RecordedSweeps:
         points, columns = _returns(self.recording, number)
         ring, known = self._rings(points, columns)
         intensities = intensities_of(self.recording, columns)
-        classes = next((columns[name] for name in CLASSES if name in columns), None)
         sweep = RecordedSweep(
             points,
             ring,
             None if intensities is None else np.asarray(intensities, np.float64),
-            None if classes is None else np.asarray(classes).astype(np.int64),
+            labels_of(columns),
             None if self.is_compensated or self.times is None else self.times.of_points(columns),
             _start_rad(points, ring, self.ring_count),
         )
@@ -290,6 +303,9 @@ class RecordedSweeps:
             place = np.searchsorted(self.ring_numbers, numbers, sorter=order)
             ring = order[np.minimum(place, len(order) - 1)]
             return ring, self.ring_numbers[ring] == numbers
+        if self.are_cones:
+            middles = (self.elevation_rad[1:] + self.elevation_rad[:-1]) / 2
+            return np.searchsorted(-middles, -elevations(points)), np.ones(count, bool)
         starts, is_ring = _runs(points)
         lengths = np.diff(np.append(starts, count))
         ring = self._rings_of_runs(_medians(elevations(points), starts), is_ring)
@@ -344,6 +360,30 @@ def _cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
     low, medians, high = np.array([np.quantile(part, (0.25, 0.5, 0.75)) for part in parts]).T
     order = np.argsort(-medians, kind="stable")
     return numbers[order], medians[order], float(np.median(high - low))
+
+
+def _clusters(points: Floats) -> Floats | None:
+    """Return the elevations (r,) of cones that points (n, 3) lie on, the highest first, or None.
+
+    The gaps between clusters of elevations are all larger than any cluster is wide.
+    """
+    elevation = np.sort(elevations(points))
+    gaps = np.diff(elevation)
+    largest = np.sort(gaps)[::-1][:_MAX_CLUSTERS]
+    if len(largest) < _MAX_CLUSTERS:
+        return None
+    ratios = largest[:-1] / np.maximum(largest[1:], 1e-9)
+    ratios[: MIN_RINGS - 2] = 0
+    last = int(ratios.argmax())  # of the gaps between clusters
+    starts = np.append(0, np.flatnonzero(gaps >= largest[last]) + 1)
+    stops = np.append(starts[1:], len(elevation)) - 1
+    widest = float((elevation[stops] - elevation[starts]).max())
+    smallest = (stops - starts + 1).min()
+    if largest[last] < max(widest, _MIN_GAP_RATIO * largest[last + 1]):
+        return None
+    if smallest < _MIN_CLUSTER * len(elevation):
+        return None
+    return _medians(elevation, starts)[::-1]
 
 
 def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyArray]]:

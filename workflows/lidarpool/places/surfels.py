@@ -7,6 +7,7 @@ asked, until lines of other rings and sweeps are among these.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,8 @@ import numpy as np
 from lidarsim.base.allowance import bytes_of, memory
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
+from lidarsim.scene.colours import join_colours
+from lidarsim.scene.face_materials import join_materials
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..clouds.file_points import POINT_BYTES
@@ -122,6 +125,18 @@ class Surfels:
             materials=surfel_materials(points, voxels),
         )
         return cls(mesh)
+
+
+def joined_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
+    """Return the surfels of meshes as one mesh, with the name of the first."""
+    sizes = [len(mesh.faces) for mesh in meshes]
+    return SceneMesh(
+        meshes[0].name,
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        surfel_faces(sum(sizes) // 2),
+        colours=join_colours([mesh.colours for mesh in meshes], sizes),
+        materials=join_materials([mesh.materials for mesh in meshes], sizes),
+    )
 
 
 class _Planes(NamedTuple):
