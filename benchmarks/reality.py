@@ -197,15 +197,17 @@ def _cells(world: Floats) -> Ints:
     return np.floor(world / _STATIC_VOXEL_M).astype(np.int64)
 
 
-def to_next(sweeps: RecordedSweeps, numbers: Ints) -> dict[str, float | None]:
+def to_next(sweeps: RecordedSweeps, numbers: Ints, answering: Answering) -> dict[str, float | None]:
     """Return how far the ranges of sweeps are from the ranges of the next recorded sweep.
 
-    With the F1 of "no return", of cells that any of these sweeps has a return in.
+    With the F1 of "no return", of cells in which the sensor has returns.
     """
     images = {
         n: _range_image(sweeps, n) for n in np.unique([numbers, numbers + 1]) if n < sweeps.count
     }
-    answering = np.any([np.isfinite(image) for image in images.values()], axis=0)
+    share = (np.arange(_IMAGE_COLUMNS) + 0.5) / _IMAGE_COLUMNS
+    columns = (share * answering.cells.shape[1]).astype(np.int64)
+    is_answering = answering.cells[:, columns]
     differences = []
     lost_in_both = 0
     lost = 0
@@ -215,7 +217,7 @@ def to_next(sweeps: RecordedSweeps, numbers: Ints) -> dict[str, float | None]:
         one, following = images[number], images[number + 1]
         both = np.isfinite(one) & np.isfinite(following)
         differences.append(np.abs(one - following)[both])
-        is_lost, is_lost_next = (np.isnan(image) & answering for image in (one, following))
+        is_lost, is_lost_next = (np.isnan(image) & is_answering for image in (one, following))
         lost_in_both += int((is_lost & is_lost_next).sum())
         lost += int(is_lost.sum() + is_lost_next.sum())
     if not differences:
@@ -317,7 +319,7 @@ def _row(
         "interval_m": interval(
             rays.select(rays.standing), lambda part: part.figures()["all"]["median_size_m"]
         ),
-        "next": to_next(recorded, compared),
+        "next": to_next(recorded, compared, answering),
         "motion": sweeps.alignment.motion.value,
         "plane_m": float(np.nanmedian(plane_m)),
         "stretches": len(stretches),

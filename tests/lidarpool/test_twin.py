@@ -188,7 +188,7 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
     sweep = RecordedSweep(points, ring[rows], None, None, None, np.full(16, -np.pi))
     answering = Answering(np.ones((16, 720), bool), 50.0)
-    lost = lost_pulses(sweep, elevation, answering, 0.0)
+    lost, _ = lost_pulses(sweep, elevation, answering, 0.0)
     expected = ~returned & received
     assert len(lost.ring) == pytest.approx(expected.sum(), rel=0.01)
     for number in (0, 5, 9):
@@ -204,8 +204,10 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
         *3 * [None],
         sweep.start_rad,
     )
-    assert len(lost_pulses(both, elevation, answering, 0.0)) == pytest.approx(len(lost), rel=0.01)
-    unknown = lost_pulses(sweep, np.empty(0), answering, 0.0)
+    assert len(lost_pulses(both, elevation, answering, 0.0)[0]) == pytest.approx(
+        len(lost), rel=0.01
+    )
+    unknown, _ = lost_pulses(sweep, np.empty(0), answering, 0.0)
     assert not len(unknown.points)
 
 
@@ -459,6 +461,32 @@ def test_rings_are_found_by_elevations_in_any_order(street, survey):
     compensated = Recording("drive", 4, lambda number: (moved[number::4], {}, None))
     notes = RecordedSweeps.of_recording(compensated).notes
     assert "their elevations are not those of a few cones" in notes[0]
+
+
+def test_a_window_returns_nothing_in_the_place(street, survey, tmp_path):
+    body = static_box("van", (6.0, 0.6, 3.0), (2.0, 5.2))
+    corners = [[0.5, 4.88, 0.6], [3.5, 4.88, 0.6], [3.5, 4.88, 2.4], [0.5, 4.88, 2.4]]
+    window = SceneMesh("window", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+    scene = Scene.from_meshes([*street.meshes(), body, window])
+    seen = replace(survey, materials=[Material("window", 0.0), *survey.materials])
+    part = columns_of(list(Rig(scene, seen, "auto").cast(0, seen.scan_count)))
+    cloud = part.cloud((SCAN, *seen.stored_columns[3:]), seen.precision_m, scene.origin)
+    sweeps = Sweeps.from_survey(seen, scene)
+    found = twin(replace(cloud, sweeps=lambda: sweeps))
+    assert found.figures["dark_surfels"] > 50
+    assert found.figures["held_out"]["no_return"]["f1"] > 0.85
+    found.save(tmp_path / "twin")
+    job = build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+    scan = columns_of(list(Rig(job.scene, job.survey, "auto").cast(0, job.survey.scan_count)))
+    names = (SCAN, *job.survey.stored_columns[3:])
+    again = scan.cloud(names, job.survey.precision_m, job.scene.origin).positions
+    on_van = (np.abs(again[:, 1] - 4.9) < 0.2) & (again[:, 0] > -1) & (again[:, 0] < 5)
+    inside = (np.abs(again[:, 0] - 2) < 1.3) & (np.abs(again[:, 2] - 1.5) < 0.7)
+    share = job.survey.scan_count / seen.scan_count  # the last pose is at the start of a sweep
+    recorded = cloud.positions
+    on_recorded = (np.abs(recorded[:, 1] - 4.9) < 0.1) & (np.abs(recorded[:, 0] - 2) < 3)
+    assert (on_van & ~inside).sum() == pytest.approx(share * on_recorded.sum(), rel=0.1)
+    assert (on_van & inside).sum() < 0.03 * on_recorded.sum()
 
 
 @pytest.mark.extended

@@ -152,6 +152,7 @@ class AlignedSweep(NamedTuple):
     ring: Ints  # (n,)
     intensities: Floats | None  # (n,)
     labels: Ints | None  # (n,): of class and object
+    gap_range_m: Floats | None = None  # (n,): of lost pulses: ranges around their gaps, or NaN
 
     @property
     def range_m(self) -> Floats:
@@ -184,8 +185,10 @@ class AlignedSweeps:
         share = self.alignment.sweep_s / step_s if is_compensated else 0.0
         moved_m = share * float(np.linalg.norm(step.translation))
         sweep = self.recorded.read(number)
-        lost = lost_pulses(sweep, self.recorded.elevation_rad, self.answering, moved_m)
-        return self.aligned(sweep, number), self.aligned(lost, number)
+        elevation_rad = self.recorded.elevation_rad
+        lost, gap_range_m = lost_pulses(sweep, elevation_rad, self.answering, moved_m)
+        aligned = self.aligned(lost, number)._replace(gap_range_m=gap_range_m)
+        return self.aligned(sweep, number), aligned
 
     def aligned(self, sweep: RecordedSweep, number: int) -> AlignedSweep:
         """Return points of a sweep at their places."""

@@ -60,7 +60,7 @@ from .stretch_tasks import (
     build_stretch,
 )
 from .stretches import AlignedStretch, Stretch, divide, joined
-from .surfels import Surfels, joined_surfels
+from .surfels import joined_surfels, surfel_centres, surfel_mesh
 
 MIN_SWEEPS = 4
 SCENE_FILE = "place.glb"
@@ -77,6 +77,7 @@ _RESPONSE_STRETCHES = 4  # that tell the response of the sensor
 _POSES = Step("poses", (RecordedPoses,))
 _ALIGN = Step("align", (AlignedStretch,))
 _BUILD = Step("build", (StretchSurfels, Observations, HeldOut, SweepImages, Above))
+NO_RETURN = "no return"  # name of the object of dark surfels
 _MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
 
 
@@ -166,7 +167,9 @@ class Twin:
             scenario["world"] = {"origin": self.origin.tolist()}
         light = {"reflectance": "texture"} if self.scene.has_colours.any() else {}
         classes = self._classes()
-        materials: list[dict[str, Any]] = [
+        is_dark = NO_RETURN in self.scene.names
+        materials: list[dict[str, Any]] = [{"objects": NO_RETURN, "reflectance": 0}] * is_dark
+        materials += [
             {"material": name} | light | {"class": number} for number, name in classes.items()
         ]
         if light:
@@ -376,7 +379,12 @@ class _Building:
         some = even_indices(len(built.parts), _RESPONSE_STRETCHES).tolist()
         response = fit_response([self._seen(index) for index in some], recorded.ring_count)
         name = Path(recorded.recording.name).name
-        meshes = [part.surfels.mesh(name) for part in built.parts]
+        # The points of a stretch may all belong to its neighbours.
+        meshes = {
+            index: part.surfels.mesh(name)
+            for index, part in enumerate(built.parts)
+            if len(part.surfels.corners)
+        }
         model, notes = self._sensor(built, sweeps, meshes, response)
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
@@ -398,12 +406,14 @@ class _Building:
             "errors": draw_errors(figures),
         }
         if response is not None:
-            meshes = [
-                coloured(mesh, response.reflectances(self._seen(index), Surfels(mesh).centres))
-                for index, mesh in enumerate(meshes)
-            ]
+            meshes = {
+                index: coloured(
+                    mesh, response.reflectances(self._seen(index), surfel_centres(mesh))
+                )
+                for index, mesh in meshes.items()
+            }
         return Twin(
-            scene=Scene.from_meshes(divided(joined_surfels(meshes))),
+            scene=Scene.from_meshes([*divided(joined_surfels([*meshes.values()])), *built.dark()]),
             poses=alignment.poses,
             times_s=poses.times_s,
             origin=poses.origin,
@@ -416,14 +426,14 @@ class _Building:
         self,
         built: _Built,
         sweeps: AlignedSweeps,
-        meshes: Sequence[SceneMesh],
+        meshes: Mapping[int, SceneMesh],
         response: Response | None,
     ) -> tuple[SensorModel, list[str]]:
         """Return the sensor with the noise of its pulses on a part of the place, and notes."""
         middle = len(built.parts) // 2
         numbers = built.stretches[middle].own_numbers
         sizes = built.parts[middle].surfels.points
-        near = meshes[max(middle - 1, 0) : middle + 2]
+        near = [mesh for index, mesh in meshes.items() if abs(index - middle) <= 1]
         white = None if response is None else response.white
         return fit_sensor(
             sweeps,
@@ -447,6 +457,7 @@ class _Building:
             "points": sum(int(one.points.sum()) for one in surfels),
             "moved": sum(int(one.moved.sum()) for one in surfels),
             "surfels": sum(len(one.corners) for one in surfels),
+            "dark_surfels": sum(len(one.dark_corners) for one in surfels),
             "voxel_m": self.voxel_m,
             "length_m": float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()),
             "thickness_m": list(alignment.thickness_m),
@@ -475,6 +486,11 @@ class _Built:
     def held_out(self) -> HeldOut:
         """Return the rays of all held-out sweeps that were compared."""
         return HeldOut.joined([part.held_out for part in self.parts if part.held_out is not None])
+
+    def dark(self) -> list[SceneMesh]:
+        """Return the surfels that return nothing as at most one mesh."""
+        corners = np.concatenate([part.surfels.dark_corners for part in self.parts])
+        return [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 
     def images(self) -> SweepImages:
         """Return the images of a held-out sweep in the middle, or raise LidarError without one."""

@@ -22,6 +22,8 @@ _LEFT = 0.075
 _CHART_WIDTH = 0.77
 _IMAGE_HEIGHT = 190
 _GAP = 62
+_ABOVE_HEIGHT = 1000
+_ABOVE_FRAME = (_LEFT, 0.09, 0.86, 0.76)  # left, bottom, width and height, shares of the page
 _TOP = 150
 _BOTTOM = 90
 _COLUMNS = 720  # of the images, at most: 0.5° each
@@ -158,9 +160,9 @@ def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
 
 def draw_above(parts: Sequence[Above], path: Floats) -> Page:
     """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
-    page = Page((_WIDTH, 1000))
+    page = Page((_WIDTH, _ABOVE_HEIGHT))
     page.title("From above", "grey: what stands; red: left out, because rays passed it")
-    axes = page.chart((_LEFT, 0.09, 0.86, 0.76), xlabel="x, m", ylabel="y, m")
+    axes = page.chart(_ABOVE_FRAME, xlabel="x, m", ylabel="y, m")
     near = np.concatenate([part.still for part in parts])
     moved = np.concatenate([part.moved for part in parts])
     for points, colour, size, most in (
@@ -172,8 +174,14 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
         axes.scatter(some[:, 0], some[:, 1], c=colour, s=dots, lw=0, rasterized=True)
     axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, lw=1.6 * page.unit)
     low, high = np.quantile(near, (0.01, 0.99), axis=0)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axes.set_aspect("equal", adjustable="datalim")
+    # A metre is as long in x as in y.
+    sides = np.array([_ABOVE_FRAME[2] * _WIDTH, _ABOVE_FRAME[3] * _ABOVE_HEIGHT])
+    half = ((high - low) / sides).max() * sides / 2
+    middle = (low + high) / 2
+    axes.set(
+        xlim=(middle[0] - half[0], middle[0] + half[0]),
+        ylim=(middle[1] - half[1], middle[1] + half[1]),
+    )
     return page
 
 

@@ -187,7 +187,7 @@ def _rays(
     """Cast the rays of a sweep, with recorded ranges (n,), at a place."""
     seen = place.see(sweep)
     simulated_m = np.full(len(sweep.points), np.nan)
-    simulated_m[seen.rays] = seen.distance_m
+    simulated_m[seen.rays] = np.where(place.surfels.dark[seen.surfel], np.nan, seen.distance_m)
     unknown = np.full(len(sweep.points), np.nan)
     return HeldOut(
         sweep=np.full(len(sweep.points), number),

@@ -21,16 +21,22 @@ _MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep stre
 _MAX_STEPS = 3.0  # of a ring's own step, over the typical step
 _MIN_STEP_RAD = np.radians(0.02)  # closer returns are of one pulse
 _MIN_RETURNS = 8  # of a ring whose steps are known
+_MAX_GAP_M = 5.0  # wide, of lost pulses on a surface that returns nothing: a side of a car
+# Step of range between the ends of such a gap: at most, and for each metre of range.
+_MAX_STEP_M = 0.5
+_MAX_STEP_PER_M = 0.2
 _COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
 _ANSWERING_SWEEPS = 100  # that show these cells
+_LOW_RAD = np.radians(-3)  # elevation of rings that see the ground
+_MIN_ANSWERING = 0.1  # share of the sweeps in which a cell of such a ring has a return
 _SECTORS = 360  # of azimuth, in which all rings may be empty
 _MIN_RINGS = 0.05  # share of the rings that return in a sector; with less, no packet came
 
 
 def lost_pulses(
     sweep: RecordedSweep, elevation_rad: Floats, answering: Answering, moved_m: float
-) -> RecordedSweep:
-    """Return the lost pulses of a sweep, as points a metre away without intensities.
+) -> tuple[RecordedSweep, Floats]:
+    """Return the lost pulses of a sweep, as points a metre away, and the ranges around their gaps.
 
     Parameters
     ----------
@@ -43,9 +49,15 @@ def lost_pulses(
         Where the sensor has returns at all.
     moved_m
         How far the sensor moved during the sweep, if points are compensated; else 0.
+
+    Returns
+    -------
+    tuple
+        The k pulses, without intensities, and the ranges (k,) that surfaces have there which end
+        where the gap does, metres; NaN of a wide gap, or between different surfaces.
     """
     if not len(elevation_rad) or len(sweep) < _MIN_RETURNS:
-        return sweep.part(np.zeros(len(sweep), bool))
+        return sweep.part(np.zeros(len(sweep), bool)), np.empty(0)
     gaps = _Gaps.of_sweep(sweep)
     lost = gaps.between(moved_m)
     silent = np.setdiff1d(np.arange(len(elevation_rad)), gaps.ring)
@@ -53,6 +65,7 @@ def lost_pulses(
     azimuth = np.append(lost.azimuth, np.tile(circle, len(silent)))
     elevation = np.append(lost.elevation, elevation_rad[silent].repeat(len(circle)))
     ring = np.append(lost.ring, silent.repeat(len(circle)))
+    range_m = np.append(lost.range_m, np.full(len(silent) * len(circle), np.nan))
     level = np.cos(elevation)
     directions = np.stack(
         [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1
@@ -60,7 +73,8 @@ def lost_pulses(
     time_s = None if sweep.time_s is None else _times_s(sweep, azimuth)
     pulses = RecordedSweep(directions, ring, None, None, time_s, sweep.start_rad)
     received = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
-    return pulses.part(received & answering.cells[_cells(pulses)])
+    chosen = received & answering.cells[_cells(pulses)]
+    return pulses.part(chosen), range_m[chosen]
 
 
 def _times_s(sweep: RecordedSweep, azimuth: Floats) -> Floats:
@@ -74,11 +88,12 @@ def _times_s(sweep: RecordedSweep, azimuth: Floats) -> Floats:
 
 
 class _Lost(NamedTuple):
-    """Lost pulses (k,): azimuths and elevations, radians, and rings."""
+    """Lost pulses (k,): azimuths and elevations, radians, rings, and ranges around their gaps."""
 
     azimuth: Floats
     elevation: Floats
     ring: Ints
+    range_m: Floats
 
 
 class _Gaps(NamedTuple):
@@ -128,7 +143,20 @@ class _Gaps(NamedTuple):
         azimuth = self.azimuth[before] + share * self.gap_rad[before]
         elevation = self.elevation[before]
         elevation = elevation + share * (self.elevation[self.following[before]] - elevation)
-        return _Lost(azimuth, elevation, self.ring[before])
+        return _Lost(azimuth, elevation, self.ring[before], self._ranges(before, share))
+
+    def _ranges(self, before: Ints, share: Floats) -> Floats:
+        """Return the ranges (k,) at shares of gaps that begin at returns (k,).
+
+        NaN where the gap is wide, or its ends are of different surfaces.
+        """
+        from_m = self.range_m[before]
+        to_m = self.range_m[self.following[before]]
+        nearer_m = np.minimum(from_m, to_m)
+        is_narrow = self.gap_rad[before] * nearer_m < _MAX_GAP_M
+        is_one = np.abs(from_m - to_m) < _MAX_STEP_M + _MAX_STEP_PER_M * nearer_m
+        range_m = 1 / ((1 - share) / from_m + share / to_m)  # of a plane
+        return np.where(is_narrow & is_one, range_m, np.nan)
 
 
 def _step_rad(gap_rad: Floats) -> float:
@@ -157,14 +185,21 @@ class Answering(NamedTuple):
     @classmethod
     def of_sweeps(cls, sweeps: RecordedSweeps) -> Answering:
         """Look where any sweep has a return; LidarError if the recording cannot be read."""
-        cells = np.zeros((sweeps.ring_count, _COLUMNS), bool)
+        returned = np.zeros((sweeps.ring_count, _COLUMNS), np.int64)
         max_range_m = 0.0
-        for number in even_indices(sweeps.count, _ANSWERING_SWEEPS).tolist():
+        numbers = even_indices(sweeps.count, _ANSWERING_SWEEPS).tolist()
+        for number in numbers:
             sweep = sweeps.read(number)
+            cells = np.zeros_like(returned, bool)
             cells[_cells(sweep)] = True
+            returned += cells
             if len(sweep):
                 max_range_m = max(max_range_m, float(np.linalg.norm(sweep.points, axis=1).max()))
-        return cls(cells, max_range_m)
+        # Below the horizon is the ground, unless the carrier hides it in most sweeps.
+        is_low = np.zeros(sweeps.ring_count, bool)
+        is_low[: len(sweeps.elevation_rad)] = sweeps.elevation_rad < _LOW_RAD
+        least = np.where(is_low, _MIN_ANSWERING * len(numbers), 0)
+        return cls(returned > least[:, None], max_range_m)
 
 
 def _cells(sweep: RecordedSweep) -> tuple[Ints, Ints]:

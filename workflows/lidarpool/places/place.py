@@ -2,8 +2,11 @@
 
 Surfels reach beyond edges, and single points of things that moved are left. The caster decides:
 rays of the recording that pass a surfel, although it should have stopped them, count against the
-surfel, and rays that end on it count for it. Lost pulses count against it, too: windows and black
-cars return few pulses.
+surfel, and rays that end on it count for it. Lost pulses count against it, too.
+
+Windows and black cars return few pulses, and hide what is behind. Where pulses are lost between
+returns of the same surface, dark surfels are tried: lost pulses that meet one count for it, and
+pulses that return from there or from behind against it.
 
 Surfels overlap, and a ray meets the nearest. So the surface that rays see is above the means of the
 points: by 5 to 10 mm on a road. Each surfel is moved until its rays end on it, in the median.
@@ -123,13 +126,14 @@ class Place:
         )
 
     def refined(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Surfels:
-        """Return the surfels without those that more rays pass, or are lost on, than meet.
+        """Return the surfels without those that more rays contradict than support.
 
-        Each surfel moves along its normal to the median of the rays that end on it. LidarError if
-        no surfel is left.
+        Each surfel that is not dark moves along its normal to the median of the rays that end on
+        it. LidarError if no surfel is left.
         """
         count = len(self.surfels)
         votes = np.zeros(count, np.int64)
+        sign = np.where(self.surfels.dark, 1, -1)  # of the votes of lost pulses
         surfel = []
         offset_m = []
         for number in _some(standing):
@@ -137,14 +141,18 @@ class Place:
             seen = self.see(sweep, standing[number])
             ends = seen.ends
             farther_m = seen.range_m - seen.distance_m
-            votes += np.bincount(seen.surfel[ends], minlength=count)
-            votes -= np.bincount(seen.surfel[~ends & (farther_m > _ON_RAY_M)], minlength=count)
-            votes -= np.bincount(self.see(lost).surfel, minlength=count)
-            moving = ends | (np.abs(farther_m) < _MAX_SHIFT_M)
+            dark = self.surfels.dark[seen.surfel]
+            passing = ~ends & (farther_m > _ON_RAY_M)
+            votes += np.bincount(seen.surfel[ends & ~dark], minlength=count)
+            votes -= np.bincount(
+                seen.surfel[np.where(dark, ends | passing, passing)], minlength=count
+            )
+            votes += sign * np.bincount(self.see(lost).surfel, minlength=count)
+            moving = ~dark & (ends | (np.abs(farther_m) < _MAX_SHIFT_M))
             surfel.append(seen.surfel[moving])
             offset_m.append((farther_m * seen.inward)[moving])
         shifts_m = _shifts(np.concatenate(surfel), np.concatenate(offset_m), count)
-        supported = votes >= 0
+        supported = votes >= self.surfels.dark  # a dark surfel needs a pulse that is lost
         if not supported.any():
             raise LidarError(f"{sweeps.name}: its sweeps contradict each other.")
         return self.surfels.moved(shifts_m).part(supported)
@@ -155,7 +163,7 @@ class Place:
         for number in _some(standing):
             sweep = sweeps.read(number)
             seen = self.see(sweep, standing[number])
-            ends = seen.ends
+            ends = seen.ends & ~self.surfels.dark[seen.surfel]
             rays = seen.rays[ends]
             parts.append(
                 Observations(
@@ -177,10 +185,29 @@ def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: f
     if not len(points):
         raise LidarError(f"{sweeps.name} has no points that stand: nothing is left.")
     name = Path(sweeps.name).name
-    surfels = Surfels.of_points(name, points, voxel_m, sweeps.recorded.gap_rad)
+    gap_rad = sweeps.recorded.gap_rad
+    surfels = Surfels.of_points(name, points, voxel_m, gap_rad)
+    dark = _dark(sweeps, standing)
+    if Surfels.are_enough(dark, voxel_m):
+        surfels = surfels.with_dark(Surfels.of_points(name, dark, voxel_m, gap_rad))
     for _ in range(_ROUNDS):  # of two trees, the second would take as much memory again
         surfels = Place.of_surfels(surfels).refined(sweeps, standing)
     return Place.of_surfels(surfels)
+
+
+def _dark(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPoints:
+    """Return where lost pulses were lost, if surfaces go on in their gaps."""
+    positions = []
+    outward = []
+    for number in _some(standing):
+        _, lost = sweeps.read_with_lost(number)
+        assert lost.gap_range_m is not None
+        known = np.isfinite(lost.gap_range_m)
+        vectors = (lost.world - lost.origins)[known]
+        vectors *= (lost.gap_range_m[known] / np.linalg.norm(vectors, axis=1))[:, None]
+        positions.append(lost.origins[known] + vectors)
+        outward.append(-vectors)
+    return ScannedPoints(np.concatenate(positions), np.concatenate(outward))
 
 
 def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,6 @@ from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints, Ints32
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from ..scenario.point_scene import surfel_faces
 from .alignment import AlignedSweeps, Alignment, align
 from .charts import Above, SweepImages
 from .free_space import standing_points
@@ -22,7 +21,7 @@ from .place import Observations, Place, build_place
 from .recorded_sweeps import RecordedSweeps
 from .reflectances import Reflectances, fit_response
 from .stretches import AlignedStretch, Stretch
-from .surfels import Surfels
+from .surfels import Surfels, surfel_mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +77,7 @@ class StretchSurfels(NamedTuple):
     """Surfels of a stretch, and numbers of the points of its own sweeps."""
 
     corners: Floats  # (m, 4, 3): metres
+    dark_corners: Floats  # (d, 4, 3): of surfels that return nothing
     materials: AnyArray | None  # names
     material: Ints32 | None  # (m,): rows of `materials`
     points: Ints  # (k,): of each of its own sweeps
@@ -85,28 +85,30 @@ class StretchSurfels(NamedTuple):
 
     @classmethod
     def of_surfels(
-        cls, surfels: Surfels, standing: Mapping[int, Bools], own: Ints
+        cls, surfels: Surfels, chosen: Bools, standing: Mapping[int, Bools], own: Ints
     ) -> StretchSurfels:
-        """Return the arrays of surfels."""
+        """Return the arrays of chosen surfels (m,), and numbers of points of its `own` sweeps."""
+        corners = surfels.mesh.vertices.reshape(-1, 4, 3)
+        lit = chosen & ~surfels.dark
         materials = surfels.mesh.materials
         index = None if materials is None else materials.index
         masks = [standing[number] for number in own.tolist()]
         return cls(
-            surfels.mesh.vertices.reshape(-1, 4, 3),
+            corners[lit],
+            corners[chosen & surfels.dark],
             None if materials is None else np.array(materials.names),
-            None if index is None else index[::2],
+            None if index is None else index[::2][lit],
             np.array([len(mask) for mask in masks]),
             np.array([int((~mask).sum()) for mask in masks]),
         )
 
     def mesh(self, name: str) -> SceneMesh:
-        """Return the mesh of the surfels."""
+        """Return the mesh of the surfels that return light."""
         materials = None
         if self.materials is not None:
             index = None if self.material is None else self.material.repeat(2)
             materials = FaceMaterials(tuple(self.materials.tolist()), index)
-        faces = surfel_faces(len(self.corners))
-        return SceneMesh(name, self.corners.reshape(-1, 3), faces, materials=materials)
+        return replace(surfel_mesh(name, self.corners), materials=materials)
 
 
 BuiltStretch = tuple[StretchSurfels, Observations, HeldOut | None, SweepImages | None, Above]
@@ -126,8 +128,8 @@ def build_stretch(task: BuildTask) -> BuiltStretch:
     held_out, images = compared_sweeps(sweeps, task, standing)
     place = build_place(sweeps, standing, task.voxel_m)
     own = stretch.owns(place.surfels.centres, task.alignment.poses)
-    seen = place.observations(sweeps, standing).of_surfels(own)
-    surfels = StretchSurfels.of_surfels(place.surfels.part(own), standing, stretch.own_numbers)
+    seen = place.observations(sweeps, standing).of_surfels(own & ~place.surfels.dark)
+    surfels = StretchSurfels.of_surfels(place.surfels, own, standing, stretch.own_numbers)
     above = Above.of_sweeps(sweeps, standing, stretch.own_numbers, task.drawn_share)
     return surfels, seen, held_out, images, above
 

@@ -43,6 +43,7 @@ class Surfels:
     """Surfels, each two triangles in turn."""
 
     mesh: SceneMesh
+    dark: Bools  # (m,): of surfaces that return nothing, such as windows
 
     def __len__(self) -> int:
         return len(self.mesh.faces) // 2
@@ -50,7 +51,7 @@ class Surfels:
     @cached_property
     def centres(self) -> Floats:
         """Middles of the surfels, (m, 3), metres."""
-        return np.asarray(self.mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
+        return surfel_centres(self.mesh)
 
     @cached_property
     def normals(self) -> Floats:
@@ -67,12 +68,23 @@ class Surfels:
         faces = surfel_faces(int(rows.sum()))
         both = np.flatnonzero(rows.repeat(2))
         materials = None if mesh.materials is None else mesh.materials.take(both)
-        return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials))
+        return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials), self.dark[rows])
 
     def moved(self, shifts_m: Floats) -> Surfels:
         """Return the surfels moved along their normals by shifts (m,), metres."""
         offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
-        return Surfels(replace(self.mesh, vertices=self.mesh.vertices + offsets))
+        return replace(self, mesh=replace(self.mesh, vertices=self.mesh.vertices + offsets))
+
+    def with_dark(self, others: Surfels) -> Surfels:
+        """Return these surfels, and others that return nothing."""
+        dark = np.append(self.dark, np.ones(len(others), bool))
+        return Surfels(joined_surfels([self.mesh, others.mesh]), dark)
+
+    @staticmethod
+    def are_enough(points: ScannedPoints, voxel_m: float) -> bool:
+        """Whether points make surfels: they are in enough voxels."""
+        cells = np.unique(np.floor(points.positions / voxel_m).astype(np.int64), axis=0)
+        return len(cells) > 2 * _NEIGHBOURS[-1]
 
     @classmethod
     def of_points(cls, name: str, points: ScannedPoints, voxel_m: float, gap_rad: float) -> Surfels:
@@ -124,7 +136,17 @@ class Surfels:
             surfel_faces(count),
             materials=surfel_materials(points, voxels),
         )
-        return cls(mesh)
+        return cls(mesh, np.zeros(count, bool))
+
+
+def surfel_mesh(name: str, corners: Floats) -> SceneMesh:
+    """Return the mesh of surfels with corners (m, 4, 3), metres."""
+    return SceneMesh(name, corners.reshape(-1, 3), surfel_faces(len(corners)))
+
+
+def surfel_centres(mesh: SceneMesh) -> Floats:
+    """Return the middles (m, 3) of the surfels of a mesh, metres."""
+    return np.asarray(mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
 
 
 def joined_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
