@@ -239,7 +239,7 @@ def test_what_moved_is_no_part_of_the_place(place):
     middles = place.scene.vertices[place.scene.faces].mean(axis=1)
     in_lane = np.abs(middles[:, 1] - CAR_Y) < CAR[1] / 2 + 0.1
     ghosts = in_lane & (middles[:, 2] > 0.15) & (middles[:, 2] < CAR[2] + 0.1)
-    assert ghosts.mean() < 0.005
+    assert ghosts.mean() < 0.004
     assert (np.abs(middles[:, 1] - CAR_Y) < 1).any()  # the ground stays
     assert place.figures["moved"] > 0
 
@@ -251,7 +251,7 @@ def test_surfaces_are_as_bright_as_they_were(place):
     light = LINEAR[colours.means()].mean(axis=1)
     floor = np.median(light[middles[:, 2] < 0.05])
     walls = np.median(light[(np.abs(middles[:, 1]) > 7.3) & (middles[:, 2] > 1)])
-    np.testing.assert_allclose(floor / walls, FLOOR / WALLS, rtol=0.3)
+    np.testing.assert_allclose(floor / walls, FLOOR / WALLS, rtol=0.25)
 
 
 def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
@@ -367,6 +367,10 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     empty = Recording("drive", 9, lambda _: (np.zeros((0, 3)), {}, None))
     with pytest.raises(LidarError, match="drive has no points"):
         twin(empty)
+    unknown = np.tile(np.eye(4), (SWEEPS, 1, 1))
+    unknown[7, 0, 3] = np.nan
+    with pytest.raises(LidarError, match="has a pose of sweep 7 that is not a number"):
+        twin(replace(recording, frame_poses=lambda: unknown))
     trajectory = tmp_path / "poses.csv"
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
     with pytest.raises(LidarError, match="has 2 poses for 12 sweeps without times"):

@@ -22,6 +22,7 @@ _POINTS_OF_VOXEL = 4  # points that are registered in the length of a voxel
 _MAX_DISTANCE_M = 1.0  # of a point from its voxel's plane
 _MAP_SWEEPS = 100  # since a voxel was last met, after which the map forgets it
 _MIN_POINTS = 100  # of a sweep that is registered; with fewer the motion goes on
+_FIRST_SWEEPS = 4  # that tell the reach of the sensor
 _MAX_LOCAL_M = 10_000.0  # coordinates of a place that single precision holds
 _MAX_STEP_M = 5.0  # from sweep to sweep at 10 Hz: 180 km/h
 DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 Hz
@@ -77,6 +78,12 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         poses, times_s = _of_file(sweeps, trajectory, times_s)
         return RecordedPoses.in_world(poses, times_s, f"of {trajectory.name}")
     recorded = sweeps.recording.poses(range(sweeps.count))
+    if recorded is not None and not np.isfinite(recorded).all():
+        number = int(np.flatnonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0])
+        raise LidarError(
+            f"{sweeps.recording.name} has a pose of sweep {number} that is not a number: give the "
+            "poses by --trajectory."
+        )
     share = 0.0
     # Many files of a sweep each state the pose of none, as VIEWPOINT of PCD does.
     is_known = sweeps.recording.fired is not None  # of a result, which may stand
@@ -147,15 +154,16 @@ def _registered(sweeps: RecordedSweeps) -> Floats:
     need("small_gicp", "twin", "Sweeps without poses are registered")
     import small_gicp
 
-    first = sweeps.read(0)
-    reach_m = float(np.quantile(np.linalg.norm(first.points, axis=1), 0.98)) if len(first) else 0.0
+    # The first sweeps may be empty, or parts of one.
+    sizes = [np.linalg.norm(sweeps.read(number).points, axis=1) for number in range(_FIRST_SWEEPS)]
+    reach_m = float(np.quantile(np.concatenate(sizes), 0.98)) if any(map(len, sizes)) else 0.0
     voxel_m = float(np.clip(reach_m / _VOXELS_OF_REACH, _MIN_VOXEL_M, _MAX_VOXEL_M))
     voxels = small_gicp.GaussianVoxelMap(voxel_m)
     voxels.set_lru(horizon=_MAP_SWEEPS, clear_cycle=10)
     poses: list[Floats] = []
     step = np.eye(4)
     for number in range(sweeps.count):
-        sweep = sweeps.read(number) if number else first
+        sweep = sweeps.read(number)
         pose = poses[-1] @ step if poses else np.eye(4)
         if len(sweep) >= _MIN_POINTS:
             points, _ = small_gicp.preprocess_points(
