@@ -24,6 +24,7 @@ from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
 from lidarsim.columns.table import SCAN, Column
 
+from .block_loops import write_scans
 from .parts import reading_part
 
 _ALIGNMENT = 64  # bytes: a line of the cache
@@ -105,14 +106,6 @@ class _Scans(NamedTuple):
     first: int  # number of the first scan
     row_ends: Ints  # (scans,): number of rows up to the end of each scan
 
-    def write(self, first: int, stop: int, scan_of_row: AnyArray) -> None:
-        """Write the scans of the rows from `first` to `stop`, (stop - first,)."""
-        begin = int(np.searchsorted(self.row_ends, first, "right"))
-        end = int(np.searchsorted(self.row_ends, stop)) + 1
-        row_ends = np.minimum(self.row_ends[begin:end], stop)
-        scans = np.arange(self.first + begin, self.first + end, dtype=scan_of_row.dtype)
-        scan_of_row[:] = np.repeat(scans, np.diff(row_ends, prepend=first))
-
 
 class _OpenPart:
     """A part that is being read.
@@ -168,7 +161,7 @@ class _OpenPart:
             self._fill(data, array.offset + first * array.dtype.itemsize)
             self._crcs[name] = crc32(data, self._crcs[name])
         if self._scans is not None:
-            self._scans.write(first, stop, columns[SCAN.name])
+            write_scans(self._scans.row_ends, self._scans.first, first, columns[SCAN.name])
         return columns
 
     def check(self) -> None:
