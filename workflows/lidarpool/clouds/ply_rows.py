@@ -81,7 +81,11 @@ class RowMaker:
         axes = [(memory.starts[axis.name] // 4, _offset(row, axis.name)) for axis in AXES]
         self._axes = np.array(axes, np.int64)
         self._columns = _Columns(
-            *(memory.data.view(f"u{size}") for size in _SIZES), memory.data.view(np.int32)
+            memory.data,
+            memory.data.view(np.uint16),
+            memory.data.view(np.uint32),
+            memory.data.view(np.uint64),
+            memory.data.view(np.int32),
         )
         factor = float(10 ** decimals_of(precision_m))
         self._scale = Scale(float(precision_m), np.array(origin, np.float64), factor)

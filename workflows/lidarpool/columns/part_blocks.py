@@ -11,7 +11,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from io import BufferedIOBase
+from io import BufferedReader
 from typing import NamedTuple
 
 import numpy as np
@@ -95,7 +95,7 @@ def read_blocks(
             part.check()
 
 
-def _open(storage: Storage, name: str) -> BufferedIOBase:
+def _open(storage: Storage, name: str) -> BufferedReader | io.BytesIO:
     """Open a part: a file, or its bytes in memory if the storage is not a folder."""
     return open_input(storage.local(name)) if storage.is_local else io.BytesIO(storage.read(name))
 
@@ -113,7 +113,9 @@ class _OpenPart:
     The constructor and the methods raise LidarError for a damaged part; the message is a clause.
     """
 
-    def __init__(self, file: BufferedIOBase, row_count: int, memory: BlockMemory) -> None:
+    def __init__(
+        self, file: BufferedReader | io.BytesIO, row_count: int, memory: BlockMemory
+    ) -> None:
         self._file = file
         self._memory = memory
         try:
