@@ -86,7 +86,9 @@ def read_blocks(
     """
     with ExitStack() as stack:
         with reading_part(storage, name):
-            part = _OpenPart(stack.enter_context(_open(storage, name)), row_count, memory)
+            file = _open(storage, name)
+            stack.callback(file.close)
+            part = _OpenPart(file, row_count, memory)
         for first in range(0, row_count, memory.max_rows):
             with reading_part(storage, name):
                 columns = part.read(first, min(first + memory.max_rows, row_count))
