@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpool.report.cloud_counts import CloudCounts, GridCounts
+from lidarsim.columns.table import TABLE
 
 NEAR = np.int64(0x15555555)  # added to coordinates
 
@@ -49,6 +50,38 @@ def test_counts_are_those_of_the_finest_grid_that_holds_all_points(axes, across,
             assert grid.counts.tolist() == expected.tolist()
             assert grid.total == len(cells)
             assert (grid.box == box_of(cells)).all()
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize("step", [0.5, 30, 1e5])
+def test_merged_counts_are_those_of_one_grid(axes, step):
+    """Of threads that count pieces far apart, or nothing."""
+    cells = walk(axes, 3000, step, seed=axes)
+    expected = grid_of(cells, 16, 1)
+    for order in ([0, 1, 2, 3], [3, 1, 0, 2]):
+        pieces = [grid_of(piece, 16, 2) for piece in np.array_split(cells, [100, 150, 2000])]
+        merged = GridCounts(axes, 16)
+        for k in order:
+            merged.merge(pieces[k])
+        merged.merge(GridCounts(axes, 16))
+        assert merged.side == expected.side
+        assert (merged.lowest == expected.lowest).all()
+        assert merged.counts.tolist() == expected.counts.tolist()
+
+
+def test_labels_of_no_surface_and_of_no_object_are_told_apart():
+    counts = CloudCounts(
+        [TABLE["object"], TABLE["material"]], 3, 2, 0.01, np.zeros(3), from_above=False
+    )
+    labels = np.array([0, 0, -1, 2, 2, 2, -1, -1, 0], np.int32)
+    counts.add({"object": labels, "material": np.array([-1, 1, 1, 0, 0, 0, 0, 1, -1], np.int32)})
+    assert counts.by_object.tolist() == [3, 0, 3]
+    assert counts.no_surface == 3
+    assert counts.by_material.tolist() == [4, 3]
+    assert counts.point_count == 9
+    counts.add({"object": np.array([3], np.int32), "material": np.array([0], np.int32)})
+    assert counts.point_count == 9  # an object that the scene lacks
+    assert counts.limits == {"object": (-1, 3), "material": (-1, 1)}
 
 
 def test_farthest_cells_are_counted():

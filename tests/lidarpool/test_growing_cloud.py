@@ -14,6 +14,7 @@ from tests.daemons import wait_until
 
 from lidarpool import Job, LidarError, Scene, Sensor, Survey, read_cloud, save_cloud
 from lidarpool.clouds import ply
+from lidarpool.report import growing_cloud
 from lidarpool.report.growing_cloud import GrowingCloud, write_cloud
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.store.run_store import RunStore
@@ -79,6 +80,50 @@ def test_bytes_and_counts_are_those_of_a_cloud_written_at_once(
     again = write_cloud(tmp_path / "again.ply", points, sweeps, SCENE, from_above=True)
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     assert counted(again) == counted(expected)
+
+
+@pytest.mark.parametrize("block_rows", [1, 3, 65_536])
+@pytest.mark.parametrize("count", [1, 2, 16])
+def test_bytes_and_counts_do_not_depend_on_threads_and_blocks(
+    store, tmp_path, monkeypatch, count, block_rows
+):
+    monkeypatch.setattr(growing_cloud, "processors", lambda: count)
+    monkeypatch.setattr(growing_cloud, "_BLOCK_ROWS", block_rows)
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
+        for first, counts in FEW.items():
+            add(store, growing, first, counts)
+        points = store.only_job.points()
+        grown = growing.finish(tmp_path / "grown.ply", points)
+    save_cloud(points, tmp_path / "whole.ply")
+    assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
+    expected = counts_of(points, len(SCENE.all_names), len(SCENE.material_names))
+    assert counted(grown) == counted(expected)
+
+
+def test_a_disk_that_is_full_for_one_thread_is_told_in_the_end(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(growing_cloud, "processors", lambda: 4)
+    write = ply.GrowingPly.write_rows
+    offsets = []
+
+    def faulty(self, rows, offset):
+        offsets.append(offset)
+        if len(offsets) % 5 == 3:
+            raise OSError(28, "No space left on device")
+        write(self, rows, offset)
+
+    monkeypatch.setattr(ply.GrowingPly, "write_rows", faulty)
+    path = grown_at(tmp_path / "new")
+    with GrowingCloud(path, store.only_job, from_above=True) as growing:
+        for first, counts in FEW.items():
+            add(store, growing, first, counts)
+        points = store.only_job.points()
+        assert growing.finish(tmp_path / "grown.ply", points) is None
+    assert not any(path.parent.iterdir())
+    offsets.clear()
+    sweeps = Sweeps.from_survey(SURVEY, SCENE)
+    with pytest.raises(OSError, match="No space left"):
+        write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE, from_above=True)
+    assert not {thread.name for thread in threading.enumerate() if "cloud" in thread.name}
 
 
 @pytest.mark.parametrize("far_first", [0, 5, 10])

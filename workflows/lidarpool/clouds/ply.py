@@ -65,6 +65,9 @@ class GrowingPly:
     further points follow as such rows. The bytes are the same as if Open3D wrote all points at
     once, which would need memory for all.
 
+    After the first points, several threads may write rows at the same time: one thread extends the
+    file in the order of its points, and any thread then writes the rows at the offset.
+
     Parameters
     ----------
     path
@@ -115,6 +118,11 @@ class GrowingPly:
         """Size of the file in bytes."""
         return self._start + self.count * self.row.itemsize
 
+    @property
+    def has_layout(self) -> bool:
+        """True after the first points, when `row` is the type of the rows in the file."""
+        return bool(self._start)
+
     def check_room(self, count: int) -> None:
         """Raise LidarError unless the disk has room for `count` points, and for the first again."""
         size = len(header(self.row, count, self._comments)) + count * self.row.itemsize
@@ -159,6 +167,22 @@ class GrowingPly:
                     rows[column.in_files] = as_file_type(column, values[first:])
             self._write(rows.data.cast("B"))
         self.count += count
+
+    def extend(self, count: int) -> int:
+        """Extend the file, after the first points, by rows that will be written.
+
+        Returns the offset of the first of these rows, bytes.
+        """
+        offset = self.size
+        self.count += count
+        return offset
+
+    def write_rows(self, rows: memoryview, offset: int) -> None:
+        """Write the bytes of rows at an offset.
+
+        Raises OSError if the disk is full, or the file cannot be written for another reason.
+        """
+        _write_at(self._file.fileno(), rows, offset)
 
     def flush(self) -> None:
         """Flush the points to the disk."""
@@ -215,17 +239,21 @@ def _comments(table: Sequence[Column], sweeps: Sweeps) -> str:
     return comments
 
 
+def _write_at(file: int, data: memoryview, offset: int) -> None:
+    """Write bytes at an offset of a file."""
+    while data:  # the kernel writes 2 GiB at most at a time
+        count = os.pwrite(file, data, offset)
+        data = data[count:]
+        offset += count
+
+
 def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
     """Move the bytes from `start` to `stop` of a file to `new_start`, and cut off what follows."""
     offsets = range(start, stop, _BLOCK_BYTES)
     distance = new_start - start
     for offset in reversed(offsets) if distance > 0 else offsets:
         block = memoryview(os.pread(file, min(_BLOCK_BYTES, stop - offset), offset))
-        position = offset + distance
-        while block:
-            written_count = os.pwrite(file, block, position)
-            block = block[written_count:]
-            position += written_count
+        _write_at(file, block, offset + distance)
     os.ftruncate(file, stop + distance)
 
 

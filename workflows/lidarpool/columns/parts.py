@@ -13,7 +13,8 @@ from __future__ import annotations
 import re
 import zipfile
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -136,8 +137,18 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
     Raises LidarError if the part is missing, unreadable or damaged.
     """
-    try:
+    with reading_part(storage, name):
         return unpack(storage.read(name))
+
+
+@contextmanager
+def reading_part(storage: Storage, name: str) -> Iterator[None]:
+    """Say in errors of the body which part cannot be read or used, and what to do, as LidarError.
+
+    A LidarError of the body is a clause.
+    """
+    try:
+        yield
     except LidarError as error:
         raise LidarError(
             f"The part {storage.path(name)} cannot be used: {error}. {_AGAIN}"
@@ -214,18 +225,10 @@ class StoredCloud(CloudDisplay):
         """Return the points of a part, or a selection of rows."""
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
-    def columns_of(self, part: PartColumns) -> dict[str, AnyArray]:
-        """Return the columns of a part without positions, {name: (n,)}, in the order of files."""
-        return {
-            column.name: part.scan_column() if column is SCAN else part.columns[column.name]
-            for column in self.table
-        }
-
-    def positions_of(self, part: PartColumns, row_range: slice) -> Iterator[tuple[str, Floats]]:
-        """Yield the names of axes with coordinates of rows of a part, (n,), metres."""
+    def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
+        """Yield the names of axes with coordinates, (n,), metres, of columns of a part."""
         for i, axis in enumerate(AXES):
-            cells = part.columns[axis.name][row_range]
-            yield axis.name, positions_of(cells, self.precision_m, self.origin[i])
+            yield axis.name, positions_of(columns[axis.name], self.precision_m, self.origin[i])
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the cloud in order, from row `first` on, in chunks of `points`.

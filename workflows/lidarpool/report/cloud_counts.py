@@ -11,13 +11,12 @@ from lidarsim.base.arrays import AnyArray, Floats, Ints, Ints32
 from lidarsim.columns.part_columns import positions_of
 from lidarsim.columns.table import Column
 
+from .count_loops import SHIFT, count_cells, count_labels
+
 _CUBES = 64  # most cubes along an axis of the grid that measures density, a power of two
 _SQUARES = 1024  # most pixels along an axis of the points from above, a power of two
 _MIN_SQUARES = 50  # pixels along an axis that are not joined, however few the points are
 _MIN_POINTS = 12  # points in a cube that suffice for an estimate of density
-# Added to coordinates, in binary 101…0101. Multiples of no power of two are near it, so that no
-# grid has a boundary at zero, where floors often are: their points would be in two layers.
-_SHIFT = 0x15555555
 
 
 class CloudCounts:
@@ -63,24 +62,22 @@ class CloudCounts:
 
     def add(self, columns: Mapping[str, AnyArray]) -> None:
         """Add points: {name of a column: (n,)}, n > 0."""
-        owners = columns["object"]
-        if owners.min(initial=0) < 0:
-            self.no_surface += int(np.count_nonzero(owners < 0))
-            owners = owners[owners >= 0]
-        self.by_object += np.bincount(owners, minlength=len(self.by_object))
+        self.no_surface += count_labels(columns["object"], self.by_object)
         if "class" in columns:
-            self.by_class += np.bincount(columns["class"], minlength=len(self.by_class))
+            count_labels(columns["class"], self.by_class)
         if "material" in columns:
-            numbers = columns["material"]
-            numbers = numbers[numbers >= 0]
-            self.by_material += np.bincount(numbers, minlength=len(self.by_material))
+            count_labels(columns["material"], self.by_material)
         for column in self.table:
             values = columns[column.name]
-            lower, upper = self.limits.get(column.name, (np.inf, -np.inf))
-            self.limits[column.name] = (
-                min(lower, np.fmin.reduce(values).item()),
-                max(upper, np.fmax.reduce(values).item()),
+            self._add_limits(
+                column.name, np.fmin.reduce(values).item(), np.fmax.reduce(values).item()
             )
+
+    def _add_limits(self, name: str, lower: float, upper: float) -> None:
+        """Widen the limits of a column."""
+        limits = self.limits.get(name, (np.inf, -np.inf))
+        # Of 0.0 and -0.0, which are equal, the one that comes first would be the limit.
+        self.limits[name] = (min(limits[0], lower) + 0, max(limits[1], upper) + 0)
 
     def widen(self, cell_box: Ints) -> None:
         """Make room for points between lowest and highest cells, (2, 3), before they are added."""
@@ -96,6 +93,23 @@ class CloudCounts:
         self._cubes.add(cells)
         if self._squares is not None:
             self._squares.add(cells[:2])
+
+    def merge(self, other: CloudCounts) -> None:
+        """Add the points of other counts of the same cloud, whose counts are no longer used."""
+        self.by_object += other.by_object
+        self.no_surface += other.no_surface
+        self.by_class += other.by_class
+        self.by_material += other.by_material
+        for name, (lower, upper) in other.limits.items():
+            self._add_limits(name, lower, upper)
+        self._cubes.merge(other._cubes)
+        if self._squares is not None and other._squares is not None:
+            self._squares.merge(other._squares)
+
+    @property
+    def point_count(self) -> int:
+        """Number of points, by their objects."""
+        return int(self.by_object.sum()) + self.no_surface
 
     @property
     def bounds(self) -> Floats:
@@ -150,7 +164,7 @@ class GridCounts:
     of two of cells of positions, and larger cubes consist of whole smaller cubes. So the numbers
     are the same whatever the order of the points is, and no point is needed again.
 
-    A part of an axis has the number `(cell + _SHIFT) >> level`, and the array has the part at this
+    A part of an axis has the number `(cell + SHIFT) >> level`, and the array has the part at this
     number modulo `across`: the array stays as it is while points spread in any direction.
 
     Parameters
@@ -182,16 +196,18 @@ class GridCounts:
 
     def add(self, cells: Sequence[Ints32]) -> None:
         """Add points by their cells along each axis, (n,), within the box of `widen`."""
-        indices = np.zeros(1, np.int32)
-        for along_axis in cells:
-            # A sum beyond 32 bits differs in bits that are not used.
-            numbers = along_axis + np.int32(_SHIFT)
-            numbers >>= self._level
-            numbers &= self._across - 1
-            numbers += indices * self._across
-            indices = numbers
-        # `bincount` would make an array of the grid's size each time.
-        np.add.at(self._array.reshape(-1), indices.astype(np.intp), 1)
+        contiguous = [np.ascontiguousarray(along_axis) for along_axis in cells]
+        bits = self._across.bit_length() - 1
+        count_cells(*contiguous[:2], contiguous[-1], self._level, bits, self._array)
+
+    def merge(self, other: GridCounts) -> None:
+        """Add the points of another grid, which may become coarser by it."""
+        if other.box is None:
+            return
+        self.widen(other.box)
+        while other._level < self._level:
+            other.coarsen()
+        self._array += other._array
 
     def coarsen(self) -> None:
         """Double the side."""
@@ -226,7 +242,7 @@ class GridCounts:
     def lowest(self) -> Ints:
         """Lowest cell of `counts` along each axis, (axes,)."""
         box = np.zeros((2, self._array.ndim), np.int64) if self.box is None else self.box
-        return (_numbers(box[0], self._level) << self._level) - _SHIFT
+        return (_numbers(box[0], self._level) << self._level) - SHIFT
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -238,11 +254,11 @@ class GridCounts:
     @property
     def counts(self) -> Ints:
         """Number of points in each square or cube between the lowest and highest points."""
-        lowest = (self.lowest + _SHIFT) >> self._level
+        lowest = (self.lowest + SHIFT) >> self._level
         numbers = [low + np.arange(n) for low, n in zip(lowest, self.shape, strict=True)]
         return self._array[self._indices(numbers)]
 
 
 def _numbers(cells: Ints, level: int) -> Ints:
     """Return the numbers of parts of axes that contain cells."""
-    return (cells + _SHIFT) >> level
+    return (cells + SHIFT) >> level

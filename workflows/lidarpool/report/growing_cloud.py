@@ -5,7 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
@@ -16,22 +17,28 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidarsim.base.arrays import AnyArray, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.table import AXES
 from lidarsim.scene.scene import Scene
 from lidarsim.sweeps.sweeps import Sweeps
 
+from ..base.processors import processors
 from ..clouds.ply import GrowingPly, real_type
-from ..columns.parts import StoredCloud, read_part
+from ..clouds.ply_rows import RowMaker
+from ..columns.part_blocks import BlockMemory, read_blocks
+from ..columns.parts import StoredCloud
 from ..run.pipeline.stage_messages import Receipt
 from ..run.store.job_under_way import JobUnderWay
 from .cloud_counts import CloudCounts
 
-# Bytes appended between two flushes: the last flush is short, and no flush delays the flushes of
-# parts.
+_MAX_THREADS = 4  # that write parts; each has a block of rows in memory
+# Bytes written between two flushes. No result relies on these flushes, since the complete file is
+# flushed before it is moved into place: they keep that flush short, and no flush delays the flushes
+# of parts.
 _FLUSH_BYTES = 1 << 25
-# Rows in memory at a time. Of a whole part, each axis in float64 took memory from the system, and
-# gave it back: four times the processor time.
+# Rows of a block. Blocks of a quarter of this size stay in the second cache of a core, and took as
+# long: there are four times as many system calls.
 _BLOCK_ROWS = 1 << 16
 _LOOK_EVERY_S = 0.05
 
@@ -46,8 +53,83 @@ class _Part(NamedTuple):
     cell_box: tuple[int, ...]  # lowest and highest cell as six numbers; empty without points
 
 
+class _RowsOfPart(NamedTuple):
+    """A part that is written to a file."""
+
+    name: str
+    row_count: int
+    cell_box: Ints  # lowest and highest cells of its points or of more points, (2, 3)
+    offset: int = 0  # of its first row in the file, bytes; 0 for the first part
+    is_flushed: bool = False  # True if the file is flushed after the part
+
+
+class _PartWriter:
+    """Writes parts to a file, one at a time, in memory that is used again, and counts their points.
+
+    Each thread has its own.
+
+    Parameters
+    ----------
+    file
+        The file.
+    points
+        Points of the survey.
+    counts
+        Counts of the points.
+    """
+
+    def __init__(self, file: GrowingPly, points: StoredCloud, counts: CloudCounts) -> None:
+        self.counts = counts
+        self._file = file
+        self._points = points
+        self._memory = BlockMemory((*AXES, *points.table), _BLOCK_ROWS)
+        self._row_maker: RowMaker | None = None  # once the file has its layout
+
+    def write(self, part: _RowsOfPart) -> None:
+        """Write the points of a part block by block; the first part of a file gives it its layout.
+
+        LidarError if the part cannot be used, OSError if the disk is full.
+        """
+        self.counts.widen(part.cell_box)
+        offset = part.offset
+        for columns in read_blocks(self._points.storage, part.name, part.row_count, self._memory):
+            self.counts.add(columns)
+            self.counts.add_positions([columns[axis.name] for axis in AXES])
+            if not self._file.has_layout:
+                self._write_first(columns)
+                continue
+            rows = self._rows_of(columns)
+            if not part.offset:  # the number of first points is known by now
+                offset = self._file.extend(len(columns[AXES[0].name]))
+            self._file.write_rows(rows, offset)
+            offset += len(rows)
+        if part.is_flushed:
+            self._file.flush()
+
+    def _write_first(self, columns: Mapping[str, AnyArray]) -> None:
+        """Write the first points of a file."""
+        positions = self._points.positions_of(columns)
+        values = ((column.name, columns[column.name]) for column in self._points.table)
+        self._file.append(len(columns[AXES[0].name]), chain(positions, values))
+
+    def _rows_of(self, columns: Mapping[str, AnyArray]) -> memoryview:
+        """Return the rows of a block."""
+        if self._row_maker is None:
+            self._row_maker = RowMaker(
+                self._file.row,
+                self._points.table,
+                self._memory,
+                self._points.precision_m,
+                self._points.origin,
+            )
+        return self._row_maker.make(columns)
+
+
 class CloudWriter:
     """Writes the points of parts to a PLY file, and counts the points in the same pass.
+
+    Parts are appended in scan order, so that the offset of a part is known. Several threads write
+    them, a part each. An error of a thread is raised by the next call.
 
     Parameters
     ----------
@@ -62,7 +144,7 @@ class CloudWriter:
     expected_count
         Expected number of points (`GrowingPly`).
     from_above
-        Whether the points are counted as seen from above, too, which takes as long as the rest.
+        Whether the points are counted as seen from above, too.
     """
 
     def __init__(
@@ -76,47 +158,102 @@ class CloudWriter:
         *,
         from_above: bool,
     ) -> None:
-        self.counts = CloudCounts(
-            points.table,
-            len(scene.all_names),
-            len(scene.material_names),
-            points.precision_m,
-            points.origin,
-            from_above=from_above,
-        )
         self.file = GrowingPly(path, points.table, position_type, sweeps, expected_count)
-        self._points = points
-        self._flushed_bytes = 0
+        self._flushed_bytes = 0  # size of the file at the last flush
+        self.threads = min(processors(), _MAX_THREADS)
+        self._idle = SimpleQueue[_PartWriter]()
+        for _ in range(self.threads):
+            counts = CloudCounts(
+                points.table,
+                len(scene.all_names),
+                len(scene.material_names),
+                points.precision_m,
+                points.origin,
+                from_above=from_above,
+            )
+            self._idle.put(_PartWriter(self.file, points, counts))
+        self._executor = ThreadPoolExecutor(self.threads, "write cloud")
+        self._errors: list[BaseException] = []
 
-    def append(self, name: str) -> int:
-        """Append the points of a part, and return their number.
+    def __enter__(self) -> CloudWriter:
+        return self
 
-        LidarError if the part cannot be used, OSError if the disk is full.
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def append(self, name: str, row_count: int, cell_box: Ints) -> None:
+        """Append the points of a part; wait while as many parts as there are threads are written.
+
+        Parameters
+        ----------
+        name
+            The part.
+        row_count
+            Number of its points, at least 1.
+        cell_box
+            Lowest and highest cells of its points or of more points, (2, 3).
+
+        Raises
+        ------
+        LidarError
+            If a part cannot be used.
+        OSError
+            If the disk is full, or the file cannot be written for another reason.
         """
-        part = read_part(self._points.storage, name)
-        cell_box = part.cell_box
-        if cell_box is not None:
-            columns = self._points.columns_of(part)
-            self.counts.add(columns)
-            self.counts.widen(cell_box)
-            for first in range(0, len(part), _BLOCK_ROWS):
-                rows = slice(first, min(first + _BLOCK_ROWS, len(part)))
-                self.counts.add_positions([part.columns[axis.name][rows] for axis in AXES])
-                values = ((name, values[rows]) for name, values in columns.items())
-                positions = self._points.positions_of(part, rows)
-                self.file.append(rows.stop - first, chain(positions, values))
-        return len(part)
+        part_writer = self._idle.get()  # bounds the parts in memory
+        part = _RowsOfPart(name, row_count, cell_box)
+        if self.file.has_layout and not self._errors:
+            part = part._replace(
+                offset=self.file.extend(row_count), is_flushed=self._is_flush_due()
+            )
+            self._executor.submit(self._write, part_writer, part)
+        else:
+            self._write(part_writer, part)
+        self._raise_error()
 
-    def flush(self) -> None:
-        """Flush the file to the disk if many points were appended since the last flush."""
-        if self.file.size - self._flushed_bytes > _FLUSH_BYTES:
+    def _is_flush_due(self) -> bool:
+        """Return True once for each `_FLUSH_BYTES` of the file."""
+        is_due = self.file.size - self._flushed_bytes > _FLUSH_BYTES
+        if is_due:
             self._flushed_bytes = self.file.size
-            self.file.flush()
+        return is_due
+
+    def _write(self, part_writer: _PartWriter, part: _RowsOfPart) -> None:
+        """Write a part, unless there was an error, and note an error."""
+        try:
+            if not self._errors:
+                part_writer.write(part)
+        except BaseException as error:  # raised by the thread that appends parts
+            self._errors.append(error)
+        finally:
+            self._idle.put(part_writer)
+
+    def _raise_error(self) -> None:
+        """Raise the first error of a thread."""
+        if self._errors:
+            raise self._errors[0]
 
     def finish(self) -> CloudCounts:
-        """Complete the file, and return the counts of its points."""
+        """Complete the file, and return the counts of its points.
+
+        Raises the errors of `append`.
+        """
+        first, *others = [self._idle.get() for _ in range(self.threads)]
+        self._raise_error()
         self.file.finish()
-        return self.counts
+        for part_writer in others:
+            first.counts.merge(part_writer.counts)
+        if first.counts.point_count != self.file.count:
+            raise LidarError(
+                f"{first.counts.point_count:,} of {self.file.count:,} points are on objects of the "
+                "scene or on none: the parts are of another scene."
+            )
+        return first.counts
+
+    def close(self) -> None:
+        """Wait until no thread writes, and close the file."""
+        self._executor.shutdown(cancel_futures=True)
+        self.file.close()
 
 
 def write_cloud(
@@ -135,12 +272,15 @@ def write_cloud(
     """
     position_type = real_type(points.bounds, points.precision_m)
     count = len(points)
-    writer = CloudWriter(path, points, sweeps, scene, position_type, count, from_above=from_above)
-    with writer.file:
+    with CloudWriter(
+        path, points, sweeps, scene, position_type, count, from_above=from_above
+    ) as writer:
         writer.file.check_room(count)
         for name, rows in zip(points.names, points.rows, strict=True):
             if rows:
-                points.tell(writer.append(name))
+                assert points.cells is not None, "of points"
+                writer.append(name, rows, points.cells)
+                points.tell(rows)
         return writer.finish()
 
 
@@ -225,7 +365,7 @@ class GrowingCloud:
         if writer is None or not is_usable or writer.file.count != len(points):
             self._discard()
             return None
-        with writer.file:
+        with writer:
             counts = writer.finish()
         self._path.replace(path)
         self._writer = None
@@ -271,8 +411,8 @@ class GrowingCloud:
             parts = self._appended
             self._writer = self._new_writer(position_type)
         for appended in parts:
-            self._appended_rows += self._writer.append(appended.name)
-            self._writer.flush()
+            self._writer.append(appended.name, appended.point_count, cells)
+            self._appended_rows += appended.point_count
 
     def _new_writer(self, position_type: np.dtype[np.floating]) -> CloudWriter:
         """Return the writer of a new file.
@@ -297,17 +437,19 @@ class GrowingCloud:
 
         Else the disk would be full before all scans are stored.
         """
-        row_bytes = 0 if self._writer is None else self._writer.file.row.itemsize
+        rows_bytes = 0
+        if self._writer is not None:  # as many parts as there are threads may not be written yet
+            rows_bytes = part.point_count * self._writer.file.row.itemsize * self._writer.threads
         scans_left = len(self._job.scans) - self._committed_scans
         bytes_left = self._committed_bytes * scans_left // self._committed_scans
         free_bytes = shutil.disk_usage(self._path.parent).free
-        if free_bytes < part.point_count * row_bytes + bytes_left:
+        if free_bytes < rows_bytes + bytes_left:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self._path))
 
     def _discard(self) -> None:
         """Remove the file."""
         if self._writer is not None:
-            self._writer.file.close()
+            self._writer.close()
             self._writer = None
         with suppress(OSError):
             self._path.unlink(missing_ok=True)

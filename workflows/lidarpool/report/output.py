@@ -375,14 +375,14 @@ def _move(
 
     If the process is killed in between, --resume continues from the run's folder.
     """
-    for name in files:
+    for name in files:  # before its name: parts, the other copy of the points, are removed then
         flush(staged / name)
     with deferred_interrupts():
         _clear(Storage.at(folder), files, earlier)
         for name in (*_known_further(files), *FILES):
             if name in files:
                 (staged / name).replace(folder / name)
-        flush(folder)
+        flush(folder)  # the names last before the parts are removed
         on_written()
 
 
@@ -399,5 +399,5 @@ def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) ->
     missing = [name for name in FILES if name not in files]
     for name in (REPORT, PAGE, *further, *missing):
         target.discard(name)
-        if name == PAGE and target.is_local:
+        if name == PAGE and target.is_local:  # no report lasts beside files of another result
             flush(target.local())

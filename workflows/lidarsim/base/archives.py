@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import re
 import struct
 import zipfile
@@ -11,7 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -53,6 +54,16 @@ def packed(arrays: Mapping[str, Any]) -> bytes:
     memory = io.BytesIO()  # NumPy leaves a file open if writing fails
     np.savez_compressed(memory, **arrays)
     return memory.getvalue()
+
+
+class StoredArray(NamedTuple):
+    """An array in an archive without compression, which is read piece by piece."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    offset: int  # of the first element in the archive, bytes
+    head_crc: int  # CRC-32 of the file of NumPy up to the first element
+    crc: int  # CRC-32 of the whole file of NumPy
 
 
 class _StoredFile(NamedTuple):
@@ -165,15 +176,51 @@ def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, An
     The bytes of the arrays are taken from `allowance`. LidarError if they exceed the allowance; any
     exception if the archive is damaged.
     """
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        entries = archive.infolist()
-    # A damaged entry of the file list may hide later ones.
-    if len(entries) != int.from_bytes(data[-12:-10], "little"):
-        raise ValueError(f"{len(entries)} arrays")
+    entries = _entries(io.BytesIO(data))
     if allowance is not None:
         allowance.take(sum(entry.file_size for entry in entries))
     files = ((entry.filename, _content(data, entry)) for entry in entries)
     return {name.removesuffix(".npy"): read_npy(content, name) for name, content in files}
+
+
+def stored_arrays(file: IO[bytes]) -> dict[str, StoredArray]:
+    """Find the arrays of an archive without compression, {name: array}, and read no element.
+
+    Any exception if the archive is damaged.
+    """
+    return {
+        entry.filename.removesuffix(".npy"): _stored_array(file, entry) for entry in _entries(file)
+    }
+
+
+def _entries(file: IO[bytes]) -> list[zipfile.ZipInfo]:
+    """Return the list of files of an archive."""
+    with zipfile.ZipFile(file) as archive:
+        entries = archive.infolist()
+    # A damaged entry of the file list may hide later ones.
+    file.seek(-12, os.SEEK_END)
+    if len(entries) != int.from_bytes(file.read(2), "little"):
+        raise ValueError(f"{len(entries)} arrays")
+    return entries
+
+
+def _stored_array(file: IO[bytes], entry: zipfile.ZipInfo) -> StoredArray:
+    """Return the array in a file of an archive.
+
+    Raises ValueError for a damaged or compressed file.
+    """
+    name = entry.orig_filename.encode()
+    file.seek(entry.header_offset)
+    header = file.read(_FILE.size + len(name))
+    file.seek(int.from_bytes(header[28:30], "little"), os.SEEK_CUR)
+    head = file.read(10)
+    head += file.read(int.from_bytes(head[8:10], "little"))
+    array = _array_type(head, entry.filename)
+    size = len(head) + math.prod(array.shape) * array.dtype.itemsize
+    is_stored = entry.compress_type == zipfile.ZIP_STORED and not array.is_fortran
+    if not is_stored or header[_FILE.size :] != name or entry.file_size != size:
+        raise ValueError(f"{entry.filename} is damaged")
+    return StoredArray(array.dtype, array.shape, file.tell(), crc32(head), entry.CRC)
 
 
 def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
@@ -208,13 +255,30 @@ def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
     Archives are read by several threads. NumPy's reader parses headers with `ast`, which failed now
     and then in threads of Python 3.11: "AST constructor recursion depth mismatch".
     """
-    start = 10 + int.from_bytes(content[8:10], "little")
-    if (header := _HEADER.fullmatch(content, 10, start)) is None:
-        raise ValueError(f"{name} is not an array of numbers or text")
-    kind = np.dtype(header[1].decode())
-    shape = tuple(int(count) for count in header[3].split(b",") if count.strip())
+    kind, shape, is_fortran, start = _array_type(content, name)
     data = bytearray(memoryview(content)[start:])
     if len(data) != math.prod(shape) * kind.itemsize:
         raise ValueError(f"{name} is longer or shorter than its array")
     array = np.frombuffer(data, kind)
-    return array.reshape(shape[::-1]).T if header[2] == b"True" else array.reshape(shape)
+    return array.reshape(shape[::-1]).T if is_fortran else array.reshape(shape)
+
+
+class _ArrayType(NamedTuple):
+    """Content of the head of a file of NumPy."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    is_fortran: bool
+    start: int  # of the elements in the file, bytes
+
+
+def _array_type(content: bytes | memoryview, name: str) -> _ArrayType:
+    """Read the head of a file of NumPy.
+
+    Raises ValueError for a damaged head.
+    """
+    start = 10 + int.from_bytes(content[8:10], "little")
+    if (header := _HEADER.fullmatch(content, 10, start)) is None:
+        raise ValueError(f"{name} is not an array of numbers or text")
+    shape = tuple(int(count) for count in header[3].split(b",") if count.strip())
+    return _ArrayType(np.dtype(header[1].decode()), shape, header[2] == b"True", start)

@@ -232,7 +232,7 @@ class Storage:
         try:
             with temporary.open("xb") as file:
                 yield file
-                if self.durable:
+                if self.durable:  # before the name: else a power failure may leave an empty file
                     file.flush()
                     os.fsync(file.fileno())
             temporary.replace(target)
@@ -240,7 +240,7 @@ class Storage:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
-        if self.durable:
+        if self.durable:  # the receipt of a part is committed only once its name lasts, too
             flush(target.parent)
 
     def read(self, name: str, first: int = 0, stop: int | None = None) -> bytes:

@@ -92,13 +92,20 @@ class PartColumns:
         return Cloud(positions_of(cells, precision_m, origin), columns, tuple(table), sweeps)
 
 
+def decimals_of(precision_m: float) -> int:
+    """Return the number of decimals that positions in cells of `precision_m` are rounded to.
+
+    Multiplying gives 0.07000000000000001 for 0.07; positions are the nearest short decimals.
+    """
+    return max(0, 3 - decade(precision_m))
+
+
 def positions_of(cells: AnyArray, precision_m: float, origin: Floats | float) -> Floats:
     """Return world coordinates, metres, of points in cells of `precision_m`.
 
     Cells are whole numbers, (n, 3) with an origin (3,), or (n,) along an axis with a coordinate.
     """
-    # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.
-    digits = max(0, 3 - decade(precision_m))
+    digits = decimals_of(precision_m)
     positions = np.empty(cells.shape)
     for start in range(0, len(cells), _BLOCK_CELLS):  # intermediate values stay in the cache
         block = slice(start, start + _BLOCK_CELLS)

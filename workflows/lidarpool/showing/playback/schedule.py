@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -11,6 +10,8 @@ from itertools import islice
 from typing import Generic, Self, TypeVar
 
 from lidarsim.base.arrays import Ints
+
+from ...base.processors import processors
 
 Item = TypeVar("Item")
 _CHECK_S = 0.1
@@ -29,9 +30,7 @@ def casting_threads() -> int:
     The threads of a single cast share only its rays; steps on their hits, a half of the time, would
     use one core.
     """
-    known = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if known else os.cpu_count() or 1
-    return min(cores, _MAX_THREADS)
+    return min(processors(), _MAX_THREADS)
 
 
 class Schedule:

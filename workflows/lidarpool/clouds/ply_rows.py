@@ -1,0 +1,131 @@
+"""Rows of a PLY file from the columns of a part, in one compiled pass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import AnyArray, Floats, Ints32
+from lidarsim.columns.part_columns import decimals_of
+from lidarsim.columns.ply_format import as_file_type
+from lidarsim.columns.table import AXES, Column
+
+from ..columns.part_blocks import BlockMemory
+from .ply_loops import TILE_ROWS, make_rows
+
+_SIZES = (1, 2, 4, 8)  # of numbers, bytes
+
+
+class Scale(NamedTuple):
+    """Positions of cells: `round((cell * precision_m + origin) * factor) / factor`."""
+
+    precision_m: float  # size of a cell, metres
+    origin: Floats  # world position of the cell 0, 0, 0, (3,), metres
+    factor: float  # a power of ten
+
+
+class _Columns(NamedTuple):
+    """Memory of columns, as numbers of each size in bytes."""
+
+    of_1: AnyArray
+    of_2: AnyArray
+    of_4: AnyArray
+    of_8: AnyArray
+    cells: Ints32
+
+
+class _Rows(NamedTuple):
+    """Memory of rows, as numbers of each size in bytes, (rows, offsets) each."""
+
+    of_1: AnyArray
+    of_2: AnyArray
+    of_4: AnyArray
+    of_8: AnyArray
+
+
+class RowMaker:
+    """Makes rows of a PLY file, in memory that is used again.
+
+    Columns whose type in the file is another are converted by NumPy.
+
+    Parameters
+    ----------
+    row
+        Type of a row.
+    table
+        Columns beside the positions.
+    memory
+        Memory of the columns.
+    precision_m, origin
+        Size of the cells of positions, and world position of the cell 0, 0, 0, (3,), metres.
+    """
+
+    def __init__(
+        self,
+        row: np.dtype[np.void],
+        table: Sequence[Column],
+        memory: BlockMemory,
+        precision_m: float,
+        origin: Floats,
+    ) -> None:
+        copied = [column for column in table if np.dtype(column.dtype) == row[column.in_files]]
+        self._converted = [column for column in table if column not in copied]
+        sizes = [np.dtype(column.dtype).itemsize for column in copied]
+        copies = [
+            (size, memory.starts[column.name] // size, _offset(row, column.in_files))
+            for column, size in zip(copied, sizes, strict=True)
+        ]
+        self._copied = np.array(copies, np.int64).reshape(-1, 3)
+        axes = [(memory.starts[axis.name] // 4, _offset(row, axis.name)) for axis in AXES]
+        self._axes = np.array(axes, np.int64)
+        self._columns = _Columns(
+            memory.data,
+            memory.data.view(np.uint16),
+            memory.data.view(np.uint32),
+            memory.data.view(np.uint64),
+            memory.data.view(np.int32),
+        )
+        factor = float(10 ** decimals_of(precision_m))
+        self._scale = Scale(float(precision_m), np.array(origin, np.float64), factor)
+        self._rows = np.zeros(memory.max_rows, row)
+        self._fields = [self._fields_of(np.dtype(f"u{size}")) for size in _SIZES]
+        self._positions = self._fields_of(row[AXES[0].name])
+        self._tile = np.zeros(TILE_ROWS, self._positions.dtype)
+
+    def _fields_of(self, dtype: np.dtype[Any]) -> AnyArray:
+        """Return the rows as numbers of a type, (rows, offsets in bytes), which overlap."""
+        row_bytes = self._rows.itemsize
+        shape = (len(self._rows), row_bytes - dtype.itemsize + 1)
+        return np.ndarray(shape, dtype, self._rows.view(np.uint8), strides=(row_bytes, 1))
+
+    def make(self, columns: Mapping[str, AnyArray]) -> memoryview:
+        """Return the bytes of the rows of a block, until the next block.
+
+        Parameters
+        ----------
+        columns
+            {name: (n,)}: the columns of the block in the memory.
+
+        Raises
+        ------
+        LidarError
+            If a value does not fit into the file.
+        """
+        count = len(columns[AXES[0].name])
+        rows = self._rows[:count]
+        fields = _Rows(*(numbers[:count] for numbers in self._fields))
+        positions = self._positions[:count]
+        make_rows(
+            self._columns, self._copied, self._axes, self._scale, fields, positions, self._tile
+        )
+        for column in self._converted:
+            rows[column.in_files] = as_file_type(column, columns[column.name])
+        return rows.data.cast("B")
+
+
+def _offset(row: np.dtype[np.void], name: str) -> int:
+    """Return the offset of a field in a row, bytes."""
+    assert row.fields is not None, "named fields"
+    return row.fields[name][1]

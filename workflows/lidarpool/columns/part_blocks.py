@@ -1,0 +1,184 @@
+"""Blocks of rows of parts, read into memory that is used again.
+
+The columns of a part are as far apart in its file as they are long. A whole part in memory is
+written there, and read again for its checksums, for the cloud and for counting, past the caches;
+and memory of that size is taken from the system and given back for each part. A block of all
+columns stays in the cache of a core.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from io import BufferedReader
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.archives import StoredArray, stored_arrays
+from lidarsim.base.arrays import AnyArray, Bytes, Ints
+from lidarsim.base.checksum import crc32
+from lidarsim.base.errors import LidarError
+from lidarsim.base.input_files import open_input
+from lidarsim.base.storage import Storage
+from lidarsim.columns.table import SCAN, Column
+
+from .block_loops import write_scans
+from .parts import reading_part
+
+_ALIGNMENT = 64  # bytes: a line of the cache
+
+
+class BlockMemory:
+    """Memory for the columns of a block of rows.
+
+    Parameters
+    ----------
+    columns
+        Columns of a part, and `scan` if its values are asked for.
+    max_rows
+        Rows of the largest block.
+
+    Attributes
+    ----------
+    data
+        All columns, (bytes,); a column is contiguous.
+    starts
+        {name: offset of a column in `data`, bytes}, multiples of 64.
+    """
+
+    data: Bytes
+    starts: Mapping[str, int]
+
+    def __init__(self, columns: Sequence[Column], max_rows: int) -> None:
+        self.max_rows = max_rows
+        starts = {}
+        size = 0
+        for column in columns:
+            starts[column.name] = size
+            column_bytes = max_rows * np.dtype(column.dtype).itemsize
+            size += -(-column_bytes // _ALIGNMENT) * _ALIGNMENT
+        self.starts = starts
+        self.data = np.zeros(size, np.uint8)
+        self._columns = {
+            column.name: np.frombuffer(self.data, column.dtype, max_rows, starts[column.name])
+            for column in columns
+        }
+
+    def columns(self, rows: int) -> dict[str, AnyArray]:
+        """Return the first rows of all columns, {name: (rows,)}: views, until the next block."""
+        return {name: values[:rows] for name, values in self._columns.items()}
+
+
+def read_blocks(
+    storage: Storage, name: str, row_count: int, memory: BlockMemory
+) -> Iterator[dict[str, AnyArray]]:
+    """Read the columns of a part block by block into `memory`, and yield the columns of each block.
+
+    The checksums of these columns are compared after the last block: what is made of the blocks
+    counts only once the iterator has ended.
+
+    Raises
+    ------
+    LidarError
+        If the part is missing, unreadable, damaged, or has other columns or not `row_count` rows.
+    """
+    with ExitStack() as stack:
+        with reading_part(storage, name):
+            file = _open(storage, name)
+            stack.callback(file.close)
+            part = _OpenPart(file, row_count, memory)
+        for first in range(0, row_count, memory.max_rows):
+            with reading_part(storage, name):
+                columns = part.read(first, min(first + memory.max_rows, row_count))
+            yield columns
+        with reading_part(storage, name):
+            part.check()
+
+
+def _open(storage: Storage, name: str) -> BufferedReader | io.BytesIO:
+    """Open a part: a file, or its bytes in memory if the storage is not a folder."""
+    return open_input(storage.local(name)) if storage.is_local else io.BytesIO(storage.read(name))
+
+
+class _Scans(NamedTuple):
+    """Scans of a part."""
+
+    first: int  # number of the first scan
+    row_ends: Ints  # (scans,): number of rows up to the end of each scan
+
+
+class _OpenPart:
+    """A part that is being read.
+
+    The constructor and the methods raise LidarError for a damaged part; the message is a clause.
+    """
+
+    def __init__(
+        self, file: BufferedReader | io.BytesIO, row_count: int, memory: BlockMemory
+    ) -> None:
+        self._file = file
+        self._memory = memory
+        try:
+            arrays = stored_arrays(file)
+            self._arrays = {name: arrays[name] for name in memory.starts if name != SCAN.name}
+        except Exception as error:  # zipfile and NumPy raise errors of many kinds
+            raise LidarError(f"it is damaged ({error})") from error
+        self._crcs = {name: array.head_crc for name, array in self._arrays.items()}
+        columns = memory.columns(0)
+        if any(
+            array.shape != (row_count,) or array.dtype != columns[name].dtype
+            for name, array in self._arrays.items()
+        ):
+            raise LidarError("it is damaged (its arrays do not fit together)")
+        self._scans = None
+        if SCAN.name in memory.starts:
+            self._scans = self._read_scans(arrays, row_count)
+
+    def _read_scans(self, arrays: Mapping[str, StoredArray], row_count: int) -> _Scans:
+        """Read the scans of the rows."""
+        try:
+            first, stop = self._read_small(arrays[".scans"]).tolist()
+            counts = self._read_small(arrays[".counts"])
+        except (LookupError, ValueError) as error:
+            raise LidarError(f"it is damaged ({error})") from error
+        row_ends = np.cumsum(counts)
+        if (counts < 0).any() or len(counts) != stop - first or row_ends[-1] != row_count:
+            raise LidarError("it is damaged (its arrays do not fit together)")
+        return _Scans(first, row_ends)
+
+    def _read_small(self, array: StoredArray) -> AnyArray:
+        """Read a whole array, and compare its checksum."""
+        values = np.zeros(array.shape, array.dtype)
+        data = values.reshape(-1).view(np.uint8).data
+        self._fill(data, array.offset)
+        if crc32(data, array.head_crc) != array.crc:
+            raise LidarError("it is damaged (its checksums differ)")
+        return values
+
+    def read(self, first: int, stop: int) -> dict[str, AnyArray]:
+        """Read rows into the memory, and return their columns."""
+        columns = self._memory.columns(stop - first)
+        for name, array in self._arrays.items():
+            data = columns[name].view(np.uint8).data
+            self._fill(data, array.offset + first * array.dtype.itemsize)
+            self._crcs[name] = crc32(data, self._crcs[name])
+        if self._scans is not None:
+            write_scans(self._scans.row_ends, self._scans.first, first, columns[SCAN.name])
+        return columns
+
+    def check(self) -> None:
+        """Compare the checksums of all columns after the last block."""
+        for name, array in self._arrays.items():
+            if self._crcs[name] != array.crc:
+                raise LidarError(f"it is damaged ({name}.npy is damaged)")
+
+    def _fill(self, data: memoryview, offset: int) -> None:
+        """Read the bytes from an offset on."""
+        self._file.seek(offset)
+        # Mapped into memory, a part takes as long, and an error of the disk ends the process.
+        while data and (count := self._file.readinto(data)):
+            data = data[count:]
+        if data:
+            raise LidarError("it is damaged (it is cut)")
