@@ -16,9 +16,10 @@ from click.testing import CliRunner
 from distributed import Client
 
 import poolpart.deploy
-from lidarpool import Mounted, Pose, Sensor, Survey, Track, save_cloud, twin
+from lidarpool import LidarError, Mounted, Pose, Sensor, Survey, Track, save_cloud, twin
 from lidarpool.cli.commands import cli
 from lidarpool.places.alignment import Alignment
+from lidarpool.places.finished_steps import STEPS_FOLDER
 from lidarpool.places.motion import Motion, Step
 from lidarpool.places.stretches import AlignedStretch, divide, joined
 from lidarscenes.procedural.city import city
@@ -146,6 +147,8 @@ def test_the_same_place_by_any_number_of_workers_and_after_a_kill(bag, tmp_path)
         cli, ["twin", str(bag), "--out", str(folder), "--voxel-m", "0.2", "--resume"]
     )
     assert "an unfinished twin of another recording, of other options" in str(other.exception)
+    with pytest.raises(LidarError, match="an unfinished twin of another recording"):
+        twin(bag, intensity="ring", folder=folder / STEPS_FOLDER, resume=True)
     start = time.perf_counter()
     resumed = runner.invoke(cli, ["twin", str(bag), "--out", str(folder), "--resume"])
     resumed_s = time.perf_counter() - start

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import secrets
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -280,17 +281,22 @@ def _check(recorded: RecordedSweeps) -> None:
         )
 
 
-def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[tuple[str, int, int]]:
-    """Return names, sizes and times of change of the files that a twin is made of."""
+def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
+    """Return what was chosen, and names, sizes and times of change of files that twins are of.
+
+    Nothing is the same as a recording in memory.
+    """
     source = recorded.source
-    chosen = [source.path] if isinstance(source, RecordingChoice) else []
-    files = [*chosen, *([] if trajectory is None else [trajectory])]
+    if not isinstance(source, RecordingChoice):
+        return [secrets.token_hex()]
+    files = [source.path, *([] if trajectory is None else [trajectory])]
     inner = chain.from_iterable(sorted(file.rglob("*")) for file in files if file.is_dir())
-    return [
+    stated = [
         (str(file), status.st_size, status.st_mtime_ns)
         for file in chain(files, inner)
-        if (status := file.stat()) and not file.is_dir()
+        if file.is_file() and (status := file.stat())
     ]
+    return [source, str(trajectory), *stated]
 
 
 @dataclass(frozen=True, eq=False)
