@@ -558,6 +558,26 @@ def test_a_mirrored_recording_is_refused_and_a_sensor_that_stood_is_noted(drive)
 
 
 @pytest.mark.extended
+def test_sweeps_that_are_tilted_against_the_sensor_tell_no_noise(drive, tmp_path):
+    opened = open_recording(drive, name="drive")
+    angle = np.radians(4)
+    tilt = np.eye(4)
+    tilt[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    poses = opened.poses(range(SWEEPS)) @ np.linalg.inv(tilt)
+
+    def read(number):
+        points, columns, _ = opened.read(number)
+        return points @ tilt[:3, :3].T, {"ring": columns["channel"]}, None
+
+    found = twin(Recording("drive", SWEEPS, read, frame_poses=lambda: poses))
+    assert found.model.performance is None
+    assert found.model.firings_per_turn == pytest.approx(480, rel=0.02)
+    assert any("the noise of the sensor is unknown: " in note for note in found.figures["notes"])
+    found.save(tmp_path / "twin")
+    build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
+
+
+@pytest.mark.extended
 def test_a_drive_far_from_zero_with_an_empty_sweep_and_a_trajectory(drive, place, tmp_path):
     opened = open_recording(drive, name="drive")
     far = np.array([400_000.0, 5_600_000.0, 90.0])

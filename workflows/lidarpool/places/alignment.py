@@ -39,6 +39,7 @@ _RANGE_SWEEPS = 48  # that tell the ranges of the sensor
 _TURN_M = 10.0  # motion that blurs as much as a turn by a radian
 _NEAR_VOXELS = 160  # twice the median range
 _MAX_SHARE_OF_VOXELS = 0.99  # of those of the usual way, filled in another way that is right
+_SHIFTS = (0.0, 0.5)  # of the voxels that are counted, in voxels
 _STEPS = 3  # of Gauss and Newton in a round
 _MAX_VOXELS = 1.5  # distance to a plane's centre beyond which a point is not compared
 _MIN_SIGMA_M = 0.005  # of distances: simulated ranges may have no noise
@@ -305,7 +306,11 @@ def _filled_voxels(
         points, _ = alignment.compensated(sample, number)
         near = np.linalg.norm(sample.points, axis=1) < _NEAR_VOXELS * voxel_m
         parts.append(placed(points[near], alignment.poses[number]))
-    return len(np.unique(np.floor(np.concatenate(parts) / voxel_m).astype(np.int64), axis=0))
+    # A level floor on a boundary is in two layers of voxels: of other voxels it is in one.
+    cells = np.concatenate(parts) / voxel_m
+    return sum(
+        len(np.unique(np.floor(cells + shift).astype(np.int64), axis=0)) for shift in _SHIFTS
+    )
 
 
 def _fastest(poses: RecordedPoses) -> slice:

@@ -37,8 +37,6 @@ from ..clouds.folder import result_folder, staging
 from ..clouds.recording import Read, Recording
 from ..columns.parts import StoredCloud
 from ..comparing.fit import fit
-from ..comparing.fit.fitting import recorded_sensor
-from ..comparing.fit.stack import SweepStack
 from ..recordings.opening import open_recording
 from ..report.page.rendering import rendered
 from ..scenario.point_scene import CLASS_MATERIAL
@@ -47,7 +45,7 @@ from .charts import STANDING_DOTS, Above, SweepImages, draw_above, draw_errors, 
 from .finished_steps import FinishedSteps, Map, Step
 from .held_out import HeldOut
 from .labels import divided
-from .lost_pulses import Answering
+from .lost_pulses import Answering, firings_per_turn
 from .odometry import RecordedPoses, find_poses
 from .place import Observations
 from .processes import mapping
@@ -539,7 +537,10 @@ def fit_sensor(
     # A sweep with few points, as with lost packets, looks like one of another sensor.
     counts = np.array([*sizes.values()])
     whole = np.array([*sizes])[counts >= np.median(counts) / 2]
-    chosen = whole[even_indices(len(whole), _FIT_SWEEPS)].tolist()
+    some = whole[even_indices(len(whole), 2 * _FIT_SWEEPS)]
+    # Compensated sweeps may be tilted against the sensor, so that their rings are no cones.
+    spread_rad = [sweeps.recorded.cone_spread_rad(number) for number in some.tolist()]
+    chosen = np.sort(some[np.argsort(spread_rad, kind="stable")[:_FIT_SWEEPS]]).tolist()
 
     def read(index: int) -> Read:
         sweep = sweeps.read(chosen[index])
@@ -553,7 +554,7 @@ def fit_sensor(
     try:
         fitted = fit(aligned, scene=scene, pose=poses, white=white).model
     except LidarError as error:  # the place is there, and a scan of it needs no noise
-        sensor = base or recorded_sensor(SweepStack.read(aligned))
+        sensor = base or _without_noise(sweeps, chosen[0])
         return sensor, [f"the noise of the sensor is unknown: {error}"]
     if base is None or fitted.performance is None:
         return base or fitted, []
@@ -563,6 +564,18 @@ def fit_sensor(
         "sources": {**base.sources, "performance": source},
     }
     return SensorModel.model_validate(base.model_dump() | changes), []
+
+
+def _without_noise(sweeps: AlignedSweeps, number: int) -> SensorModel:
+    """Return a sensor with the rings of a recording, and the steps of azimuth of a sweep."""
+    elevation_deg = np.degrees(np.sort(sweeps.recorded.elevation_rad)).round(3)
+    return SensorModel(
+        name="Recorded sensor",
+        sources={"angles": "medians of the recorded points"},
+        firings_per_turn=firings_per_turn(sweeps.recorded.read(number)),
+        range_m=(0.0, float(np.ceil(1.1 * sweeps.answering.max_range_m))),
+        beams={"elevation_deg": elevation_deg.tolist()},
+    )
 
 
 def _drive_notes(alignment: Alignment) -> list[str]:

@@ -87,6 +87,11 @@ def _times_s(sweep: RecordedSweep, azimuth: Floats) -> Floats:
     return np.asarray(sweep.time_s[order[index]])
 
 
+def firings_per_turn(sweep: RecordedSweep) -> int:
+    """Return the number of steps of a revolution, by the typical step between returns of a ring."""
+    return round(2 * np.pi / float(np.median(_Gaps.of_sweep(sweep).step_rad)))
+
+
 class _Lost(NamedTuple):
     """Lost pulses (k,): azimuths and elevations, radians, rings, and ranges around their gaps."""
 

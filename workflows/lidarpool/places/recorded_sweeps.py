@@ -286,6 +286,13 @@ class RecordedSweeps:
         )
         return sweep if known.all() else sweep.part(known)
 
+    def cone_spread_rad(self, number: int) -> float:
+        """Return how far the rings of a sweep are from cones (`_cones`), radians; inf if empty."""
+        sweep = self.read(number)
+        if not len(sweep):
+            return float("inf")
+        return _cones(sweep.ring, elevations(sweep.points))[2]
+
     def _rings(self, points: Floats, columns: Columns) -> tuple[Ints, Bools]:
         """Return the rows of the rings of points (n,), and which rings are known."""
         count = len(points)

@@ -23,7 +23,7 @@ from .motion import Step
 
 _OWN_SWEEPS = 80  # of a stretch, about
 _AROUND_SWEEPS = 40  # before and after, at most
-_AROUND_M = 20.0
+_AROUND_M = 40.0
 _METRE_M = 1.0  # length of the drive of which all or no sweeps belong to a stretch
 _METRE_SWEEPS = 80  # of a metre that count
 
