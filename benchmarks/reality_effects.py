@@ -29,14 +29,17 @@ from typing import Any
 import numpy as np
 
 from lidarpool.places.alignment import AlignedSweeps
-from lidarpool.places.building import coloured, fit_sensor
+from lidarpool.places.building import NO_RETURN, coloured, fit_sensor
 from lidarpool.places.lost_pulses import Answering
 from lidarpool.places.motion import Motion
+from lidarpool.places.place import Place
 from lidarpool.places.recorded_sweeps import RecordedSweeps
 from lidarpool.places.reflectances import Reflectances
+from lidarpool.places.surfels import surfel_mesh
 from lidarsim import Material, Noise, Returns, Scanner, Scene
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.motion.trajectory import CENTRE
+from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.beams import Spin
 from lidarsim.sensor.models import SensorModel, read_model
 from lidarsim.sensor.ray_sensors import ListedSensor
@@ -174,7 +177,10 @@ class Effects:
         scanner = Scanner(
             scene,
             rays.sensor(),
-            materials=[Material("*", reflectance="texture")] if self.textured else [],
+            materials=[
+                Material(NO_RETURN, reflectance=0),
+                Material("*", reflectance="texture" if self.textured else None),
+            ],
             returns=self.returns,
             noise=self.noise,
         )
@@ -216,6 +222,16 @@ def figures(rays: Rays, simulated_m: Floats) -> dict[str, float]:
     }
 
 
+def meshes(place: Place, reflectances: Reflectances | None) -> tuple[SceneMesh, list[SceneMesh]]:
+    """Return the surfels that return light, with colours, and those that return nothing, if any."""
+    dark = place.surfels.dark
+    lit = place.surfels.part(~dark).mesh
+    if reflectances is not None:
+        lit = coloured(lit, replace(reflectances, surfels=reflectances.surfels[~dark]))
+    corners = place.surfels.mesh.vertices.reshape(-1, 4, 3)[dark]
+    return lit, [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
+
+
 def measure(name: str, root: Path) -> list[dict[str, Any]]:
     """Return and print the figures of a recording's parts, with and without effects."""
     source = SOURCES[name]
@@ -244,12 +260,13 @@ def _rows(half: HalfPlace, base: SensorModel, only: str = "") -> list[dict[str, 
     """Return the figures of held-out sweeps, with all effects and without each."""
     place, reflectances = half.place, half.reflectances
     sizes = {number: len(half.standing[number]) for number in half.mapped}
-    bare = Scene.from_meshes([place.surfels.mesh])
+    lit, dark = meshes(place, reflectances)
+    bare = Scene.from_meshes([lit])
     white = None if reflectances is None else reflectances.response.white
     model, notes = fit_sensor(half.sweeps, sizes, bare, white, base)
     rays = Rays.of_sweeps(half.sweeps, half.standing, half.compared)
     print(f"{len(rays.recorded_m):,} rays, {model.performance}, {notes}", flush=True)
-    scene = Scene.from_meshes([coloured(place.surfels.mesh, reflectances)])
+    scene = Scene.from_meshes([lit, *dark])
     max_range_m = half.sweeps.answering.max_range_m + _RANGE_MARGIN_M
     rows = []
     for effect, effects in Effects.of_model(model, reflectances is not None).without().items():
