@@ -178,7 +178,7 @@ class Effects:
             scene,
             rays.sensor(),
             materials=[
-                Material(NO_RETURN, reflectance=0),
+                *[Material(NO_RETURN, reflectance=0)] * (NO_RETURN in scene.names),
                 Material("*", reflectance="texture" if self.textured else None),
             ],
             returns=self.returns,
