@@ -381,7 +381,11 @@ class _Building:
         alignment = sweeps.alignment
         self.tell("fitting the sensor")
         some = even_indices(len(built.parts), _RESPONSE_STRETCHES).tolist()
-        response = fit_response([self._seen(index) for index in some], recorded.ring_count)
+        response = fit_response(
+            [self._seen(index) for index in some],
+            recorded.ring_count,
+            are_energies=recorded.recording.energies,
+        )
         name = Path(recorded.recording.name).name
         # The points of a stretch may all belong to its neighbours.
         meshes = {

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ _RANGE_EDGES_M = (0, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, 50, 65, 80, 100,
 _INCIDENCE_BINS = 10  # of the cosine
 _MIN_RAYS = 200  # of a factor; fewer do not change it
 _WHITE_QUANTILE = 0.999  # of the intensities: what is brighter is as bright as white
+_WHITE_SHARE = 0.99  # of the rays, which end on surfaces up to white
 _MIN_REFLECTANCE = 0.01  # surfaces that were recorded as black
 
 
@@ -101,11 +102,15 @@ class Reflectances:
         return intensities
 
 
-def fit_response(parts: Sequence[Observations], ring_count: int) -> Response | None:
+def fit_response(
+    parts: Sequence[Observations], ring_count: int, *, are_energies: bool
+) -> Response | None:
     """Fit the response of a sensor to rays that end on surfels, or return None without intensities.
 
-    Each of the `parts` has surfels of its own. Sums, not logarithms, are compared: many sensors
-    report dark surfaces as 0.
+    Each of the `parts` has surfels of its own. Intensities that are compensated for the range do
+    not depend on it, at first, and energies fall with the square of the range and the cosine of the
+    incidence: unless it is known that they `are_energies`, what explains the intensities better is
+    kept. Sums, not logarithms, are compared: many sensors report dark surfaces as 0.
     """
     seen = Observations.joined(parts)
     seen = seen.part(np.isfinite(seen.intensity))
@@ -113,33 +118,59 @@ def fit_response(parts: Sequence[Observations], ring_count: int) -> Response | N
         return None
     brightest = float(np.quantile(seen.intensity, _WHITE_QUANTILE))
     intensity = np.minimum(seen.intensity / brightest, 1.0)
-    (by_range, by_incidence, by_ring), reflectance = _factors(seen, intensity, ring_count)
-    # Reflectances of 1 are white: the factors take what is above.
-    scale = max(float(np.quantile(reflectance, _WHITE_QUANTILE)), 1e-6)
-    typical = float(np.median(reflectance)) / scale
+    fits = [
+        _Factors.of_rays(seen, intensity, _first_factors(ring_count, energies=energies))
+        for energies in ((True,) if are_energies else (False, True))
+    ]
+    best = min(fits, key=lambda fit: fit.difference)
+    # Reflectances of 1 are white: the factors take what is above. Surfels that few rays met
+    # scatter, so rays count.
+    scale = max(float(np.quantile(best.reflectance[seen.surfel], _WHITE_SHARE)), 1e-6)
+    typical = float(np.nanmedian(best.reflectance)) / scale
+    by_range, by_incidence, by_ring = best.factors
     return Response(by_range, by_incidence, by_ring, brightest * scale, brightest, typical)
 
 
-def _factors(
-    seen: Observations, intensity: AnyFloats, ring_count: int
-) -> tuple[list[Floats], Floats]:
-    """Return the factors by range, incidence and ring, and the reflectances of surfels seen."""
-    count = int(seen.surfel.max()) + 1
-    rows: list[Integers] = [_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring]
-    factors = [np.ones(len(_RANGE_EDGES_M) - 1), np.ones(_INCIDENCE_BINS), np.ones(ring_count)]
-    reflectance = np.ones(count)
-    for _ in range(_ROUNDS):
-        product = np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
-        reflectance = _ratios(seen.surfel, intensity, product, np.full(count, np.nan))
-        for index, row in enumerate(rows):
-            others = product / factors[index][row]
-            expected = others * reflectance[seen.surfel]
-            factors[index] = _ratios(row, intensity, expected, factors[index])
-            factors[index] /= np.average(
-                factors[index], weights=np.bincount(row, minlength=len(factors[index]))
-            )
-            product = others * factors[index][row]
-    return factors, reflectance[np.isfinite(reflectance)]
+def _first_factors(ring_count: int, *, energies: bool) -> list[Floats]:
+    """Return the factors by range, incidence and ring from which fitting starts.
+
+    A surface is met by few ranges, incidences and rings: what these do not tell stays.
+    """
+    edges_m = np.array(_RANGE_EDGES_M[:-1], np.float64)
+    widths_m = np.diff(edges_m, append=1.5 * edges_m[-1])
+    cosines = (np.arange(_INCIDENCE_BINS) + 0.5) / _INCIDENCE_BINS
+    if not energies:
+        return [np.ones(len(edges_m)), np.ones(_INCIDENCE_BINS), np.ones(ring_count)]
+    return [1 / (edges_m + widths_m / 2) ** 2, cosines, np.ones(ring_count)]
+
+
+class _Factors(NamedTuple):
+    """Factors by range, incidence and ring, and reflectances of surfels, NaN if not seen."""
+
+    factors: list[Floats]
+    reflectance: Floats
+    difference: float  # mean, of intensities
+
+    @classmethod
+    def of_rays(cls, seen: Observations, intensity: AnyFloats, factors: list[Floats]) -> _Factors:
+        """Fit factors and reflectances in turn to the intensities (k,) of rays."""
+        unknown = np.full(int(seen.surfel.max()) + 1, np.nan)
+        rows: list[Integers] = [_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring]
+        reflectance = unknown
+        product = intensity
+        for _ in range(_ROUNDS):
+            product = np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
+            reflectance = _ratios(seen.surfel, intensity, product, unknown)
+            for index, row in enumerate(rows):
+                others = product / factors[index][row]
+                expected = others * reflectance[seen.surfel]
+                factors[index] = _ratios(row, intensity, expected, factors[index])
+                factors[index] /= np.average(
+                    factors[index], weights=np.bincount(row, minlength=len(factors[index]))
+                )
+                product = others * factors[index][row]
+        difference = np.abs(reflectance[seen.surfel] * product - intensity).mean()
+        return cls(factors, reflectance, float(difference))
 
 
 def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Floats) -> Floats:

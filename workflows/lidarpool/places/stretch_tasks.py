@@ -182,7 +182,11 @@ def rebuild(
     standing = standing_points(sweeps, numbers)
     place = build_place(sweeps, standing, voxel_m)
     seen = place.observations(sweeps, standing)
-    response = fit_response([seen], sweeps.recorded.ring_count)
+    response = fit_response(
+        [seen],
+        sweeps.recorded.ring_count,
+        are_energies=sweeps.recorded.recording.energies,
+    )
     if response is None:
         return place, None
     return place, response.reflectances(seen, place.surfels.centres)
