@@ -233,13 +233,23 @@ class CloudWriter:
         if self._errors:
             raise self._errors[0]
 
+    def wait(self) -> list[_PartWriter]:
+        """Wait until no thread writes, and return the writers of all threads.
+
+        Raises the errors of `append`.
+        """
+        part_writers = [self._idle.get() for _ in range(self.threads)]
+        for part_writer in part_writers:
+            self._idle.put(part_writer)
+        self._raise_error()
+        return part_writers
+
     def finish(self) -> CloudCounts:
         """Complete the file, and return the counts of its points.
 
         Raises the errors of `append`.
         """
-        first, *others = [self._idle.get() for _ in range(self.threads)]
-        self._raise_error()
+        first, *others = self.wait()
         self.file.finish()
         for part_writer in others:
             first.counts.merge(part_writer.counts)
@@ -379,6 +389,8 @@ class GrowingCloud:
                 while (parts := self._queue.get()) is not None:
                     self._waiting |= {part.first: part for part in parts}
                     self._append_waiting()
+                if self._writer is not None:
+                    self._writer.wait()  # errors of its threads are errors of the file, too
                 self._is_complete = True
         finally:
             if not self._is_complete:
