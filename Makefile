@@ -60,7 +60,6 @@ lint: dev docs  ## format check, lint, types, layers, names, documentation; prin
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python .ci/readability.py
 	$(BIN)/python .ci/lines.py
 
 docs: dev  ## the documentation as a site in build/site; a warning is an error
