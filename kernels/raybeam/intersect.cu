@@ -62,7 +62,7 @@ typedef long long Count;
 #define DONE ((int)0x80000000)
 #define TINY 8.673617379884035e-19  // 2^-60: replaces a direction component of zero
 #define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
-#define ACROSS 4.0                  // more than the diagonal of any scene
+#define ACROSS 4.0                  // more than the diagonal of a box, see mesh.py
 #define RECORD 20                   // doubles of an instance
 #define MISSED 1e30f                // distance of a box that the ray does not meet
 #define SPAN 32                     // times for each box of a moving body

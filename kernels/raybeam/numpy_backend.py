@@ -20,7 +20,7 @@ from . import triangle as exact
 from .arrays import Bools, Floats, Floats32, Indices, Ints
 from .backend import Backend, ClosestHits
 from .instances import Scene
-from .mesh import TINY, clip
+from .mesh import ACROSS, TINY, clip
 from .opacity import join_masks
 from .rays import Rays
 from .tree import LEAF_BITS, PAD, WideTree, build_top, build_tree, join
@@ -28,7 +28,6 @@ from .tree import LEAF_BITS, PAD, WideTree, build_top, build_tree, join
 _WIDTH = 8
 _LEAF_SIZE = 4
 _BLOCK = 1 << 15  # pairs: a step's arrays take about 6 MiB; smaller blocks need more calls
-_ACROSS = 4.0  # local units: more than the diagonal of any scene
 _SHIFT = 32  # keys of hits have the instance from this bit on (`_Best`)
 _SLACK = 2.0**-20  # margin of distance limits in float32: far more than their rounding
 
@@ -393,4 +392,4 @@ def _packet(
 def _limit(t: Floats, entry: Floats) -> Floats32:
     """Return distances from `entry` as float32, never less than the exact distances."""
     remaining = (t - entry) * (1 + _SLACK) + _SLACK
-    return np.clip(remaining, -_ACROSS, _ACROSS).astype(np.float32)
+    return np.clip(remaining, -ACROSS, ACROSS).astype(np.float32)

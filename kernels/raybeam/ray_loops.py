@@ -17,7 +17,6 @@ from . import cast_memory as memory
 from .arrays import Floats, Ints
 from .cast_memory import casts_at, float64s, int64s
 from .compiled import WHOLE, compiled, inlined, part, stage
-from .mesh import NEAR
 from .pattern import Pattern
 from .poses import Poses
 from .tile_memory import DX, NUMBER, OX, POSE, ROW, WITHIN, row_at, thread_tiles
@@ -509,12 +508,13 @@ def _clip_axis(lower, upper, o, d, entry):  # type: ignore[no-untyped-def]
 
 @inlined
 def entry_distance(half, o, d):  # type: ignore[no-untyped-def]
-    """Return the distance at which a remote ray enters the box from -half to half, or 0 for others.
+    """Return the distance at which a ray enters the box from -half to half; 0 if it starts inside.
 
-    Local; `o` and `d` are the ray's origin and direction.
+    All lengths are in local units; `o` and `d` are the ray's origin and direction. For a ray that
+    misses the box, the result has no meaning.
     """
     entry = 0.0
-    if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > NEAR:
+    if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > half:
         entry = _clip_axis(-half, half, o[0], d[0], entry)
         entry = _clip_axis(-half, half, o[1], d[1], entry)
         entry = _clip_axis(-half, half, o[2], d[2], entry)

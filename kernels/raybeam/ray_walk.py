@@ -19,6 +19,7 @@ from .cast_memory import (
     int64s,
 )
 from .compiled import WHOLE, inlined, part, stage
+from .mesh import ACROSS
 from .mesh_loops import enter_instance
 from .ray_loops import entry_distance
 from .tile_exact import decide_one
@@ -34,9 +35,8 @@ from .vectors import at_least, higher_of, load, lower_of, lowest_bit, multiply_a
 _NEAR = at("near")
 _STACK = at("stack")
 _TINY = np.float32(2.0**-60)
-_ACROSS = 4.0
 SLACK = 2.0**-20
-_MAX_ENTRY = 1e9
+_MAX_ENTRY = 1e9  # see tree.py
 
 
 class _Start(NamedTuple):
@@ -45,7 +45,7 @@ class _Start(NamedTuple):
     Attributes
     ----------
     entry
-        Distance of the start from the ray's origin, float64; 0 unless the origin is remote.
+        Distance of the start from the ray's origin, float64; 0 if the origin is inside the box.
     x, y, z, dx, dy, dz
         Start and direction.
     ix, iy, iz
@@ -124,7 +124,7 @@ def _not_zero(component):  # type: ignore[no-untyped-def]
 @inlined
 def _limit_of(t, entry):  # type: ignore[no-untyped-def]
     """Return a distance after the entry as float32, never less than the exact distance."""
-    return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -_ACROSS), _ACROSS))
+    return np.float32(min(max((t - entry) * (1 + SLACK) + SLACK, -ACROSS), ACROSS))
 
 
 @inlined

@@ -3,11 +3,12 @@
 Boxes are rounded and padded outwards, so that a test of a ray and a box in float32 never
 loses a triangle that the ray meets in exact arithmetic:
 
-With u = 2**-24, local coordinates and origins within [-1, 1] and unit directions, a plane's
-parameter is computed from an origin that is off by u, a reciprocal direction that is off by 2u
-relative, and with up to three more roundings of values up to 2. Expressed as a shift of the
-plane, this is at most 12 u. Boxes are padded by 20 u. Storing the boxes in float32 takes at most u
-of the padding.
+With u = 2**-24, local coordinates and starts within [-1, 1] and unit directions, the distance to a
+plane is computed from a start that is off by u, a reciprocal direction that is off by 2u relative,
+and with up to three more roundings of values up to 2. Expressed as a shift of the plane, this is at
+most 12 u. Advancing a remote ray to the box in float64 adds up to 6 u at 1e9 local units, the
+distance beyond which every triangle is decided in float64. Boxes are padded by 20 u. Storing the
+boxes in float32 takes at most u of the padding.
 """
 
 from __future__ import annotations

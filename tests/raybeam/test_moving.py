@@ -304,3 +304,20 @@ def test_bodies_that_deform_are_hit_where_they_are_at_the_time_of_each_ray():
     assert np.array_equal(found.body, expected[1])
     assert np.array_equal(found.distance[hit], expected[0][hit])
     assert np.array_equal(found.triangle[hit], expected[2][hit])
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.extended)])
+def test_rays_aimed_at_bodies_from_anywhere(backend, seed):
+    """Scattered rays that start inside bodies, or up to 10,000 of their sizes away."""
+    random = np.random.default_rng(seed)
+    bodies = Bodies(30, seed)
+    times = np.sort(random.uniform(0, PERIOD, RAYS))
+    aimed = random.choice(np.flatnonzero(np.isinf(bodies.presence[:, 1])), RAYS)
+    centers = bodies.poses(aimed, times)[:3].T
+    outward = random.choice([-1.0, 1], (RAYS, 3)) * random.uniform(0.5, 1, (RAYS, 3))
+    origins = centers + outward * 10 ** random.uniform(-0.5, 4, (RAYS, 1))
+    targets = centers + random.uniform(-0.1, 0.1, (RAYS, 3))
+    scan = check_scan(Pattern(targets - origins, origins), np.zeros(3), t_min=0, t_max=1e6)
+    expected = by_all(bodies.moving("numpy"), scan, times)
+    assert len(expected) > 0.85 * RAYS  # some go through holes of masks
+    assert listed(hits_on(bodies.moving(backend), scan, lambda ray: times[ray])) == expected
