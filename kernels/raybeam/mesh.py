@@ -13,8 +13,8 @@ from .opacity import LocalOpacity, Opacity, check_opacity
 from .rays import finite_rows, real_rows, refuse_rows
 from .tree import PAD
 
-# Every traversal in float32 starts inside the box of a scene or mesh: a ray from outside is advanced
-# to the box first, so that float32 rounds by the size of the scene and not by the distance to it.
+# Every traversal in float32 starts inside the box of a scene or mesh: a ray from outside is first
+# advanced to the box, so that float32 rounds by the size of the scene, not by the distance to it.
 # The box lies within [-1, 1] in local units, plus padding, so no hit is farther from the start than
 # its diagonal, 2 * sqrt(3) * (1 + 2**-16) = 3.47. Limits in float32 are clipped to ACROSS.
 ACROSS = 4.0

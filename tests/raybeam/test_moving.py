@@ -319,5 +319,6 @@ def test_rays_aimed_at_bodies_from_anywhere(backend, seed):
     targets = centers + random.uniform(-0.1, 0.1, (RAYS, 3))
     scan = check_scan(Pattern(targets - origins, origins), np.zeros(3), t_min=0, t_max=1e6)
     expected = by_all(bodies.moving("numpy"), scan, times)
-    assert len(expected) > 0.85 * RAYS  # some go through holes of masks
+    at_balls = np.flatnonzero(bodies.shape[aimed] == 0)  # others may pass through holes or beside
+    assert len(at_balls) > 0.2 * RAYS and {*at_balls} <= {ray for ray, *_ in expected}
     assert listed(hits_on(bodies.moving(backend), scan, lambda ray: times[ray])) == expected
