@@ -320,5 +320,5 @@ def test_rays_aimed_at_bodies_from_anywhere(backend, seed):
     scan = check_scan(Pattern(targets - origins, origins), np.zeros(3), t_min=0, t_max=1e6)
     expected = by_all(bodies.moving("numpy"), scan, times)
     at_balls = np.flatnonzero(bodies.shape[aimed] == 0)  # others may pass through holes or beside
-    assert len(at_balls) > 0.2 * RAYS and {*at_balls} <= {ray for ray, *_ in expected}
+    assert len(at_balls) > 200 and {*at_balls} <= {ray for ray, *_ in expected}
     assert listed(hits_on(bodies.moving(backend), scan, lambda ray: times[ray])) == expected
