@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 OUT ?= lidarpool-out
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all durations slow compat chaos soak lint docs format bench clean dev
+.PHONY: help demo test test-all durations slow compat chaos mutants soak lint docs format bench clean dev
 
 # Where Python may not write what it has compiled, as in containers, each of the many processes of a
 # run or of the tests would compile all modules again.
@@ -51,6 +51,9 @@ chaos: dev  ## 200 faults at every point of a survey, and damage of files; SEED=
 	$(BIN)/python -m tests.chaos --faults 200 $(if $(SEED),--seed $(SEED))
 	$(BIN)/python -m tests.chaos.damage --count 3 --seconds 60 $(if $(SEED),--seed $(SEED))
 	$(BIN)/python -m tests.chaos.local_runs --faults 24 $(if $(SEED),--seed $(SEED))
+
+mutants: dev  ## COUNT faults planted in the sources (default 20), and which of them no test notices; SEED=n draws them again
+	$(BIN)/python -m tests.mutants --count $(or $(COUNT),20) $(if $(SEED),--seed $(SEED)) $(PACKAGES)
 
 soak: dev  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
 	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png

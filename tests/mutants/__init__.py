@@ -1,0 +1,4 @@
+"""Plant faults in the sources, one at a time, and list those that no test notices.
+
+Run with `python -m tests.mutants --help`, or by `make mutants`.
+"""

@@ -1,0 +1,246 @@
+"""Plant faults, run the tests that execute them, and list the faults that no test notices."""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from queue import Queue
+
+from tests.mutants.faults import ROOTS, Fault, choose
+from tests.mutants.lines import Lines
+
+ROOT = Path(__file__).parents[2]
+FOLDER = ROOT / "build" / "mutants"
+# What decides values that users get, or which process gets which task.
+PACKAGES = [
+    *("workflows/lidarsim/" + name for name in (
+        "simulator", "motion", "media", "sensor", "sensor_files", "packets", "columns", "sweeps",
+        "survey", "scene", "base/random_numbers.py", "base/vectors.py", "base/tables.py",
+    )),
+    "kernels/raybeam",
+    "scheduler/poolpart",
+    "workflows/lidarscenes/files",
+    "workflows/lidarscenes/roads",
+    *("workflows/lidarpool/" + name for name in (
+        "clouds", "comparing", "places", "plan", "columns", "datasets", "recordings",
+        "run/pipeline", "run/store", "scenario/campaign_sections.py", "scenario/campaign_jobs.py",
+        "report/merging.py", "report/growing_cloud.py", "base/shard.py",
+    )),
+]  # fmt: skip
+_SELECTION = "not slow"  # what CI runs
+_FIRST_S = 20.0  # estimated time of the tests that are tried first
+_EXTRA_S = 120.0  # a fault that makes tests this much slower counts as noticed
+
+
+@dataclass
+class Outcome:
+    """What became of a fault.
+
+    Attributes
+    ----------
+    fault
+        The fault.
+    noticed
+        "by" and the first test that failed, "hangs", or "" if all tests passed.
+    tests
+        Number of the tests that were run.
+    seconds
+        Elapsed time.
+    """
+
+    fault: Fault
+    noticed: str
+    tests: int
+    seconds: float
+
+    def __str__(self) -> str:
+        verdict = "noticed" if self.noticed else "PASSED " if self.tests else "NOT RUN"
+        return f"{verdict} {self.fault} [{self.tests} tests, {self.seconds:.0f} s] {self.noticed}"
+
+
+def main() -> None:
+    """Run as the command line says, and exit with 1 if a fault passed."""
+    options = _parser().parse_args()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    record = FOLDER / "lines.json"
+    if options.record or not record.is_file():
+        lines = Lines.record(ROOT, FOLDER, ["-m", _SELECTION, "-n", str(options.jobs)])
+    else:
+        lines = Lines.read(record)
+    if options.again:
+        faults = [
+            Fault(**{**row["fault"], "columns": tuple(row["fault"]["columns"])})
+            for row in json.loads(options.again.read_text())
+            if not row["noticed"]
+        ]
+    else:
+        faults = choose(ROOT, options.packages or PACKAGES, options.count, options.seed)
+    outcomes = []
+    out = options.out or FOLDER / f"{options.seed}.json"
+    with _copies(options.jobs) as copies, ThreadPoolExecutor(options.jobs) as pool:
+        tasks = [pool.submit(_try, copies, lines, fault, options.budget) for fault in faults]
+        for task in tasks:
+            outcomes.append(task.result())
+            print(outcomes[-1], flush=True)
+            out.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1))
+    _print_summary(outcomes)
+    sys.exit(any(not outcome.noticed for outcome in outcomes))
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser("python -m tests.mutants", description=__doc__)
+    add = parser.add_argument
+    add(
+        "packages",
+        nargs="*",
+        help="Folders or files to plant faults in (default: what decides values).",
+    )
+    add(
+        "--seed", type=int, default=int(time.time()), help="Seed of the choice (default: the time)."
+    )
+    add("--count", type=int, default=20, help="Number of faults (default: 20).")
+    add("--jobs", type=int, default=2, help="Faults that are tried at the same time (default: 2).")
+    add(
+        "--budget",
+        type=float,
+        default=240.0,
+        help="Estimated seconds of tests for a fault (default: 240).",
+    )
+    add(
+        "--record",
+        action="store_true",
+        help="Record anew which tests execute which lines (20 minutes).",
+    )
+    add(
+        "--again",
+        type=Path,
+        help="Try the faults again that passed in an earlier run, a JSON file.",
+    )
+    add("--out", type=Path, help="Output file (default: build/mutants/SEED.json).")
+    return parser
+
+
+@contextmanager
+def _copies(count: int) -> Iterator["Queue[Path]"]:
+    """Yield copies of the project in which faults are planted."""
+    copies: Queue[Path] = Queue()
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        for number in range(count):
+            copy = Path(folder) / str(number) / "project"
+            ignored = shutil.ignore_patterns(".venv", ".git", "lidarpool-out", "build", "*_cache")
+            shutil.copytree(ROOT, copy, ignore=ignored, symlinks=True)
+            copies.put(copy)
+        yield copies
+
+
+def _try(copies: "Queue[Path]", lines: Lines, fault: Fault, budget_s: float) -> Outcome:
+    """Plant a fault in a copy, run tests, and restore the copy."""
+    start = time.monotonic()
+    tests = lines.tests_of(ROOT, fault)
+    copy = copies.get()
+    path = copy / fault.path
+    try:
+        path.write_text(fault.plant((ROOT / fault.path).read_text()))
+        noticed, tried = "", 0
+        for group in _groups(lines, tests, budget_s):
+            tried += len(group)
+            noticed = _failure(copy, group, sum(map(lines.cost, group)))
+            if noticed:
+                break
+    finally:
+        shutil.copy2(ROOT / fault.path, path)
+        _restore_loops(copy, fault)
+        copies.put(copy)
+    return Outcome(fault, noticed, tried, time.monotonic() - start)
+
+
+def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[str]]:
+    """Yield tests to run together: quick ones first, then the others up to a budget."""
+    group: list[str] = []
+    spent = total = 0.0
+    limit = _FIRST_S
+    for test in tests:
+        cost = lines.cost(test)
+        if total + cost > budget_s:
+            break
+        if group and spent + cost > limit:
+            yield group
+            group, spent, limit = [], 0.0, budget_s
+        group.append(test)
+        spent += cost
+        total += cost
+    if group:
+        yield group
+
+
+def _failure(copy: Path, tests: list[str], expected_s: float) -> str:
+    """Run tests in a copy, and return which one failed first, "hangs", or "" if all passed."""
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        _SELECTION,
+    ]
+    environment = os.environ | {
+        "PYTHONPATH": os.pathsep.join(str(copy / root) for root in (*ROOTS, ".")),
+        "PYTEST_TIMEOUT": str(int(_EXTRA_S)),
+    }
+    try:
+        done = subprocess.run(
+            [*command, *tests],
+            cwd=copy,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=3 * expected_s + _EXTRA_S,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return "hangs"
+    if done.returncode in (0, 5):
+        return ""
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return f"by {failed[0].split(' - ')[0]}" if failed else f"exit status {done.returncode}"
+
+
+def _restore_loops(copy: Path, fault: Fault) -> None:
+    """Bring back the compiled loops that the fault's tests have replaced."""
+    for root in ROOTS:
+        for cached in (copy / root).rglob("__pycache__/*.nb[ic]"):
+            kept = ROOT / cached.relative_to(copy)
+            if not kept.is_file():
+                cached.unlink()
+            elif kept.stat().st_mtime != cached.stat().st_mtime:
+                shutil.copy2(kept, cached)
+
+
+def _print_summary(outcomes: list[Outcome]) -> None:
+    """Print the share of noticed faults by folder."""
+    total: Counter[str] = Counter()
+    noticed: Counter[str] = Counter()
+    for outcome in outcomes:
+        folder = "/".join(outcome.fault.path.split("/")[1:3]).removesuffix(".py")
+        total[folder] += 1
+        noticed[folder] += bool(outcome.noticed)
+    for folder in sorted(total):
+        print(f"{folder:40} {noticed[folder]:4} of {total[folder]:4}")
+    print(f"{sum(noticed.values())} of {total.total()} faults were noticed")
+
+
+if __name__ == "__main__":
+    main()

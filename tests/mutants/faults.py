@@ -1,0 +1,264 @@
+"""Faults that can be planted in a source file: another operator, comparison, constant or condition.
+
+A fault replaces one expression on one line. Messages, assertions, log calls and representations are
+left alone, since tests do not assert their wording.
+"""
+
+import ast
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+ROOTS = ("kernels", "scheduler", "workflows")
+COMPILED = {"compiled", "inlined", "stage", "part"}  # decorators of loops that numba compiles
+
+# Layout of pictures and pages: looked at, not asserted.
+SKIPPED_MODULES = (
+    "workflows/lidarview/render/*",
+    "workflows/lidarview/viewer/*",
+    "workflows/lidarview/cell_pictures.py",
+    "workflows/lidarpool/showing/pages/*",
+    "workflows/lidarpool/**/*picture*.py",
+    "workflows/lidarpool/**/*page*.py",
+    "workflows/lidarpool/**/*drawing*.py",
+    "workflows/lidarpool/cli/*",
+    "scheduler/poolpart/**/*page*.py",
+    "scheduler/poolpart/notebook.py",
+    # Run on GPUs only.
+    "kernels/raybeam/cuda_backend.py",
+    "kernels/raybeam/device.py",
+    "workflows/lidarsim/**/device_*.py",
+)
+_MESSAGE_CALLS = {"debug", "info", "warning", "error", "exception", "warn", "note", "echo", "about"}
+_MESSAGE_FUNCTIONS = ("__repr__", "__str__", "_repr_html_")
+
+_COMPARISONS: dict[type[ast.cmpop], type[ast.cmpop]] = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+}
+_OPERATORS: dict[type[ast.operator], type[ast.operator]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Div,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+}
+_NAMES = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum"}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A replacement of one expression.
+
+    Attributes
+    ----------
+    path
+        Source file, relative to the project's root.
+    line
+        Line number.
+    columns
+        First and last column of the expression, in bytes.
+    function
+        Qualified name of the function that contains it.
+    before, after
+        Text of the expression and of its replacement.
+    compiled
+        Whether numba compiles the function.
+    """
+
+    path: str
+    line: int
+    columns: tuple[int, int]
+    function: str
+    before: str
+    after: str
+    compiled: bool
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line} in {self.function}: {self.before} -> {self.after}"
+
+    def plant(self, source: str) -> str:
+        """Return the source with the fault.
+
+        Raises ValueError if the expression is not where it was.
+        """
+        lines = source.splitlines(keepends=True)
+        line = lines[self.line - 1].encode() if self.line <= len(lines) else b""
+        begin, end = self.columns
+        if line[begin:end].decode() != self.before:
+            raise ValueError(f"{self.path}:{self.line} has changed since the fault was chosen.")
+        lines[self.line - 1] = (line[:begin] + f"({self.after})".encode() + line[end:]).decode()
+        return "".join(lines)
+
+
+def faults_in(root: Path, path: str) -> list[Fault]:
+    """Return all faults that can be planted in a file."""
+    source = (root / path).read_text()
+    tree = ast.parse(source)
+    lines = source.splitlines()
+    found = []
+    for function, compiled, node in _expressions(tree.body, "", compiled=False):
+        for expression, after in _replacements(node):
+            if expression.lineno != expression.end_lineno or expression.end_col_offset is None:
+                continue
+            begin, end = expression.col_offset, expression.end_col_offset
+            before = lines[expression.lineno - 1].encode()[begin:end].decode()
+            columns = (begin, end)
+            found.append(Fault(path, expression.lineno, columns, function, before, after, compiled))
+    return found
+
+
+def modules(root: Path, packages: list[str]) -> list[str]:
+    """Return the source files below packages, without those whose layout is not asserted."""
+    paths = {
+        path.relative_to(root)
+        for package in packages
+        for path in (
+            [root / package] if package.endswith(".py") else (root / package).rglob("*.py")
+        )
+    }
+    return sorted(
+        path.as_posix()
+        for path in paths
+        if not any(_matches(path, pattern) for pattern in SKIPPED_MODULES)
+    )
+
+
+def choose(root: Path, packages: list[str], count: int, seed: int) -> list[Fault]:
+    """Draw faults at random, without repetition, from all that can be planted below packages."""
+    every = [fault for path in modules(root, packages) for fault in faults_in(root, path)]
+    random.Random(seed).shuffle(every)
+    usable = (fault for fault in every if _can_be_parsed(fault, (root / fault.path).read_text()))
+    return list(islice(usable, count))
+
+
+def function_spans(source: str) -> dict[str, tuple[int, int]]:
+    """Return first and last line of the body of each function, by qualified name."""
+    spans = {}
+    waiting: list[tuple[str, ast.AST]] = [("", ast.parse(source))]
+    while waiting:
+        prefix, parent = waiting.pop()
+        for node in ast.iter_child_nodes(parent):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+                name = f"{prefix}{node.name}"
+                if not isinstance(node, ast.ClassDef):
+                    spans[name] = (node.body[0].lineno, node.end_lineno or node.lineno)
+                waiting.append((f"{name}.", node))
+            else:
+                waiting.append((prefix, node))
+    return spans
+
+
+def _matches(path: Path, pattern: str) -> bool:
+    """Return whether a path matches a pattern in which ``**`` stands for any folders."""
+    if "**" not in pattern:
+        return path.match(pattern)
+    start, _, end = pattern.partition("/**/")
+    return path.as_posix().startswith(f"{start}/") and path.match(end)
+
+
+def _expressions(
+    body: list[ast.stmt], prefix: str, *, compiled: bool
+) -> Iterator[tuple[str, bool, ast.AST]]:
+    """Yield the nodes in functions, with the function's qualified name."""
+    for statement in body:
+        if isinstance(statement, ast.ClassDef):
+            yield from _expressions(statement.body, f"{prefix}{statement.name}.", compiled=False)
+        elif isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef):
+            if statement.name in _MESSAGE_FUNCTIONS:
+                continue
+            name = f"{prefix}{statement.name}"
+            loop = compiled or any(_name(node) in COMPILED for node in statement.decorator_list)
+            for inner in statement.body:
+                for node in _walk(inner):
+                    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                        yield from _expressions([node], f"{name}.", compiled=loop)
+                    else:
+                        yield name, loop, node
+
+
+def _walk(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield a node and its descendants, without messages and without the inside of functions."""
+    if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.AnnAssign) or (
+        isinstance(node, ast.Call) and _name(node.func) in _MESSAGE_CALLS
+    ):
+        return
+    yield node
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return
+    for child in ast.iter_child_nodes(node):
+        yield from _walk(child)
+
+
+def _name(node: ast.expr) -> str:
+    """Return the last name of a decorator or a called function, such as "warn"."""
+    if isinstance(node, ast.Call):
+        return _name(node.func)
+    if isinstance(node, ast.Attribute):
+        return node.attr
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+def _replacements(node: ast.AST) -> Iterator[tuple[ast.expr, str]]:
+    """Yield expressions at a node, each with the text of a faulty one."""
+    match node:
+        case ast.Compare(left, [operator], [right]) if type(operator) in _COMPARISONS:
+            faulty = ast.Compare(left, [_COMPARISONS[type(operator)]()], [right])
+            yield node, ast.unparse(faulty)
+        case ast.BinOp(left, operator, right) if type(operator) in _OPERATORS:
+            if not _is_text(left) and not _is_text(right):
+                yield node, ast.unparse(ast.BinOp(left, _OPERATORS[type(operator)](), right))
+        case ast.BoolOp(operator, values):
+            other = ast.Or() if isinstance(operator, ast.And) else ast.And()
+            yield node, ast.unparse(ast.BoolOp(other, values))
+        case ast.UnaryOp(ast.USub() | ast.Not(), operand):
+            yield node, ast.unparse(operand)
+        case ast.If(test) | ast.While(test) | ast.IfExp(test):
+            yield test, f"not ({ast.unparse(test)})"
+        case ast.Call(called):
+            yield from _other_functions(called)
+        case ast.Constant(value):
+            yield from ((node, text) for text in _other_values(value))
+
+
+def _other_functions(called: ast.expr) -> Iterator[tuple[ast.expr, str]]:
+    """Yield a called function with the name of another one, such as `max` for `min`."""
+    name = _name(called)
+    if name in _NAMES and isinstance(called, ast.Name):
+        yield called, _NAMES[name]
+    elif name in _NAMES and isinstance(called, ast.Attribute):
+        yield called, ast.unparse(ast.Attribute(called.value, _NAMES[name], ast.Load()))
+
+
+def _other_values(value: object) -> Iterator[str]:
+    """Yield the text of a constant other than a number or truth value."""
+    if isinstance(value, bool):
+        yield repr(not value)
+    elif isinstance(value, int | float) and value not in (0, 1):
+        yield repr(value + 1 if isinstance(value, int) else value * 1.1)
+
+
+def _is_text(node: ast.expr) -> bool:
+    """Return whether an operand is a string, or a sum of strings."""
+    if isinstance(node, ast.BinOp):
+        return _is_text(node.left) or _is_text(node.right)
+    return isinstance(node, ast.JoinedStr) or isinstance(getattr(node, "value", None), str)
+
+
+def _can_be_parsed(fault: Fault, source: str) -> bool:
+    """Return whether the source is still Python: patterns of `match` allow no parentheses."""
+    try:
+        ast.parse(fault.plant(source))
+    except SyntaxError:
+        return False
+    return True

@@ -1,0 +1,170 @@
+"""Which tests execute a line, as `recorder` has found, and which of them to run for a fault."""
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+
+from tests.mutants.faults import ROOTS, Fault, function_spans
+
+_TEST_S = 0.05  # added to the time of a test: sets that are alike in time should be small
+
+
+@dataclass
+class Lines:
+    """What the tests executed, and how long they took.
+
+    Attributes
+    ----------
+    tests
+        Names of the tests.
+    seconds
+        Duration of each test, in seconds, with set-up and tear-down.
+    lines
+        Numbers of the tests that execute each line, by file.
+    spans
+        First and last line of the functions of each file, when it was recorded.
+    checksums
+        Checksums of the files, when they were recorded.
+    """
+
+    tests: list[str]
+    seconds: dict[str, float]
+    lines: dict[str, dict[int, set[int]]]
+    spans: dict[str, dict[str, tuple[int, int]]]
+    checksums: dict[str, str]
+
+    @classmethod
+    def record(cls, root: Path, folder: Path, pytest_options: list[str]) -> "Lines":
+        """Run the tests with `recorder`, write ``lines.json``, and return its content."""
+        for path in folder.glob("gw*.json"):
+            path.unlink()
+        command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.mutants.recorder"]
+        environment = os.environ | {"LIDARPOOL_MUTANTS": str(folder)}
+        subprocess.run([*command, *pytest_options], cwd=root, env=environment, check=False)
+        merged = cls([], {}, defaultdict(lambda: defaultdict(set)), {}, {})
+        numbers: dict[str, int] = {}
+        for path in folder.glob("gw*.json"):
+            merged._add(json.loads(path.read_text()), numbers)
+        merged.tests = [*numbers]
+        for path in merged.lines:
+            source = (root / path).read_text()
+            merged.spans[path] = function_spans(source)
+            merged.checksums[path] = _checksum(source)
+        merged._write(folder / "lines.json")
+        return merged
+
+    @classmethod
+    def read(cls, path: Path) -> "Lines":
+        """Read what `record` has written."""
+        content = json.loads(path.read_text())
+        lines = {
+            file: {int(line): set(tests) for line, tests in by_line.items()}
+            for file, by_line in content.pop("lines").items()
+        }
+        return cls(lines=lines, **content)
+
+    def tests_of(self, root: Path, fault: Fault) -> list[str]:
+        """Return the tests that may notice a fault, quickest first.
+
+        These are the tests that execute its line; for a compiled loop, or a line that is only
+        executed by the processes of clusters, those that execute a function of a module that
+        imports the fault's module.
+        """
+        numbers = self._executing(root, fault)
+        if not numbers:
+            numbers = set()
+            for path in _importers(root, fault.path):
+                for span in self.spans.get(path, {}).values():
+                    numbers |= self._in_span(path, span)
+        return sorted((self.tests[number] for number in numbers), key=self.cost)
+
+    def cost(self, test: str) -> float:
+        """Return the time of a test, in seconds, with a share of the time of its process."""
+        return self.seconds.get(test, 1.0) + _TEST_S
+
+    def _executing(self, root: Path, fault: Fault) -> set[int]:
+        if self.checksums.get(fault.path) == _checksum((root / fault.path).read_text()):
+            return self.lines[fault.path].get(fault.line, set())
+        span = self.spans.get(fault.path, {}).get(fault.function)
+        return self._in_span(fault.path, span) if span else set()
+
+    def _in_span(self, path: str, span: tuple[int, int]) -> set[int]:
+        by_line = self.lines.get(path, {})
+        found = (by_line.get(line, set()) for line in range(span[0], span[1] + 1))
+        return set[int]().union(*found)
+
+    def _add(self, record: dict, numbers: dict[str, int]) -> None:
+        """Add what one process has recorded."""
+        own = [numbers.setdefault(name, len(numbers)) for name in record["tests"]]
+        for path, by_line in record["lines"].items():
+            for line, tests in by_line.items():
+                self.lines[path][int(line)].update(own[test] for test in tests)
+        for test, seconds in record["seconds"].items():
+            self.seconds[test] = max(seconds, self.seconds.get(test, 0.0))
+
+    def _write(self, path: Path) -> None:
+        lines = {
+            file: {line: sorted(tests) for line, tests in by_line.items()}
+            for file, by_line in self.lines.items()
+        }
+        path.write_text(json.dumps({**vars(self), "lines": lines}))
+
+
+def _importers(root: Path, path: str) -> set[str]:
+    """Return the files that import a file, directly or through modules of compiled loops."""
+    imports = _imports(root)
+    found: set[str] = set()
+    waiting = [path]
+    while waiting:
+        module = waiting.pop()
+        for importer, imported in imports.items():
+            if module in imported and importer not in found:
+                found.add(importer)
+                if "raybeam.compiled" in (text := (root / importer).read_text()) or (
+                    "from .compiled import" in text
+                ):
+                    waiting.append(importer)
+    return found
+
+
+_known_imports: dict[Path, dict[str, set[str]]] = {}
+
+
+def _imports(root: Path) -> dict[str, set[str]]:
+    """Return the files that each file imports, of those below the source roots."""
+    if root not in _known_imports:
+        files = {
+            path.relative_to(root).as_posix(): path
+            for source_root in ROOTS
+            for path in (root / source_root).rglob("*.py")
+        }
+        _known_imports[root] = {name: _imported(root, path, files) for name, path in files.items()}
+    return _known_imports[root]
+
+
+def _imported(root: Path, path: Path, files: dict[str, Path]) -> set[str]:
+    candidates: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        words = (node.module or "").split(".") if node.module else []
+        if node.level:
+            folders = [path.parents[node.level - 1]]
+        else:
+            folders = [root / source_root for source_root in ROOTS]
+        for folder in folders:
+            module = folder.joinpath(*words)
+            candidates.add(module.with_suffix(".py").relative_to(root).as_posix())
+            for alias in node.names:
+                candidates.add((module / f"{alias.name}.py").relative_to(root).as_posix())
+    return candidates & files.keys()
+
+
+def _checksum(source: str) -> str:
+    return sha256(source.encode()).hexdigest()
