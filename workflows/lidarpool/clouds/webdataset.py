@@ -17,6 +17,7 @@ from lidarsim.base.arrays import AnyArray, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
+from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
@@ -184,7 +185,7 @@ def open_file(source: RecordingSource) -> Recording:
 
 def open_folder(source: RecordingSource) -> Recording:
     """Open the samples of the tar files in a folder."""
-    files = sorted(source.path.rglob("*.tar"))
+    files = sort_by_number(source.path.rglob("*.tar"))
     return _open_files(source, files)
 
 
