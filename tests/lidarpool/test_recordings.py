@@ -117,5 +117,5 @@ def test_poses_of_kitti_without_a_calibration(tmp_path):
     assert recording.notes[0].endswith("no calib.txt, so its poses count as poses of the lidar")
     np.testing.assert_allclose(recording.poses(range(3))[:, 0, 3], [0, 1, 2])
     (folder / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
-    with pytest.raises(LidarError, match="calib.txt has no line `Tr:`, the transform from the"):
+    with pytest.raises(LidarError, match=r"calib\.txt has no line `Tr:`, the transform from the"):
         open_recording(folder)
