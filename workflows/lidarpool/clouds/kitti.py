@@ -36,6 +36,7 @@ from .recording import Read, Recording, RecordingSource, SweepFiles, take_positi
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
 NAMES_FILE = "semantic-kitti.yaml"
+CALIBRATION_FILE = "calib.txt"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
@@ -104,7 +105,9 @@ class Pieces(pieces.Pieces):
             files |= {f"{folder}/poses.txt": poses, f"poses/{self.names[sensor]}.txt": poses}
             files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[sweep_mask] / 1e9)
             lines = [f"P{number}: {_row(np.eye(3))}\n" for number in range(4)]
-            files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(camera)}\n"]).encode()
+            files[f"{folder}/{CALIBRATION_FILE}"] = "".join(
+                [*lines, f"Tr: {_row(camera)}\n"]
+            ).encode()
         if sweeps.classes and self.entry is None:  # else all jobs share a file
             files[NAMES_FILE] = labels_file(sweeps.classes)
         return files
@@ -246,6 +249,7 @@ def _sequences(folder: Path) -> dict[str, SweepFiles]:
 def _sequence(folder: Path, inner: str) -> SweepFiles:
     """Open the sweeps of a folder, with its labels, poses and times if it has these."""
     files = sort_by_number((folder / inner).glob("*.bin"))
+    calibration = folder / CALIBRATION_FILE
     notes = []
 
     def of_frames(rows: Floats, table: str) -> Floats:
@@ -258,9 +262,9 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
     poses: Floats | None = None
     if (folder / "poses.txt").exists():
         rows = of_frames(_matrices(folder / "poses.txt"), "poses.txt")
-        poses = lidar_poses(rows, folder / "calib.txt")
-        if not (folder / "calib.txt").exists():
-            notes.append("has no calib.txt, so its poses count as poses of the lidar")
+        poses = lidar_poses(rows, calibration)
+        if not calibration.exists():
+            notes.append(f"has no {CALIBRATION_FILE}, so its poses count as poses of the lidar")
     times_ns: Floats | None = None
     if (folder / "times.txt").exists():
         seconds = np.loadtxt(folder / "times.txt", ndmin=1)
@@ -272,7 +276,7 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
         pose = None if poses is None else poses[number]
         return _read_sweep(file, folder / "labels" / f"{file.stem}.label", pose)
 
-    return SweepFiles(len(files), read, times_ns, notes=tuple(notes))
+    return SweepFiles(len(files), read, times_ns, notes=tuple(notes), calibration=calibration)
 
 
 def lidar_poses(rows: Floats, calibration: Path) -> Floats:
