@@ -268,12 +268,11 @@ class RecordedSweeps:
             [columns for _, columns in references.values()],
             None if stamps_s is None else stamps_s[[*references]],
         )
-        rings = cls._of_references(recording, [*references.values()])
-        clock_note = ()
-        if stamps_s is not None and recording.fired is None:
-            clock_note = _clock_notes(recording.name, times)
-        notes = (*rings.notes, *clock_note)
-        return replace(rings, notes=notes, times=times, stamps_s=stamps_s)
+        sweeps = cls._of_references(recording, [*references.values()])
+        if stamps_s is not None and not sweeps.is_compensated:
+            notes = (*sweeps.notes, *_clock_notes(recording.name, times))
+            sweeps = replace(sweeps, notes=notes)
+        return replace(sweeps, times=times, stamps_s=stamps_s)
 
     @classmethod
     def _of_references(
