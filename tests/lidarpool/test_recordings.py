@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import tarfile
+
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -315,6 +318,27 @@ def test_sweeps_that_are_out_of_order_are_named(tmp_path):
     path = write_bag(tmp_path / "drive", sweeps)
     with pytest.raises(LidarError, match=r"do not ascend: sweep 4 is at .*300000 s, and sweep 3"):
         twin(path)
+
+
+def test_samples_of_tar_files_have_times_if_all_of_them_state_one(tmp_path):
+    def write_tar(name, samples):
+        with tarfile.open(tmp_path / name, "w") as tar:
+            for key, (x, text) in samples.items():
+                memory = io.BytesIO()
+                np.save(memory, np.full((1, 3), x))
+                contents = {"points.npy": memory.getvalue(), "json": text.encode()}
+                for ending, content in contents.items():
+                    member = tarfile.TarInfo(f"{key}.{ending}")
+                    member.size = len(content)
+                    tar.addfile(member, io.BytesIO(content))
+
+    write_tar("shard-10.tar", {"d": (3, '{"time_ns": 300}')})
+    write_tar("shard-9.tar", {"b": (1, '{"time_ns": 100}'), "c": (2, '{"time_ns": 200}')})
+    recording = open_recording(tmp_path)
+    assert first_x(recording) == [1, 2, 3]
+    assert [*recording.times()] == [100, 200, 300]
+    write_tar("shard-11.tar", {"e": (4, "{}")})
+    assert open_recording(tmp_path).times is None
 
 
 # -- poses -----------------------------------------------------------------------------------
