@@ -573,6 +573,10 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     assert opened.count >= 3 and opened.white == 100 and set(sweep.intensities) == {50.0}
     assert len(np.unique(sweep.rings)) == 16
     assert np.linalg.norm(sweep.points, axis=1) == pytest.approx(5, abs=0.05)
+    # A sweep has the time of its first packet, and its points have times since then.
+    times_s = opened.read(1)[1]["time"]
+    assert 0 <= times_s.min() < 0.002 and times_s.max() == pytest.approx(0.1, abs=0.002)
+    assert [*opened.times()][1] == pytest.approx(1e8, abs=4e6)  # three packets
     frame = bytearray(frames[-1])
     frame[16 + 29] = 7  # the end of the sender's address
     (tmp_path / "room.pcap").write_bytes(b"".join([*frames, frame]))

@@ -333,7 +333,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     shutil.copytree(folder / "nuscenes", tmp_path / "lost")
     next((tmp_path / "lost" / "samples").rglob("*.bin")).unlink()
     for name, words in (
-        ("cut", "poses.txt has 1 rows for 3 files"),
+        ("cut", "poses.txt has no row for frames 1 to 2: it has 1 row, and row k"),
         ("bad", r"poses.txt: line 1 has 11 cells, and 12 were expected \(m00, m01"),
         ("uncalibrated", "calib.txt: line 1 has 'x' as m00, and a number was expected"),
         ("long", "they are probably nanoseconds; write seconds into times.txt"),

@@ -27,6 +27,7 @@ from lidarpool import (
 )
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.recording import Recording
+from lidarpool.places.alignment import Alignment
 from lidarpool.places.lost_pulses import Answering, lost_pulses
 from lidarpool.places.motion import Motion
 from lidarpool.places.odometry import find_poses
@@ -287,26 +288,29 @@ def test_rings_are_found_in_the_order_of_points(drive):
 def test_times_of_points_have_one_unit_and_tell_the_period(drive):
     opened = open_recording(drive, name="drive")
 
-    def recording(times):
+    def recording(times, stamps_ns=None):
         def read(number):
             points, columns, pose = opened.read(number)
             kept = slice({3: 0, 4: 6}.get(number))
             found = {"ring": columns["channel"], "time": times(columns["time"] % 100_000_000)}
             return points[kept], {key: values[kept] for key, values in found.items()}, pose
 
-        return Recording("drive", opened.count, read)
+        return Recording("drive", opened.count, read, times=stamps_ns)
 
     fired_s = (opened.read(4)[1]["time"][:6] % 100_000_000) * 1e-9
     absolute_s = 1.7e9
-    for times, half_s in (
-        (lambda ns: ns * 1e-6, 1e-9),
-        (lambda ns: absolute_s + ns * 1e-9, 1e-6),
-        (lambda ns: ns.astype(np.uint64) + np.uint64(1_700_000_000_000_000_000), 1e-9),
-        (lambda ns: (ns - 50_000_000).astype(np.int32), 1e-9),
-    ):
+    for times, half_s, stamp_s in (
+        (lambda ns: ns * 1e-6, 1e-9, 0.0),
+        (lambda ns: (ns - 50_000_000).astype(np.int32), 1e-9, 0.05),
+        (lambda ns: (ns - 99_000_000).astype(np.int32), 1e-9, 0.099),
+        # Without stamps, absolute times count from the first point.
+        (lambda ns: absolute_s + ns * 1e-9, 1e-6, fired_s.min()),
+        (lambda ns: ns.astype(np.uint64) + np.uint64(1_700_000_000_000_000_000), 1e-9,
+         fired_s.min()),
+    ):  # fmt: skip
         sweeps = RecordedSweeps.of_recording(recording(times))
         found_s = sweeps.read(4).time_s
-        np.testing.assert_allclose(found_s, fired_s - fired_s.min(), atol=half_s)
+        np.testing.assert_allclose(found_s, fired_s - stamp_s, atol=half_s)
         assert not len(sweeps.read(3).time_s)
     quick = RecordedSweeps.of_recording(recording(lambda ns: ns // 2))
     np.testing.assert_allclose(np.diff(find_poses(quick, None).times_s), 0.05, rtol=0.01)
@@ -323,8 +327,15 @@ def test_a_sweep_has_its_share_of_a_step_with_dropped_sweeps():
         (Motion.COUNTERCLOCKWISE, [0, 0.25, 0.5, 0.75]),
         (Motion.CLOCKWISE, [0, 0.75, 0.5, 0.25]),
     ):
-        np.testing.assert_allclose(motion.shares(sweep, 0.1, 0.1), expected)
-        np.testing.assert_allclose(motion.shares(sweep, 0.1, 0.2), np.array(expected) / 2)
+        np.testing.assert_allclose(motion.times_s(sweep, 0.1), 0.1 * np.array(expected))
+        poses = np.tile(np.eye(4), (2, 1, 1))
+        poses[1, 0, 3] = 2.0
+        for step_s, whole_m in ((0.1, 2.0), (0.2, 1.0)):
+            times_s = np.array([0, step_s])
+            alignment = Alignment(poses, times_s, 0.1, 0.1, motion, np.zeros((1, 3)))
+            moved, origins = alignment.compensated(sweep, 0)
+            np.testing.assert_allclose(origins[:, 0], whole_m * np.array(expected))
+            np.testing.assert_allclose(moved, points + origins)
 
 
 def test_few_points_and_unknown_intensities_change_no_others(drive):
@@ -373,7 +384,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
         twin(replace(recording, frame_poses=lambda: unknown))
     trajectory = tmp_path / "poses.csv"
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
-    with pytest.raises(LidarError, match="has 2 poses for 12 sweeps without times"):
+    with pytest.raises(LidarError, match="has 2 poses, and drive has 12 sweeps without times"):
         twin(recording, trajectory=trajectory)
 
 

@@ -343,16 +343,26 @@ def test_oxts_of_kitti(oxts):
     assert np.allclose(track.positions, [[0, 0, 0], [0, 0, 1.2]])
 
 
+def test_rows_of_oxts_belong_to_the_files_with_their_numbers(oxts):
+    (oxts / "data" / "0000000001.txt").unlink()
+    track = load_trajectory(oxts)
+    assert np.allclose(track.times_s - track.times_s[0], [0, 2])
+    assert np.allclose(track.positions[1, 2], 0.2)
+
+
 def test_oxts_that_are_not_whole(oxts):
     (oxts / "data" / "0000000001.txt").write_text("1 2 3")
     with pytest.raises(LidarError, match=r"0000000001\.txt has 3 numbers, not 30"):
         load_trajectory(oxts)
-    (oxts / "data" / "0000000001.txt").unlink()
+    (oxts / "data" / "0000000001.txt").write_text(" ".join(map(str, OXTS)))
     with pytest.raises(LidarError, match="its times are dates: leave out time_unit"):
-        (oxts / "data" / "0000000003.txt").write_text(" ".join(map(str, OXTS)))
         load_trajectory(oxts, time_unit="s")
-    (oxts / "data" / "0000000003.txt").unlink()
-    with pytest.raises(LidarError, match=r"2 files of data, and timestamps\.txt 3 times"):
+    (oxts / "data" / "0000000001.txt").rename(oxts / "data" / "0000000003.txt")
+    with pytest.raises(LidarError, match=r"timestamps\.txt has no row for frame 3: it has 3 rows"):
+        load_trajectory(oxts)
+    (oxts / "data" / "0000000003.txt").rename(oxts / "data" / "0000000001.txt")
+    (oxts / "data" / "0000000002.txt").unlink()
+    with pytest.raises(LidarError, match=r"timestamps\.txt has rows for frame 2, which have no"):
         load_trajectory(oxts)
     (oxts / "timestamps.txt").unlink()
     with pytest.raises(LidarError, match=r"a folder is one of KITTI, with timestamps\.txt"):

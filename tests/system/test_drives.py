@@ -25,7 +25,7 @@ BAD = [
     ("trajectory: t.txt", LINE + "3 nan 0 0 0 0 0 1\n", "position of pose 2 is not finite"),
     ("trajectory: t.txt", LINE + "3 5 0 0 0 0 0 1.01\n", "quaternion of pose 2 is not of length 1"),
     ("trajectory: {file: t.txt, start_s: 4.5}", LINE, "start_s is 4.5 s, 2.5 s outside"),
-    ("trajectory: {file: t.txt, format: kitti}", LINE, "give their file as times"),
+    ("trajectory: {file: t.txt, format: kitti}", LINE, "Set `times` to the file that holds"),
     ("trajectory: {file: t.txt, format: tum}\nsteps: 399", LINE, "1.*s less"),
     ("trajectory: {file: t.txt, times: t.txt, format: tum}", LINE, "times are of KITTI's poses"),
     ("trajectory: {file: t.txt, ignore: a}", LINE, "columns and ignore are of tables"),

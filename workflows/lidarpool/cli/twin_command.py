@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     help="The sensor; needed if it has no rings.",
 )
 @options.path(
-    "--trajectory", help="Poses of the sensor.  [default: the recording's, or registered]"
+    "--trajectory",
+    help="Poses of the sensor, with times or as KITTI rows, one per sweep.  "
+    "[default: from the recording, otherwise by registration]",
 )
 @click.option(
     "--voxel-m", type=float, default=0.1, show_default=True, help="Distance of the surfels, metres."

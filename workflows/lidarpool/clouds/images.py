@@ -15,7 +15,7 @@ from lidarsim.base.arrays import AnyArray
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
-from lidarsim.base.words import natural
+from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.ray_image import Image, fired_of
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
@@ -123,7 +123,7 @@ def open_folder(source: RecordingSource) -> Recording:
 def _sensors(folder: Path) -> dict[str, SweepFiles]:
     """Open range images, {sensor: sweeps} of folders of .npz files."""
     files_of_sensor = {
-        inner.name: sorted(inner.glob("*.npz"), key=lambda file: natural(file.name))
+        inner.name: sort_by_number(inner.glob("*.npz"))
         for inner in sorted(folder.iterdir())
         if inner.is_dir()
     }

@@ -14,8 +14,13 @@ from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input, read_input_text
+from lidarsim.base.numbered_files import (
+    frames_in_words,
+    frames_without_file,
+    rows_of_frames,
+    sort_by_number,
+)
 from lidarsim.base.time_units import seconds_of
-from lidarsim.base.words import natural
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns, read_float_rows
@@ -31,6 +36,7 @@ from .recording import Read, Recording, RecordingSource, SweepFiles, take_positi
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
 NAMES_FILE = "semantic-kitti.yaml"
+CALIBRATION_FILE = "calib.txt"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
@@ -99,7 +105,9 @@ class Pieces(pieces.Pieces):
             files |= {f"{folder}/poses.txt": poses, f"poses/{self.names[sensor]}.txt": poses}
             files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[sweep_mask] / 1e9)
             lines = [f"P{number}: {_row(np.eye(3))}\n" for number in range(4)]
-            files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(camera)}\n"]).encode()
+            files[f"{folder}/{CALIBRATION_FILE}"] = "".join(
+                [*lines, f"Tr: {_row(camera)}\n"]
+            ).encode()
         if sweeps.classes and self.entry is None:  # else all jobs share a file
             files[NAMES_FILE] = labels_file(sweeps.classes)
         return files
@@ -226,7 +234,7 @@ def read_points(path: Path) -> FilePoints:
 
 def _sequences(folder: Path) -> dict[str, SweepFiles]:
     """Open the sequences of KITTI odometry or SemanticKITTI, a sequence, or its .bin files."""
-    sequences = sorted(p for p in folder.glob("sequences/*") if (p / "velodyne").is_dir())
+    sequences = sort_by_number(p for p in folder.glob("sequences/*") if (p / "velodyne").is_dir())
     if sequences:
         return {
             sequence.name: _sequence(sequence, "velodyne")._replace(sequence=sequence.name)
@@ -240,28 +248,45 @@ def _sequences(folder: Path) -> dict[str, SweepFiles]:
 
 def _sequence(folder: Path, inner: str) -> SweepFiles:
     """Open the sweeps of a folder, with its labels, poses and times if it has these."""
-    files = sorted((folder / inner).glob("*.bin"), key=lambda file: natural(file.name))
+    files = sort_by_number((folder / inner).glob("*.bin"))
+    calibration = folder / CALIBRATION_FILE
+    notes = []
+
+    def of_frames(rows: Floats, table: str) -> Floats:
+        """Return the rows that belong to the files, and note those that belong to none."""
+        indices = rows_of_frames(files, len(rows), table, "files of points")
+        if surplus := frames_without_file(files, len(rows)):
+            notes.append(f"has no file of points for {frames_in_words(surplus)} of {table}")
+        return rows[indices]
+
     poses: Floats | None = None
     if (folder / "poses.txt").exists():
-        rows = _matrices(folder / "poses.txt")
-        camera = _calibration(folder / "calib.txt")
-        poses = np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
+        rows = of_frames(_matrices(folder / "poses.txt"), "poses.txt")
+        poses = lidar_poses(rows, calibration)
+        if not calibration.exists():
+            notes.append(f"has no {CALIBRATION_FILE}, so its poses count as poses of the lidar")
     times_ns: Floats | None = None
     if (folder / "times.txt").exists():
         seconds = np.loadtxt(folder / "times.txt", ndmin=1)
         times_ns = 1e9 * seconds_of(seconds, None, advice="write seconds into times.txt")
-    for kind, rows_of_kind in (("poses", poses), ("times", times_ns)):
-        if rows_of_kind is not None and len(rows_of_kind) < len(files):
-            raise ValueError(
-                f"{kind}.txt has {len(rows_of_kind)} rows for {len(files)} files of points"
-            )
+        times_ns = of_frames(times_ns, "times.txt")
 
     def read(number: int) -> Read:
         file = files[number]
         pose = None if poses is None else poses[number]
         return _read_sweep(file, folder / "labels" / f"{file.stem}.label", pose)
 
-    return SweepFiles(len(files), read, None if times_ns is None else times_ns[: len(files)])
+    return SweepFiles(len(files), read, times_ns, notes=tuple(notes), calibration=calibration)
+
+
+def lidar_poses(rows: Floats, calibration: Path) -> Floats:
+    """Return the poses (n, 4, 4) of the lidar, given rows (n, 3, 4) of `poses.txt`.
+
+    The rows are poses of the camera whose place `calibration` states, or, if there is no such file,
+    of the lidar.
+    """
+    camera = _calibration(calibration)
+    return np.array([np.linalg.inv(camera) @ _square(row) @ camera for row in rows])
 
 
 def _matrices(path: Path) -> Floats:
@@ -278,16 +303,20 @@ def _matrices(path: Path) -> Floats:
 
 def _calibration(path: Path) -> Floats:
     """Return the matrix (4, 4) from the lidar to the camera, or the identity without a file."""
-    if path.exists():
-        for number, line in enumerate(read_input_text(path).splitlines(), 1):
-            key, _, values = line.partition(":")
-            if key == "Tr":
-                reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
-                try:
-                    return _square(reader.read([values], number).reshape(3, 4))
-                except ValueError as error:
-                    raise ValueError(f"{path.name}: {error}") from error
-    return np.eye(4)
+    if not path.exists():
+        return np.eye(4)
+    for number, line in enumerate(read_input_text(path).splitlines(), 1):
+        key, _, values = line.partition(":")
+        if key == "Tr":
+            reader = RowReader(_MATRIX_NUMBERS, range(len(_MATRIX_NUMBERS)))
+            try:
+                return _square(reader.read([values], number).reshape(3, 4))
+            except ValueError as error:
+                raise ValueError(f"{path.name}: {error}") from error
+    raise ValueError(
+        f"{path.name} has no line `Tr:`, the transform from the lidar to the camera of the poses. "
+        f"Add it, or remove {path.name} if the poses are those of the lidar."
+    )
 
 
 def _square(matrix_rows: Floats) -> Floats:

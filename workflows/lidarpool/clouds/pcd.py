@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray
 from lidarsim.base.extras import reading
-from lidarsim.base.words import natural
+from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import COLOURS, NORMAL
 from lidarsim.scene.colours import as_float
@@ -74,7 +74,7 @@ def open_file(source: RecordingSource) -> Recording:
 def open_folder(source: RecordingSource) -> Recording:
     """Open the .pcd files of a folder, a sweep each."""
     files = [file for file in source.path.iterdir() if file.suffix.lower() == ".pcd"]
-    return _open_files(source, sorted(files, key=lambda file: natural(file.name)))
+    return _open_files(source, sort_by_number(files))
 
 
 def _open_files(source: RecordingSource, files: list[Path]) -> Recording:

@@ -38,10 +38,11 @@ class SweepFiles(NamedTuple):
 
     sweeps: int  # or parts
     read: Callable[[int], Read]
-    times_ns: Floats | None = None  # (sweeps,): start of each sweep; None if unknown
+    times_ns: Floats | None = None  # (sweeps,): stamp of each sweep; None if unknown
     point_count: int | None = None  # number of points of a cloud in parts; None for sweeps
     sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
     notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
+    calibration: Path | None = None  # KITTI's calib.txt, which may not exist
     epsg: int | None = None  # EPSG code of the file's system, if that is in metres
 
 
@@ -130,7 +131,7 @@ class Recording:
     intensity_column: str | None = None  # a name that is not in `_INTENSITY_COLUMNS`
     is_cloud: bool = False
     point_count: int | None = None  # None if unknown before the points are read
-    times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
+    times: Callable[[], Iterable[float]] | None = None  # stamp of each sweep, ns
     notes: tuple[str, ...] = ()
     thinned: bool = False  # whether hits were left out: gaps are not lost returns
     white: float | None = None  # intensity of a white surface, if it is the same at all ranges
@@ -143,6 +144,7 @@ class Recording:
     # None if they are unknown; None if the recording has no frames.
     frame_poses: Callable[[], Floats | None] | None = None
     sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
+    calibration: Path | None = None  # KITTI's calib.txt, which may not exist
     noise_filter: NoiseFilter | None = None  # applied by `read`; None if nothing is left out
     # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
     fired: Callable[[int], FiredPoints] | None = None
@@ -261,6 +263,7 @@ class RecordingSource:
             times=None if files.times_ns is None else files.times_ns.tolist,
             notes=self.named(files.notes),
             sequence=files.sequence,
+            calibration=files.calibration,
             epsg=files.epsg,
         )
 

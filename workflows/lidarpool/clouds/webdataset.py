@@ -17,6 +17,7 @@ from lidarsim.base.arrays import AnyArray, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
+from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
@@ -184,7 +185,7 @@ def open_file(source: RecordingSource) -> Recording:
 
 def open_folder(source: RecordingSource) -> Recording:
     """Open the samples of the tar files in a folder."""
-    files = sorted(source.path.rglob("*.tar"))
+    files = sort_by_number(source.path.rglob("*.tar"))
     return _open_files(source, files)
 
 
@@ -199,21 +200,23 @@ def _sensors(files: list[Path]) -> dict[str, SweepFiles]:
 
     LidarError if no sample has points.
     """
-    keys_of_sensor: dict[str, list[tuple[float, Path, dict[str, tuple[int, int]]]]] = {}
+    samples_of_sensor: dict[str, list[tuple[float | None, Path, dict[str, tuple[int, int]]]]] = {}
     for path in files:
         for members in _samples(path).values():
             if "points.npy" not in members:
                 continue
             description = json.loads(_slice(path, *members["json"])) if "json" in members else {}
-            sample = (float(description.get("time_ns", 0)), path, members)
-            keys_of_sensor.setdefault(description.get("sensor", ""), []).append(sample)
-    if not keys_of_sensor:
+            sample = (description.get("time_ns"), path, members)
+            samples_of_sensor.setdefault(description.get("sensor", ""), []).append(sample)
+    if not samples_of_sensor:
         raise LidarError(
             f"{files[0].name} has no samples of points: a WebDataset of sweeps has files "
             "KEY.points.npy."
         )
 
-    def sweeps_of(samples: list[tuple[float, Path, dict[str, tuple[int, int]]]]) -> SweepFiles:
+    def sweeps_of(
+        samples: list[tuple[float | None, Path, dict[str, tuple[int, int]]]],
+    ) -> SweepFiles:
         def read(number: int) -> Read:
             _, path, members = samples[number]
             arrays = {
@@ -224,10 +227,11 @@ def _sensors(files: list[Path]) -> dict[str, SweepFiles]:
             pose = arrays.pop("pose", None)
             return arrays.pop("points"), arrays, pose
 
-        times = np.array([time for time, _, _ in samples])
-        return SweepFiles(len(samples), read, times)
+        times = [time for time, _, _ in samples]
+        times_ns = None if None in times else np.array(times, np.float64)
+        return SweepFiles(len(samples), read, times_ns)
 
-    return {sensor: sweeps_of(samples) for sensor, samples in keys_of_sensor.items()}
+    return {sensor: sweeps_of(samples) for sensor, samples in samples_of_sensor.items()}
 
 
 def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:

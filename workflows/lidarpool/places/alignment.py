@@ -3,7 +3,8 @@
 Odometry is exact to centimetres, and the rings of a sensor differ by as much. Both blur a place.
 Here the distances of points to the planes of the map are made small: by the pose of each sweep, and
 by an offset of range, elevation and azimuth of each ring. Points as they were fired are compensated
-by the motion from their sweep to the next.
+by the motion from their sweep to the next or, if they were fired before the stamp of their sweep,
+from the sweep before.
 
 Arrays have s sweeps, r rings and n points.
 """
@@ -59,9 +60,9 @@ class Alignment:
     Attributes
     ----------
     poses
-        float64 (s, 4, 4): from the sensor frame at the start of each sweep to the world.
+        float64 (s, 4, 4): from the sensor frame at the stamp of each sweep to the world.
     times_s
-        float64 (s,): starts of the sweeps.
+        float64 (s,): stamps of the sweeps.
     sweep_s
         Seconds that a sweep takes: from most sweeps to the next, if none was dropped.
     voxel_m
@@ -90,7 +91,7 @@ class Alignment:
     def unaligned(
         cls, poses: RecordedPoses, voxel_m: float, motion: Motion, ring_count: int
     ) -> Alignment:
-        """Return the alignment of poses, moved to the starts of sweeps, without corrections."""
+        """Return the alignment of poses, moved to the stamps of sweeps, without corrections."""
         offsets = np.zeros((ring_count, 3))
         sweep_s = float(np.median(np.diff(poses.times_s)))
         alignment = cls(poses.matrices.copy(), poses.times_s, sweep_s, voxel_m, motion, offsets)
@@ -101,7 +102,7 @@ class Alignment:
             alignment,
             poses=np.stack(
                 [
-                    pose @ step.part(-poses.share * alignment.sweep_s / step_s)
+                    pose @ step.part(-(poses.first_s + poses.share * sweep_s) / step_s)
                     for pose, (step, step_s) in zip(poses.matrices, steps, strict=True)
                 ]
             ),
@@ -111,23 +112,38 @@ class Alignment:
         """Return the poses and times of some sweeps, ascending."""
         return replace(self, poses=self.poses[numbers], times_s=self.times_s[numbers])
 
-    def step(self, number: int) -> tuple[Step, float]:
-        """Return the motion from a sweep to the next, and its seconds; of the last, from before."""
-        first = min(number, len(self.poses) - 2)
-        step_s = float(self.times_s[first + 1] - self.times_s[first])
-        return Step.between(self.poses[first], self.poses[first + 1]), step_s
+    def step(self, number: int, *, backward: bool = False) -> tuple[Step, float]:
+        """Return the motion from a sweep to the next or to the previous sweep, and its seconds.
+
+        The seconds are negative for a step backward. The last sweep has the motion of the step
+        before, and the first sweep has no step backward, so its step is the one forward.
+        """
+        if backward and number > 0:
+            first, second = number, number - 1
+        else:
+            first = min(number, len(self.poses) - 2)
+            second = first + 1
+        step_s = float(self.times_s[second] - self.times_s[first])
+        return Step.between(self.poses[first], self.poses[second]), step_s
 
     def compensated(self, sweep: RecordedSweep, number: int) -> tuple[Floats, Floats]:
-        """Return the points (n, 3) of a sweep in the sensor frame of its start, calibrated.
+        """Return the points (n, 3) of a sweep in the sensor frame at its stamp, calibrated.
 
         The second array (n, 3) has the positions of the sensor when it fired, in the same frame.
         """
         points = self._calibrated(sweep)
-        step, step_s = self.step(number)
-        shares = self.motion.shares(sweep, self.sweep_s, step_s)
-        if shares is None:
-            return points, np.zeros_like(points)
-        return step.compensated(points, shares), shares[:, None] * step.translation
+        origins = np.zeros_like(points)
+        times_s = self.motion.times_s(sweep, self.sweep_s)
+        if times_s is None:
+            return points, origins
+        compensated = np.empty_like(points)
+        for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
+            if rows.any():
+                step, step_s = self.step(number, backward=backward)
+                shares = times_s[rows] / step_s
+                compensated[rows] = step.compensated(points[rows], shares)
+                origins[rows] = shares[:, None] * step.translation
+        return compensated, origins
 
     def _calibrated(self, sweep: RecordedSweep) -> Floats:
         """Return the points (n, 3) of a sweep with the offsets of their rings."""
@@ -147,7 +163,7 @@ class Alignment:
 class AlignedSweep(NamedTuple):
     """Returns of a sweep, as arrays of n points."""
 
-    points: Floats  # (n, 3): in the sensor frame of the start, calibrated, metres
+    points: Floats  # (n, 3): in the sensor frame at the stamp, calibrated, meters
     world: Floats  # (n, 3): metres
     origins: Floats  # (n, 3): of the rays, in the world
     ring: Ints  # (n,)

@@ -34,6 +34,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.models import SensorModel, read_model
 
 from ..clouds.folder import result_folder, staging
+from ..clouds.kitti import CALIBRATION_FILE
 from ..clouds.recording import Read, Recording
 from ..columns.parts import StoredCloud
 from ..comparing.fit import fit
@@ -89,9 +90,9 @@ class Twin:
     scene
         The place: surfels with reflectances as colours, and classes as materials.
     poses
-        float64 (s, 4, 4): from the sensor frame of each sweep to the scene frame.
+        float64 (s, 4, 4): from the sensor frame at the stamp of each sweep to the scene frame.
     times_s
-        float64 (s,): times of the sweeps, seconds from the first.
+        float64 (s,): stamps of the sweeps, seconds from the first.
     origin
         float64 (3,): of the scene frame in the world of the recording's poses, metres.
     model
@@ -214,7 +215,8 @@ def twin(
         The sensor, by name or file, for its optics and data sheet; needed for a sensor without
         rings. By default a sensor with the recorded rings.
     trajectory
-        File of the poses of the sensor. By default the poses are the recording's, and without these
+        File with the poses of the sensor: with times in the clock of the recording, or rows of
+        KITTI, one for each sweep. By default the poses are the recording's, and without these
         sweeps are registered to each other.
     voxel_m
         Edge of the cubes in each of which all points become their mean.
@@ -287,7 +289,9 @@ def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
     source = recorded.source
     if not isinstance(source, RecordingChoice):
         return [secrets.token_hex()]
-    files = [source.path, *([] if trajectory is None else [trajectory])]
+    files = [source.path]
+    if trajectory is not None:
+        files += [trajectory, trajectory.with_name(CALIBRATION_FILE)]
     inner = chain.from_iterable(sorted(file.rglob("*")) for file in files if file.is_dir())
     stated = [
         (str(file), status.st_size, status.st_mtime_ns)
@@ -343,8 +347,8 @@ class _Building:
             return (find_poses(self.recorded, trajectory),)
 
         (poses,) = self.steps.once(_POSES, find)
-        return RecordedPoses(
-            poses.matrices, poses.times_s, str(poses.source), poses.origin, float(poses.share)
+        return poses._replace(
+            source=str(poses.source), share=float(poses.share), first_s=float(poses.first_s)
         )
 
     def _aligned(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> Alignment:

@@ -2,7 +2,8 @@
 
 Points are stored as they were fired, each in the sensor frame of its own time, or compensated: all
 in the sensor frame of the start of the sweep. Files do not say which. As fired, a point has a share
-of the motion from its sweep to the next: by its time or, without times, by its azimuth.
+of the motion from its sweep to the next, or from the sweep before: by its time relative to the
+stamp of the sweep or, without times, by its azimuth. The pose of a sweep holds at its stamp.
 """
 
 from __future__ import annotations
@@ -25,23 +26,23 @@ class Motion(StrEnum):
     COUNTERCLOCKWISE = "as fired, counter-clockwise"
     CLOCKWISE = "as fired, clockwise"
 
-    def shares(self, sweep: RecordedSweep, sweep_s: float, step_s: float) -> Floats | None:
-        """Return the shares (n,) of a step of `step_s`; None if compensated.
+    def times_s(self, sweep: RecordedSweep, sweep_s: float) -> Floats | None:
+        """Return the times of points (n,) relative to the stamp of their sweep.
 
-        A sweep takes `sweep_s`, and a step is longer where sweeps were dropped.
+        `sweep_s` is the duration of a sweep. Returns None if points are compensated.
         """
         if self is Motion.TIMED:
-            return None if sweep.time_s is None else sweep.time_s / step_s
+            return sweep.time_s
         if self is Motion.COMPENSATED:
             return None
         turn = sweep.turn
         if self is Motion.CLOCKWISE:
             turn = -turn % 1  # the first points are at 0, and not at 1
-        return turn * sweep_s / step_s
+        return turn * sweep_s
 
 
 class Step(NamedTuple):
-    """Motion of the sensor from the start of a sweep to the start of the next, sensor frame."""
+    """Motion of the sensor from the stamp of a sweep to that of another, in the sensor frame."""
 
     rotation: Floats  # (3,): rotation vector, radians
     translation: Floats  # (3,): metres
@@ -67,7 +68,7 @@ class Step(NamedTuple):
         return moved
 
     def compensated(self, points: Floats, shares: Floats) -> Floats:
-        """Return points (n, 3), fired at shares (n,) of the step, in the frame of its start."""
+        """Return points (n, 3), fired at shares (n,) of the step, in its first frame."""
         from scipy.spatial.transform import Rotation
 
         turned = Rotation.from_rotvec(shares[:, None] * self.rotation).apply(points)

@@ -9,10 +9,11 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import need
+from lidarsim.base.extras import need, reading
 from lidarsim.base.words import plural
-from lidarsim.motion.trajectory_files import load_trajectory
+from lidarsim.motion.trajectory_files import load_trajectory, read_kitti_poses
 
+from ..clouds.kitti import CALIBRATION_FILE, lidar_poses
 from .recorded_sweeps import RecordedSweeps
 
 _VOXELS_OF_REACH = 75  # voxels of the map in the range of the sensor
@@ -25,6 +26,9 @@ _MIN_POINTS = 100  # of a sweep that is registered; with fewer the motion goes o
 _FIRST_SWEEPS = 4  # that tell the reach of the sensor
 _MAX_LOCAL_M = 10_000.0  # coordinates of a place that single precision holds
 _MAX_STEP_M = 5.0  # from sweep to sweep at 10 Hz: 180 km/h
+_MAX_ROUNDING_S = 1e-3  # by which stamps may lie outside a trajectory
+_MIN_CAMERA_M = 1.0  # motion that shows the axes of poses
+_CAMERA_SHARE = 0.9  # of the motion along z, which is forward for a camera and upward for a lidar
 DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 Hz
 
 
@@ -36,6 +40,7 @@ class RecordedPoses(NamedTuple):
     source: str  # a clause, such as "of the recording"
     origin: Floats  # (3,): of the frame of the place in the world, whole metres
     share: float = 0.0  # of the motion of a sweep as fired, at which its pose holds
+    first_s: float = 0.0  # from the stamp of a sweep to its first point, of poses with a share
 
     @property
     def are_given(self) -> bool:
@@ -64,16 +69,20 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     sweeps
         The sweeps.
     trajectory
-        A file of poses of the sensor; by default the poses are the recording's, and without these
-        VGICP (Koide et al., 2021) registers each sweep to a map of the earlier sweeps.
+        A file with poses of the sensor, with times or as rows of KITTI, one for each sweep. By
+        default the poses are the recording's, and without these VGICP (Koide et al., 2021)
+        registers each sweep to a map of the earlier sweeps.
 
     Raises
     ------
     LidarError
-        If the recording has no times to look up in a trajectory, small_gicp is needed and not
-        installed, or the poses jump.
+        If the trajectory does not fit the sweeps, small_gicp is needed and not installed, or the
+        poses jump.
     """
-    times_s = _times_s(sweeps)
+    times_s = sweeps.stamps_s
+    if times_s is None:
+        period_s = DEFAULT_PERIOD_S if sweeps.times is None else sweeps.times.sweep_s
+        times_s = period_s * np.arange(sweeps.count, dtype=np.float64)
     if trajectory is not None:
         poses, times_s = _of_file(sweeps, trajectory, times_s)
         return RecordedPoses.in_world(poses, times_s, f"of {trajectory.name}")
@@ -85,6 +94,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
             "poses by --trajectory."
         )
     share = 0.0
+    first_s = 0.0
     # Many files of a sweep each state the pose of none, as VIEWPOINT of PCD does.
     is_known = sweeps.recording.fired is not None  # of a result, which may stand
     if recorded is not None and (is_known or np.ptp(recorded, axis=0).any()):
@@ -94,6 +104,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         poses = _registered(sweeps)
         source = "by registration"
         share = 0.5
+        first_s = 0.0 if sweeps.times is None else sweeps.times.first_s
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         if len(steps_m) and steps_m.max() > _MAX_STEP_M:
             number = int(steps_m.argmax()) + 1
@@ -101,46 +112,71 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
                 f"Registration moves {steps_m.max():.1f} m from sweep {number - 1} to sweep "
                 f"{number} of {sweeps.recording.name}, which is a failure: give --trajectory."
             )
-    return RecordedPoses.in_world(poses, times_s, source)._replace(share=share)
-
-
-def _times_s(sweeps: RecordedSweeps) -> Floats:
-    """Return the times (s,) of the sweeps, seconds.
-
-    If unknown, they are from 0, and as far apart as the times of points tell, or at 10 Hz.
-    """
-    times = sweeps.recording.times
-    if times is None:
-        period_s = DEFAULT_PERIOD_S if sweeps.times is None else sweeps.times.sweep_s
-        return period_s * np.arange(sweeps.count, dtype=np.float64)
-    seconds = 1e-9 * np.fromiter(times(), np.float64)
-    if len(seconds) != sweeps.count or not (np.diff(seconds) > 0).all():
-        raise LidarError(f"{sweeps.recording.name} has times of sweeps that do not ascend.")
-    return np.asarray(seconds)
+    located = RecordedPoses.in_world(poses, times_s, source)
+    return located._replace(share=share, first_s=first_s)
 
 
 def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple[Floats, Floats]:
-    """Return the poses of a file at the times of the sweeps, or one for each sweep, and times."""
+    """Return the poses (s, 4, 4) of a file, and the times (s,) of the sweeps.
+
+    A file without times has one pose for each sweep. Poses with times are looked up at the stamps
+    of the sweeps; if the recording has no stamps, there is one pose for each sweep.
+    """
+    rows = read_kitti_poses(trajectory)
+    if rows is not None:
+        return _of_rows(sweeps, trajectory, rows), times_s
     track = load_trajectory(trajectory)
-    if len(track.times_s) != sweeps.count and sweeps.recording.times is None:
-        raise LidarError(
-            f"{trajectory} has {plural(len(track.times_s), 'pose')} for "
-            f"{plural(sweeps.count, 'sweep')} without times: give a pose for each sweep."
-        )
+    name = sweeps.recording.name
     first_s, last_s = (float(track.times_s[k]) for k in (0, -1))
-    if len(track.times_s) == sweeps.count:
+    if sweeps.stamps_s is None:
+        if len(track.times_s) != sweeps.count:
+            raise LidarError(
+                f"{trajectory} has {plural(len(track.times_s), 'pose')}, and {name} has "
+                f"{plural(sweeps.count, 'sweep')} without times. Give one pose for each sweep."
+            )
         times_s = np.asarray(track.times_s, np.float64)
-    elif times_s[0] < first_s or times_s[-1] > last_s:
+    elif times_s[0] < first_s - _MAX_ROUNDING_S or times_s[-1] > last_s + _MAX_ROUNDING_S:
         raise LidarError(
-            f"{trajectory} is from {first_s:.3f} to {last_s:.3f} s, and "
-            f"{sweeps.recording.name} from {times_s[0]:.3f} to {times_s[-1]:.3f} s: give the "
-            "trajectory of the same drive, in the same time."
+            f"{trajectory} covers {first_s:.3f} to {last_s:.3f} s, and the sweeps of {name} are "
+            f"stamped {times_s[0]:.3f} to {times_s[-1]:.3f} s. Give a trajectory of the same "
+            "drive in the same clock, or rows of KITTI, one for each sweep."
         )
-    positions, rotations = track.poses(0, 1e9 * (times_s - first_s))
+    positions, rotations = track.poses(0, 1e9 * (times_s.clip(first_s, last_s) - first_s))
     poses = np.tile(np.eye(4), (sweeps.count, 1, 1))
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = positions
     return poses, times_s
+
+
+def _of_rows(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
+    """Return the poses (s, 4, 4) of the sensor, given KITTI's rows (k, 3, 4).
+
+    The rows are poses of a camera if the recording, or else the folder of the file, has KITTI's
+    calibration.
+    """
+    name = sweeps.recording.name
+    if len(rows) != sweeps.count:
+        raise LidarError(
+            f"{trajectory} has {plural(len(rows), 'row')} without times, and {name} has "
+            f"{plural(sweeps.count, 'sweep')}. Give one row for each sweep, or poses with times, "
+            "such as TUM."
+        )
+    of_recording = sweeps.recording.calibration
+    is_calibrated = of_recording is not None and of_recording.exists()
+    calibration = of_recording if is_calibrated else trajectory.with_name(CALIBRATION_FILE)
+    assert calibration is not None
+    with reading(str(trajectory)):
+        poses = lidar_poses(rows, calibration)
+    steps = (np.linalg.inv(poses[:-1]) @ poses[1:])[:, :3, 3]
+    length_m = float(np.linalg.norm(steps, axis=1).sum())
+    upward_m = float(np.abs(steps[:, 2]).sum())
+    if length_m > _MIN_CAMERA_M and upward_m > _CAMERA_SHARE * length_m:
+        raise LidarError(
+            f"{trajectory} moves the sensor along its z axis, so these are probably poses of a "
+            f"camera. Put KITTI's {CALIBRATION_FILE} beside the file, or give poses of the sensor "
+            "with times, such as TUM."
+        )
+    return poses
 
 
 def _registered(sweeps: RecordedSweeps) -> Floats:

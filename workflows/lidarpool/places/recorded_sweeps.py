@@ -7,8 +7,9 @@ any order, points as fired by a sensor whose beams sweep cones show their rings 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import reading
+from lidarsim.base.words import plural
 
 from ..clouds.recording import Columns, Recording, intensities_of, rings_of
 from ..recordings.opening import open_recording
@@ -32,6 +34,7 @@ _BACKWARD_DEG = 15.0  # a step back of the azimuth that begins a ring
 _SHORT_RING = 0.02  # a run of points shorter than this share of the median is no ring
 _TIME_COLUMNS = ("t", "time", "time_s", "timestamp", "offset_time", "time_offset", "time_stamp")
 _TIME_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+_MAX_OUTSIDE = 0.5  # sweeps by which a stamp may lie before the first point or after the last
 _MIN_SWEEP_S = 0.01
 _MAX_SWEEP_S = 2.0
 _MAX_START_RAD = np.radians(12)  # between the first pulses of rings
@@ -51,7 +54,7 @@ class RecordedSweep:
     ring: Ints  # (n,): row in `RecordedSweeps.elevation_rad`; 0 for a sensor without rings
     intensities: Floats | None  # (n,): in the scale of the recording
     labels: Ints | None  # (n,): of class and object
-    time_s: Floats | None  # (n,): since the first of its points
+    time_s: Floats | None  # (n,): relative to the stamp of the sweep, which may be the last point's
     start_rad: Floats  # (r,): azimuths at which the rings start
 
     def __len__(self) -> int:
@@ -112,50 +115,100 @@ def _opened(choice: RecordingChoice) -> Recording:
     return open_recording(*choice, name="the recording")
 
 
+class Clock(StrEnum):
+    """What the times of points count from."""
+
+    STAMP = "the stamp of the sweep"
+    SHARED = "the zero of the stamps"
+    OTHER = "another zero"
+
+
 class PointTimes(NamedTuple):
     """Column of the times of points, the same for all sweeps.
 
     Sweeps last 0.01 to 2 s, so the span of the column tells its unit: s, ms, µs or ns. A sweep of
     few points, with a short span, has the unit of the others.
+
+    Drivers stamp a sweep with the time of its first or of its last point. Times are relative to the
+    stamp if most sweeps have zero among them, and absolute if most sweeps have their stamp among
+    them. Otherwise they come from another clock, and the first point is taken as fired at the
+    stamp.
     """
 
     unit_s: float
     sweep_s: float  # median span of the times of a sweep
+    clock: Clock = Clock.OTHER
+    first_s: float = 0.0  # median time of the first point of a sweep, relative to the stamp
 
     @classmethod
-    def of_sweeps(cls, sweeps: list[dict[str, AnyArray]]) -> PointTimes | None:
-        """Find the unit of the times in columns of sweeps, or return None without times."""
-        parts = [_since_first(columns) for columns in sweeps]
-        spans = [float(part.max()) for part in parts if len(np.unique(part)) >= _MIN_TIMES]
+    def of_sweeps(
+        cls, sweeps: Sequence[Columns], stamps_s: Sequence[float] | Floats | None = None
+    ) -> PointTimes | None:
+        """Find the unit and the clock of the times in columns of sweeps.
+
+        `stamps_s` are the stamps of these sweeps; None if they are unknown. Returns None if the
+        sweeps have no times.
+        """
+        parts = [_times(columns) for columns in sweeps]
+        spans = [
+            float(part.since.max()) for part in parts if len(np.unique(part.since)) >= _MIN_TIMES
+        ]
         if len(spans) <= len(sweeps) / 2:
             return None
         span = float(np.median(spans))
-        for unit_s in _TIME_UNITS_S:
-            if _MIN_SWEEP_S <= span * unit_s <= _MAX_SWEEP_S:
-                return cls(unit_s, span * unit_s)
-        return None
-
-    def of_points(self, columns: Columns) -> Floats | None:
-        """Return the times (n,) of the points of a sweep since the first, seconds.
-
-        None if a time is missing, or the times span no sweep.
-        """
-        times_s = _since_first(columns) * self.unit_s
-        is_known = len(times_s) == len(next(iter(columns.values()), ()))
-        if not is_known or (len(times_s) and times_s.max() > _MAX_SWEEP_S):
+        unit_s = next((u for u in _TIME_UNITS_S if _MIN_SWEEP_S <= span * u <= _MAX_SWEEP_S), None)
+        if unit_s is None:
             return None
-        return times_s
+        sweep_s = span * unit_s
+        known = [row for row, part in enumerate(parts) if len(part.since)]
+        firsts_s = np.array([parts[row].first for row in known]) * unit_s
+        lasts_s = firsts_s + [parts[row].since.max() * unit_s for row in known]
+        zeros_s = {Clock.STAMP: np.zeros(len(known))}
+        if stamps_s is not None:
+            zeros_s[Clock.SHARED] = np.asarray(stamps_s)[known]
+        for clock, zero_s in zeros_s.items():
+            outside_s = np.maximum(firsts_s - zero_s, zero_s - lasts_s)
+            if np.median(outside_s) <= _MAX_OUTSIDE * sweep_s:
+                return cls(unit_s, sweep_s, clock, float(np.median(firsts_s - zero_s)))
+        return cls(unit_s, sweep_s)
+
+    def of_points(self, columns: Columns, stamp_s: float | None = None) -> Floats | None:
+        """Return the times (n,) of the points of a sweep relative to its stamp, seconds.
+
+        None if a time is missing, if the times span no sweep, or if they are far from the stamp.
+        """
+        times = _times(columns)
+        since_s = times.since * self.unit_s
+        if len(since_s) != len(next(iter(columns.values()), ())):
+            return None
+        if not len(since_s):
+            return since_s
+        first_s = 0.0
+        if self.clock is not Clock.OTHER:
+            zero_s = stamp_s if self.clock is Clock.SHARED and stamp_s is not None else 0.0
+            first_s = times.first * self.unit_s - zero_s
+        if since_s.max() > _MAX_SWEEP_S or abs(first_s) > _MAX_SWEEP_S:
+            return None
+        return since_s + first_s
 
 
-def _since_first(columns: Columns) -> Floats:
-    """Return the times (n,) of points since the first, in their unit; empty without times."""
+class _Times(NamedTuple):
+    """Times of the points of a sweep in the unit of their column; empty without times."""
+
+    since: Floats  # (n,): since the first, to the last digit
+    first: float = 0.0
+
+
+def _times(columns: Columns) -> _Times:
+    """Return the times of points."""
     values = next((columns[name] for name in _TIME_COLUMNS if name in columns), ())
     times = np.asarray(values)
     if not len(times) or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
-        return np.empty(0)
+        return _Times(np.empty(0))
     if times.dtype.kind == "i":  # differences of short integers overflow
         times = times.astype(np.int64)
-    return np.asarray((times - times.min()).astype(np.float64))
+    first = times.min()
+    return _Times(np.asarray((times - first).astype(np.float64)), float(first))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,6 +228,8 @@ class RecordedSweeps:
         Sentences on what the recording lacks.
     times
         The times of points; None if the recording has none.
+    stamps_s
+        float64 (s,): stamps of the sweeps, seconds; None if the recording has none.
     are_cones
         Whether elevations show the rings, not the order of points.
     """
@@ -184,6 +239,7 @@ class RecordedSweeps:
     ring_numbers: Ints | None
     notes: tuple[str, ...]
     times: PointTimes | None = None
+    stamps_s: Floats | None = None
     are_cones: bool = False
     _kept: dict[int, RecordedSweep] = field(default_factory=dict)
 
@@ -202,24 +258,37 @@ class RecordedSweeps:
         """Find the rings of a recording, or raise LidarError if no sweep can be read."""
         if recording.is_cloud or not recording.count:
             raise LidarError(f"{recording.name} has no sweeps: give a recording of sweeps.")
-        references = []
-        for number in even_indices(recording.count, _REFERENCE_SWEEPS).tolist():
-            points, columns = _returns(recording, number)
-            if len(points):
-                references.append((points, columns))
+        numbers = even_indices(recording.count, _REFERENCE_SWEEPS).tolist()
+        returns = {number: _returns(recording, number) for number in numbers}
+        references = {number: found for number, found in returns.items() if len(found[0])}
         if not references:
             raise LidarError(f"{recording.name} has no points: there is no place to rebuild.")
-        times = PointTimes.of_sweeps([columns for _, columns in references])
+        stamps_s = _stamps_s(recording)
+        times = PointTimes.of_sweeps(
+            [columns for _, columns in references.values()],
+            None if stamps_s is None else stamps_s[[*references]],
+        )
+        sweeps = cls._of_references(recording, [*references.values()])
+        if stamps_s is not None and not sweeps.is_compensated:
+            notes = (*sweeps.notes, *_clock_notes(recording.name, times))
+            sweeps = replace(sweeps, notes=notes)
+        return replace(sweeps, times=times, stamps_s=stamps_s)
+
+    @classmethod
+    def _of_references(
+        cls, recording: Recording, references: Sequence[tuple[Floats, Columns]]
+    ) -> RecordedSweeps:
+        """Find the rings in the points and columns of some sweeps."""
         if all(rings_of(columns) is not None for _, columns in references):
             rings = np.concatenate([np.asarray(rings_of(columns)) for _, columns in references])
             elevation = np.concatenate([elevations(points) for points, _ in references])
             numbers, medians, spread_rad = _cones(rings.astype(np.int64), elevation)
             if len(numbers) < MIN_RINGS:
-                return cls(recording, np.empty(0), None, (), times)
+                return cls(recording, np.empty(0), None, ())
             if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
                 note = f"The rings of {recording.name} are no cones: its rays are not calibrated."
-                return cls(recording, np.empty(0), None, (note,), times)
-            return cls(recording, medians, numbers, (), times)
+                return cls(recording, np.empty(0), None, (note,))
+            return cls(recording, medians, numbers, ())
         found = [_runs_in_order(points) for points, _ in references]
         runs = [run for run in found if run is not None]
         if not runs:
@@ -229,19 +298,19 @@ class RecordedSweeps:
                     f"{recording.name} has no column of rings: the elevations of its points show "
                     f"{len(clusters)} rings."
                 )
-                return cls(recording, clusters, None, (note,), times, are_cones=True)
+                return cls(recording, clusters, None, (note,), are_cones=True)
             note = (
                 f"{recording.name} has no column of rings, the order of its points shows none, and "
                 "their elevations are not those of a few cones: its points are compensated for the "
                 "motion, or its rays are not calibrated."
             )
-            return cls(recording, np.empty(0), None, (note,), times)
+            return cls(recording, np.empty(0), None, (note,))
         medians = max(runs, key=len)
         note = (
             f"{recording.name} has no column of rings: the order of its points shows "
             f"{len(medians)} rings."
         )
-        return cls(recording, np.sort(medians)[::-1], None, (note,), times)
+        return cls(recording, np.sort(medians)[::-1], None, (note,))
 
     @property
     def count(self) -> int:
@@ -281,10 +350,17 @@ class RecordedSweeps:
             ring,
             None if intensities is None else np.asarray(intensities, np.float64),
             labels_of(columns),
-            None if self.is_compensated or self.times is None else self.times.of_points(columns),
+            self._point_times_s(number, columns),
             _start_rad(points, ring, self.ring_count),
         )
         return sweep if known.all() else sweep.part(known)
+
+    def _point_times_s(self, number: int, columns: Columns) -> Floats | None:
+        """Return the times (n,) of the points of a sweep relative to its stamp, or None."""
+        if self.is_compensated or self.times is None:
+            return None
+        stamp_s = None if self.stamps_s is None else float(self.stamps_s[number])
+        return self.times.of_points(columns, stamp_s)
 
     def cone_spread_rad(self, number: int) -> float:
         """Return how far the rings of a sweep are from cones (`_cones`), radians; inf if empty."""
@@ -331,6 +407,38 @@ class RecordedSweeps:
         chosen, rows = linear_sum_assignment(np.abs(medians[runs, None] - self.elevation_rad))
         ring[runs[chosen]] = rows
         return ring
+
+
+def _stamps_s(recording: Recording) -> Floats | None:
+    """Return the stamps (s,) of the sweeps of a recording, seconds, or None without stamps."""
+    if recording.times is None:
+        return None
+    with reading(recording.name):
+        stamps_s = 1e-9 * np.fromiter(recording.times(), np.float64)
+    if len(stamps_s) != recording.count:
+        raise LidarError(
+            f"{recording.name} has {plural(recording.count, 'sweep')}, of which {len(stamps_s):,} "
+            "can be read. Repair the file, or record it again."
+        )
+    backward = np.flatnonzero(np.diff(stamps_s) <= 0)
+    if len(backward):
+        number = int(backward[0])
+        raise LidarError(
+            f"{recording.name} has stamps that do not ascend: sweep {number + 1:,} is at "
+            f"{stamps_s[number + 1]:.6f} s, and sweep {number:,} at {stamps_s[number]:.6f} s. "
+            "Remove repeated sweeps, and sort the others by their stamps."
+        )
+    return stamps_s
+
+
+def _clock_notes(name: str, times: PointTimes | None) -> tuple[str, ...]:
+    """Return a note on times of points that cannot be related to the stamps."""
+    if times is None or times.clock is not Clock.OTHER:
+        return ()
+    return (
+        f"The times of points in {name} come from another clock than the stamps of its sweeps. The "
+        "first point of each sweep is taken as fired at the stamp.",
+    )
 
 
 def elevations(points: Floats) -> Floats:

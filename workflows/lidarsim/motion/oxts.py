@@ -18,7 +18,7 @@ from ..base.arrays import Floats
 from ..base.elementary import log, sin_cos
 from ..base.elementary_scalars import sin_cos_of
 from ..base.input_files import read_input_text
-from ..base.words import natural
+from ..base.numbered_files import rows_of_frames, sort_by_number
 from .rotations import quaternions_of, rotations_of
 
 WIDTH = 30  # numbers of a row
@@ -37,7 +37,7 @@ def find_oxts(path: Path) -> Path | None:
 
 def oxts_files(folder: Path) -> list[Path]:
     """Return the files of a folder «oxts», each with a row, in the order of their numbers."""
-    return sorted((folder / "data").glob("*.txt"), key=lambda file: natural(file.name))
+    return sort_by_number((folder / "data").glob("*.txt"))
 
 
 def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Floats, Floats]:
@@ -65,10 +65,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
     seconds = dates_of(read_input_text(folder / OXTS_TIMES))
     if seconds is None:
         raise ValueError(f"{OXTS_TIMES} has rows that are no dates, as 2011-09-26 13:02:25.964")
-    if len(seconds) != len(files):
-        raise ValueError(
-            f"it has {len(files)} files of data, and {OXTS_TIMES} {len(seconds)} times"
-        )
+    seconds = seconds[rows_of_frames(files, len(seconds), OXTS_TIMES, "files in data")]
     return seconds, *oxts_poses(np.array(rows), origin)
 
 

@@ -39,6 +39,7 @@ Duration = Annotated[float, Field(gt=0, le=1e9)]
 Latitude = Annotated[float, Field(gt=-90, lt=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
 Height = Annotated[float, Field(ge=-1e5, le=1e6)]
+_KITTI_WIDTH = 12  # numbers of a row
 # Cameras look along z with y down; carriers look along x with z up.
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # A .trj of HELIOS++ states neither units nor the order of rotations: its survey does.
@@ -160,6 +161,31 @@ def load_trajectory(
         raise LidarError(f"{path} is not a usable trajectory: {message_of(error)}{note}") from error
 
 
+def read_kitti_poses(path: Path) -> Floats | None:
+    """Read the matrices (k, 3, 4) of a file of KITTI's poses, which states no times.
+
+    Returns None if the file has another format, or cannot be read.
+
+    LidarError if a rotation is none.
+    """
+    if path.is_dir() or is_bag(path):
+        return None
+    try:
+        text = read_text(path)
+        has_header = find_header(text.splitlines(), _is_pose_column) is not None
+        rows = np.empty((0, 0)) if has_header else _numbers(text)
+    except (OSError, ValueError, LidarError):  # `load_trajectory` says why
+        return None
+    if rows.shape[1] != _KITTI_WIDTH:
+        return None
+    matrices = rows.reshape(-1, 3, 4)
+    try:
+        check_rotations(matrices[..., :3], slack=2 * QUATERNION_SLACK)
+    except (ValueError, LidarError) as error:
+        raise LidarError(f"{path} is not a usable trajectory: {message_of(error)}") from error
+    return matrices
+
+
 def files_of_trajectory(path: Path) -> list[Path]:
     """Return the files of a trajectory: the path itself, or the files in a folder."""
     if not path.is_dir():
@@ -236,7 +262,9 @@ def _of_rows(
     """Return the format and the poses of rows of numbers (k, n) without header."""
     width = rows.shape[1]
     if kind is None:
-        kind = "oxts" if width == WIDTH else "kitti" if timing.file or width == 12 else "tum"
+        kind = (
+            "oxts" if width == WIDTH else "kitti" if timing.file or width == _KITTI_WIDTH else "tum"
+        )
     if kind == "tum":
         if width != 8:
             raise ValueError(
@@ -245,9 +273,9 @@ def _of_rows(
             )
         return kind, PoseTable(seconds_of(rows[:, 0], timing.unit), rows[:, 1:4], rows[:, 4:])
     if timing.file is None:
-        raise ValueError("KITTI's poses have no times: give their file as times")
+        raise ValueError("KITTI's poses have no times. Set `times` to the file that holds them")
     seconds = _seconds_in_file(Path(timing.file), timing.unit)
-    expected = WIDTH if kind == "oxts" else 12
+    expected = WIDTH if kind == "oxts" else _KITTI_WIDTH
     if width != expected:
         raise ValueError(f"its rows have {width} numbers, not {expected}")
     if len(rows) != len(seconds):

@@ -179,7 +179,8 @@ class VelodyneDecoder(PacketDecoder):
     def sweeps(self, sensor: int) -> Iterable[Any]:
         """Return the sweeps, as velodyne_decoder gives them."""
         decoder: Any = import_module("velodyne_decoder")
-        sweeps: Iterable[Any] = decoder.read_pcap(str(self.path), as_pcl_structs=True)
+        config = decoder.Config(timestamp_first_packet=True)
+        sweeps: Iterable[Any] = decoder.read_pcap(str(self.path), config, as_pcl_structs=True)
         return sweeps
 
     def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
@@ -187,5 +188,5 @@ class VelodyneDecoder(PacketDecoder):
         return {name: sweep.points[name] for name in sweep.points.dtype.names}
 
     def time_ns(self, sweep: Any) -> float:
-        """Return the time at which the receiver has got the sweep."""
+        """Return the time at which the receiver got the first packet of the sweep."""
         return float(1e9 * sweep.stamp.host)

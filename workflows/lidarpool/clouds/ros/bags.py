@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import (
@@ -23,6 +24,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import reading
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
     POINT_CLOUD,
@@ -54,6 +56,7 @@ _LATCHED = Qos(
     liveliness_lease_duration=QosTime(0, 0),
     avoid_ros_namespace_conventions=False,
 )
+_UNSTAMPED = "has no stamps, so its sweeps have the times at which they were recorded"
 _MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
 
 
@@ -226,18 +229,29 @@ def open_file(source: RecordingSource) -> Recording:
         columns = columns_of(message[2])
         return positions_of(columns), columns, None
 
+    with reading(source.name):
+        # Programs that set no stamps leave zeros.
+        is_stamped = any(_header_of(data).stamp_ns for _, _, data in islice(messages(), 2))
+
+    def headers() -> Iterator[_Header]:
+        for _, recorded_ns, data in messages():
+            header = _header_of(data)
+            yield header if is_stamped else header._replace(stamp_ns=recorded_ns)
+
     def times() -> Iterator[float]:
-        return (time for _, time, _ in messages())
+        return (float(header.stamp_ns) for header in headers())
 
     def frame_poses() -> Floats | None:
-        return _sweep_poses(source.path, (data for _, _, data in messages()))
+        return _sweep_poses(source.path, [*headers()])
 
+    unstamped = () if is_stamped or not connection.msgcount else (_UNSTAMPED,)
     return source.stream(
         messages,
         points,
         connection.msgcount,
         times=times,
         frame_poses=frame_poses,
+        notes=source.named(unstamped),
     )
 
 
@@ -246,21 +260,28 @@ def open_folder(source: RecordingSource) -> Recording:
     return open_file(source)
 
 
-def _header_of(data: bytes) -> tuple[int, str]:
-    """Return the stamp, ns, and the frame of a message that begins with a header of ROS 2."""
+class _Header(NamedTuple):
+    """Header of a message."""
+
+    stamp_ns: int  # when the data was measured, which may be long before it was recorded
+    frame: str
+
+
+def _header_of(data: bytes) -> _Header:
+    """Return the header of a message of ROS 2 that begins with one."""
     order = "<u4" if data[1] & 1 else ">u4"
     seconds, nanoseconds, length = np.frombuffer(data, order, 3, 4).tolist()
-    return seconds * 10**9 + nanoseconds, bytes(data[16 : 15 + length]).decode(errors="replace")
+    frame = bytes(data[16 : 15 + length]).decode(errors="replace")
+    return _Header(seconds * 10**9 + nanoseconds, frame)
 
 
-def _sweep_poses(path: Path, messages: Iterable[bytes]) -> Floats | None:
+def _sweep_poses(path: Path, headers: Sequence[_Header]) -> Floats | None:
     """Return the poses (n, 4, 4) of the frame of sweeps in the root of its tree of frames.
 
-    `messages` are the sweeps of a sensor. None if the bag has no poses of the frame at the
+    `headers` are those of the sweeps of a sensor. None if the bag has no poses of the frame at the
     times of all sweeps.
     """
-    headers = [_header_of(message) for message in messages]
-    frames = {frame.lstrip("/") for _, frame in headers}
+    frames = {header.frame.lstrip("/") for header in headers}
     if len(frames) != 1:
         return None
     try:
@@ -268,7 +289,7 @@ def _sweep_poses(path: Path, messages: Iterable[bytes]) -> Floats | None:
     except LidarError:  # no frame of this name, or a frame that stands still
         return None
     times_ns = 1e9 * (seconds - seconds[0])
-    stamps_ns = np.array([stamp for stamp, _ in headers]) - 1e9 * seconds[0]
+    stamps_ns = np.array([header.stamp_ns for header in headers]) - 1e9 * seconds[0]
     within_ns = stamps_ns.clip(times_ns[0], times_ns[-1])
     if np.abs(stamps_ns - within_ns).max() > _MAX_DISTANCE_NS:
         return None

@@ -1,0 +1,391 @@
+"""Recordings of other programs: which sweep is which, when it was, and where the sensor was."""
+
+from __future__ import annotations
+
+import io
+import tarfile
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from lidarpool import LidarError, compare, twin
+from lidarpool.places.alignment import AlignedSweeps, Alignment, first_alignment
+from lidarpool.places.lost_pulses import Answering
+from lidarpool.places.motion import Motion
+from lidarpool.places.odometry import RecordedPoses, find_poses
+from lidarpool.places.recorded_sweeps import RecordedSweeps, RecordingChoice
+from lidarpool.recordings.opening import open_recording
+from lidarsim.base.archives import packed
+from lidarsim.columns.bags import POINT_CLOUD
+
+# From axes of a lidar to those of a camera of KITTI: x to the right, y down, z forward.
+TO_CAMERA = np.array([[0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1.0]])
+
+
+def write_scan(path, x):
+    """Write a .bin with one point at x."""
+    np.array([[x, 1, 1, 0.5]], "<f4").tofile(path)
+
+
+def write_pcd(path, x):
+    """Write a .pcd with one point at x."""
+    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\n"
+    path.write_text(f"{head}POINTS 1\nDATA ascii\n{x} 1 1\n")
+
+
+def write_image(path, x):
+    """Write a range image with one ray that ends at x."""
+    names = ("x", "y", "z", "range")
+    arrays = {name: np.full((1, 1), x, np.float32) for name in names} | {"pose": np.eye(4)}
+    path.write_bytes(packed(arrays))
+
+
+def first_x(recording):
+    """Return the x of the first point of each sweep."""
+    return [float(recording.read(number)[0][0, 0]) for number in range(recording.count)]
+
+
+def kitti(folder, frames, pose_count, time_count=None, calibrated=True):
+    """Write a sequence; the sensor of frame k is at x = k, and its scan has a point at 50 - k."""
+    (folder / "velodyne").mkdir(parents=True)
+    for frame in frames:
+        write_scan(folder / "velodyne" / f"{frame:06}.bin", 50 - frame)
+    poses = np.tile(np.eye(4), (pose_count, 1, 1))
+    poses[:, 0, 3] = np.arange(pose_count)
+    rows = TO_CAMERA @ poses @ np.linalg.inv(TO_CAMERA) if calibrated else poses
+    np.savetxt(folder / "poses.txt", rows[:, :3].reshape(-1, 12))
+    if time_count is not None:
+        np.savetxt(folder / "times.txt", 0.1 * np.arange(time_count))
+    if calibrated:
+        numbers = " ".join(map(str, TO_CAMERA[:3].ravel()))
+        (folder / "calib.txt").write_text(f"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: {numbers}\n")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("folder", "suffix", "write"),
+    [("", ".pcd", write_pcd), ("velodyne", ".bin", write_scan), ("lidar", ".npz", write_image)],
+)
+def test_files_are_in_the_order_of_the_numbers_in_their_names(tmp_path, folder, suffix, write):
+    (tmp_path / folder).mkdir(exist_ok=True)
+    names = ["1000.0", "1000.05", "1000.1", "1000.15", "1000.9", "1001", "1001.25", "20000.5"]
+    for number in (3, 7, 0, 5, 1, 6, 4, 2):
+        write(tmp_path / folder / f"{names[number]}{suffix}", number)
+    assert first_x(open_recording(tmp_path)) == [*range(8)]
+
+
+def test_the_digits_of_stamps_are_compared_to_the_last(tmp_path):
+    names = ["a2_1623456789.123456780", "a2_1623456789.123456789", "a10_0.5", "a10_00.75"]
+    for number in (2, 1, 3, 0):
+        write_pcd(tmp_path / f"{names[number]}.pcd", number)
+    assert first_x(open_recording(tmp_path)) == [0, 1, 2, 3]
+
+
+def test_rows_of_kitti_belong_to_the_frames_with_their_numbers(tmp_path):
+    recording = open_recording(kitti(tmp_path / "some", [10, 11, 13], 20, 20))
+    np.testing.assert_allclose(recording.poses(range(3))[:, 0, 3], [10, 11, 13], atol=1e-9)
+    np.testing.assert_allclose(recording.poses(range(3))[:, :3, :3], [np.eye(3)] * 3, atol=1e-9)
+    np.testing.assert_allclose([*recording.times()], [1.0e9, 1.1e9, 1.3e9])
+    for number in range(3):
+        assert recording.read_points(number, in_world=True).points[0, 0] == pytest.approx(50)
+    assert recording.notes[0].endswith(
+        "some has no file of points for frames 0 to 9, 12, 14 to 19 of poses.txt"
+    )
+    assert open_recording(kitti(tmp_path / "all", range(3), 3, 3)).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("frames", "rows", "words"),
+    [
+        ([0, 1, 2, 3, 7], (5, 8), "poses.txt has no row for frame 7: it has 5 rows, and row k"),
+        ([0, 1, 2, 3, 7], (8, 3), "times.txt has no row for frames 3, 7: it has 3 rows"),
+        ([10, 11], (2, 20), "poses.txt has no row for frames 10 to 11"),
+        ([0, 1, 2], (3, 5), "times.txt has rows for frames 3 to 4, which have no file"),
+    ],
+)
+def test_rows_of_kitti_that_fit_no_frames_are_refused(tmp_path, frames, rows, words):
+    with pytest.raises(LidarError, match=words):
+        open_recording(kitti(tmp_path / "s", frames, *rows))
+
+
+def test_files_that_are_not_numbered_have_a_row_each(tmp_path):
+    folder = kitti(tmp_path / "s", [], 2)
+    for name, x in (("1623456789.5", 50), ("1623456789.25", 49)):
+        write_scan(folder / "velodyne" / f"{name}.bin", x)
+    recording = open_recording(folder)
+    assert first_x(recording) == [49, 50]
+    np.testing.assert_allclose(recording.poses(range(2))[:, 0, 3], [0, 1], atol=1e-9)
+    write_scan(folder / "velodyne" / "1623456789.75.bin", 51)
+    with pytest.raises(LidarError, match="has 2 rows for 3 files of points, whose names are not"):
+        open_recording(folder)
+
+
+def test_poses_of_kitti_without_a_calibration(tmp_path):
+    folder = kitti(tmp_path / "s", range(3), 3, calibrated=False)
+    recording = open_recording(folder)
+    assert recording.notes[0].endswith("no calib.txt, so its poses count as poses of the lidar")
+    np.testing.assert_allclose(recording.poses(range(3))[:, 0, 3], [0, 1, 2])
+    (folder / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(LidarError, match=r"calib\.txt has no line `Tr:`, the transform from the"):
+        open_recording(folder)
+
+
+# -- times -----------------------------------------------------------------------------------
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+START_NS = 1_700_000_000 * 10**9
+SWEEP_S = 0.1
+SWEEPS = 8
+HALF_SIZE = np.array([30.0, 8.0])  # of a room whose walls are crossed by all rays
+KINDS = {"<f4": 7, "<f8": 8, "<u2": 4, "<u4": 6}  # of PointField
+
+
+def position(seconds):
+    """Return the x of a sensor that accelerates from 10 m/s."""
+    return 10 * seconds + np.square(seconds)
+
+
+def fired(number):
+    """Return positions (n, 3) of a sweep as fired, rings, and seconds since the start of all."""
+    ring, step = (index.ravel() for index in np.indices((8, 360)))
+    azimuth = np.radians(step - 179.5)
+    elevation = np.radians(ring - 3.5)
+    seconds = SWEEP_S * (number + step / 360)
+    level = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    start = np.stack([position(seconds), 0 * seconds], axis=1)
+    ranges = ((np.sign(level) * HALF_SIZE - start) / level).min(axis=1)
+    directions = np.column_stack([level, np.tan(elevation)])
+    return ranges[:, None] * directions, ring, seconds
+
+
+def write_bag(path, sweeps, late_ns=0):
+    """Write sweeps (stamp in ns, {field: values}) that were recorded later than stamped."""
+    types = STORE.types
+    field_type = types["sensor_msgs/msg/PointField"]
+    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+        topic = bag.add_connection("/points", POINT_CLOUD, typestore=STORE)
+        for number, (stamp_ns, columns) in enumerate(sweeps):
+            kinds = [(name, values.dtype.str) for name, values in columns.items()]
+            rows = np.zeros(len(columns["x"]), kinds)
+            for name, values in columns.items():
+                rows[name] = values
+            fields = [
+                field_type(name, rows.dtype.fields[name][1], KINDS[kind], 1) for name, kind in kinds
+            ]
+            stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+            header = types["std_msgs/msg/Header"](stamp, "lidar")
+            size = rows.itemsize
+            data = rows.view(np.uint8).reshape(-1)
+            message = types[POINT_CLOUD](
+                header, 1, len(rows), fields, False, size, size * len(rows), data, True
+            )
+            recorded_ns = START_NS + round(1e9 * SWEEP_S * number) + late_ns
+            bag.write(topic, recorded_ns, STORE.serialize_cdr(message, POINT_CLOUD))
+    return path
+
+
+def drive(times, stamp_s=0.0, kind="<f8", name="time"):
+    """Return sweeps through the room.
+
+    `times` maps seconds since 1970, and those of the stamp, to the field of times; stamps are
+    `stamp_s` after the first point of a sweep.
+    """
+    sweeps = []
+    for number in range(SWEEPS):
+        points, ring, seconds = fired(number)
+        stamp_ns = START_NS + round(1e9 * (SWEEP_S * number + stamp_s))
+        since_s = seconds - SWEEP_S * number - stamp_s
+        columns = dict(zip("xyz", points.T.astype("<f4"), strict=True))
+        columns |= {"ring": ring.astype("<u2"), name: times(stamp_ns, since_s).astype(kind)}
+        sweeps.append((stamp_ns, columns))
+    return sweeps
+
+
+def write_poses(path, first_s=0.0):
+    """Write the poses of the drive as TUM, by a clock that begins at `first_s`."""
+    seconds = np.arange(-0.2, SWEEP_S * (SWEEPS + 2), 0.01)
+    with path.open("w") as file:
+        for second in seconds:
+            file.write(f"{first_s + second:.6f} {position(second):.6f} 0 0 0 0 0 1\n")
+    return path
+
+
+def relative(stamp_ns, since_s):
+    return since_s
+
+
+def absolute_s(stamp_ns, since_s):
+    return stamp_ns * 1e-9 + since_s
+
+
+def absolute_ns(stamp_ns, since_s):
+    return stamp_ns + 1e9 * since_s
+
+
+def of_another_clock(stamp_ns, since_s):
+    return (stamp_ns - START_NS) * 1e-9 + since_s + 5000
+
+
+@pytest.mark.extended(every=2)
+@pytest.mark.parametrize(
+    ("times", "stamp_s", "kind", "name"),
+    [
+        (relative, 0.0, "<f4", "time"),
+        (relative, SWEEP_S, "<f4", "time"),
+        (relative, 0.6 * SWEEP_S, "<f4", "time"),
+        (lambda _, since_s: 1e9 * since_s, 0.0, "<u4", "t"),
+        (absolute_s, SWEEP_S, "<f8", "timestamp"),
+        (absolute_s, 0.0, "<f8", "timestamp"),
+        (absolute_ns, SWEEP_S, "<f8", "timestamp"),
+        (of_another_clock, 0.0, "<f8", "timestamp"),
+    ],
+)
+def test_points_are_where_they_were_fired_whatever_their_times_count_from(
+    tmp_path, times, stamp_s, kind, name
+):
+    path = write_bag(tmp_path / "drive", drive(times, stamp_s, kind, name), late_ns=10**8)
+    sweeps = RecordedSweeps.of_choice(RecordingChoice(path))
+    poses = find_poses(sweeps, write_poses(tmp_path / "poses.txt", START_NS * 1e-9))
+    alignment = first_alignment(sweeps, poses)
+    assert alignment.motion is Motion.TIMED
+    aligned = AlignedSweeps(sweeps, alignment, Answering.of_sweeps(sweeps))
+    for number in range(1, SWEEPS - 1):  # the first and the last sweep have one neighbor
+        world = aligned.read(number).world[:, :2]
+        off_m = np.abs(HALF_SIZE - np.abs(world)).min(axis=1)
+        assert off_m.max() < 0.005
+        np.testing.assert_allclose(
+            aligned.read(number).origins[:, 0], position(fired(number)[2]), atol=0.005
+        )
+    is_noted = any("come from another clock" in note for note in sweeps.notes)
+    assert is_noted == (times is of_another_clock)
+
+
+@pytest.mark.slow
+def test_a_place_of_late_stamps_lies_where_it_is(tmp_path):
+    path = write_bag(tmp_path / "drive", drive(absolute_s, SWEEP_S, name="timestamp"))
+    found = twin(path, trajectory=write_poses(tmp_path / "poses.txt", START_NS * 1e-9))
+    centers = found.scene.vertices.reshape(-1, 4, 3).mean(axis=1)
+    ends = centers[np.abs(centers[:, 1]) < 6]
+    assert np.median(ends[ends[:, 0] > 20, 0]) == pytest.approx(30, abs=0.02)
+    np.testing.assert_allclose(found.times_s, SWEEP_S * np.arange(SWEEPS), atol=1e-6)
+    np.testing.assert_allclose(
+        found.poses[:, 0, 3], position(SWEEP_S * np.arange(1, SWEEPS + 1)), atol=0.02
+    )
+
+
+def test_poses_by_registration_are_moved_to_the_stamps():
+    matrices = np.tile(np.eye(4), (4, 1, 1))
+    matrices[:, 0, 3] = np.arange(4)
+    for first_s, moved_m in ((0.0, -0.5), (-0.1, 0.5), (-0.05, 0.0)):
+        poses = RecordedPoses(
+            matrices, 0.1 * np.arange(4), "by registration", np.zeros(3), 0.5, first_s
+        )
+        found = Alignment.unaligned(poses, 0.1, Motion.TIMED, 1)
+        np.testing.assert_allclose(found.poses[:, 0, 3], np.arange(4) + moved_m, atol=1e-9)
+
+
+def test_sweeps_of_bags_have_the_times_of_their_headers(tmp_path):
+    sweeps = drive(relative)
+    live = write_bag(tmp_path / "live", sweeps, late_ns=10**8)
+    offline = write_bag(tmp_path / "offline", sweeps)
+    expected_ns = START_NS + 1e8 * np.arange(SWEEPS)
+    np.testing.assert_allclose([*open_recording(live).times()], expected_ns, rtol=0, atol=512)
+    found = compare(live, offline, match="time").figures
+    assert found["pairs"] == SWEEPS
+    assert found["range_image"]["residual"]["rmse_m"] < 1e-6
+
+
+def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):
+    unstamped = [(0, columns) for _, columns in drive(relative)]
+    recording = open_recording(write_bag(tmp_path / "bag", unstamped, late_ns=10**8))
+    expected_ns = START_NS + 1e8 * np.arange(1, SWEEPS + 1)
+    np.testing.assert_allclose([*recording.times()], expected_ns, rtol=0, atol=512)
+    assert recording.notes[0].endswith(
+        "bag has no stamps, so its sweeps have the times at which they were recorded"
+    )
+    # A simulation may begin at zero.
+    simulated = [(stamp_ns - START_NS, columns) for stamp_ns, columns in drive(relative)]
+    recording = open_recording(write_bag(tmp_path / "simulated", simulated))
+    assert [*recording.times()] == [1e8 * number for number in range(SWEEPS)]
+    assert recording.notes == ()
+
+
+def test_sweeps_that_are_out_of_order_are_named(tmp_path):
+    sweeps = drive(relative)
+    sweeps[3], sweeps[4] = sweeps[4], sweeps[3]
+    path = write_bag(tmp_path / "drive", sweeps)
+    with pytest.raises(LidarError, match=r"do not ascend: sweep 4 is at .*300000 s, and sweep 3"):
+        twin(path)
+
+
+def test_samples_of_tar_files_have_times_if_all_of_them_state_one(tmp_path):
+    def write_tar(name, samples):
+        with tarfile.open(tmp_path / name, "w") as tar:
+            for key, (x, text) in samples.items():
+                memory = io.BytesIO()
+                np.save(memory, np.full((1, 3), x))
+                contents = {"points.npy": memory.getvalue(), "json": text.encode()}
+                for ending, content in contents.items():
+                    member = tarfile.TarInfo(f"{key}.{ending}")
+                    member.size = len(content)
+                    tar.addfile(member, io.BytesIO(content))
+
+    write_tar("shard-10.tar", {"d": (3, '{"time_ns": 300}')})
+    write_tar("shard-9.tar", {"b": (1, '{"time_ns": 100}'), "c": (2, '{"time_ns": 200}')})
+    recording = open_recording(tmp_path)
+    assert first_x(recording) == [1, 2, 3]
+    assert [*recording.times()] == [100, 200, 300]
+    write_tar("shard-11.tar", {"e": (4, "{}")})
+    assert open_recording(tmp_path).times is None
+
+
+# -- poses -----------------------------------------------------------------------------------
+
+
+def test_poses_with_times_are_looked_up_though_there_is_one_for_each_sweep(tmp_path):
+    sweeps = RecordedSweeps.of_choice(
+        RecordingChoice(write_bag(tmp_path / "drive", drive(relative)))
+    )
+    seconds = START_NS * 1e-9 + np.linspace(-0.5, 1.5, SWEEPS)
+    poses = tmp_path / "poses.txt"
+    poses.write_text("".join(f"{s:.6f} {s - 1.7e9:.6f} 0 0 0 0 0 1\n" for s in seconds))
+    found = find_poses(sweeps, poses)
+    np.testing.assert_allclose(found.matrices[:, 0, 3], SWEEP_S * np.arange(SWEEPS), atol=1e-5)
+    with pytest.raises(LidarError, match=r"covers -0.200 to .* stamped 1700000000.000 to"):
+        find_poses(sweeps, write_poses(poses))
+
+
+def test_rows_of_kitti_are_poses_of_the_sweeps(tmp_path):
+    folder = kitti(tmp_path / "s", range(4), 4)
+    rows = np.loadtxt(folder / "poses.txt")
+    (folder / "poses.txt").unlink()
+    poses = tmp_path / "poses.txt"
+    np.savetxt(poses, rows)
+    sweeps = RecordedSweeps.of_choice(RecordingChoice(folder))
+    # The poses are of a camera: its place is in the sequence.
+    np.testing.assert_allclose(find_poses(sweeps, poses).matrices[:, 0, 3], range(4), atol=1e-9)
+    np.testing.assert_allclose(find_poses(sweeps, poses).times_s, 0.1 * np.arange(4))
+    # Or beside the poses of a recording in another format.
+    for number in range(4):
+        write_pcd(tmp_path / f"{number}.pcd", 50 - number)
+    files = RecordedSweeps.of_choice(RecordingChoice(tmp_path))
+    with pytest.raises(LidarError, match=r"its z axis, .*Put KITTI's calib\.txt beside the file"):
+        find_poses(files, poses)
+    (folder / "calib.txt").rename(tmp_path / "calib.txt")
+    np.testing.assert_allclose(find_poses(files, poses).matrices[:, 0, 3], range(4), atol=1e-9)
+    # Without a calibration they are poses of the lidar.
+    (tmp_path / "calib.txt").unlink()
+    np.savetxt(poses, lidar_rows(4))
+    np.testing.assert_allclose(find_poses(files, poses).matrices[:, 0, 3], range(4))
+    np.savetxt(poses, lidar_rows(3))
+    with pytest.raises(LidarError, match=r"has 3 rows without times, and .* has 4 sweeps"):
+        find_poses(files, poses)
+
+
+def lidar_rows(count):
+    """Return rows (count, 12) of a lidar at x = 0, 1, …."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.arange(count)
+    return poses[:, :3].reshape(-1, 12)
