@@ -43,6 +43,7 @@ from lidarsim.scene.files.coordinate_systems import (
     transformed,
     zone_in_metres,
 )
+from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
     MAX_TRIANGLES,
     Content,
@@ -77,14 +78,6 @@ PixelRange = tuple[int, int]  # half-open
 _LOWEST_M = -12_000.0
 _HIGHEST_M = 9_000.0
 _NO_DATA = -9999.0  # which many programs write without saying so in the file
-_FOOT_M = 0.3048
-_US_FOOT_M = 1200 / 3937
-_UNIT_NAMES = {  # names of the units of heights, as files spell the names
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
-    **dict.fromkeys(("ft", "foot", "feet", "international foot"), _FOOT_M),
-    **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus", "us_ft"), _US_FOOT_M),
-    **{name: UNITS_M[name] for name in ("mm", "cm", "dm", "km")},
-}
 
 
 @dataclass(frozen=True)
@@ -630,7 +623,7 @@ def _height_unit_m(source: _Source, notes: list[str]) -> float:
     """Return the metres in the unit of heights: of the band, else of the vertical system."""
     stated = source.file.units[0]
     if stated:
-        if (unit_m := _UNIT_NAMES.get(stated.strip().lower())) is not None:
+        if (unit_m := unit_by_name(stated)) is not None:
             return unit_m
         notes.append(f"has heights in {stated[:40]!r}, which is no known unit: taken in metres")
         return 1.0
