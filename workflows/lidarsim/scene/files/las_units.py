@@ -160,6 +160,8 @@ _HORIZONTAL = {
 _VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
 _ANGULAR = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"}
 _COMPOUND = {"COMPD_CS", "COMPOUNDCRS"}
+_BOUND = {"BOUNDCRS"}
+WKT_KEYWORDS = _HORIZONTAL | _ANGULAR | _COMPOUND | _BOUND  # that a system begins with
 _LENGTH_UNITS = ("UNIT", "LENGTHUNIT")
 
 
@@ -240,7 +242,7 @@ def _systems(text: str) -> tuple[_Node, list[_Node]]:
 
 def _without_transformation(node: _Node) -> _Node:
     """Return the system within a bound one: a system, and its transformation to another one."""
-    source = node.child({"SOURCECRS"}) if node.keyword == "BOUNDCRS" else None
+    source = node.child({"SOURCECRS"}) if node.keyword in _BOUND else None
     return source.nodes[0] if source and source.nodes else node
 
 
