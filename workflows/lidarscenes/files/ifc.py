@@ -358,12 +358,13 @@ class _MapConversion:
         elif not abs(true_scale - 1) < _MAX_SCALE_ERROR:
             raise ValueError(f"its scale, {true_scale:g}, does not fit its units")
         x, y, z = (true_scale * (numbers[f"Factor{axis}"] or 1.0) for axis in "XYZ")
+        east, north, height = (numbers[name] or 0.0 for name in _MAP_NUMBERS[:3])
         abscissa = numbers["XAxisAbscissa"] or 0.0
         ordinate = numbers["XAxisOrdinate"] or 0.0
         return cls(
             str(stated["system"] or "")[:80],
             unit_m,
-            tuple(numbers[name] or 0.0 for name in _MAP_NUMBERS[:3]),
+            (east, north, height),
             math.degrees(math.atan2(ordinate, abscissa)),
             (x, y, z),
             ignores_scale,
