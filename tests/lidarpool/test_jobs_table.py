@@ -185,3 +185,16 @@ def test_hash_can_be_computed_from_its_description():
     assert Tally.from_cloud(cloud).sha256 == hashlib.sha256(lines.encode()).hexdigest()
     assert Tally().sha256 == Tally.from_cloud(cloud[:0]).sha256
     assert Tally().classes == {}
+
+
+@pytest.mark.parametrize("fields", [
+    {"name": "../../secret"}, {"name": "/etc/hostname"}, {"name": ".."}, {"split": "../train"},
+])  # fmt: skip
+def test_names_of_jobs_that_lead_elsewhere_are_refused(tmp_path, fields):
+    row = JobRow(**({"number": 0, "name": "0"} | fields))
+    storage = Storage.at(tmp_path)
+    write_table(storage, [], lambda: [row])
+    with pytest.raises(LidarError, match=r"the (name|split) .* of job 0 is not a plain file name"):
+        list(read_table(storage))
+    with pytest.raises(ValueError, match="is not a plain file name"):
+        JobRow.from_json(dataclasses.asdict(row))

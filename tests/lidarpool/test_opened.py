@@ -1,5 +1,6 @@
 """The viewer opens whatever lidarpool reads or writes: exports, recordings, meshes, scenarios."""
 
+import json
 import shutil
 import time
 from dataclasses import replace
@@ -257,6 +258,61 @@ def test_text_of_points_is_a_cloud_and_a_raster_of_heights_is_a_scene(tmp_path):
     heights = "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2 3\n4 5 6\n"
     (tmp_path / "heights.asc").write_text(heights)
     assert open_view(tmp_path / "heights.asc").preview
+
+
+@pytest.fixture
+def nuscenes(exported, tmp_path):
+    """A copy of the data set of nuScenes, with its table of sweeps."""
+    folder, *_ = exported
+    shutil.copytree(folder / "nuscenes", tmp_path / "nuscenes")
+    return tmp_path / "nuscenes", tmp_path / "nuscenes" / "v1.0-lidarpool" / "sample_data.json"
+
+
+def test_one_of_several_versions_of_nuscenes_is_asked_for(nuscenes):
+    root, table = nuscenes
+    sweeps = open_recording(root, "LIDAR_TOP").count
+    shutil.copytree(table.parent, root / "v1.0-mini")
+    mini = root / "v1.0-mini" / "sample_data.json"
+    mini.write_text(json.dumps(json.loads(table.read_text())[:1]))
+    for open_it in (open_recording, open_view):
+        with pytest.raises(LidarError) as told:
+            open_it(root)
+        assert str(told.value) == (
+            f"{root} has several versions of nuScenes: v1.0-lidarpool, v1.0-mini. Give the folder "
+            f"of one of them, for example {root}/v1.0-lidarpool."
+        )
+    assert open_recording(table.parent, "LIDAR_TOP").count == sweeps
+    one = open_recording(mini.parent)
+    assert one.count == 1 and len(one.read_points(0)) > 100
+
+
+@pytest.mark.parametrize("name", ["../secret.bin", "{root}/../secret.bin", "samples/link.bin"])
+@pytest.mark.parametrize("table", ["sample_data", "lidarseg"])
+def test_tables_of_nuscenes_name_files_of_the_data_set_only(nuscenes, name, table):
+    root, sample_data = nuscenes
+    rows = json.loads(sample_data.read_text())
+    first = min(rows, key=lambda row: row["timestamp"])
+    secret = root.parent / "secret.bin"
+    shutil.copy(root / first["filename"], secret)
+    (root / "samples" / "link.bin").symlink_to(secret)
+    name = name.format(root=root)
+    if table == "sample_data":
+        first["filename"] = name
+        sample_data.write_text(json.dumps(rows))
+    else:
+        row = {"token": "1", "sample_data_token": first["token"], "filename": name}
+        (sample_data.parent / "lidarseg.json").write_text(json.dumps([row]))
+    with pytest.raises(LidarError) as told:
+        open_recording(root, "LIDAR_TOP").read_points(0)
+    key = "token" if table == "sample_data" else "sample_data_token"
+    assert str(told.value) == (
+        f"{root}: v1.0-lidarpool/{table}.json, {key} {first['token']}, names {name!r}, which leads "
+        "outside of the folder of the data. Only files in that folder are read: copy the file "
+        "there, and correct the name."
+    )
+    if "link" not in name:  # refused before any sweep is read
+        with pytest.raises(LidarError, match="leads outside"):
+            open_recording(root, "LIDAR_TOP")
 
 
 def test_single_sweeps_of_kitti_and_nuscenes_have_their_columns(tmp_path):

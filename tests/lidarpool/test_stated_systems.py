@@ -254,6 +254,19 @@ def test_a_ply_may_state_its_system_in_a_comment(tmp_path, comment):
     assert bounds_of(other)[1] == []
 
 
+@pytest.mark.parametrize("system", [
+    'LOCAL_CS["Site grid",UNIT["US survey foot",0.304800609601219]]',
+    'ENGCRS["Site grid",EDATUM["Peg"],CS[Cartesian,2],AXIS["x",east],AXIS["y",north],'
+    'LENGTHUNIT["US survey foot",0.304800609601219]]',
+])  # fmt: skip
+def test_a_comment_may_state_a_local_system(tmp_path, system):
+    points = np.stack(np.meshgrid(*[np.linspace(0, 40, 21)] * 2, [3.0]), axis=-1).reshape(-1, 3)
+    path = with_comment(tmp_path / "a.ply", f"comment crs: {system}", points)
+    (lower, upper), _ = bounds_of(path)
+    np.testing.assert_allclose((upper - lower)[:2], 40 * 1200 / 3937, atol=0.02)
+    assert lower[2] == pytest.approx(3 * 1200 / 3937, abs=1e-3)
+
+
 def e57_with(monkeypatch, path, metadata, points):
     pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
     text = pye57.libe57.StringNode

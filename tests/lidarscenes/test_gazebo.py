@@ -253,6 +253,11 @@ def test_above_a_world_only_folders_with_a_configuration_are_models(tmp_path):
             "contains it as assets."
         ) in str(caught.value)
         assert load(deep, world(part), assets=tmp_path)[0]
+    (deep / "link.dae").symlink_to(tmp_path / "private" / "house.dae")
+    for name in ("link.dae", "../../private/house.dae", f"file://{tmp_path}/private/house.dae"):
+        with pytest.raises(LidarError, match=r"leads out of .*city: put the file there"):
+            load(deep, world(mesh.format(name)))
+        assert load(deep, world(mesh.format(name)), assets=tmp_path)[0]
     write(tmp_path / "private" / "package.xml", "<package/>")
     assert load(deep, world(mesh.format("package://private/house.dae")))[0]
     with pytest.raises(LidarError, match="as assets"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -622,6 +623,31 @@ def test_mistakes_are_told_in_a_line_and_nothing_is_written(survey, tmp_path, ch
         import_checked(path, tmp_path / "out")
     assert str(told.value).startswith(str(path)) and "\n" not in str(told.value)
     assert [entry.name for entry in tmp_path.iterdir()] == ["helios"]
+
+
+@pytest.mark.parametrize("named", ["parts/ground.obj", "g.mtl"])
+@pytest.mark.parametrize("target", ["{outside}", "../../{outside}", "link"])
+def test_files_outside_of_the_folders_of_a_survey_are_refused(
+    survey, tmp_path, tmp_path_factory, named, target
+):
+    outside = tmp_path_factory.mktemp("outside") / "file"
+    outside.write_text(SQUARE if named.endswith("obj") else ON_GROUND)
+    deep = tmp_path / "1/2/3/4/5"  # the five folders above do not hold the file
+    deep.mkdir(parents=True)
+    path = survey(LASER, FLY)
+    path.parents[1].rename(deep / "helios")
+    root = deep / "helios"
+    if target == "link":
+        (root / "parts" / "link").symlink_to(outside)
+        name = "link" if named == "g.mtl" else "parts/link"
+    else:
+        name = os.path.relpath(outside, root / "parts")
+        name = str(outside) if target == "{outside}" else name
+    file = root / ("parts/ground.obj" if named == "g.mtl" else "deep/fly.xml")
+    file.write_text(file.read_text().replace(named, name))
+    with pytest.raises(LidarError, match=r"names the file .*, which is not in its folder") as told:
+        import_checked(root / "deep" / "fly.xml", tmp_path / "out")
+    assert repr(name) in str(told.value) and not (tmp_path / "out").exists()
 
 
 def test_angular_resolutions_set_the_rates(imported):

@@ -303,14 +303,137 @@ def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
         assert notes[1].endswith("long on the ground here, unlike that of the building")
     system.Name = "EPSG:25832"
     del notes[1]
-    conversion.Scale = 1.0
+    conversion.Scale = 0.5
     load_meshes(model.write(path), tell=notes.append)
-    assert notes[1].endswith("into EPSG:25832 whose scale, 1000, does not fit its units")
+    assert notes[1].endswith("cannot be used: its scale, 500, does not fit its units")
     model.file.remove(conversion)
     model.site.RefLatitude = (48, 8, 15)
     model.site.RefLongitude = (-11, -34, -30)
     load_meshes(model.write(path), tell=notes.append)
     assert notes[2].endswith("the position of its site, 48.1375° N, 11.575° W, which is not used")
+
+
+def with_map_sets(model, owner, system, conversion, names=("ePSet_MapConversion",)):
+    """Add the property sets of a map conversion to an object."""
+    create = model.file.create_entity
+    for name, values in ((names[0], conversion), ("ePset_ProjectedCRS", system)):
+        properties = [
+            create(
+                "IfcPropertySingleValue",
+                Name=key,
+                NominalValue=create("IfcLabel" if isinstance(value, str) else "IfcReal", value),
+            )
+            for key, value in values.items()
+        ]
+        group = model.rooted("IfcPropertySet", name, HasProperties=properties)
+        model.rooted(
+            "IfcRelDefinesByProperties",
+            None,
+            RelatedObjects=[owner],
+            RelatingPropertyDefinition=group,
+        )
+
+
+def map_note(model, path):
+    notes = []
+    model.element("IfcWall", "W")
+    load_meshes(model.write(path), tell=notes.append)
+    (note,) = notes
+    return note.removeprefix(f"{path} ")
+
+
+PLACE = {"Eastings": 2_600_000.0, "Northings": 1_200_000.0, "OrthogonalHeight": 500.0}
+
+
+@needs_ifcopenshell
+@pytest.mark.parametrize(("schema", "prefix", "unit", "scale", "translation"), [
+    ("IFC2X3", "MILLI", "METRE", {}, "[2600000, 1200000, 500]"),
+    ("IFC2X3", "MILLI", "METRE", {"Scale": 0.001}, "[2600000, 1200000, 500]"),
+    ("IFC2X3", "MILLI", None, {"Scale": 0.001}, "[2600000, 1200000, 500]"),
+    ("IFC2X3", "MILLI", None, {}, "[2600, 1200, 0.5]"),
+    ("IFC2X3", "MILLI", "MILLIMETRE", {}, "[2600, 1200, 0.5]"),
+    ("IFC2X3", None, "US survey foot", {}, "[792481.584963, 365760.731521, 152.400305]"),
+    ("IFC4", "MILLI", "meter", {"Scale": 0.001}, "[2600000, 1200000, 500]"),
+])  # fmt: skip
+def test_the_map_unit_of_property_sets_counts(
+    forked, tmp_path, schema, prefix, unit, scale, translation
+):
+    model = Model(schema, prefix)
+    system = {"Name": "EPSG:2056"} | ({"MapUnit": unit} if unit else {})
+    with_map_sets(model, model.project, system, PLACE | scale)
+    note = map_note(model, tmp_path / "a.ifc")
+    assert note.startswith(f"has a map conversion, which is not applied: translation {translation}")
+
+
+@needs_ifcopenshell
+@pytest.mark.parametrize("name", ["ePSet_MapConversion", "EPset_MapConversion"])
+@pytest.mark.parametrize("owner", ["project", "site", "building"])
+def test_property_sets_of_a_map_are_found_wherever_they_are(forked, tmp_path, owner, name):
+    model = Model("IFC2X3")
+    numbers = {key: str(value) for key, value in PLACE.items()}
+    with_map_sets(model, getattr(model, owner), {"Name": "EPSG:2056"}, numbers, [name])
+    note = map_note(model, tmp_path / "a.ifc")
+    assert "translation [2600000, 1200000, 500] moves it into EPSG:2056" in note
+
+
+@needs_ifcopenshell
+@pytest.mark.parametrize(("system", "conversion", "reason"), [
+    ({"MapUnit": "furlong"}, PLACE, "its map unit 'furlong' is not a known unit of length"),
+    ({}, PLACE | {"Northings": "1.2e6 m"}, "Northings is '1.2e6 m', not a number"),
+])  # fmt: skip
+def test_a_map_conversion_that_is_not_understood_is_noted(
+    forked, tmp_path, system, conversion, reason
+):
+    model = Model("IFC2X3")
+    with_map_sets(model, model.site, system, conversion)
+    note = map_note(model, tmp_path / "a.ifc")
+    assert note == f"has a map conversion that cannot be used: {reason}"
+
+
+@needs_ifcopenshell
+def test_map_conversions_that_differ_are_noted(forked, tmp_path):
+    model = Model("IFC2X3")
+    for owner, height in ((model.site, 0.0), (model.building, 3.0)):
+        with_map_sets(model, owner, {}, PLACE | {"OrthogonalHeight": height})
+    note = map_note(model, tmp_path / "a.ifc")
+    assert note.endswith("cannot be used: the file has 2 property sets of it that differ")
+
+
+@needs_ifcopenshell
+def test_a_map_scale_of_1_between_units_is_ignored(forked, tmp_path):
+    model = Model("IFC2X3", "MILLI")
+    with_map_sets(model, model.site, {"MapUnit": "METRE"}, PLACE | {"Scale": 1.0})
+    note = map_note(model, tmp_path / "a.ifc")
+    assert "translation [2600000, 1200000, 500] moves it" in note
+    assert note.endswith("it is ignored, and the units count")
+
+
+@needs_ifcopenshell
+def test_map_scales_of_axes_and_angles_are_told_apart(forked, tmp_path):
+    model = Model("IFC4X3_ADD2")
+    create = model.file.create_entity
+    system = create("IfcProjectedCRS", Name="EPSG:2056")
+    scaled = create(
+        "IfcMapConversionScaled",
+        SourceCRS=model.context,
+        TargetCRS=system,
+        **PLACE,
+        FactorX=0.9996,
+        FactorY=0.9996,
+        FactorZ=1.0,
+    )
+    path = tmp_path / "a.ifc"
+    assert "and scale [0.9996, 0.9996, 1] move it into EPSG:2056" in map_note(model, path)
+    model.file.remove(scaled)
+    create(
+        "IfcRigidOperation",
+        SourceCRS=model.context,
+        TargetCRS=create("IfcGeographicCRS", Name="EPSG:4326"),
+        FirstCoordinate=create("IfcPlaneAngleMeasure", 47.0),
+        SecondCoordinate=create("IfcPlaneAngleMeasure", 8.0),
+    )
+    note = map_note(model, path)
+    assert note.endswith("cannot be used: it states longitude and latitude, not meters")
 
 
 def test_equal_shapes_are_shared(forked, tmp_path, monkeypatch):

@@ -296,9 +296,13 @@ def test_too_many_geoms_are_refused(tmp_path, monkeypatch):
 def test_files_of_named_folders_are_read(tmp_path):
     (tmp_path / "models").mkdir()
     write(tmp_path / "other.xml", f"<mujocoinclude><body>{BOX}</body></mujocoinclude>")
-    path = write(tmp_path / "models" / "m.xml", world('<include file="../other.xml"/>'))
-    objects, notes = load(path, assets=tmp_path)
-    assert [*objects] == ["body 1"] and not notes
+    (tmp_path / "models" / "link.xml").symlink_to(tmp_path / "other.xml")
+    for name in ("../other.xml", "link.xml", f"{tmp_path}/other.xml"):
+        path = write(tmp_path / "models" / "m.xml", world(f'<include file="{name}"/>'))
+        with pytest.raises(LidarError, match=r"name a folder that holds that file as assets"):
+            load(path)
+        objects, notes = load(path, assets=tmp_path)
+        assert [*objects] == ["body 1"] and not notes
 
 
 def test_soft_bodies_are_noted(tmp_path):

@@ -160,6 +160,48 @@ def test_units_of_heights(tmp_path, options, unit, metres, said):
     assert feet == (" from EPSG:2263" in taken.summary)
 
 
+SITE = 'LOCAL_CS["Site grid",UNIT["US survey foot",0.304800609601219]]'
+ENGINEERING = (
+    'ENGCRS["Site grid",EDATUM["Peg"],CS[Cartesian,2],AXIS["x",east,ORDER[1]],'
+    'AXIS["y",north,ORDER[2]],LENGTHUNIT["foot",0.3048]]'
+)
+COMPOUND = f'COMPD_CS["Site",{SITE},VERT_CS["h",VERT_DATUM["h",2005],UNIT["metre",1]]]'
+METRIC = 'LOCAL_CS["Site grid",UNIT["metre",1]]'
+
+
+@pytest.mark.parametrize(
+    ("crs", "unit_m", "height_m", "noted"),
+    [
+        (SITE, 1200 / 3937, 1200 / 3937, ["in the unit US survey foot", "no unit of heights"]),
+        (ENGINEERING, 0.3048, 0.3048, ["in the unit foot", "no unit of heights"]),
+        (COMPOUND, 1200 / 3937, 1, ["in the unit US survey foot"]),
+        (METRIC, 1, 1, []),
+    ],
+)
+@pytest.mark.parametrize("suffix", [".tif", ".asc"])
+def test_local_systems_have_units(tmp_path, crs, unit_m, height_m, noted, suffix):
+    path = tmp_path / f"m{suffix}"
+    if suffix == ".tif":
+        write(path, 100 + SLOPE, crs=crs, place=from_origin(0, 60, 10, 10))
+    else:
+        head = "ncols 8\nnrows 6\nxllcorner 0\nyllcorner 0\ncellsize 10\n"
+        rows = [" ".join(map(str, row)) for row in (100 + SLOPE).tolist()]
+        path.write_text(head + "\n".join(rows))
+        path.with_suffix(".prj").write_text(crs)
+    mesh, taken, notes = read(path)
+    expected = np.array([[5, 5, 100], [75, 55, 147]]) * [unit_m, unit_m, height_m]
+    np.testing.assert_allclose(mesh.bounds, expected)
+    assert [words in note for words, note in zip(noted, notes, strict=True)] == [True] * len(noted)
+    assert taken.crs == "" and "from the local system" in taken.summary
+    # Windows and steps are in the coordinates of the scene.
+    part, *_ = read(path, window=(0, 0, 41 * unit_m, 100 * unit_m))
+    assert part.bounds[:, 0] == pytest.approx([5 * unit_m, 35 * unit_m])
+    coarse, *_ = read(path, step_m=20 * unit_m)
+    np.testing.assert_allclose(
+        coarse.bounds[:, :2], np.array([[10, 10], [70, 50]]) * unit_m, rtol=1e-6
+    )
+
+
 def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     east, south = np.meshgrid(np.arange(40), np.arange(60))
     place = from_origin(-58.5, -34.5, 1 / 1200, 1 / 1200)
@@ -420,6 +462,18 @@ def test_what_has_no_place_on_earth_is_refused(tmp_path):
     with pytest.raises(LidarError, match=r"has no place on Earth by it: .*gdalwarp -t_srs"):
         read(path)
     assert read(write(tmp_path / "m.tif", crs="IAU_2015:30110", place=()))[1] is not None
+
+
+def test_systems_without_axes_along_the_ground_are_refused(tmp_path):
+    path = tmp_path / "m.asc"
+    head = "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n"
+    path.write_text(head + "1 2 3\n4 5 6\n")
+    path.with_suffix(".prj").write_text(rasterio.crs.CRS.from_string("EPSG:4978").to_wkt())
+    with pytest.raises(LidarError, match="no axes along the ground"):
+        read(path)
+    path.with_suffix(".prj").write_text("feet, roughly")
+    with pytest.raises(LidarError, match=r"in m\.prj that PROJ does not understand"):
+        read(path)
 
 
 def test_rasters_near_the_poles_are_in_polar_coordinates(tmp_path):

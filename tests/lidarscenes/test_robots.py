@@ -206,6 +206,7 @@ def packages(tmp_path):
 
 def test_mesh_files_of_packages(tmp_path, packages):
     package = packages / "my_robot"
+    (package / "meshes" / "link.dae").symlink_to(tmp_path / "secret.dae")
     for name in (
         "../meshes/leg.dae",
         "package://my_robot/meshes/leg.dae",
@@ -220,6 +221,7 @@ def test_mesh_files_of_packages(tmp_path, packages):
     missing = "with a package.xml: name the folder '{}', or one that contains it, as assets"
     for name, words in (
         ("../../../secret.dae", outside),
+        ("../meshes/link.dae", outside),
         ("package://my_robot/../../secret.dae", outside),
         (f"file://{tmp_path}/secret.dae", outside),
         ("package://../secret.dae", "names no package: write package://NAME/FILE, or the path of"),

@@ -332,7 +332,7 @@ FORMATS = {
         boxes=True,
         actor_boxes=True,
         raw=True,
-        folders=("v1.0-*/sample_data.json",),
+        folders=("v1.0-*/sample_data.json", "sample_data.json"),
     ),
     "webdataset": FormatRow(
         "webdataset",

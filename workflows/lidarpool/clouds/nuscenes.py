@@ -15,8 +15,10 @@ import numpy as np
 from PIL import Image
 
 from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
+from lidarsim.base.named_files import check_name, file_below
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.motion.rotations import matrices
@@ -43,6 +45,8 @@ _TABLES = (
     "sample_annotation", "sample_data", "scene", "sensor", "visibility",
 )  # fmt: skip
 _LABELS = f"lidarseg/{VERSION}/"
+_SWEEP_TABLE = "sample_data.json"
+_Row = Mapping[str, Any]  # of a table
 _SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of a data set share
 
 
@@ -353,58 +357,94 @@ class _Tables:
 
 
 def open_folder(source: RecordingSource) -> Recording:
-    """Open a lidar of a nuScenes data set."""
-    tables = min(source.path.glob("v1.0-*/sample_data.json")).parent
+    """Open a lidar of a nuScenes data set, by its root or the folder of its tables.
+
+    LidarError for a root with the tables of several versions.
+    """
+    tables = source.path
+    if not (tables / _SWEEP_TABLE).is_file():
+        versions = sorted(table.parent for table in source.path.glob(f"v1.0-*/{_SWEEP_TABLE}"))
+        if len(versions) > 1:
+            names = ", ".join(version.name for version in versions)
+            raise LidarError(
+                f"{source.name} has several versions of nuScenes: {names}. Give the folder of one "
+                f"of them, for example {source.name}/{versions[0].name}."
+            )
+        (tables,) = versions
     with reading(source.name):
-        lidars = _lidars(source.path, tables)
+        lidars = _DataSet(tables.absolute()).lidars()
     return source.of_sensors(lidars)
 
 
-def _lidars(folder: Path, tables: Path) -> dict[str, SweepFiles]:
-    """Open the lidars of a nuScenes data set, {channel: sweeps in order of time}.
+class _DataSet:
+    """The lidars in the tables of a data set, whose files are below the folder above the tables."""
 
-    The names of channels begin with the name of their scene if there are several scenes.
-    """
+    def __init__(self, tables: Path) -> None:
+        self._tables = tables
+        self._poses = self._table("ego_pose")
+        self._calibrated = self._table("calibrated_sensor")
+        self._labels: dict[str, str] = {}  # {token of a sweep: file of its classes}
+        if (tables / "lidarseg.json").exists():
+            rows = self._table("lidarseg").values()
+            self._labels = {row["sample_data_token"]: row["filename"] for row in rows}
 
-    def table(name: str) -> dict[str, dict[str, Any]]:
-        return {row["token"]: row for row in json.loads(read_input(tables / f"{name}.json"))}
+    def _table(self, name: str) -> dict[str, _Row]:
+        rows = json.loads(read_input(self._tables / f"{name}.json"))
+        return {row["token"]: row for row in rows}
 
-    sensors = table("sensor")
-    calibrated = table("calibrated_sensor")
-    poses = table("ego_pose")
-    labels: dict[str, str] = {}  # {token of a sweep: file of its classes}
-    if (tables / "lidarseg.json").exists():
-        labels = {row["sample_data_token"]: row["filename"] for row in table("lidarseg").values()}
-    scenes = table("scene")
-    scene_of_sample = {token: row["scene_token"] for token, row in table("sample").items()}
-    rows_of_channel: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in table("sample_data").values():
-        sensor = sensors[calibrated[row["calibrated_sensor_token"]]["sensor_token"]]
-        if sensor["modality"] == "lidar":
-            scene = scenes[scene_of_sample[row["sample_token"]]]["name"]
-            rows_of_channel.setdefault((scene, sensor["channel"]), []).append(row)
+    def lidars(self) -> dict[str, SweepFiles]:
+        """Return the lidars, {channel: sweeps in order of time}.
 
-    def pose_of(row: Mapping[str, Any]) -> Floats:
-        w, x, y, z = row["rotation"]
-        return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(row["translation"]))
+        The names of channels begin with the name of their scene if there are several scenes.
+        """
+        sensors = self._table("sensor")
+        scenes = self._table("scene")
+        samples = self._table("sample")
+        rows_of_channel: dict[tuple[str, str], list[_Row]] = {}
+        for row in self._table("sample_data").values():
+            sensor = sensors[self._calibrated[row["calibrated_sensor_token"]]["sensor_token"]]
+            if sensor["modality"] == "lidar":
+                scene = scenes[samples[row["sample_token"]]["scene_token"]]["name"]
+                rows_of_channel.setdefault((scene, sensor["channel"]), []).append(row)
+                for name, entry in self._named_files(row):
+                    check_name(name, entry)
+        if len(scenes) == 1:
+            return {
+                channel: self._sweeps(rows)
+                for (_, channel), rows in sorted(rows_of_channel.items())
+            }
+        return {
+            f"{scene} {channel}": self._sweeps(rows)._replace(sequence=scene)
+            for (scene, channel), rows in sorted(rows_of_channel.items())
+        }
 
-    def sweeps_of(rows: list[dict[str, Any]]) -> SweepFiles:
+    def _named_files(self, row: _Row) -> list[tuple[str, str]]:
+        """Return the names of the file of a sweep and of its classes, and the entries of both."""
+        token = row["token"]
+        folder = self._tables.name
+        names = [(row["filename"], f"{folder}/{_SWEEP_TABLE}, token {token},")]
+        if token in self._labels:
+            entry = f"{folder}/lidarseg.json, sample_data_token {token},"
+            names.append((self._labels[token], entry))
+        return names
+
+    def _sweeps(self, rows: list[_Row]) -> SweepFiles:
         rows.sort(key=lambda row: row["timestamp"])
+        times_ns = 1e3 * np.array([row["timestamp"] for row in rows])
+        return SweepFiles(len(rows), lambda number: self._read(rows[number]), times_ns)
 
-        def read(number: int) -> Read:
-            row = rows[number]
-            columns = read_float_columns(folder / row["filename"], NUSCENES)
-            positions = take_positions(columns)
-            if row["token"] in labels:
-                columns["class"] = np.frombuffer(read_input(folder / labels[row["token"]]), "u1")
-            calibration = pose_of(calibrated[row["calibrated_sensor_token"]])
-            return positions, columns, pose_of(poses[row["ego_pose_token"]]) @ calibration
+    def _read(self, row: _Row) -> Read:
+        names = self._named_files(row)
+        file, *label_files = [file_below(self._tables.parent, *named) for named in names]
+        columns = read_float_columns(file, NUSCENES)
+        positions = take_positions(columns)
+        for label_file in label_files:
+            columns["class"] = np.frombuffer(read_input(label_file), "u1")
+        calibration = _pose_of(self._calibrated[row["calibrated_sensor_token"]])
+        return positions, columns, _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
 
-        return SweepFiles(len(rows), read, 1e3 * np.array([row["timestamp"] for row in rows]))
 
-    if len(scenes) == 1:
-        return {channel: sweeps_of(rows) for (_, channel), rows in sorted(rows_of_channel.items())}
-    return {
-        f"{scene} {channel}": sweeps_of(rows)._replace(sequence=scene)
-        for (scene, channel), rows in sorted(rows_of_channel.items())
-    }
+def _pose_of(row: _Row) -> Floats:
+    """Return the pose (4, 4) of a row with a rotation and a translation."""
+    w, x, y, z = row["rotation"]
+    return affine(matrices(np.array([[x, y, z, w]]))[0], np.array(row["translation"]))

@@ -20,6 +20,7 @@ import numpy as np
 from lidarsim._version import __version__
 from lidarsim.base.archives import packed
 from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.named_files import leads_outside
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked_fields
 from lidarsim.columns.cloud import CloudLike
@@ -312,7 +313,7 @@ class DataSet:
                 return row, ""
             for file, checksum in (manifest["files"] | {manifest_name: None}).items():
                 # No file of a data set: the manifest is foreign or edited.
-                if ".." in Path(file).parts or Path(file).is_absolute():
+                if leads_outside(file):
                     return row, source.path(manifest_name)
                 with suppress(FileNotFoundError):
                     self.storage.prepare(Path(file).parent)

@@ -29,7 +29,9 @@ import numpy as np
 
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.input_files import open_input
+from lidarsim.base.named_files import is_plain
 from lidarsim.base.storage import Storage
+from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud, CloudLike
 
 Value = bool | int | float | str
@@ -86,6 +88,7 @@ class JobRow:
         Hash of its points (`Tally`): the same on any cluster.
     classes
         {class: points}; empty if the points have no column ``class``.
+
     """
 
     number: int
@@ -111,7 +114,8 @@ class JobRow:
     def from_json(cls, data: Mapping[str, Any]) -> JobRow:
         """Return a row from its JSON object.
 
-        ValueError if an entry is missing, unknown or of another type.
+        ValueError if an entry is missing, unknown or of another type, or if its name or split is
+        not a plain file name.
         """
         if differing := data.keys() ^ {entry.name for entry in fields(cls)}:
             raise ValueError(f"a row of a job has other entries: {min(differing)}")
@@ -120,7 +124,7 @@ class JobRow:
             if not isinstance(data[name], kind):
                 raise ValueError(f"the {name} of a job is {data[name]!r}")
         classes = {int(number): int(count) for number, count in data["classes"].items()}
-        return cls(**{**data, "classes": classes})
+        return _with_plain_names(cls(**{**data, "classes": classes}))
 
 
 class Tally:
@@ -351,7 +355,20 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
     }
     varied = zip(names, cells[first:stop], strict=True)
     values = {name: _read(text) for name, text in varied if text}
-    return JobRow(values=values, classes=classes, **entries)
+    return _with_plain_names(JobRow(values=values, classes=classes, **entries))
+
+
+def _with_plain_names(row: JobRow) -> JobRow:
+    """Return a row that was read. Its name and split are parts of names of files.
+
+    Raises ValueError if one of them would lead elsewhere.
+    """
+    for kind, text in (("name", row.name), ("split", row.split)):
+        if text and not is_plain(text):
+            raise ValueError(
+                f"the {kind} {printable(text)!r} of job {row.number} is not a plain file name"
+            )
+    return row
 
 
 def _plain(value: Any) -> Any:

@@ -27,6 +27,7 @@ from lidarsim.scene.files.coordinate_systems import (
     has_registry,
     horizontal_part,
     is_geocentric,
+    linear_unit,
     scale_problem,
     suggested_epsg,
 )
@@ -381,7 +382,7 @@ class _System:
             return cls(name, epsg, None, is_of_angles)
         horizontal, up_m = horizontal_part(crs)
         is_of_angles |= horizontal.is_geographic or is_geocentric(crs)
-        unit_m = float(horizontal.linear_units_factor[1]) if horizontal.is_projected else 1.0
+        _, unit_m = linear_unit(horizontal) or ("metre", 1.0)
         return cls(name, epsg, crs, is_of_angles, unit_m, (up_m or unit_m) / unit_m)
 
     def check(self, corners: Floats) -> None:

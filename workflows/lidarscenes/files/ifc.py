@@ -6,6 +6,7 @@ iterator of ifcopenshell, with openings cut out.
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections import defaultdict
@@ -27,6 +28,7 @@ from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import plural
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
+from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
     Content,
     MeshFileError,
@@ -68,6 +70,17 @@ MEMORY_TIMES = 30  # memory as a multiple of the file's bytes
 _END = b"END-ISO-10303-21"
 _END_BYTES = 200  # bytes of a file that contain its end
 _MAX_SCALE_ERROR = 0.1  # limit: metres of a map are metres of a building, nearly
+_MAP_NUMBERS = (
+    "Eastings",
+    "Northings",
+    "OrthogonalHeight",
+    "XAxisAbscissa",
+    "XAxisOrdinate",
+    "Scale",
+    "FactorX",
+    "FactorY",
+    "FactorZ",
+)
 _ADVICE = "export it in parts"
 _EMPTY = "holds no elements with a shape, such as walls and slabs, or none in these storeys"
 
@@ -252,8 +265,8 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
 
     `middle` (2,) are x and y in the middle of the building.
     """
-    conversion = building["map"]
-    if conversion is None:
+    stated = building["map"]
+    if stated is None:
         if building["site"] is None:
             return []
         latitude, longitude = building["site"]
@@ -262,28 +275,138 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
             f"{abs(longitude):.6g}° {'W' if longitude < 0 else 'E'}"
         )
         return [f"states the position of its site, {position}, which is not used"]
-    epsg = re.search(r"(?i)\bepsg:{1,2}(\d{4,6})\b", conversion["system"])
-    system = f"EPSG:{epsg[1]}" if epsg else repr(conversion["system"])
-    where = system if conversion["system"] else "its coordinate system"
-    scale = conversion["scale"]
-    if not abs(scale - 1) < _MAX_SCALE_ERROR:
-        return [f"has a map conversion into {where} whose scale, {scale:g}, does not fit its units"]
-    turn = conversion["heading_deg"]
-    x, y, z = conversion["offset"]
-    if not (any(conversion["offset"]) or turn or abs(scale - 1) > 1e-9):
+    try:
+        conversion = _MapConversion.from_file(stated)
+    except ValueError as error:
+        return [f"has a map conversion that cannot be used: {error}"]
+    epsg = re.search(r"(?i)\bepsg:{1,2}(\d{4,6})\b", conversion.system)
+    system = f"EPSG:{epsg[1]}" if epsg else repr(conversion.system)
+    if conversion.is_identity:
         if problem := scale_problem(system, *middle.tolist()) if epsg else "":
             return [f"is in {system}, {problem}"]
         return [f"is in EPSG:{epsg[1]}: <world.epsg={epsg[1]}> writes that to LAS"] if epsg else []
-    if problem := scale_problem(system, x, y, in_system=False) if epsg else "":
+    return [_conversion_note(conversion, system, is_known=epsg is not None)]
+
+
+def _conversion_note(conversion: _MapConversion, system: str, *, is_known: bool) -> str:
+    """Return the note on a map conversion that moves, rotates or scales a building.
+
+    `is_known` says whether `system` is an EPSG code.
+    """
+    where = system if conversion.system else "its coordinate system"
+    x, y, z = (number * conversion.unit_m for number in conversion.offset)
+    if (
+        problem := scale_problem(system, *conversion.offset[:2], in_system=False)
+        if is_known
+        else ""
+    ):
         where += f", {problem}, unlike that of the building"
     moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
-    if turn:
-        moves.append(f"rotation_deg [0, 0, {turn:.9g}]")
-    if abs(scale - 1) > 1e-9:
-        moves.append(f"scale {scale:.9g}")
+    if conversion.heading_deg:
+        moves.append(f"rotation_deg [0, 0, {conversion.heading_deg:.9g}]")
+    if not conversion.is_true:
+        scales = dict.fromkeys(f"{scale:.9g}" for scale in conversion.scales)
+        moves.append(f"scale {next(iter(scales)) if len(scales) == 1 else _scale_list(conversion)}")
     verb = "moves" if len(moves) == 1 else "move"
     all_of_it = "" if moves[1:] else f"; {world_advice(x, y, z)}"
-    return [
+    ignored = ""
+    if conversion.ignores_scale:
+        ignored = ". Its Scale of 1 does not convert the unit of the project to that of the map: "
+        ignored += "it is ignored, and the units count"
+    in_unit = "" if conversion.unit_m == 1 else " in meters"
+    return (
         f"has a map conversion, which is not applied: {' and '.join(moves)} {verb} it into {where}"
-        f"{all_of_it}"
-    ]
+        f"{in_unit}{all_of_it}{ignored}"
+    )
+
+
+def _scale_list(conversion: _MapConversion) -> str:
+    return f"[{', '.join(f'{scale:.9g}' for scale in conversion.scales)}]"
+
+
+@dataclass(frozen=True)
+class _MapConversion:
+    """The map conversion of a building, with its numbers validated."""
+
+    system: str  # name of the coordinate system, or empty
+    unit_m: float  # meters in the unit of the map
+    offset: tuple[float, float, float]  # eastings, northings, height in the unit of the map
+    heading_deg: float
+    scales: tuple[float, float, float]  # along x, y and z, without the conversion of units
+    ignores_scale: bool  # whether the stated scale is 1 although units differ
+
+    @classmethod
+    def from_file(cls, stated: dict[str, Any]) -> _MapConversion:
+        """Return the conversion that a file states.
+
+        Raises ValueError if it cannot be understood. The unit of the map is that of the coordinate
+        system, else the unit by which the stated scale is near 1, of the project or meters, else
+        that of the project. A scale that is not stated converts units and nothing else.
+        """
+        if stated["count"] > 1:
+            raise ValueError(f"the file has {stated['count']} property sets of it that differ")
+        if stated.get("is_angle"):
+            raise ValueError("it states longitude and latitude, not meters")
+        numbers = {name: _number(stated, name) for name in _MAP_NUMBERS}
+        project_m = stated["unit_m"]
+        scale = numbers["Scale"] or None
+        unit_m = _map_unit_m(stated["map_unit"], project_m, scale)
+        true_scale = 1.0 if scale is None else scale * unit_m / project_m
+        ignores_scale = scale == 1 and abs(true_scale - 1) >= _MAX_SCALE_ERROR
+        if ignores_scale:
+            true_scale = 1.0
+        elif not abs(true_scale - 1) < _MAX_SCALE_ERROR:
+            raise ValueError(f"its scale, {true_scale:g}, does not fit its units")
+        x, y, z = (true_scale * (numbers[f"Factor{axis}"] or 1.0) for axis in "XYZ")
+        east, north, height = (numbers[name] or 0.0 for name in _MAP_NUMBERS[:3])
+        abscissa = numbers["XAxisAbscissa"] or 0.0
+        ordinate = numbers["XAxisOrdinate"] or 0.0
+        return cls(
+            str(stated["system"] or "")[:80],
+            unit_m,
+            (east, north, height),
+            math.degrees(math.atan2(ordinate, abscissa)),
+            (x, y, z),
+            ignores_scale,
+        )
+
+    @property
+    def is_true(self) -> bool:
+        """Whether lengths of the building are lengths on the map."""
+        return all(abs(scale - 1) <= 1e-9 for scale in self.scales)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether coordinates of the building are coordinates on the map, but for the unit."""
+        return self.is_true and not any(self.offset) and not self.heading_deg
+
+
+def _number(stated: dict[str, Any], name: str) -> float | None:
+    """Return a number of a map conversion, or None if it is not stated.
+
+    Property sets may have it as text.
+    """
+    value = stated.get(name)
+    if value is None or value == "":
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{name} is {str(value)[:40]!r}, not a number")
+    return number
+
+
+def _map_unit_m(unit: float | str | None, project_m: float, scale: float | None) -> float:
+    """Return the meters in the unit of a map, by its length in meters, its name, or the scale."""
+    if isinstance(unit, str):
+        unit_m = unit_by_name(unit)
+        if unit_m is None:
+            raise ValueError(f"its map unit {unit[:40]!r} is not a known unit of length")
+        return unit_m
+    if unit is not None:
+        return unit
+    fits_project = scale is None or abs(scale - 1) < _MAX_SCALE_ERROR
+    fits_meters = scale is not None and abs(scale / project_m - 1) < _MAX_SCALE_ERROR
+    return 1.0 if fits_meters and not fits_project else project_m

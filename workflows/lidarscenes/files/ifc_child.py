@@ -20,7 +20,6 @@ from typing import Any
 import ifcopenshell
 import ifcopenshell.geom
 import numpy as np
-from ifcopenshell.util.geolocation import get_crs, get_helmert_transformation_parameters
 from ifcopenshell.util.unit import calculate_unit_scale, get_unit_scale
 from numpy.typing import NDArray
 
@@ -66,6 +65,17 @@ _PARENTS = (
     ("FillsVoids", "RelatingOpeningElement"),
     ("VoidsElements", "RelatingBuildingElement"),
     ("AdheresToElement", "RelatingElement"),
+)
+# Property sets that stand in for IfcMapConversion and IfcProjectedCRS, in lower case.
+_CONVERSION_SET = "epset_mapconversion"
+_SYSTEM_SET = "epset_projectedcrs"
+_MAP_NUMBERS = (
+    "Eastings",
+    "Northings",
+    "OrthogonalHeight",
+    "XAxisAbscissa",
+    "XAxisOrdinate",
+    "Scale",
 )
 
 
@@ -216,26 +226,65 @@ class Building:
         return any(getattr(unit, "UnitType", None) == "LENGTHUNIT" for unit in units)
 
     def _map_conversion(self) -> dict[str, Any] | None:
-        """Return the map conversion of the file, in metres, or None."""
+        """Return the map conversion as the file states it, or None.
+
+        Entities take precedence over the property sets that stand in for them in IFC2X3. Values
+        are those of the file; `ifc.py` validates and converts them.
+        """
         if not self._file.by_type("IfcProject"):
             return None
-        conversion = get_helmert_transformation_parameters(self._file)
-        if conversion is None:
+        stated = self._stated_operation() or self._stated_sets()
+        if stated is None:
             return None
-        system = get_crs(self._file) or {}
-        unit_m = calculate_unit_scale(self._file)
-        map_unit = system.get("MapUnit")
-        # Without a unit, numbers of a map are in the unit of the project.
-        map_unit_m = unit_m
-        if map_unit is not None and not isinstance(map_unit, str):
-            map_unit_m = get_unit_scale(map_unit)
+        return {"unit_m": calculate_unit_scale(self._file), "count": 1} | stated
+
+    def _stated_operation(self) -> dict[str, Any] | None:
+        """Return the first coordinate operation, an entity since IFC4, or None."""
+        try:
+            operations = self._file.by_type("IfcCoordinateOperation")
+        except RuntimeError:  # IFC2X3 has no such class
+            return None
+        if not operations:
+            return None
+        operation = operations[0]
+        system = operation.TargetCRS
+        unit = getattr(system, "MapUnit", None)
+        stated = {
+            "system": getattr(system, "Name", None),
+            "map_unit": None if unit is None else get_unit_scale(unit),
+        }
+        if operation.is_a("IfcRigidOperation"):
+            coordinates = (operation.FirstCoordinate, operation.SecondCoordinate)
+            return stated | {
+                "Eastings": coordinates[0].wrappedValue,
+                "Northings": coordinates[1].wrappedValue,
+                "OrthogonalHeight": operation.Height,
+                "is_angle": coordinates[0].is_a("IfcPlaneAngleMeasure"),
+            }
+        names = (*_MAP_NUMBERS, "FactorX", "FactorY", "FactorZ")
+        return stated | {name: getattr(operation, name, None) for name in names}
+
+    def _stated_sets(self) -> dict[str, Any] | None:
+        """Return the map conversion in property sets, by whatever object has the sets, or None.
+
+        "User Guide for Geo-referencing in IFC" of buildingSMART, version 2, has them on the
+        project; programs have them on the site, too, and differ in the case of the name.
+        """
+        sets: dict[str, list[dict[str, Any]]] = {_CONVERSION_SET: [], _SYSTEM_SET: []}
+        for entity in self._file.by_type("IfcPropertySet"):
+            found = sets.get((entity.Name or "").lower())
+            properties = _properties(entity) if found is not None else {}
+            if found is not None and properties not in found:
+                found.append(properties)
+        if not sets[_CONVERSION_SET]:
+            return None
+        conversion = sets[_CONVERSION_SET][0]
+        system = sets[_SYSTEM_SET][0] if sets[_SYSTEM_SET] else {}
         return {
-            "system": str(system.get("Name") or "")[:80],
-            "offset": [
-                float(number) * map_unit_m for number in (conversion.e, conversion.n, conversion.h)
-            ],
-            "heading_deg": float(np.degrees(np.arctan2(conversion.xao, conversion.xaa))),
-            "scale": float(conversion.scale) * map_unit_m / unit_m,
+            "system": system.get("Name") or conversion.get("TargetCRS"),
+            "map_unit": system.get("MapUnit") or conversion.get("MapUnit"),
+            "count": max(map(len, sets.values())),
+            **{name: conversion.get(name) for name in _MAP_NUMBERS},
         }
 
     def _position_of_site(self) -> list[float] | None:
@@ -312,6 +361,16 @@ def _parent(element: Any) -> Any:
         if relations:
             return getattr(relations[0], parent, None)
     return None
+
+
+def _properties(entity: Any) -> dict[str, Any]:
+    """Return the single values of a property set."""
+    values = {}
+    for item in entity.HasProperties or ():
+        if item.is_a("IfcPropertySingleValue") and item.NominalValue is not None:
+            value = item.NominalValue.wrappedValue
+            values[item.Name] = value if isinstance(value, int | float) else str(value)
+    return values
 
 
 def _name(element: Any) -> str:

@@ -35,14 +35,18 @@ from lidarsim.scene.files.coordinate_systems import (
     crs_key,
     crs_name,
     crs_of_code,
+    crs_of_text,
     ground_scale,
     horizontal_part,
+    is_local,
+    linear_unit,
     longitude_latitude,
     projjson,
     target_problem,
     transformed,
     zone_in_metres,
 )
+from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
     MAX_TRIANGLES,
     Content,
@@ -77,14 +81,6 @@ PixelRange = tuple[int, int]  # half-open
 _LOWEST_M = -12_000.0
 _HIGHEST_M = 9_000.0
 _NO_DATA = -9999.0  # which many programs write without saying so in the file
-_FOOT_M = 0.3048
-_US_FOOT_M = 1200 / 3937
-_UNIT_NAMES = {  # names of the units of heights, as files spell the names
-    **dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0),
-    **dict.fromkeys(("ft", "foot", "feet", "international foot"), _FOOT_M),
-    **dict.fromkeys(("us survey foot", "us survey feet", "us-ft", "ftus", "us_ft"), _US_FOOT_M),
-    **{name: UNITS_M[name] for name in ("mm", "cm", "dm", "km")},
-}
 
 
 @dataclass(frozen=True)
@@ -217,19 +213,73 @@ class _Source:
     """An open raster, with the coordinates of its pixels."""
 
     file: Any
-    affine: Any  # transform from columns and rows to x and y
+    affine: Any  # transform from columns and rows to x and y, in meters in a local system
     crs: Any  # horizontal coordinate system of x and y; None for none on Earth
     up_m: float | None  # unit of heights of the vertical system, metres
+    local: _LocalSystem | None = None  # system without a place on Earth, if the file states one
 
     def heights_m(self, values: Floats, unit_m: float) -> Floats:
         """Return the heights in metres of values of the first band, which has a unit."""
         return (values * self.file.scales[0] + self.file.offsets[0]) * unit_m
 
 
+@dataclass(frozen=True)
+class _LocalSystem:
+    """A system without a place on Earth, such as the grid of a site."""
+
+    name: str
+    unit: str
+    unit_m: float
+
+    @property
+    def note(self) -> str:
+        """A note on the conversion to meters, empty for meters."""
+        if self.unit_m == 1:
+            return ""
+        return (
+            f"is in the local coordinate system {self.name!r}, in the unit {self.unit}: its "
+            "coordinates were converted to meters"
+        )
+
+
 def _source(file: Any, path: Path) -> _Source:
     """Return an open raster with the coordinates of its pixels."""
-    crs, up_m = _systems(file)
-    return _Source(file, _affine(file, path), crs, up_m)
+    from rasterio.transform import Affine
+
+    affine = _affine(file, path)
+    stated = _stated_crs(file, path)
+    if stated is None:
+        return _Source(file, affine, None, None)
+    crs, up_m = horizontal_part(stated)
+    if crs.is_projected or crs.is_geographic:
+        return _Source(file, affine, crs, up_m)
+    unit = linear_unit(crs) if is_local(crs) else None
+    if unit is None:
+        raise MeshFileError(
+            f"is in {crs_name(crs)}, which has no axes along the ground: project it to meters "
+            "first (gdalwarp -t_srs SYSTEM IN OUT)"
+        )
+    name, unit_m = unit
+    local = _LocalSystem(str(projjson(crs)["name"])[:80], name, unit_m)
+    scaled = Affine(*(unit_m * number for number in [*affine][:6]))
+    return _Source(file, scaled, None, up_m, local)
+
+
+def _stated_crs(file: Any, path: Path) -> Any:
+    """Return the coordinate system that a raster or the `.prj` of an ASCII grid states, or None.
+
+    GDAL reads `.prj` files in WKT 1 only, and ignores others.
+    """
+    if file.crs is not None or file.driver != "AAIGrid":
+        return file.crs
+    text = _read_beside(path, ".prj").decode("utf-8", "replace").strip()
+    crs = crs_of_text(text) if text else None
+    if text and crs is None:
+        raise MeshFileError(
+            f"has a coordinate system in {path.stem}.prj that PROJ does not understand: correct "
+            "it, or delete the file to read the coordinates in meters"
+        )
+    return crs
 
 
 @contextmanager
@@ -302,13 +352,6 @@ def _check_kind(source: Any) -> None:
             f"has blocks of {columns:,} x {rows:,} pixels, each {bytes_of(size)}, of at most "
             f"{bytes_of(memory_share())}: write it in tiles (gdal_translate -co TILED=YES)"
         )
-
-
-def _systems(source: Any) -> tuple[Any, float | None]:
-    """Return the horizontal system, None for none on Earth, and metres in its unit of heights."""
-    if source.crs is None or not (source.crs.is_projected or source.crs.is_geographic):
-        return None, None
-    return horizontal_part(source.crs)
 
 
 def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
@@ -630,30 +673,37 @@ def _height_unit_m(source: _Source, notes: list[str]) -> float:
     """Return the metres in the unit of heights: of the band, else of the vertical system."""
     stated = source.file.units[0]
     if stated:
-        if (unit_m := _UNIT_NAMES.get(stated.strip().lower())) is not None:
+        if (unit_m := unit_by_name(stated)) is not None:
             return unit_m
         notes.append(f"has heights in {stated[:40]!r}, which is no known unit: taken in metres")
         return 1.0
     if source.up_m is not None:
         return source.up_m
-    crs = source.crs
-    if crs is not None and crs.is_projected and crs.linear_units_factor[1] != 1:
-        name, factor = crs.linear_units_factor
+    name = ""
+    factor = 1.0
+    if source.local is not None:
+        name = source.local.unit
+        factor = source.local.unit_m
+    elif source.crs is not None and source.crs.is_projected:
+        name, factor = source.crs.linear_units_factor
+    if factor != 1:
         notes.append(
             f"states no unit of heights: taken in {name}, as its coordinates are; "
             '<file.unit="m"> takes them in metres'
         )
-        return float(factor)
-    return 1.0
+    return float(factor)
 
 
 def _notes(source: _Source, path: Path) -> list[str]:
     """Return notes on missing coordinates, further bands and files that are not read."""
     file = source.file
     notes = []
-    if file.transform.is_identity and source.affine.f == file.height:
-        notes.append("states no place: its pixels are taken as 1 m, from x and y 0")
-    if source.crs is None:
+    unit_m = 1.0 if source.local is None else source.local.unit_m
+    if file.transform.is_identity and source.affine.f == file.height * unit_m:
+        notes.append(f"states no place: its pixels are taken as {unit_m:.6g} m, from x and y 0")
+    if source.local is not None:
+        notes += [source.local.note] if source.local.note else []
+    elif source.crs is None:
         notes.append(
             "states no coordinate system: its coordinates are taken in metres (gdal_translate "
             "-a_srs EPSG:CODE gives it one)"
@@ -682,6 +732,8 @@ def _summary(source: _Source, grid: _RasterGrid, step_m: float | None, valid: Bo
         words += f" out of {source.file.width:,} x {source.file.height:,} pixels"
     if grid.target_crs is not None:
         words += f", {_crs_label(grid.target_crs)}"
+    if source.local is not None:
+        words += f", from the local system {source.local.name!r}"
     if source.crs is not None and source.crs != grid.target_crs:
         words += f" from {_crs_label(source.crs)}"
     holes = valid.size - int(np.count_nonzero(valid))

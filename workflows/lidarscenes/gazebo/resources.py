@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.input_files import read_input
+from lidarsim.base.named_files import is_inside
 from lidarsim.base.words import natural, printable
 
 from ..files.lenient_xml import lenient_root
@@ -154,7 +155,7 @@ class Resources:
             except (OSError, ValueError, RuntimeError):
                 continue  # no file can have this name
             roots = (root, *self.trusted)
-            if not any(resolved.is_relative_to(folder) for folder in roots):
+            if not is_inside(resolved, roots):
                 raise LidarError(
                     f"{printable(uri)!r} leads out of {root}: put the file there, or name its "
                     "folder as assets."

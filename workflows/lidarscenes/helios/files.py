@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
@@ -15,12 +16,14 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, explained, prefixed
 from lidarsim.base.input_files import read_input
-from lidarsim.base.words import did_you_mean
+from lidarsim.base.named_files import is_inside
+from lidarsim.base.words import did_you_mean, printable
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.scene.transform import rotation_about
 
 # Folder in a checkout of HELIOS++ that contains its surveys' data/scanners_als.xml.
 _PACKAGE = Path("python/pyhelios")
+_MAX_FOLDERS_UP = 5  # folders above a survey that are searched for its files
 _MAX_TEMPLATES = 10  # length of a chain
 
 
@@ -32,21 +35,42 @@ class Asset(NamedTuple):
 
 
 class Assets:
-    """Files that a survey names, in `folders` or in the folders above the survey."""
+    """Files that a survey names, in `folders` or in the folders above the survey.
+
+    Files in other folders are refused (`named_files.py`).
+    """
 
     def __init__(self, survey: Path, folders: Sequence[Path]) -> None:
-        above = survey.resolve().parents
-        candidates = [*folders, Path(), *above, *(folder / _PACKAGE for folder in above)]
+        own, *above = survey.resolve().parents
+        home = Path(os.path.expanduser("~")).resolve()  # noqa: PTH111 - never fails
+        nearby = [Path(), *above[:_MAX_FOLDERS_UP]]
+        nearby = [own, *(f for f in nearby if not home.is_relative_to(f.resolve()))]
+        candidates = [*folders, *nearby, *(folder / _PACKAGE for folder in nearby)]
         self.folders = tuple(dict.fromkeys(candidates))
+        self._allowed = [folder.resolve() for folder in self.folders]
         self.root = cache(_root)
+
+    def check(self, file: Path, name: str) -> None:
+        """Check that a file that the survey names may be read.
+
+        LidarError if the file is outside of all folders.
+        """
+        with suppress(OSError, ValueError, RuntimeError):  # no file can have this name
+            if is_inside(file, self._allowed):
+                return
+            raise LidarError(
+                f"the survey names the file {printable(name)!r}, which is not in its folder or one "
+                "above it. Name a folder that contains the file with --assets DIR."
+            )
 
     def file(self, name: str) -> Path:
         """Return the path of a file by its name.
 
-        Raises LidarError if no folder has the file.
+        Raises LidarError if no folder has the file, or if the file must not be read.
         """
         for folder in self.folders:
             if (folder / name).is_file():
+                self.check(folder / name, name)
                 return folder / name
         raise LidarError(
             f"there is no file {name!r} in the survey's folder or one above it: give the folder "

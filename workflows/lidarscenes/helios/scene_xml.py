@@ -41,6 +41,7 @@ _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
 class HeliosPart:
     """A mesh file of a scene and its placement: rotated, scaled, moved."""
 
+    assets: Assets
     file: Path
     up_axis: str | None
     rotation: Floats  # (3, 3)
@@ -59,6 +60,8 @@ class HeliosPart:
         values_by_material: dict[str, dict[str, str]] = {}  # {name of a material: values}
         names = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
         libraries = [self.file.parent / name for name in names]
+        for name, library in zip(names, libraries, strict=True):
+            self.assets.check(library, name)
         libraries += [self.library] if self.library else []
         for library in libraries:
             values: dict[str, str] = {}
@@ -176,7 +179,7 @@ class HeliosScene:
                 self._load(draft, kind, text, name)
             else:
                 draft.transform(kind, text, params.get("rotation"))
-        return draft.parts()
+        return draft.parts(self._assets)
 
     def _load(self, draft: _PartDraft, kind: str, text: dict[str, str], name: str) -> None:
         """Set the files of a part by a loader with the parameters {name: text}."""
@@ -238,6 +241,7 @@ class HeliosScene:
         """
         for root in self._assets.folders:
             for folder in (root / "spectra", root / "data" / "spectra"):
+                self._assets.check(folder / f"{name}.txt", name)
                 text = _text(folder / f"{name}.txt")
                 rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
                 if rows:  # micrometres and per cent
@@ -292,7 +296,7 @@ class _PartDraft:
                 "scale, translate."
             )
 
-    def parts(self) -> list[HeliosPart]:
+    def parts(self, assets: Assets) -> list[HeliosPart]:
         """Return a part for each file.
 
         Raises LidarError without files.
@@ -301,6 +305,7 @@ class _PartDraft:
             raise LidarError("no filter loads a file.")
         return [
             HeliosPart(
+                assets=assets,
                 file=file,
                 up_axis=self.up_axis if self.up_axis in ("y", "z") else None,
                 rotation=self.rotation,
@@ -349,6 +354,8 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
     for root in assets.folders:
         if (root / folder).is_dir():
             paths = sorted(p for p in (root / folder).iterdir() if fits.fullmatch(p.name))
+            for path in paths:
+                assets.check(path, text["efilepath"])
             if paths:
                 return paths
     raise LidarError(f"no file fits the efilepath {text['efilepath']!r}.")

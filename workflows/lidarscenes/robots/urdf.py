@@ -20,6 +20,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import Bytes, Floats
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.input_files import read_input
+from lidarsim.base.named_files import is_inside
 from lidarsim.base.validation import checked
 from lidarsim.base.value_texts import shown
 from lidarsim.base.vectors import length
@@ -386,8 +387,7 @@ class _LinkMeshes:
     def _meshes(self, name: str) -> list[SceneMesh]:
         """Return the meshes of a file, in the axes of the file."""
         path, package = self._find(name)
-        resolved = path.resolve()
-        if not any(resolved.is_relative_to(folder) for folder in (package, *self.assets)):
+        if not is_inside(path, (package, *self.assets)):
             kind = "package" if _is_package(package) else "folder of the .urdf"
             raise LidarError(
                 f"its mesh {name[:200]!r} is outside the {kind}, {package}: name a folder that "

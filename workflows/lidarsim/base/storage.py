@@ -23,6 +23,7 @@ from .checksum import crc32
 from .errors import LidarError
 from .extras import install_command
 from .input_files import open_input
+from .words import printable
 
 _BLOCK_BYTES = 1 << 20  # read at a time of a file that is copied or checked
 TEMPORARY = ".lidarpool-tmp-"  # prefix of the name of an unfinished file
@@ -106,8 +107,16 @@ class Storage:
         return replace(self, url=f"{self.url}/{name}")
 
     def local(self, name: str | Path = "") -> Path:
-        """Return the path of a file or folder in a local folder, or of the folder itself."""
+        """Return the path of a file or folder in a local folder, or of the folder itself.
+
+        LidarError if the name leads outside of the folder, by `..` or as another absolute path.
+        """
         path = Path(self.url, name)
+        if ".." in Path(name).parts or not path.is_relative_to(self.url):
+            raise LidarError(
+                f"{printable(str(name))!r} is not the name of a file in {self.url}. Only files in "
+                "that folder are used."
+            )
         if not self.named:
             return path
         for ancestor in (path, *path.parents):

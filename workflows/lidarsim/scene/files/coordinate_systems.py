@@ -137,6 +137,30 @@ def horizontal_part(crs: Any) -> tuple[Any, float | None]:
     return horizontal, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
 
 
+def is_local(crs: Any) -> bool:
+    """Return True for a system with axes of length that has no place on Earth, such as a site grid.
+
+    The types LOCAL_CS of WKT 1 and ENGCRS of WKT 2. `crs` must not be compound.
+    """
+    return bool(projjson(crs)["type"] == "EngineeringCRS" and linear_unit(crs) is not None)
+
+
+def linear_unit(crs: Any) -> tuple[str, float] | None:
+    """Return the name of the unit of x and y and its length in meters, or None for angles.
+
+    `crs` must not be compound. GDAL knows the unit of projected systems only.
+    """
+    axes = projjson(crs).get("coordinate_system", {}).get("axis", ())
+    unit = axes[0].get("unit") if axes else None
+    if unit == "metre":
+        return unit, 1.0
+    if not isinstance(unit, dict) or unit.get("type") != "LinearUnit":
+        return None
+    metres = float(unit["conversion_factor"])
+    name = str(unit["name"])[:40]
+    return f"{metres:g} m" if name in UNNAMED else name, metres
+
+
 def is_geocentric(crs: Any) -> bool:
     """Return True for a system with its origin in the middle of the Earth."""
     described = projjson(crs)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from ...base.errors import CutShortError, LidarError
 from ...base.extras import install_command
+from ...base.vocabulary import UNITS_M
 from .coordinate_systems import UTM_EPSG, crs_of_code, has_registry
 
 # Records of LASF_Projection, by ASPRS LAS 1.4, and tags of TIFF.
@@ -60,6 +61,22 @@ _METHODS = {
     16: "Oblique Stereographic",
     18: "Cassini",
 }
+_UNIT_NAMES = {  # names as files spell them, lower case, with spaces for "_" and "-"
+    **UNITS_M,
+    **dict.fromkeys(("metre", "meter", "metres", "meters"), 1.0),
+    **dict.fromkeys(("millimetre", "millimeter", "millimetres", "millimeters"), 1e-3),
+    **dict.fromkeys(("centimetre", "centimeter", "centimetres", "centimeters"), 1e-2),
+    **dict.fromkeys(("decimetre", "decimeter", "decimetres", "decimeters"), 1e-1),
+    **dict.fromkeys(("kilometre", "kilometer", "kilometres", "kilometers"), 1e3),
+    **dict.fromkeys(("inch", "inches"), 0.0254),
+    **dict.fromkeys(("foot", "feet", "international foot", "international feet"), 0.3048),
+    **dict.fromkeys(
+        ("us survey foot", "us survey feet", "us foot", "us ft", "ftus", "survey foot", "usft"),
+        12 / 39.37,
+    ),
+    **dict.fromkeys(("yard", "yards"), 0.9144),
+    **dict.fromkeys(("mile", "miles"), 1609.344),
+}
 _DATUMS = range(5001, 5300)  # in a vertical system's key by GeoTIFF 1.0: datums, without units
 # Commands and functions that read a cloud have unit; compare has two clouds.
 _OVERRIDE = "give its unit (--unit, in Python unit=; of compare --unit-a and unit_a=, or b)"
@@ -82,6 +99,12 @@ class CoordinateUnit(NamedTuple):
 
 
 METRE = CoordinateUnit("metre", 1.0)
+
+
+def unit_by_name(name: str) -> float | None:
+    """Return the meters in a unit of length by its name, in any case, or None if it is unknown."""
+    words = re.sub(r"[\s_-]+", " ", name.replace(".", "")).strip().lower()
+    return _UNIT_NAMES.get(words)
 
 
 @dataclass(frozen=True)
@@ -137,6 +160,8 @@ _HORIZONTAL = {
 _VERTICAL = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
 _ANGULAR = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "GEODCRS", "GEODETICCRS", "GEOCCS"}
 _COMPOUND = {"COMPD_CS", "COMPOUNDCRS"}
+_BOUND = {"BOUNDCRS"}
+WKT_KEYWORDS = _HORIZONTAL | _ANGULAR | _COMPOUND | _BOUND  # that a system begins with
 _LENGTH_UNITS = ("UNIT", "LENGTHUNIT")
 
 
@@ -217,7 +242,7 @@ def _systems(text: str) -> tuple[_Node, list[_Node]]:
 
 def _without_transformation(node: _Node) -> _Node:
     """Return the system within a bound one: a system, and its transformation to another one."""
-    source = node.child({"SOURCECRS"}) if node.keyword == "BOUNDCRS" else None
+    source = node.child({"SOURCECRS"}) if node.keyword in _BOUND else None
     return source.nodes[0] if source and source.nodes else node
 
 

@@ -151,7 +151,12 @@ class MtlMaterials:
         read: set[Path | None] = set()
         for names in map(as_text, libraries):
             for name in [names] if self._file(names) else names.split():
-                path = self._file(name)
+                try:
+                    path = named_file(self._mesh, name, self._options)
+                except MeshFileError:
+                    reason = "outside its folder, name the folder of that file as assets"
+                    self.notes.missing_files.append(f"{name} ({reason})")
+                    continue
                 if path not in read:
                     read.add(path)
                     try:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...base.allowance import Allowance, bytes_of, memory_share
 from ...base.arrays import AnyArray, Floats, Ints
+from ...base.named_files import is_inside
 from ...base.vectors import matmul, rank
 from .. import colours, face_materials
 from ..animation import Animation
@@ -71,7 +72,7 @@ class ReadOptions(NamedTuple):
 
     def allows(self, file: Path) -> bool:
         """Return True if a file that the mesh file names may be read."""
-        return any(file.resolve().is_relative_to(folder) for folder in self.folders)
+        return is_inside(file, self.folders)
 
 
 class RigidPart(NamedTuple):

@@ -46,6 +46,7 @@ from .las_units import (
     GEO_TEXTS,
     PROJECTED_CRS,
     USER_DEFINED,
+    WKT_KEYWORDS,
     CoordinateUnits,
     advice_to_project,
     geo_keys,
@@ -63,7 +64,7 @@ _CODE = re.compile(r"(?i)(?:urn:ogc:def:crs:)?epsg:(?:[\d.]*:)?(\d{4,6})")
 _COMMENT = re.compile(
     r"(?i)(?:(?:crs|srs|projection|coordinate system|spatial reference)(?: wkt)?\s*[:=]?\s*)?"
     r"(?:epsg\s*[:=]?\s*(?P<code>\d{4,6})|"
-    r"(?P<wkt>(?:projcs|projcrs|compd_cs|compoundcrs|geogcs|geogcrs|boundcrs)\s*\[.*))"
+    rf"(?P<wkt>(?:{'|'.join(sorted(WKT_KEYWORDS))})\s*\[.*))"
 )
 Metres = tuple[float, float, float]  # metres in the units of x, y and z
 

@@ -1,0 +1,79 @@
+"""Names of files in data lead to files of the data only."""
+
+import pytest
+
+from lidarsim.base.errors import LidarError
+from lidarsim.base.named_files import file_below, is_inside, is_plain
+from lidarsim.base.storage import Storage
+from lidarsim.scene.files.meshfile import load_meshes
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A folder of data, beside which is a file, with links to that file and to its folder."""
+    folder = tmp_path / "data"
+    (folder / "sweeps").mkdir(parents=True)
+    (folder / "sweeps" / "a.bin").write_text("a")
+    (tmp_path / "secret.bin").write_text("secret")
+    (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
+    (folder / "above").symlink_to(tmp_path)
+    (folder / "inner").symlink_to(folder / "sweeps")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["sweeps/a.bin", "./sweeps/a.bin", "inner/a.bin", "sweeps/gone"])
+def test_names_below_the_root_are_files_of_the_data(root, name):
+    assert file_below(root, name, "list.txt") == root / name
+
+
+@pytest.mark.parametrize("name", [
+    "../secret.bin", "sweeps/../../secret.bin", "sweeps/../sweeps/a.bin", "link.bin",
+    "above/secret.bin", "{root}/sweeps/a.bin", "/etc/hostname",
+])  # fmt: skip
+def test_names_that_lead_outside_are_refused(root, name):
+    name = name.format(root=root)
+    with pytest.raises(LidarError) as told:
+        file_below(root, name, "list.txt, line 7,")
+    assert str(told.value).startswith(f"list.txt, line 7, names {name!r}, which leads outside")
+    assert len(str(told.value).splitlines()) == 1
+
+
+def test_a_root_may_be_a_link_itself(root, tmp_path):
+    (tmp_path / "disk").symlink_to(root)
+    path = file_below(tmp_path / "disk", "sweeps/a.bin", "list.txt")
+    assert path.read_text() == "a" and is_inside(path, [root])
+
+
+@pytest.mark.parametrize(("name", "plain"), [
+    ("0417", True), ("a.b", True), ("..a", True), ("", False), (".", False), ("..", False),
+    ("a/b", False), ("/a", False), ("a\\b", False), ("a\0", False),
+])  # fmt: skip
+def test_plain_names_have_no_folders(name, plain):
+    assert is_plain(name) is plain
+
+
+@pytest.mark.parametrize("name", ["../secret.bin", "sweeps/../../secret.bin", "/etc/hostname"])
+def test_a_storage_uses_files_of_its_folder_only(root, name):
+    for storage in (Storage.at(root), Storage(str(root))):
+        for use in (storage.read, storage.checksum, storage.below, storage.prepare):
+            with pytest.raises(LidarError, match="is not the name of a file in"):
+                use(name)
+        with pytest.raises(LidarError, match="is not the name of a file in"):
+            storage.take(storage, name, "taken")
+        assert storage.read("sweeps/a.bin") == b"a"
+
+
+@pytest.mark.parametrize("name", ["../m.mtl", "/{root}/m.mtl", "link.mtl"])
+def test_materials_outside_are_noted_with_what_to_name(tmp_path, name):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (tmp_path / "m.mtl").write_text("newmtl A\nKd 1 0 0\n")
+    (folder / "link.mtl").symlink_to(tmp_path / "m.mtl")
+    name = name.format(root=tmp_path)
+    (folder / "a.obj").write_text(f"mtllib {name}\nusemtl A\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    notes = []
+    (mesh,) = load_meshes(folder / "a.obj", colours=True, tell=notes.append)
+    assert mesh.colours is None
+    assert f"{name} (outside its folder, name the folder of that file as assets)" in notes[0]
+    (mesh,) = load_meshes(folder / "a.obj", colours=True, assets=tmp_path, tell=notes.append)
+    assert mesh.colours is not None and len(notes) == 1
