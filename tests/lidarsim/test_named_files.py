@@ -16,7 +16,7 @@ def root(tmp_path):
     (folder / "sweeps" / "a.bin").write_text("a")
     (tmp_path / "secret.bin").write_text("secret")
     (folder / "link.bin").symlink_to(tmp_path / "secret.bin")
-    (folder / "above").symlink_to(tmp_path)
+    (folder / "sweeps" / "above").symlink_to(tmp_path)
     (folder / "inner").symlink_to(folder / "sweeps")
     return folder
 
@@ -28,7 +28,7 @@ def test_names_below_the_root_are_files_of_the_data(root, name):
 
 @pytest.mark.parametrize("name", [
     "../secret.bin", "sweeps/../../secret.bin", "sweeps/../sweeps/a.bin", "link.bin",
-    "above/secret.bin", "{root}/sweeps/a.bin", "/etc/hostname",
+    "sweeps/above/secret.bin", "{root}/sweeps/a.bin", "/etc/hostname",
 ])  # fmt: skip
 def test_names_that_lead_outside_are_refused(root, name):
     name = name.format(root=root)
@@ -42,6 +42,13 @@ def test_a_root_may_be_a_link_itself(root, tmp_path):
     (tmp_path / "disk").symlink_to(root)
     path = file_below(tmp_path / "disk", "sweeps/a.bin", "list.txt")
     assert path.read_text() == "a" and is_inside(path, [root])
+
+
+def test_a_folder_in_the_root_may_be_on_another_disk(root, tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "b.bin").write_text("b")
+    (root / "samples").symlink_to(tmp_path / "disk")
+    assert file_below(root, "samples/b.bin", "list.txt").read_text() == "b"
 
 
 @pytest.mark.parametrize(("name", "plain"), [

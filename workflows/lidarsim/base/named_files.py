@@ -16,7 +16,7 @@ These folders belong to the data:
   that Gazebo is set up with
 - surveys and scanners of HELIOS++: their folder, up to five folders above, in which names start,
   and the working folder; neither the home folder nor the folders above it
-- nuScenes: the root of the data set
+- nuScenes: the root of the data set; its folders, such as `samples`, may be links to other disks
 - data sets and results of lidarpool: their folder, in which jobs and splits are plain names; links
   that the user made in it are followed
 
@@ -83,11 +83,15 @@ def file_below(root: Path, name: str, entry: str) -> Path:
     Raises
     ------
     LidarError
-        If the name leads to a file outside of the folder, also by a link.
+        If the name leads to a file outside of the folder, also by a link. A folder directly in
+        the root, such as `samples`, may be a link to another disk.
     """
     check_name(name, entry)
     path = root / name
-    if not is_inside(path, [root.resolve()]):
+    folders = [root.resolve()]
+    if len(PurePath(name).parts) > 1:
+        folders.append((root / PurePath(name).parts[0]).resolve())
+    if not is_inside(path, folders):
         raise _outside(name, entry)
     return path
 
