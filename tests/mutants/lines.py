@@ -47,6 +47,11 @@ class Lines:
         command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.mutants.recorder"]
         environment = os.environ | {"LIDARPOOL_MUTANTS": str(folder)}
         subprocess.run([*command, *pytest_options], cwd=root, env=environment, check=False)
+        return cls._merge(root, folder)
+
+    @classmethod
+    def _merge(cls, root: Path, folder: Path) -> "Lines":
+        """Merge what the processes have recorded, and write ``lines.json``."""
         merged = cls([], {}, defaultdict(lambda: defaultdict(set)), {}, {})
         numbers: dict[str, int] = {}
         for path in folder.glob("gw*.json"):

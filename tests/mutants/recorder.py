@@ -54,6 +54,8 @@ def pytest_unconfigure(config: pytest.Config) -> None:
     tests: dict[str, int] = {}
     lines: dict[str, dict[int, list[int]]] = {}
     for path in data.measured_files():
+        if not path.endswith(".py"):  # templates
+            continue
         by_line = defaultdict(list)
         for line, contexts in data.contexts_by_lineno(path).items():
             by_line[line] = [tests.setdefault(name, len(tests)) for name in contexts if name]
