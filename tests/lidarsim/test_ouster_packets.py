@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from tests.captures import variants
 from tests.shapes import Cart, box, wall
 
 from lidarpool import (
@@ -34,7 +35,7 @@ from lidarpool.recordings.opening import open_recording
 from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
-from lidarsim.packets.ouster import PROFILES
+from lidarsim.packets.ouster import LIDAR_PORT, PROFILES
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -675,6 +676,23 @@ def test_ouster_sdk_reads_imu_packets(tmp_path):
 def test_a_recording_has_the_times_of_the_sweeps(tmp_path):
     case = still("os1-32", SINGLE)
     sdk_frames(*encoded(*case[1:]), tmp_path)
+    recording = open_recording(tmp_path / "lidar.pcap")
+    assert list(recording.times()) == [START_NS + n * 1e8 for n in range(3)]
+
+
+@pytest.mark.parametrize("name", ["vlan", "cooked", "cooked 2", "pcapng", "mdns first"])
+def test_ouster_sdk_reads_any_capture(name, tmp_path):
+    sdk()
+    groups, metadata = encoded(*still("os1-32", SINGLE)[1:])
+    packets = [
+        (START_NS + int(time_ns), payload.tobytes())
+        for group in groups
+        if group.port == LIDAR_PORT
+        for time_ns, payload in zip(group.due_ns, group.payloads, strict=True)
+    ]
+    content = variants(packets, LIDAR_PORT)[name]
+    (tmp_path / "lidar.json").write_text(json.dumps(metadata))
+    (tmp_path / "lidar.pcap").write_bytes(content)
     recording = open_recording(tmp_path / "lidar.pcap")
     assert list(recording.times()) == [START_NS + n * 1e8 for n in range(3)]
 
