@@ -307,7 +307,12 @@ class OusterEncoder(PacketEncoder):
         """Raise LidarError unless an Ouster could be the sensor."""
         sensor = self.source.sensor
         head = sensor.head
-        if not isinstance(head, Spin) or isinstance(head, Mirror) or not head.clockwise:
+        if isinstance(head, Mirror):
+            raise self.unusable(
+                "need a head that fires all around: remove the azimuth_window and column_window "
+                "of its metadata"
+            )
+        if not isinstance(head, Spin) or not head.clockwise:
             raise self.unusable("need a head that spins clockwise")
         if head.firings_per_turn not in _COLUMNS or head.rate_hz != int(head.rate_hz):
             raise self.unusable(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -46,6 +47,9 @@ class Calibration:
     range_m: tuple[float, float] | None = None  # shortest and longest, if the file states ranges
     sensor: str = ""  # name of the sensor, if the file states it
     head: dict[str, Any] = field(default_factory=dict)  # fields of `SensorModel`
+    # Part of a revolution in which the unit fires, if not all of it: start and length, as shares of
+    # a revolution from firing 0 on.
+    window: tuple[float, float] | None = None
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -140,8 +144,7 @@ def _ouster(name: str, data: Any) -> Calibration:
         )
     present = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for missing beams
     origin_mm = _ouster_origin_mm(data, beam)
-    mode = str(_ouster_section(data, "config_params", data).get("lidar_mode", "1024x10"))
-    columns, rate = (int(number) for number in mode.split("x"))
+    columns, rate = _ouster_mode(data)
     count = int(present.sum())
     return Calibration(
         name,
@@ -157,7 +160,59 @@ def _ouster(name: str, data: Any) -> Calibration:
             "firings_per_turn": columns,
             "rate_hz": float(rate),
         },
+        window=_ouster_window(data, layout, columns),
     )
+
+
+def _ouster_mode(data: dict[str, Any]) -> tuple[int, int]:
+    """Return the columns of a revolution and the revolutions a second of Ouster's metadata."""
+    mode = str(_ouster_section(data, "config_params", data).get("lidar_mode", "1024x10"))
+    numbers = re.fullmatch(r"([1-9]\d{2,4})x([1-9]\d{0,2})", mode)
+    if numbers is None:
+        raise ValueError(
+            f"its lidar_mode is {printable(mode)!r}; columns and revolutions a second are "
+            "expected, such as 1024x10"
+        )
+    return int(numbers[1]), int(numbers[2])
+
+
+def _ouster_window(
+    data: dict[str, Any], layout: dict[str, Any], columns: int
+) -> tuple[float, float] | None:
+    """Return the window in which an Ouster fires (`Calibration.window`), or None for all columns.
+
+    The window of columns counts; without it, the window of azimuths. Azimuths are counter-clockwise
+    in the lidar frame, in which column 0 is at azimuth 0 and columns follow each other clockwise.
+    Windows whose end is below their start contain column 0, or azimuth 0.
+    """
+    configuration = _ouster_section(data, "config_params", data)
+    if (limits := layout.get("column_window")) is not None:
+        first, last = _limits("column_window", limits, columns - 1)
+        count = (last - first) % columns + 1
+        start = first
+    elif (limits := configuration.get("azimuth_window")) is not None:
+        right, left = _limits("azimuth_window", limits, 360_000)
+        if left - right in (0, 360_000):
+            return None
+        start = -(-columns * (360_000 - left) // 360_000) % columns
+        count = max(columns * ((left - right) % 360_000) // 360_000, 1)
+    else:
+        return None
+    return None if count == columns else (start / columns, count / columns)
+
+
+def _limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
+    """Return the two limits of a window.
+
+    Raises ValueError for other values.
+    """
+    is_pair = isinstance(limits, list) and len(limits) == 2
+    if not is_pair or not all(type(limit) is int and 0 <= limit <= maximum for limit in limits):
+        raise ValueError(
+            f"its {name} is {printable(str(limits), 60)}; two whole numbers from 0 to {maximum:,} "
+            "are expected"
+        )
+    return limits[0], limits[1]
 
 
 def _ouster_section(data: dict[str, Any], name: str, default: Any = None) -> dict[str, Any]:

@@ -484,6 +484,8 @@ def load_sensor(
         sheet = sensor_model.datasheet()
         common_fields |= {"noise": sheet.noise, "returns": sheet.returns}
     head = Spin(firings, step_deg, rate, sensor_model.clockwise, sensor_model.zero_deg)
+    if unit is not None and unit.window is not None:
+        head = head.within(*unit.window)
     if unit is not None and (unit.rays is not None or sensor_model.listed or sensor_model.prisms):
         common_fields["packets"] = sensor_model.packet_settings(np.arange(1))
         return _listed(sensor_model, unit, head, common_fields)
