@@ -233,6 +233,19 @@ def hesai(name="hesai/xt32", off=0.1, count=None):
     return "\n".join(["Channel,Elevation,Azimuth", *lines[:count]])
 
 
+@pytest.mark.parametrize("mark", ["", "eeff,1,0\n", "EEFF\n"])
+@pytest.mark.parametrize("checksum", ["", "\n" + "0a" * 32, "\n" + "0A" * 32 + ",,\n"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_files_as_hesai_writes_them(mark, checksum, newline, tmp_path):
+    """As in HesaiLidar_SDK_2.0: the mark and the checksum are lines around the table."""
+    plain = load_sensor(calibration=write(tmp_path, "a.csv", hesai()))
+    text = f"{mark}{hesai()}{checksum}".replace("\n", newline)
+    sensor = load_sensor(calibration=write(tmp_path, "b.csv", text))
+    assert sensor.channels == 32
+    assert np.array_equal(sensor.beams.elevation, plain.beams.elevation)
+    assert np.array_equal(sensor.beams.azimuth, plain.beams.azimuth)
+
+
 def test_a_calibration_finds_its_model(tmp_path):
     file = write(tmp_path, "pandar.csv", hesai())
     sensor = load_sensor(calibration=file)
@@ -503,9 +516,12 @@ BAD = {
     "many.yaml": (GOOD + "beams: {elevation_deg: {first: 0, last: 1, count: 99999999999}}", "most"),
     "prose.csv": ("dear reader\n1,2", "'dear reader', has no known format"),
     "prose.json": ("{", "Expecting property name"),
-    "mode.json": (json.dumps({**OLD, "lidar_mode": 7}), "not enough values"),
+    "mode.json": (json.dumps({**OLD, "lidar_mode": 7}), "its lidar_mode is '7'"),
     "missing.yml": (VELODYNE + "]", "must have lasers 0 to 1, each once"),
     "key.yml": ("lasers: [{laser_id: 0, vert_correction: 1}]", "'rot_correction' is missing"),
+    "mark.csv": ("eeff", "its second line is ''"),
+    "eeff.csv": ("eeff\n1,2,3", "its second line is '1,2,3'; after a line eeff"),
+    "hash.csv": ("Channel,Elevation,Azimuth\n" + "0a" * 32, "it has no lines of 3 numbers"),
     "gap.csv": ("Channel,Elevation,Azimuth\n1,2,3\n3,2,3", "channels must be 1 to 2"),
     "wide.csv": ("Channel,Elevation,Azimuth\n1,2\n", "lines of 3 numbers"),
     "nan.csv": ("Channel,Elevation,Azimuth\n1,2,3\n2,nan,3", "line 3 has numbers that are not"),

@@ -266,19 +266,26 @@ def _calibration_of(name: str, rays: FiredRays) -> Calibration:
     )
 
 
+# Hesai's own files may begin with a mark and end with a checksum, a SHA-256 of the lines before.
+_HESAI_MARK = "eeff"
+_HESAI_COLUMNS = ["elevation", "azimuth"]  # after the first, Channel or LaserID
+_HESAI_CHECKSUM = re.compile(r"^[0-9a-f]{64}[,\s]*\Z", re.IGNORECASE | re.MULTILINE)
+
+
+def _cells(line: str) -> list[str]:
+    """Return the cells between the commas of a line, in lower case."""
+    return [word.strip().lower() for word in line.split(",")]
+
+
 def _table(name: str, text: str) -> Calibration:
     """Read a comma-separated calibration in the format of its header."""
     if is_ray_table(text):
         return _calibration_of(name, rays_of_text(text))
     if is_livox(text):
         return _livox(name, text)
-    header = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
-    if header[1:] == ["elevation", "azimuth"]:
-        rows = rows_of(text, 1, 3)
-        if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
-            raise ValueError(f"channels must be 1 to {len(rows)}, each once and in order")
-        elevation, azimuth = np.radians(rows[:, 1:]).T
-        return Calibration(name, "hesai", Beams(elevation, -azimuth))
+    header = _cells(text.partition("\n")[0])
+    if header[0] == _HESAI_MARK or header[1:] == _HESAI_COLUMNS:
+        return _hesai(name, text)
     if "elevation_deg" in header:
         names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         unknown = [word for word in header if word not in names]
@@ -307,6 +314,23 @@ def _table(name: str, text: str) -> Calibration:
         ) from None
     elevation, azimuth = np.radians(rows_of(text, 0, 2)).T
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
+
+
+def _hesai(name: str, text: str) -> Calibration:
+    """Return the beams of Hesai's angle corrections, in files of its sensors or of its manuals."""
+    lines = text.splitlines()
+    skip = 2 if _cells(lines[0])[0] == _HESAI_MARK else 1
+    header = lines[skip - 1] if len(lines) >= skip else ""
+    if _cells(header)[1:] != _HESAI_COLUMNS:
+        raise ValueError(
+            f"its second line is {printable(header, 60)!r}; after a line {_HESAI_MARK}, as Hesai "
+            "writes it, Channel,Elevation,Azimuth is expected"
+        )
+    rows = rows_of(_HESAI_CHECKSUM.sub("", text), skip, 3)
+    if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
+        raise ValueError(f"channels must be 1 to {len(rows)}, each once and in order")
+    elevation, azimuth = np.radians(rows[:, 1:]).T
+    return Calibration(name, "hesai", Beams(elevation, -azimuth))
 
 
 def _livox(name: str, text: str) -> Calibration:
