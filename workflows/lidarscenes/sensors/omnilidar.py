@@ -19,10 +19,11 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance, memory_share
 from lidarsim.base.arrays import AnyArray, Floats, Ints
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, converted
 from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import check_input
 from lidarsim.base.words import listed, printable
+from lidarsim.sensor.optics import Optics
 from lidarsim.sensor_files.fired_rays import FiredRays, directions_of
 
 from ..files.child_process import Child
@@ -53,6 +54,7 @@ _WITHOUT_EFFECT = {
     "rotationDirection": None,
     "stateResolutionStep": 1,
     "validEndAzimuthDeg": 360,
+    "waveLengthNm": Optics().wavelength_nm,  # which the scenario has
 }
 _AZIMUTH_TOLERANCE_DEG = 1e-4  # angles are float32
 
@@ -85,12 +87,8 @@ def read_omnilidar(path: Path) -> ReadSensor:
         raise LidarError(f"{path} is OpenUSD, which usd-core reads: {command}.")
     if sys.platform == "win32":  # where a process has no limits of memory
         raise LidarError(f"{path} is OpenUSD, which is not read on Windows.")
-    try:
-        prim = _read_prim(path)
-        return _sensor(prim)
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(getattr(error, "strerror", None) or error).split())
-        raise LidarError(f"{path} is no usable OmniLidar: {reason}.") from error
+    with converted(f"{path} is not a usable OmniLidar"):
+        return _sensor(_read_prim(path))
 
 
 class _Prim(NamedTuple):

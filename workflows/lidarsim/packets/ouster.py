@@ -505,11 +505,12 @@ class OusterDecoder(PacketDecoder):
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, name)
+        with reading(name):
+            input_size(path)
         if find_spec("ouster") is None:
             # ouster-sdk requires old versions of packages that it can do without.
             raise LidarError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
         with reading(name):
-            input_size(path)
             if (metadata := path.with_suffix(".json")).exists():
                 input_size(metadata)
             self._file = self._readable_file(path, metadata)

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
-from ..base.errors import LidarError, message_of
+from ..base.errors import converted
 from ..base.textfile import read_text
 from ..base.words import did_you_mean_each, printable
 from ..base.yamlfile import load_yaml
@@ -25,12 +24,6 @@ from ..sensor_files.livox import is_livox
 from ..sensor_files.livox import rays_of_text as rays_of_livox
 from ..sensor_files.ray_csv import is_ray_table, rays_of_text
 from .beams import Beams
-
-# Errors of files that users write.
-UNUSABLE = (
-    OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
-    yaml.YAMLError, LidarError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,7 +64,7 @@ def read_calibration(path: Path) -> Calibration:
         If the file has none of these formats, or numbers are missing, not finite or in the wrong
         order.
     """
-    try:
+    with converted(f"{path} is not a usable calibration"):
         if path.suffix.lower() not in (".yaml", ".yml", ".json", ".csv"):
             rays = read_rays(path)
             if rays is not None:
@@ -82,8 +75,6 @@ def read_calibration(path: Path) -> Calibration:
         if path.suffix.lower() == ".json":
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
-    except UNUSABLE as error:
-        raise LidarError(f"{path} is not a usable calibration: {message_of(error)}") from error
 
 
 def _velodyne(name: str, data: Any) -> Calibration:

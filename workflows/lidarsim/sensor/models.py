@@ -18,7 +18,7 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import UnitShare
 from ..base.elementary import log1p, sin_cos
 from ..base.error_sentences import sentences
-from ..base.errors import LidarError, message_of
+from ..base.errors import LidarError, converted
 from ..base.input_files import read_input_text
 from ..base.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
 from ..base.plugins import Plugin, find_plugin
@@ -26,7 +26,7 @@ from ..base.validation import checked
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
-from .calibrations import UNUSABLE, Calibration, read_calibration
+from .calibrations import Calibration, read_calibration
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
 from .packet_settings import Identifier, PacketSettings, laser_order
@@ -380,13 +380,11 @@ def _read(path: Path | Traversable) -> SensorModel:
 
     Raises LidarError if the file cannot be used.
     """
-    try:
+    with converted(f"{path} is not a usable model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
         with sentences(SensorModel, path, content):
             return SensorModel.model_validate(content)
-    except UNUSABLE as error:
-        raise LidarError(f"{path} is not a usable model: {message_of(error)}") from error
 
 
 class Datasheet(NamedTuple):
