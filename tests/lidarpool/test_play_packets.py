@@ -481,6 +481,10 @@ def test_the_interface_of_an_ouster_answers_for_a_recording(tmp_path):
     outcome = command("play", tmp_path / "a.pcap", "--as", "packets")
     assert outcome.exit_code == 0, outcome.output
     assert "a.pcap of 192.168.1.200 sends to 127.0.0.1, port 7502; Ouster's HTTP" in outcome.stdout
+    (tmp_path / "a.json").write_text("[" * 100_000)
+    outcome = command("play", tmp_path / "a.pcap", "--as", "packets")
+    assert outcome.exit_code == 0, outcome.output
+    assert "HTTP" not in outcome.stdout
 
 
 @pytest.mark.extended

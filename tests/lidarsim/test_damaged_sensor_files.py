@@ -7,7 +7,6 @@ import json
 import re
 import resource
 import struct
-import sys
 import zipfile
 
 import numpy as np
@@ -16,6 +15,7 @@ import yaml
 from click.testing import CliRunner
 
 from lidarpool.cli.commands import cli
+from lidarpool.recordings.opening import open_recording
 from lidarsim import LidarError, load_sensor
 
 DEEP = 100_000
@@ -184,7 +184,7 @@ def parquet(header=None, rows=9, **columns):
     if header is not None:
         table = table.replace_schema_metadata({b"lidarpool": header})
     file = io.BytesIO()
-    sys.modules["pyarrow.parquet"].write_table(table, file)
+    pytest.importorskip("pyarrow.parquet").write_table(table, file)
     return file.getvalue()
 
 
@@ -215,6 +215,19 @@ def test_damaged_parquet(name, tmp_path, capfd):
     path = tmp_path / "rays.parquet"
     path.write_bytes(make())
     check_refusals(path, says, tmp_path, capfd)
+
+
+def test_a_damaged_cloud_of_parquet_is_refused_in_a_line(tmp_path):
+    pa = pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    path = tmp_path / "cloud.parquet"
+    table = pa.table({axis: np.arange(9.0) for axis in "xyz"})
+    pytest.importorskip("pyarrow.parquet").write_table(table, path)
+    path.write_bytes(flipped(path.read_bytes(), 4))  # the head of the first page
+    with pytest.raises(
+        LidarError, match=r"cloud\.parquet cannot be read: .* page header"
+    ) as raised:
+        open_recording(path).read_points(0)
+    assert len(str(raised.value).splitlines()) == 1
 
 
 def test_the_rows_of_parquet_are_limited_before_they_are_read(tmp_path):

@@ -120,7 +120,7 @@ def explained(failure: str, advice: str = "") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        why = error.strerror or error
+        why = message_of(error).rstrip(".")
         message = f"{failure} ({why}): {advice}." if advice else f"{failure}: {why}."
         raise LidarError(message) from error
 

@@ -107,7 +107,7 @@ def _service_of(recording: PcapRecording) -> Callable[..., Service | None]:
         settings = metadata["config_params"]
         ports = settings["udp_port_lidar"], settings["udp_port_imu"]
         metadata["sensor_info"]["image_rev"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         return lambda *_: None
 
     def make_service(
