@@ -93,11 +93,13 @@ def play(
       lidarpool play drive --as foxglove --loop
     """  # noqa: D301 - click wants the character, not its name
     begin("reading the source")
+    from lidarsim.packets.capture import ENDINGS
+
     from ..base.fork_server import keep_freed_memory
     from ..showing.playback.bridge import BridgeOptions, bridge_class
     from ..showing.playback.player import play_sweeps
     from ..showing.playback.schedule import Schedule
-    from ..showing.playback.sources import CAPTURE_ENDINGS, open_source
+    from ..showing.playback.sources import open_source
     from .terminal import Terminal
 
     keep_freed_memory()
@@ -107,8 +109,7 @@ def play(
     if unknown := [name for name in bridge_settings if name not in kind.settings]:
         raise click.UsageError(f"--{unknown[0]} is not for --as {bridge_name}: leave it out.")
     schedule = Schedule(rate)
-    is_capture = isinstance(source, Path) and source.suffix.lower() in CAPTURE_ENDINGS
-    if bridge_name == _PACKETS and is_capture:
+    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() in ENDINGS:
         if now:
             raise click.UsageError("--now: the stamps of recorded packets are in them.")
         options.refuse_mesh_options(of_mesh, source)

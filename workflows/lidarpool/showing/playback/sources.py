@@ -101,7 +101,7 @@ def open_source(
         if isinstance(source, Path) and source.is_file():
             if source.suffix.lower() in CAPTURE_ENDINGS:
                 raise LidarError(
-                    f"{source} contains packets. Play it with --as packets, or pass a result or a "
+                    f"{source} holds packets: play it with --as packets, or give a result or "
                     "scenario."
                 )
             yield _cast(scenario_job(source, needs, of_mesh, tell), stack)
