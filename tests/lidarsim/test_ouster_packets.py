@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from tests.captures import variants
-from tests.shapes import Cart, box, wall
+from tests.shapes import Cart, box, room, wall
 
 from lidarpool import (
     Fault,
@@ -25,6 +25,7 @@ from lidarpool import (
     Noise,
     Pose,
     Returns,
+    Scanner,
     Scene,
     Sensor,
     Survey,
@@ -595,6 +596,19 @@ def test_modes_and_profiles_that_do_not_fit_are_refused(model, mode, profile, me
 def test_heads_that_no_ouster_has_are_refused(options):
     with pytest.raises(LidarError, match=r"512, 1024, 2048, 4096 columns a turn at a whole"):
         encoder_of(PacketSource(load_sensor("ouster/os1-32", **options), "strongest"))
+
+
+def test_packets_of_a_window_are_refused_and_its_sweeps_are_whole(tmp_path):
+    source = PacketSource(load_sensor("ouster/os1-32"), "strongest")
+    metadata = encoder_of(source).metadata()
+    metadata["lidar_data_format"]["column_window"] = [256, 767]
+    (tmp_path / "os.json").write_text(json.dumps(metadata))
+    sensor = load_sensor(calibration=tmp_path / "os.json")
+    with pytest.raises(LidarError, match="need a head that fires all around: remove the azimuth_"):
+        encoder_of(PacketSource(sensor, "strongest"))
+    cloud = Scanner(room(), sensor, coordinates="sensor").sweep(Pose((0, 0, 1)), number=3)
+    azimuths_deg = np.degrees(np.arctan2(*cloud.positions[:, 1::-1].T))
+    assert len(cloud) == 512 * 32 and np.abs(azimuths_deg).max() < 95  # beams differ by 4 degrees
 
 
 # -- ouster-sdk ----------------------------------------------------------------------------------
