@@ -204,6 +204,15 @@ def test_tables_may_be_written_in_several_ways(campaign, folder, text):
     assert (crate.name, crate.box, crate.at[0].position) == ("A", (1, 2, 3), (1, 2))
 
 
+@pytest.mark.parametrize("cell", ["[" * 100_000, "9" * 5_000])
+def test_cells_that_are_no_values_are_text(campaign, folder, cell):
+    (folder / "crates.csv").write_text(f'name,box,at\nA,{cell},"[[1, 2]]"\n')
+    sample = {"from": "crates.csv", "count": 1}
+    with pytest.raises(LidarError, match=r"crates\.csv, line 2: box is .*; it must be") as raised:
+        campaign({"scene.copies": {"sample": sample}}).check_files()
+    assert len(str(raised.value)) < 3_000
+
+
 def test_columns_of_a_table_are_fields_or_ignored(campaign, folder):
     (folder / "crates.csv").write_text('name,Wood,box,at,wood\nA,oak,"[1, 2, 3]","[[1, 2]]",5\n')
     sample = {"from": "crates.csv", "count": 1}

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from benchmarks.fit_coverage import PLACES, box, place, recorded, street, trial
+from tests.captures import IPV4, MACS, ip_packet, pcap, variants
 
 from lidarpool import (
     LidarError,
@@ -550,25 +551,24 @@ def test_broken_files_are_told_in_a_line(tmp_path, name):
     assert name in str(raised.value) and len(str(raised.value).splitlines()) == 1
 
 
-def test_packets_of_a_velodyne_are_sweeps(tmp_path):
-    """A VLP-16 in the middle of a round room of 5 m, whose channels report 50 of 100."""
-    pytest.importorskip("velodyne_decoder")
-    head = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+def round_room():
+    """Return times and packets of a VLP-16 in the middle of a round room of 5 m."""
     blocks = 12
-    frames = [head]
     for number in range(76 * 4):
         data = b""
         for block in range(blocks):
             azimuth = round((number * blocks + block) * 39.8133) % 36000
             data += struct.pack("<HH", 0xEEFF, azimuth) + struct.pack("<HB", 2500, 50) * 32
         micros = round(number * blocks * 110.592)
-        data += struct.pack("<IBB", micros, 0x37, 0x22)
-        frame = b"\0" * 12 + b"\x08\x00" + b"\x45" + b"\0" * 8 + b"\x11" + b"\0" * 10
-        frame += struct.pack(">HHHH", 2368, 2368, 8 + len(data), 0) + data
-        stamp = divmod(micros, 1_000_000)
-        frames.append(struct.pack("<IIII", *stamp, len(frame), len(frame)) + frame)
-    (tmp_path / "room.pcap").write_bytes(b"".join(frames))
-    opened = open_recording(tmp_path / "room.pcap")
+        yield 1000 * micros, data + struct.pack("<IBB", micros, 0x37, 0x22)
+
+
+def test_packets_of_a_velodyne_are_sweeps(tmp_path):
+    pytest.importorskip("velodyne_decoder")
+    path = tmp_path / "room.pcap"
+    frames = [(time_ns, MACS + IPV4 + ip_packet(data)) for time_ns, data in round_room()]
+    path.write_bytes(pcap(frames))
+    opened = open_recording(path)
     sweep = opened.read_points(1)
     assert opened.count >= 3 and opened.white == 100 and set(sweep.intensities) == {50.0}
     assert len(np.unique(sweep.rings)) == 16
@@ -577,11 +577,35 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     times_s = opened.read(1)[1]["time"]
     assert 0 <= times_s.min() < 0.002 and times_s.max() == pytest.approx(0.1, abs=0.002)
     assert [*opened.times()][1] == pytest.approx(1e8, abs=4e6)  # three packets
-    frame = bytearray(frames[-1])
-    frame[16 + 29] = 7  # the end of the sender's address
-    (tmp_path / "room.pcap").write_bytes(b"".join([*frames, frame]))
-    with pytest.raises(LidarError, match=r"2 units: keep one, tcpdump .* src 0\.0\.0\.0 and"):
-        open_recording(tmp_path / "room.pcap")
+    other = [
+        (time_ns, MACS + IPV4 + ip_packet(data, source=(10, 0, 0, 7)))
+        for time_ns, data in [*round_room()][:120]
+    ]
+    path.write_bytes(pcap(sorted([*frames, *other])))
+    with pytest.raises(
+        LidarError, match=r"sensors 10\.0\.0\.7:2368, 192\.168\.1\.201:2368: choose"
+    ):
+        open_recording(path)
+    counts = [
+        open_recording(path, sensor=f"{address}:2368").count
+        for address in ("192.168.1.201", "10.0.0.7")
+    ]
+    assert counts == [opened.count, 2]
+
+
+ROOM_CAPTURES = variants(round_room())
+
+
+@pytest.mark.parametrize("name", ROOM_CAPTURES)
+def test_a_velodyne_is_read_from_any_capture(name, tmp_path):
+    pytest.importorskip("velodyne_decoder")
+    (tmp_path / "room.pcap").write_bytes(ROOM_CAPTURES[name])
+    opened = open_recording(tmp_path / "room.pcap")
+    (tmp_path / "plain.pcap").write_bytes(ROOM_CAPTURES["plain"])
+    plain = open_recording(tmp_path / "plain.pcap")
+    assert opened.count == plain.count
+    assert np.array_equal(opened.read_points(1).points, plain.read_points(1).points)
+    assert list(opened.times()) == pytest.approx(list(plain.times()), rel=0, abs=2000)
 
 
 @pytest.mark.extended

@@ -191,6 +191,10 @@ def test_fields_of_several_numbers_and_of_the_same_name():
     assert columns["ring"].tolist() == [0, 0] and columns["ring_2"].tolist() == [5, 5]
     with pytest.raises(ValueError, match="its field 'n' has 4,000,000,000 numbers from byte 12 on"):
         point_columns(point_cloud(rows, [*axes, ("n", 12, 7, 4_000_000_000)]))
+    for datatype, count in ((0, 1), (9, 1), (7, 0)):
+        says = f"its field 'n' has datatype {datatype} and count {count}; PointField has datatypes"
+        with pytest.raises(ValueError, match=says):
+            point_columns(point_cloud(rows, [*axes, ("n", 12, datatype, count)]))
 
 
 @pytest.mark.extended

@@ -80,6 +80,16 @@ def test_columns_are_named_by_the_header(tmp_path):
     assert kinds["classification"] == "i" and kinds["intensity"] == "f"
 
 
+@pytest.mark.parametrize("name", ["Points:{}", "Points_m_XYZ:{}"])
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_veloview_names_points_in_two_ways(tmp_path, name, quote):
+    axes = [f"{quote}{name.format(index)}{quote}" for index in range(3)]
+    header = ",".join([f"{quote}intensity{quote}", *axes, f"{quote}laser_id{quote}"])
+    scan = read(tmp_path, "a.csv", f"{header}\n9,1.5,2,-3,7\n8,4,5,6,6\n")
+    assert scan.positions.tolist() == [[1.5, 2, -3], [4, 5, 6]]
+    assert columns_of(scan) == {"intensity": [9, 8], "laser_id": [7, 6]}
+
+
 def test_columns_of_words_are_left_out_and_empty_cells_are_nan(tmp_path):
     text = 'name,x,y,z,i,label\n"a, b",1.5,2,3,,Ground\nc,4,5.25,6,7,\n'
     scan = read(tmp_path, "a.csv", text)

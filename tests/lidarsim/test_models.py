@@ -233,6 +233,19 @@ def hesai(name="hesai/xt32", off=0.1, count=None):
     return "\n".join(["Channel,Elevation,Azimuth", *lines[:count]])
 
 
+@pytest.mark.parametrize("mark", ["", "eeff,1,0\n", "EEFF\n"])
+@pytest.mark.parametrize("checksum", ["", "\n" + "0a" * 32, "\n" + "0A" * 32 + ",,\n"])
+@pytest.mark.parametrize("newline", ["\n", "\r\n"])
+def test_files_as_hesai_writes_them(mark, checksum, newline, tmp_path):
+    """As in HesaiLidar_SDK_2.0: the mark and the checksum are lines around the table."""
+    plain = load_sensor(calibration=write(tmp_path, "a.csv", hesai()))
+    text = f"{mark}{hesai()}{checksum}".replace("\n", newline)
+    sensor = load_sensor(calibration=write(tmp_path, "b.csv", text))
+    assert sensor.channels == 32
+    assert np.array_equal(sensor.beams.elevation, plain.beams.elevation)
+    assert np.array_equal(sensor.beams.azimuth, plain.beams.azimuth)
+
+
 def test_a_calibration_finds_its_model(tmp_path):
     file = write(tmp_path, "pandar.csv", hesai())
     sensor = load_sensor(calibration=file)
@@ -301,6 +314,62 @@ def test_beams_of_ouster_that_are_turned_are_refused(tmp_path):
     }
     with pytest.raises(LidarError, match="beam_to_lidar_transform turns the beams"):
         load_sensor(calibration=write(tmp_path, "os.json", json.dumps(data)))
+
+
+@pytest.mark.parametrize(
+    ("sections", "columns"),
+    [
+        ({"lidar_data_format": {"column_window": [256, 767]}}, range(256, 768)),
+        ({"lidar_data_format": {"column_window": [768, 255]}}, range(768, 1280)),
+        ({"data_format": {"column_window": [10, 10]}}, range(10, 11)),
+        ({"lidar_data_format": {"column_window": [0, 1023]}}, range(1024)),
+        # Counter-clockwise from column 0: the window ahead is 90 to 270 degrees.
+        ({"config_params": {"azimuth_window": [90000, 270000]}}, range(256, 768)),
+        ({"config_params": {"azimuth_window": [270000, 90000]}}, range(768, 1280)),
+        ({"config_params": {"azimuth_window": [0, 360000]}}, range(1024)),
+        (
+            {
+                "config_params": {"azimuth_window": [0, 90000]},
+                "lidar_data_format": {"column_window": [768, 1023]},
+            },
+            range(768, 1024),
+        ),
+    ],
+)
+def test_an_ouster_fires_in_its_window(sections, columns, tmp_path):
+    beams = {"beam_altitude_angles": [10.5, -10.25], "beam_azimuth_angles": [4.0, -1.5]}
+    path = write(tmp_path, "os.json", json.dumps({"beam_intrinsics": beams, **sections}))
+    sensor = load_sensor(calibration=path)
+    full = load_sensor(calibration=write(tmp_path, "all.json", json.dumps(beams)))
+    count = len(columns)
+    steps = sensor.steps_of_revolution(0)
+    assert sensor.period == count == sensor.firings(steps[-1])[1]
+    directions = sensor.directions(np.arange(2 * count))
+    assert np.allclose(directions[:count], full.directions(np.array(columns)), atol=1e-12)
+    assert np.array_equal(directions[count:], directions[:count])
+    times_ns = sensor.begins_ns(np.arange(2 * count))
+    expected_ns = full.begins_ns(np.array(columns)) - full.begins_ns(np.array(columns[:1]))
+    assert times_ns == pytest.approx([*expected_ns, *(expected_ns + 1e8)], abs=1e-3)
+    fewer = load_sensor(calibration=path, columns=512)
+    assert fewer.period == max(count // 2, 1)
+
+
+@pytest.mark.parametrize(
+    ("section", "says"),
+    [
+        ({"lidar_mode": "unknown"}, "its lidar_mode is 'unknown'; columns and revolutions"),
+        ({"lidar_mode": "1024x"}, "its lidar_mode is '1024x'; columns and revolutions"),
+        ({"lidar_mode": "0x10"}, "its lidar_mode is '0x10'; columns and revolutions"),
+        ({"azimuth_window": [0, 400000]}, "its azimuth_window is .* from 0 to 360,000 are"),
+        ({"azimuth_window": "all"}, "its azimuth_window is all; two whole numbers"),
+        ({"data_format": {"column_window": [0, 1024]}}, "its column_window is .* 0 to 1,023 are"),
+        ({"data_format": {"column_window": [0.5, 9]}}, "its column_window is .* two whole"),
+    ],
+)
+def test_modes_and_windows_of_ouster_that_are_not_understood(section, says, tmp_path):
+    path = write(tmp_path, "os.json", json.dumps({**OLD, **section}))
+    with pytest.raises(LidarError, match=f"os.json is not a usable calibration: {says}"):
+        load_sensor(calibration=path)
 
 
 OLD = {"beam_altitude_angles": [10.5, 1.0, -10.25], "beam_azimuth_angles": [4.0, 0.0, -1.5]}
@@ -447,9 +516,12 @@ BAD = {
     "many.yaml": (GOOD + "beams: {elevation_deg: {first: 0, last: 1, count: 99999999999}}", "most"),
     "prose.csv": ("dear reader\n1,2", "'dear reader', has no known format"),
     "prose.json": ("{", "Expecting property name"),
-    "mode.json": (json.dumps({**OLD, "lidar_mode": 7}), "not enough values"),
+    "mode.json": (json.dumps({**OLD, "lidar_mode": 7}), "its lidar_mode is '7'"),
     "missing.yml": (VELODYNE + "]", "must have lasers 0 to 1, each once"),
     "key.yml": ("lasers: [{laser_id: 0, vert_correction: 1}]", "'rot_correction' is missing"),
+    "mark.csv": ("eeff", "its second line is ''"),
+    "eeff.csv": ("eeff\n1,2,3", "its second line is '1,2,3'; after a line eeff"),
+    "hash.csv": ("Channel,Elevation,Azimuth\n" + "0a" * 32, "it has no lines of 3 numbers"),
     "gap.csv": ("Channel,Elevation,Azimuth\n1,2,3\n3,2,3", "channels must be 1 to 2"),
     "wide.csv": ("Channel,Elevation,Azimuth\n1,2\n", "lines of 3 numbers"),
     "nan.csv": ("Channel,Elevation,Azimuth\n1,2,3\n2,nan,3", "line 3 has numbers that are not"),

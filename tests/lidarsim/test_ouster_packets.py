@@ -13,7 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from tests.shapes import Cart, box, wall
+from tests.captures import variants
+from tests.shapes import Cart, box, room, wall
 
 from lidarpool import (
     Fault,
@@ -24,6 +25,7 @@ from lidarpool import (
     Noise,
     Pose,
     Returns,
+    Scanner,
     Scene,
     Sensor,
     Survey,
@@ -34,7 +36,7 @@ from lidarpool.recordings.opening import open_recording
 from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
-from lidarsim.packets.ouster import PROFILES
+from lidarsim.packets.ouster import LIDAR_PORT, PROFILES
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -596,6 +598,19 @@ def test_heads_that_no_ouster_has_are_refused(options):
         encoder_of(PacketSource(load_sensor("ouster/os1-32", **options), "strongest"))
 
 
+def test_packets_of_a_window_are_refused_and_its_sweeps_are_whole(tmp_path):
+    source = PacketSource(load_sensor("ouster/os1-32"), "strongest")
+    metadata = encoder_of(source).metadata()
+    metadata["lidar_data_format"]["column_window"] = [256, 767]
+    (tmp_path / "os.json").write_text(json.dumps(metadata))
+    sensor = load_sensor(calibration=tmp_path / "os.json")
+    with pytest.raises(LidarError, match="need a head that fires all around: remove the azimuth_"):
+        encoder_of(PacketSource(sensor, "strongest"))
+    cloud = Scanner(room(), sensor, coordinates="sensor").sweep(Pose((0, 0, 1)), number=3)
+    azimuths_deg = np.degrees(np.arctan2(*cloud.positions[:, 1::-1].T))
+    assert len(cloud) == 512 * 32 and np.abs(azimuths_deg).max() < 95  # beams differ by 4 degrees
+
+
 # -- ouster-sdk ----------------------------------------------------------------------------------
 
 
@@ -675,6 +690,23 @@ def test_ouster_sdk_reads_imu_packets(tmp_path):
 def test_a_recording_has_the_times_of_the_sweeps(tmp_path):
     case = still("os1-32", SINGLE)
     sdk_frames(*encoded(*case[1:]), tmp_path)
+    recording = open_recording(tmp_path / "lidar.pcap")
+    assert list(recording.times()) == [START_NS + n * 1e8 for n in range(3)]
+
+
+@pytest.mark.parametrize("name", ["vlan", "cooked", "cooked 2", "pcapng", "mdns first"])
+def test_ouster_sdk_reads_any_capture(name, tmp_path):
+    sdk()
+    groups, metadata = encoded(*still("os1-32", SINGLE)[1:])
+    packets = [
+        (START_NS + int(time_ns), payload.tobytes())
+        for group in groups
+        if group.port == LIDAR_PORT
+        for time_ns, payload in zip(group.due_ns, group.payloads, strict=True)
+    ]
+    content = variants(packets, LIDAR_PORT)[name]
+    (tmp_path / "lidar.json").write_text(json.dumps(metadata))
+    (tmp_path / "lidar.pcap").write_bytes(content)
     recording = open_recording(tmp_path / "lidar.pcap")
     assert list(recording.times()) == [START_NS + n * 1e8 for n in range(3)]
 

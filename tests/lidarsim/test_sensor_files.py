@@ -17,7 +17,9 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from click.testing import CliRunner
 
+from lidarpool.cli.commands import cli
 from lidarpool.cli.import_plugins import import_whole
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -330,7 +332,9 @@ def test_omnilidar_has_attributes_of_the_schema_and_reads_back(model, frames, tm
     assert angle_deg(back.rays.directions, file.rays.directions) < 1e-5
     assert np.array_equal(back.rays.times_ns, file.rays.times_ns)
     assert back.rays.range_m == pytest.approx(file.rays.range_m)
-    assert back.left_out == ["its channels: a list of rays has one"]
+    wavelength = values[f"{CORE}waveLengthNm"]
+    others = [] if wavelength == 905 else [f"waveLengthNm = {wavelength:g}"]  # 905 is the default
+    assert back.left_out == ["its channels: a list of rays has one", *others]
 
 
 ROTARY = """#usda 1.0
@@ -368,6 +372,69 @@ def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
     path.write_text('#usda 1.0\ndef Xform "World" {}\n')
     with pytest.raises(LidarError, match="it has no OmniLidar prim"):
         read_omnilidar(path)
+
+
+@pytest.mark.parametrize(
+    ("window", "lowest_deg", "highest_deg", "rays"),
+    [
+        ((-135, 135), -135, 135, 542),  # ticks of a degree, with emitters at 0 and 1 degree
+        ((0, 180), 0, 180, 362),
+        ((300, 60), -60, 60, 242),
+        ((-360, 360), -179, 180, 720),
+    ],
+)
+def test_rotary_omnilidars_return_within_a_window(window, lowest_deg, highest_deg, rays, tmp_path):
+    pytest.importorskip("pxr", reason='needs usd-core: pip install "lidarpool[usd]"')
+    names = ("validStartAzimuthDeg", "validEndAzimuthDeg")
+    lines = [f"float {CORE}{name} = {value}" for name, value in zip(names, window, strict=True)]
+    path = tmp_path / "lidar.usda"
+    path.write_text(ROTARY.format("\n".join(lines)))
+    sensor = read_omnilidar(path)
+    azimuths_deg = np.round(sensor.rays.azimuths_deg) % 360
+    azimuths_deg = np.where(azimuths_deg > 180, azimuths_deg - 360, azimuths_deg)
+    assert (azimuths_deg.min(), azimuths_deg.max()) == (lowest_deg, highest_deg)
+    assert len(sensor.rays) == rays and sensor.rays.cycle_ns == 1e8
+    assert sensor.left_out == ["its channels: a list of rays has one"]
+
+
+def test_attributes_of_an_omnilidar_that_are_not_read_are_listed(tmp_path):
+    pytest.importorskip("pxr", reason='needs usd-core: pip install "lidarpool[usd]"')
+    lines = """
+    float omni:sensor:Core:azimuthErrorMean = 0.5
+    float omni:sensor:Core:azimuthErrorStd = 0.025
+    float omni:sensor:Core:rangeOffset = 0.1
+    float omni:sensor:Core:elevationErrorMean = 0
+    token omni:sensor:Core:rayType = "IDEALIZED"
+    bool omni:sensor:Core:skipDroppingInvalidPoints = true
+    float[] omni:sensor:Core:intensityMapping = [0.5, 1]
+    string[] omni:sensor:Core:tags = ["a"]
+    float omni:sensor:Core:startAzimuthOffsetDeg = 90
+    """
+    path = tmp_path / "lidar.usda"
+    listed = [
+        "azimuthErrorMean = 0.5", "azimuthErrorStd = 0.025", "rangeOffset = 0.1",
+        "rayType = IDEALIZED", "skipDroppingInvalidPoints = True",
+        "intensityMapping = 2 values", "tags = 1 values",
+    ]  # fmt: skip
+    path.write_text(ROTARY.format(lines))
+    sensor = read_omnilidar(path)
+    assert sorted(sensor.left_out[1:]) == sorted(listed)
+    assert sensor.rays.azimuths_deg[0] == pytest.approx(90)
+    solid = ROTARY.replace('"ROTARY"', '"SOLID_STATE"')
+    path.write_text(solid.format(f"{lines} float {CORE}validEndAzimuthDeg = 180"))
+    more = ["startAzimuthOffsetDeg = 90", "validEndAzimuthDeg = 180"]
+    assert sorted(read_omnilidar(path).left_out[1:]) == sorted([*listed, *more])
+    window = f"float {CORE}validStartAzimuthDeg = 0.2 \n float {CORE}validEndAzimuthDeg = 0.7"
+    path.write_text(ROTARY.format(window))
+    with pytest.raises(LidarError, match=r"no ray is between azimuths 0\.2 and 0\.7 degrees"):
+        read_omnilidar(path)
+
+
+def test_an_imported_list_of_rays_counts_as_a_sensor(tmp_path):
+    export_sensor(load_sensor("livox/mid360"), tmp_path / "a.csv", format="livox", seconds=0.01)
+    arguments = ["import", str(tmp_path / "a.csv"), "-o", str(tmp_path / "out")]
+    outcome = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    assert "scenario.yaml: 1 sensor, 0 mesh files" in outcome.output
 
 
 def sensor_of_scanner(path, folder):

@@ -81,7 +81,7 @@ def play(
     """Play a result or scenario as its sensors would send the sweeps, at their own times.
 
     SOURCE: the folder of a result; a scenario, campaign or mesh file, whose sweeps are cast as they
-    are due; or packets in a .pcap file.
+    are due; or packets in a .pcap or .pcapng file.
 
     \b
     Examples:
@@ -93,11 +93,13 @@ def play(
       lidarpool play drive --as foxglove --loop
     """  # noqa: D301 - click wants the character, not its name
     begin("reading the source")
+    from lidarsim.packets.capture import ENDINGS
+
     from ..base.fork_server import keep_freed_memory
     from ..showing.playback.bridge import BridgeOptions, bridge_class
     from ..showing.playback.player import play_sweeps
     from ..showing.playback.schedule import Schedule
-    from ..showing.playback.sources import RECORDING, open_source
+    from ..showing.playback.sources import open_source
     from .terminal import Terminal
 
     keep_freed_memory()
@@ -107,7 +109,7 @@ def play(
     if unknown := [name for name in bridge_settings if name not in kind.settings]:
         raise click.UsageError(f"--{unknown[0]} is not for --as {bridge_name}: leave it out.")
     schedule = Schedule(rate)
-    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() == RECORDING:
+    if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() in ENDINGS:
         if now:
             raise click.UsageError("--now: the stamps of recorded packets are in them.")
         options.refuse_mesh_options(of_mesh, source)
@@ -138,9 +140,12 @@ def _play_recording(
     from ..showing.playback.transmitter import Transmitter
     from .terminal import Terminal
 
+    terminal = Terminal()
     recording = PcapRecording(path)
+    for note in recording.notes:
+        terminal.tell(note)
     streams = recorded_streams(recording, to, settings.get("api", ()))
-    transmitter = Transmitter(streams, Terminal().tell, settings.get("lateness"))
+    transmitter = Transmitter(streams, terminal.tell, settings.get("lateness"))
     with _summarized(lambda: transmitter.summary), transmitter:
         click.echo(f"ready: {transmitter.description}; Ctrl-C stops")
         play_recording(recording, transmitter, schedule, loop=loop)

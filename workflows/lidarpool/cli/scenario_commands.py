@@ -146,6 +146,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     from ..scenario.build import build
     from ..scenario.point_scene import surfels
     from ..scenario.scenario import Scenario
+    from ..scenario.sections import SensorSection
     from .import_plugins import SCENARIO_FILE, import_by, import_whole, importer_of, is_mujoco_model
 
     def check(path: Path) -> None:
@@ -166,7 +167,8 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
         left_out = import_survey(survey, folder, assets, check=check, surfels=surfels).left_out
     file = folder / SCENARIO_FILE
     scenario = Scenario.load(file)
-    sensors = plural(len(scenario.sensors), "sensor")
+    own_sensors = len(scenario.sensors) or int(scenario.sensor != SensorSection())
+    sensors = plural(own_sensors, "sensor")
     files = plural(len(scenario.scene.files), "mesh file")
     click.echo(f"{click.format_filename(file)}: {sensors}, {files}")
     for line in left_out:

@@ -370,7 +370,7 @@ FORMATS = {
         needs=("scan", *_ALL_RAYS),
         holds=("scan", "sensor", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
         inside=r"[^/]+\.(pcap|json)",
-        suffixes=(".pcap", ".osf"),
+        suffixes=(".pcap", ".pcapng", ".osf"),
         reads=("sweeps",),
     ),
     "rrd": FormatRow(

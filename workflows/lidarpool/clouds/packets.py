@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidarsim.base.extras import reading
-from lidarsim.base.input_files import open_input
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_of
 from lidarsim.packets.pcap import PcapWriter
@@ -21,7 +19,6 @@ from lidarsim.sweeps.sweeps import Sweeps, plain_names
 from .recording import Read, Recording, RecordingSource, positions_of
 
 _FORMAT = "pcap"
-_HEADER_BYTES = 24  # bytes of the header of a file, and 8 of the stamp of its first packet
 
 
 def with_packet_columns(survey: Survey, formats: Collection[str]) -> Survey:
@@ -74,10 +71,7 @@ def write_pcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 def open_file(source: RecordingSource) -> Recording:
     """Open the packets of a sensor by the decoder of its maker."""
-    with reading(source.name), open_input(source.path) as file:
-        file.seek(_HEADER_BYTES + 8)
-        frame = file.read(60)
-    decoder = decoder_of(source.path, source.name, frame)
+    decoder = decoder_of(source.path, source.name)
     sensor = [*decoder.sensors].index(source.choose("sensors", decoder.sensors))
 
     def points(sweep: Any) -> Read:
@@ -86,4 +80,10 @@ def open_file(source: RecordingSource) -> Recording:
 
     sweeps = partial(decoder.sweeps, sensor)
     white = WHITE if source.intensity in (None, decoder.intensity) else None
-    return source.stream(sweeps, points, white=white, times=lambda: map(decoder.time_ns, sweeps()))
+    return source.stream(
+        sweeps,
+        points,
+        white=white,
+        times=lambda: map(decoder.time_ns, sweeps()),
+        notes=source.named(decoder.notes),
+    )

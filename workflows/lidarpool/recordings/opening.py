@@ -18,8 +18,8 @@ from ..datasets.loader import sweeps
 
 KINDS = (
     "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .xyz, .txt, "
-    ".asc, .csv, .pts, .ptx, .npy, .bin of KITTI or nuScenes, .pcap of Velodyne or Ouster, .osf, a "
-    "bag of ROS 2, or a folder of KITTI, nuScenes, WebDataset or range images"
+    ".asc, .csv, .pts, .ptx, .npy, .bin of KITTI or nuScenes, .pcap or .pcapng of Velodyne or "
+    "Ouster, .osf, a bag of ROS 2, or a folder of KITTI, nuScenes, WebDataset or range images"
 )
 _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
     ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",

@@ -625,11 +625,12 @@ def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
 def _value(cell: str) -> Any:
     """Return the value of a cell: a number, truth value, list, mapping or text."""
     if _INTEGER.fullmatch(cell):
-        return int(cell)
+        with suppress(ValueError):  # for thousands of digits
+            return int(cell)
     if _REAL.fullmatch(cell):
         return float(cell)
     if cell[0] in "[{":
-        with suppress(ValueError):
+        with suppress(ValueError, RecursionError):
             return json.loads(cell)  # a hundred times as fast as YAML
         with suppress(yaml.YAMLError, ValueError, OverflowError, RecursionError):
             return load_yaml(cell)

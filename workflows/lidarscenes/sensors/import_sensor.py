@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from lidarsim.base.errors import LidarError, message_of
+from lidarsim.base.errors import LidarError, converted
 from lidarsim.sensor_files import ray_npz
 from lidarsim.sensor_files.fired_rays import FiredRays
 from lidarsim.sensor_files.format_table import read_rays
@@ -78,10 +78,8 @@ def _read(path: Path) -> ReadSensor:
     """
     if path.suffix.lower() in USD_ENDINGS:
         return read_omnilidar(path)
-    try:
+    with converted("it has no rays of a sensor"):
         rays = read_rays(path)
-    except (OSError, ValueError) as error:
-        raise LidarError(f"it has no rays of a sensor: {message_of(error)}") from error
     if rays is None:
         raise LidarError("it has no rays of a sensor, with azimuths and elevations or directions.")
     channels = int(rays.channels.max()) + 1

@@ -1,15 +1,17 @@
 """OmniLidar prims of Isaac Sim and Omniverse as rays: `omnilidar_child.py` reads the files.
 
 Attributes by the extension omni.sensors.nv.lidar, "Setting Lidar Attributes". Azimuths are taken
-counter-clockwise from x, where x is forward, y left and z up.
+counter-clockwise from x, where x is forward, y left and z up. Attributes that are not read are
+listed, unless they have no effect.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,21 +19,44 @@ import numpy as np
 
 from lidarsim.base.allowance import Allowance, memory_share
 from lidarsim.base.arrays import AnyArray, Floats, Ints
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, converted
 from lidarsim.base.extras import install_command
 from lidarsim.base.input_files import check_input
-from lidarsim.base.words import listed
+from lidarsim.base.words import listed, printable
+from lidarsim.sensor.optics import Optics
 from lidarsim.sensor_files.fired_rays import FiredRays, directions_of
 
 from ..files.child_process import Child
 from ..files.usd import USD_CORE_BYTES
 
-CORE = "omni:sensor:Core:"
+_SENSOR = "omni:sensor:"
+CORE = f"{_SENSOR}Core:"
 _STATE = f"{CORE}emitterState:"
 _MAX_RAYS = 20_000_000
 # Attributes of a state that are understood, and those that do not change rays.
 _READ = ("azimuthDeg", "elevationDeg", "fireTimeNs")
 _OF_NO_RAY = ("channelId", "bank", "rangeId", "roi", "isROIState", "reportRateDiv")
+# Attributes of the model that are understood, of all lidars and of rotary ones alone.
+_MODEL_READ = ("scanType", "scanRateBaseHz", "nearRangeM", "farRangeM")
+_ROTARY_READ = (
+    "patternFiringRateHz", "reportRateBaseHz", "rotationDirection", "stateResolutionStep",
+    "startAzimuthOffsetDeg", "validStartAzimuthDeg", "validEndAzimuthDeg",
+)  # fmt: skip
+# Attributes that repeat what the emitter states and rates say, or name the sensor.
+_REDUNDANT = (
+    "emitterStateCount", "numberOfEmitters", "numberOfChannels", "numLines", "numRaysPerLine",
+)  # fmt: skip
+_NAMES = ("marketName", "modelName", "modelVendor", "modelVersion", "tickRate")
+# Attributes that have no effect at these values, besides zero.
+_WITHOUT_EFFECT = {
+    "patternFiringRateHz": None,  # of a solid-state lidar, whose scans have their own rate
+    "reportRateBaseHz": None,
+    "rotationDirection": None,
+    "stateResolutionStep": 1,
+    "validEndAzimuthDeg": 360,
+    "waveLengthNm": Optics().wavelength_nm,  # which the scenario has
+}
+_AZIMUTH_TOLERANCE_DEG = 1e-4  # angles are float32
 
 
 class ReadSensor(NamedTuple):
@@ -62,12 +87,8 @@ def read_omnilidar(path: Path) -> ReadSensor:
         raise LidarError(f"{path} is OpenUSD, which usd-core reads: {command}.")
     if sys.platform == "win32":  # where a process has no limits of memory
         raise LidarError(f"{path} is OpenUSD, which is not read on Windows.")
-    try:
-        prim = _read_prim(path)
-        return _sensor(prim)
-    except (OSError, ValueError) as error:
-        reason = " ".join(str(getattr(error, "strerror", None) or error).split())
-        raise LidarError(f"{path} is no usable OmniLidar: {reason}.") from error
+    with converted(f"{path} is not a usable OmniLidar"):
+        return _sensor(_read_prim(path))
 
 
 class _Prim(NamedTuple):
@@ -126,7 +147,7 @@ def _sensor(prim: _Prim) -> ReadSensor:
         range_m=(prim.number("nearRangeM", 0.0), prim.number("farRangeM", np.inf)),
         name=str(prim.values.get("omni:sensor:modelName", "")) or "OmniLidar",
     )
-    return ReadSensor(rays, [*_left_out(prim, states)])
+    return ReadSensor(rays, [*_left_out(prim, states, kind)])
 
 
 class _State(NamedTuple):
@@ -187,9 +208,9 @@ def _solid_state(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
 
 
 def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
-    """Return the rays of the ticks of a scan.
+    """Return the rays of the ticks of a scan, within the window of azimuths.
 
-    Raises ValueError without a rate of ticks.
+    Raises ValueError without a rate of ticks, or if no ray is within the window.
     """
     tick_hz = prim.number("patternFiringRateHz", 0) or prim.number("reportRateBaseHz", 0)
     if not tick_hz > 0:
@@ -202,7 +223,7 @@ def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
     hold = max(int(prim.number("stateResolutionStep", 1)), 1)
     start_deg = prim.number("startAzimuthOffsetDeg", 0.0)
     chosen = [states[tick // hold % len(states)] for tick in range(ticks)]
-    return _Pattern(
+    pattern = _Pattern(
         np.concatenate(
             [start_deg + tick * step_deg + state.azimuths_deg for tick, state in enumerate(chosen)]
         ),
@@ -212,9 +233,37 @@ def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
         ),
         1e9 / rate_hz,
     )
+    return _within_window(prim, pattern)
 
 
-def _left_out(prim: _Prim, states: list[_State]) -> list[str]:
+def _within_window(prim: _Prim, pattern: _Pattern) -> _Pattern:
+    """Return the rays within the azimuths from which a rotary lidar accepts returns.
+
+    A window whose end is below its start contains azimuth 0, as from 300 to 60 degrees.
+
+    Raises ValueError if no ray is within the window.
+    """
+    start_deg = prim.number("validStartAzimuthDeg", 0.0)
+    end_deg = prim.number("validEndAzimuthDeg", 360.0)
+    if not isfinite(start_deg) or not isfinite(end_deg):
+        raise ValueError("validStartAzimuthDeg or validEndAzimuthDeg is not finite")
+    width_deg = end_deg - start_deg
+    if width_deg >= 360:
+        return pattern
+    width_deg %= 360
+    past_start_deg = (pattern.azimuths_deg - start_deg + _AZIMUTH_TOLERANCE_DEG) % 360
+    inside = past_start_deg <= width_deg + 2 * _AZIMUTH_TOLERANCE_DEG
+    if not inside.any():
+        raise ValueError(f"no ray is between azimuths {start_deg:g} and {end_deg:g} degrees")
+    return _Pattern(
+        pattern.azimuths_deg[inside],
+        pattern.elevations_deg[inside],
+        pattern.times_ns[inside],
+        pattern.cycle_ns,
+    )
+
+
+def _left_out(prim: _Prim, states: list[_State], kind: str) -> list[str]:
     """Return what is not as in the other program, a clause each."""
     clauses = []
     if prim.paths[1:]:
@@ -224,11 +273,28 @@ def _left_out(prim: _Prim, states: list[_State]) -> list[str]:
         clauses.append(f"{listed(others)} of its emitters")
     if len(states[0].azimuths_deg) > 1:
         clauses.append("its channels: a list of rays has one")
-    noise = [name for name in ("azimuthErrorStd", "elevationErrorStd", "rangeAccuracyM")
-             if prim.number(name, 0.0)]  # fmt: skip
-    if noise:
-        clauses.append(f"noise: {listed(noise)}")
+    clauses += [f"{name} = {value}" for name, value in _unread(prim, kind)]
     return clauses
+
+
+def _unread(prim: _Prim, kind: str) -> Iterator[tuple[str, str]]:
+    """Yield the attributes of the model that are not read but may change its points, with values.
+
+    Attributes of zero, or of another value without effect, are left out.
+    """
+    rotary = kind == "ROTARY"
+    read = {
+        *(f"{CORE}{name}" for name in (*_MODEL_READ, *_REDUNDANT, *_ROTARY_READ * rotary)),
+        *(f"{_SENSOR}{name}" for name in _NAMES),
+    }
+    for name, value in prim.values.items():
+        own = name.removeprefix(_SENSOR).removeprefix("Core:")
+        neutral = _WITHOUT_EFFECT.get(own, 0)
+        if name not in read and value and neutral is not None and value != neutral:
+            yield own, f"{value:g}" if isinstance(value, float) else printable(str(value))
+    for name, array in prim.arrays.items():
+        if name not in read and not name.startswith(_STATE) and (array != 0).any():
+            yield name.removeprefix(_SENSOR).removeprefix("Core:"), f"{array.size} values"
 
 
 def _used_arrays(arrays: Mapping[str, AnyArray]) -> list[str]:

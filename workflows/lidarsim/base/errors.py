@@ -75,6 +75,26 @@ def message_of(error: Exception) -> str:
     return " ".join(message.split()).rstrip(".") + "."
 
 
+def reason_of(error: Exception) -> str:
+    """Return why a file cannot be read, from an error of any class: a clause without a period.
+
+    Examples
+    --------
+    >>> reason_of(TypeError("'NoneType' object is not iterable"))
+    "its content is not as its format says, 'NoneType' object is not iterable"
+    >>> reason_of(RecursionError("maximum recursion depth exceeded"))
+    'its content is nested too deeply'
+    """
+    if isinstance(error, RecursionError):
+        return "its content is nested too deeply"
+    reason = type(error).__name__
+    if str(error):
+        reason = printable(message_of(error), _MAX_REASON).rstrip(".")
+    if isinstance(error, _UNFORESEEN):  # whose messages speak of Python, not of the file
+        reason = f"its content is not as its format says, {reason}"
+    return reason
+
+
 def unreadable(subject: object, error: Exception, advice: str = "") -> str:
     """Return a sentence on the error, of any class, of reading a file.
 
@@ -86,11 +106,7 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
     'a.stl is cut short (line 7 is the last): export it again.'
     """
     failure = "is cut short" if isinstance(error, CutShortError) else "cannot be read"
-    reason = type(error).__name__
-    if str(error):
-        reason = printable(message_of(error), _MAX_REASON).rstrip(".")
-    if isinstance(error, _UNFORESEEN):  # whose messages speak of Python, not of the file
-        reason = f"its content is not as its format says, {reason}"
+    reason = reason_of(error)
     return (
         f"{subject} {failure} ({reason}): {advice}."
         if advice
@@ -104,9 +120,24 @@ def explained(failure: str, advice: str = "") -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        why = error.strerror or error
+        why = message_of(error).rstrip(".")
         message = f"{failure} ({why}): {advice}." if advice else f"{failure}: {why}."
         raise LidarError(message) from error
+
+
+@contextmanager
+def converted(failure: str) -> Iterator[None]:
+    """Turn an error of any class in the body into a LidarError: the failure, and the reason.
+
+    For files that users give, whose readers and libraries raise errors of many classes.
+    """
+    try:
+        yield
+    except Exception as error:
+        reason = (
+            message_of(error).rstrip(".") if isinstance(error, LidarError) else reason_of(error)
+        )
+        raise LidarError(f"{failure}: {reason}.") from error
 
 
 @contextmanager

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-from .errors import LidarError, prefixed, unreadable
+from .errors import LidarError, message_of, prefixed, unreadable
 
 CHECKOUT = "lidarpool's checkout (docs/install.md#extras)"
 
@@ -47,6 +47,7 @@ def reading(name: str) -> Iterator[None]:
         raise
     except OSError as error:
         file = "" if error.filename in (None, name) else f", {error.filename}"
-        raise LidarError(f"{name} cannot be read: {error.strerror or error}{file}.") from error
+        reason = message_of(error).rstrip(".")
+        raise LidarError(f"{name} cannot be read: {reason}{file}.") from error
     except Exception as error:  # libraries raise errors of any class
         raise LidarError(unreadable(name, error)) from error

@@ -112,7 +112,7 @@ def message_types() -> Typestore:
 def point_columns(data: bytes) -> dict[str, AnyArray]:
     """Return the fields of a PointCloud2, {name: (n,)}.
 
-    Raises ValueError if its lengths disagree.
+    Raises ValueError if its lengths disagree, or a field has no type or count.
 
     A field of several numbers is the columns `name_0`, `name_1`, …; the second field of a name is
     `name_2`.
@@ -121,6 +121,12 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
     kinds = {number: kind for kind, number in POINT_FIELDS.items()}
     order = ">" if message.is_bigendian else "<"
     for field in message.fields:
+        if field.datatype not in kinds or not field.count:
+            raise ValueError(
+                f"its field {printable(field.name)!r} has datatype {field.datatype} and count "
+                f"{field.count}; PointField has datatypes 1 to {len(kinds)} and a count of 1 or "
+                "more. Record it again with a driver that sets both"
+            )
         if field.offset + field.count > message.point_step:  # each number has a byte or more
             raise ValueError(
                 f"its field {printable(field.name)!r} has {field.count:,} numbers from byte "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +19,7 @@ from ..sensor import Sensor
 from ..sensor.packet_settings import Identifier, PacketSettings
 from ..sweeps.instruments import Instruments
 from ..sweeps.sweeps import Sweeps
+from .capture import ENDINGS, Capture
 from .service import Destination, Service
 from .shots import Shots, settings_of
 
@@ -202,8 +203,9 @@ class PacketDecoder(ABC):
     """
 
     intensity: ClassVar[str] = ""  # column that is `WHITE` for a white surface, at any range
-    refusal: ClassVar[str] = ""  # what the file has and why it is not read, if it is not
+    refusal: ClassVar[str] = ""  # what the file contains and what to do, if it is not read
     sensors: Sequence[str] = ("",)  # names of the sensors in the file; "" for an only one
+    notes: Sequence[str] = ()  # clauses that follow the name of the file
 
     def __init__(self, path: Path, name: str) -> None:
         self.path = path
@@ -211,11 +213,8 @@ class PacketDecoder(ABC):
 
     @staticmethod
     @abstractmethod
-    def reads(path: Path, frame: bytes) -> bool:
-        """Return whether a file is of this maker.
-
-        `frame` begins with the size of its first Ethernet frame, 4 bytes, and the original size.
-        """
+    def recognizes(payload: bytes) -> bool:
+        """Return whether a UDP datagram is a packet of this maker."""
 
     @abstractmethod
     def sweeps(self, sensor: int) -> Iterable[Any]:
@@ -230,6 +229,7 @@ class PacketDecoder(ABC):
         """Return the start of a sweep, nanoseconds."""
 
 
+_OUSTER = "lidarsim.packets.ouster:OusterDecoder"
 WHITE = 100.0  # intensity that Velodyne and Ouster report of a white surface at any range
 
 # {format of packets: module and class of its encoder}
@@ -242,24 +242,45 @@ ENCODERS = {
 }
 
 
-# Classes of decoders, in the order of asking them: packets of Ouster have no mark.
+# Classes of decoders, in the order in which they are asked.
 _DECODERS = (
     "lidarsim.packets.velodyne:VelodyneDecoder",
     "lidarsim.packets.hesai:HesaiDecoder",
-    "lidarsim.packets.ouster:OusterDecoder",
+    "lidarsim.packets.robosense:RobosenseDecoder",
+    "lidarsim.packets.livox:LivoxDecoder",
+    _OUSTER,
 )
 
 
-def decoder_of(path: Path, name: str, frame: bytes) -> PacketDecoder:
-    """Return the decoder of a file by its first frame, for the file's `name` in messages.
+def decoder_of(path: Path, name: str) -> PacketDecoder:
+    """Return the decoder of a file, for the file's `name` in messages.
+
+    The first packet that a decoder recognizes decides, because captures also contain datagrams of
+    other programs.
 
     Raises
     ------
     LidarError
         If the packets of the file are not read, or a package that reads them is not installed.
     """
-    classes: Iterator[type[PacketDecoder]] = map(_imported, _DECODERS)
-    decoder = next(decoder for decoder in classes if decoder.reads(path, frame))
+    if path.suffix.lower() not in ENDINGS:  # a recording of Ouster's software
+        return _decoder(_imported(_OUSTER), path, name)
+    classes: list[type[PacketDecoder]] = [_imported(entry) for entry in _DECODERS]
+    for datagram in Capture(path, name).datagrams():
+        for decoder in classes:
+            if decoder.recognizes(datagram.payload):
+                return _decoder(decoder, path, name)
+    raise LidarError(
+        f"{name} has no packets of a known sensor. Sweeps are read from packets of Velodyne and "
+        "Ouster."
+    )
+
+
+def _decoder(decoder: type[PacketDecoder], path: Path, name: str) -> PacketDecoder:
+    """Return a decoder of a file.
+
+    Raises LidarError if the file is not read.
+    """
     if decoder.refusal:
         raise LidarError(f"{name} has {decoder.refusal}.")
     return decoder(path, name)

@@ -6,7 +6,6 @@ Sources: see hesai_layouts.py.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -229,11 +228,9 @@ def _fill_checksums(packets: Records) -> None:
 class HesaiDecoder(PacketDecoder):
     """Refuses packets of Hesai, which no package of the index reads as sweeps."""
 
-    refusal = (
-        "packets of a Hesai, which are not read: write points of them as .pcd with Hesai's SDK"
-    )
+    refusal = "packets of a Hesai, which are not read. Write their points as .pcd with Hesai's SDK"
 
     @staticmethod
-    def reads(path: Path, frame: bytes) -> bool:
-        """Return whether the datagram has Hesai's mark."""
-        return frame[50:52] in (b"\xee\xff", b"\xff\xee")
+    def recognizes(payload: bytes) -> bool:
+        """Return whether a datagram starts with Hesai's mark, as a header or of its first block."""
+        return payload[:2] in (b"\xee\xff", b"\xff\xee")

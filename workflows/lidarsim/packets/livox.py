@@ -16,7 +16,7 @@ import numpy as np
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
 from ..base.vectors import applied, inverse, matmul
 from ..motion.rotations import matrices
-from .encoders import Datagrams, PacketEncoder, PacketSource
+from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, ImuSamples
 from .service import Destination, Service
 from .shots import CarryOver, Shots
@@ -302,3 +302,15 @@ def _with_checksums(packets: Records) -> Bytes:
     payloads = packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
     packets["checksum"] = [crc32(row) for row in payloads[:, _CHECKED_FROM:]]
     return payloads
+
+
+class LivoxDecoder(PacketDecoder):
+    """Refuses packets of Livox, which no package of the index reads as sweeps."""
+
+    refusal = "packets of a Livox, which are not read. Record a bag of ROS 2 with livox_ros_driver2"
+
+    @staticmethod
+    def recognizes(payload: bytes) -> bool:
+        """Return whether a datagram is a point or IMU packet: version 0, and its own length."""
+        size = int.from_bytes(payload[1:3], "little")
+        return len(payload) > _CHECKED_FROM and payload[0] == 0 and size == len(payload)

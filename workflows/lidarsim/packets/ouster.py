@@ -13,6 +13,8 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from shutil import copyfile
+from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, NamedTuple
 from zlib import crc32
 
@@ -28,9 +30,11 @@ from ..base.vectors import applied, inverse, matmul
 from ..motion.rotations import matrices
 from ..scene.transform import affine
 from ..sensor.beams import Mirror, Spin
+from .capture import ENDINGS, Capture
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .imu_samples import ImuBatch, ImuSamples
 from .ouster_loops import DUAL, LOW_RATE, SINGLE
+from .pcap import write_datagrams
 from .service import Destination, Service
 from .shots import Shots
 
@@ -158,6 +162,14 @@ def lidar_packet(profile: Profile, beams: int) -> np.dtype[np.void]:
             ("checksum", "<u8"),
         ]
     )
+
+
+_LEGACY_BYTES = tuple(
+    lidar_packet(PROFILES["LEGACY"], beams).itemsize for beams in (16, 32, 64, 128)
+)
+_HEADER_AND_FOOTER_BYTES = 64
+_SDK_LINKS = (0, 1, 101, 113)  # link types that ouster-sdk 1.0 reads
+_MIN_COLUMNS_BYTES = 16 * (12 + 16 * 4)  # of 16 beams with a word each
 
 
 def lidar_packets(
@@ -295,7 +307,12 @@ class OusterEncoder(PacketEncoder):
         """Raise LidarError unless an Ouster could be the sensor."""
         sensor = self.source.sensor
         head = sensor.head
-        if not isinstance(head, Spin) or isinstance(head, Mirror) or not head.clockwise:
+        if isinstance(head, Mirror):
+            raise self.unusable(
+                "need a head that fires all around: remove the azimuth_window and column_window "
+                "of its metadata"
+            )
+        if not isinstance(head, Spin) or not head.clockwise:
             raise self.unusable("need a head that spins clockwise")
         if head.firings_per_turn not in _COLUMNS or head.rate_hz != int(head.rate_hz):
             raise self.unusable(
@@ -478,27 +495,41 @@ def _rounded(values: Floats) -> list[float]:
 
 
 class OusterDecoder(PacketDecoder):
-    """Reads the scans of ouster-sdk, with metadata from a .json beside a .pcap."""
+    """Reads the scans of ouster-sdk, with metadata from a .json beside a capture.
+
+    ouster-sdk reads pcap files with the usual link types. Other captures, which it would find empty
+    or refuse, are rewritten into a temporary folder.
+    """
 
     intensity = "reflectivity"
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, name)
+        with reading(name):
+            input_size(path)
         if find_spec("ouster") is None:
             # ouster-sdk requires old versions of packages that it can do without.
             raise LidarError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
         with reading(name):
-            input_size(path)
             if (metadata := path.with_suffix(".json")).exists():
                 input_size(metadata)
+            self._file = self._readable_file(path, metadata)
             self._infos = self._open().sensor_info
             self._tables: dict[int, Any] = {}
             self.sensors = [f"{info.prod_line} {info.sn}".strip() for info in self._infos]
 
     @staticmethod
-    def reads(path: Path, frame: bytes) -> bool:
-        """Return True: the packets have no mark, so ouster-sdk reads whatever no other maker's."""
-        return True
+    def recognizes(payload: bytes) -> bool:
+        """Return whether a datagram has the size of a lidar packet and, but for LEGACY, its type.
+
+        All profiles fit, also those that are not encoded here.
+        """
+        size = len(payload)
+        if size in _LEGACY_BYTES:
+            return True
+        columns_bytes = size - _HEADER_AND_FOOTER_BYTES
+        is_lidar = payload[:2] == _LIDAR_PACKET.to_bytes(2, "little")
+        return is_lidar and columns_bytes >= _MIN_COLUMNS_BYTES and columns_bytes % 4 == 0
 
     def sweeps(self, sensor: int) -> Iterable[Any]:
         """Return the scans of a sensor."""
@@ -518,8 +549,22 @@ class OusterDecoder(PacketDecoder):
         stamps = sweep.timestamp[sweep.timestamp > 0]
         return float(stamps.min()) if len(stamps) else 0.0
 
+    def _readable_file(self, path: Path, metadata: Path) -> Path:
+        """Return the file, or a plain copy of it, which is removed with the decoder."""
+        capture = Capture(path, self.name)
+        if path.suffix.lower() not in ENDINGS or capture.is_classic(_SDK_LINKS):
+            return path
+        self._folder = TemporaryDirectory(prefix="lidarpool-")
+        copy = Path(self._folder.name) / f"{path.stem}.pcap"
+        with copy.open("wb") as file:
+            write_datagrams(file, capture.datagrams())
+        if metadata.exists():
+            copyfile(metadata, copy.with_suffix(".json"))
+        self.notes = capture.notes
+        return copy
+
     def _open(self) -> Any:
-        return import_module("ouster.sdk").open_source(str(self.path))
+        return import_module("ouster.sdk").open_source(str(self._file))
 
     def _positions(self, sensor: int) -> Any:
         """Return the function from a scan to positions (rings, columns, 3) in metres."""

@@ -1,8 +1,8 @@
-"""Writes datagrams as a classic pcap file: Ethernet, IPv4 and UDP, stamps in microseconds."""
+"""Writes datagrams as pcap files: Ethernet, IPv4 and UDP, stamps in microseconds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from ipaddress import IPv4Address
 from struct import pack
 from typing import BinaryIO
@@ -10,6 +10,7 @@ from typing import BinaryIO
 import numpy as np
 
 from ..base.arrays import Bytes, Indices, Ints
+from .capture import CapturedDatagram
 from .encoders import Datagrams
 
 # Magic number of little-endian files with microseconds, version 2.4, longest frame, Ethernet.
@@ -100,6 +101,22 @@ class PcapWriter:
         checksums = _complement(words + pseudo_header.sum(dtype=np.int64))
         checksums[checksums == 0] = 0xFFFF  # 0 means that there is no checksum
         return checksums.astype(">u2").view(np.uint8).reshape(count, 2)
+
+
+def write_datagrams(file: BinaryIO, datagrams: Iterable[CapturedDatagram]) -> None:
+    """Write captured datagrams as a plain pcap file, without checksums, to all receivers.
+
+    Raises OSError on failure.
+    """
+    file.write(_FILE_HEADER)
+    macs = _BROADCAST_MAC + _SOURCE_MAC + b"\x08\x00"
+    to = IPv4Address(_IPV4_BROADCAST).packed
+    for time_ns, source, port, payload in datagrams:
+        udp = pack(">HHHH", port, port, 8 + len(payload), 0) + payload
+        head = pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0x4000, _TIME_TO_LIVE, _UDP, 0)
+        frame = macs + head + IPv4Address(source).packed + to + udp
+        seconds, rest = divmod(time_ns, 1_000_000_000)
+        file.write(pack("<IIII", seconds, rest // 1000, len(frame), len(frame)) + frame)
 
 
 def _complement(sums: Ints | Indices) -> Ints:

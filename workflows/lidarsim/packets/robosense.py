@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Records
-from .encoders import Datagrams, PacketEncoder, PacketSource
+from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .shots import CarryOver, Shots
 
 MSOP_PORT = 6699
@@ -318,3 +318,17 @@ def _write_times(times: AnyArray, since_1970_ns: Ints) -> None:
 def _as_bytes(packets: Records) -> Bytes:
     """Return records (n,) as bytes (n, size)."""
     return packets.view(np.uint8).reshape(len(packets), packets.dtype.itemsize)
+
+
+class RobosenseDecoder(PacketDecoder):
+    """Refuses packets of RoboSense, which no package of the index reads as sweeps."""
+
+    refusal = (
+        "packets of a RoboSense, which are not read. Write their points as .pcd with rs_driver, "
+        "or record a bag with rslidar_sdk"
+    )
+
+    @staticmethod
+    def recognizes(payload: bytes) -> bool:
+        """Return whether a datagram starts like an MSOP or DIFOP packet of any model."""
+        return payload.startswith((b"\x55\xaa\x05", _DIFOP_ID[:4])) and len(payload) > 1000

@@ -6,18 +6,18 @@ timing (63-9277); valgur/velodyne_decoder, packet_decoder.cpp.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+import yaml
 
 from ..base.arrays import AnyArray, Ints
-from ..base.errors import LidarError
-from ..base.extras import need, reading
-from ..base.input_files import open_input
+from ..base.extras import need
+from .capture import Capture, CapturedDatagram
 from .encoders import Datagrams, PacketDecoder, PacketEncoder, PacketSource
 from .service import Destination, Service
 from .shots import CarryOver, Shots, last_and_strongest
@@ -33,7 +33,7 @@ _MODES = {"strongest": 0x37, "last": 0x38, "dual": 0x39}
 _AZIMUTHS = 36_000  # azimuths in a revolution
 _MAX_UNITS = 65_535
 _HOUR_US = 3_600_000_000
-_FRAME_BYTES = (1248, 554)  # bytes of Ethernet frames with points, and with a position
+_FLAG_BYTES = tuple(flag.tobytes() for flag in _FLAGS)  # first bytes of a packet
 # Laser of the VLS-128 whose time is the packet's: the first of the fourth group of eight.
 _STAMPED_LASER_OF_128 = 24
 
@@ -153,40 +153,86 @@ class VelodyneEncoder(PacketEncoder):
 
 
 class VelodyneDecoder(PacketDecoder):
-    """Reads the packets of a Velodyne, which name the model of the sensor, by velodyne_decoder."""
+    """Reads the packets of a Velodyne, which name the model of the sensor, by velodyne_decoder.
+
+    Several units in a file are several sensors: `ADDRESS:PORT`, the address of the unit and the
+    port of the receiver.
+    """
 
     intensity = "intensity"
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, name)
         need("velodyne_decoder", "fit", f"{name} is read")
-        with reading(name), open_input(path) as file:
-            file.seek(24)
-            headers = iter(partial(file.read, 16), b"")
-            frames = (file.read(int.from_bytes(header[8:12], "little")) for header in headers)
-            packets = (frame for frame in frames if len(frame) == _FRAME_BYTES[0])
-            units = {(*packet[26:30], int.from_bytes(packet[36:38])) for packet in packets}
+        self._capture = Capture(path, name)
+        units = dict.fromkeys(map(_unit_of, self._packets()))
+        self._units = [*units]
+        self.notes = self._capture.notes
         if len(units) > 1:
-            a, b, c, d, port = min(units)
-            command = f"tcpdump -r {name} -w one.pcap src {a}.{b}.{c}.{d} and dst port {port}"
-            raise LidarError(f"{name} is of {len(units)} units: keep one, {command}.")
+            self.sensors = [f"{address}:{port}" for address, port in units]
 
     @staticmethod
-    def reads(path: Path, frame: bytes) -> bool:
-        """Return whether a packet has the size of a Velodyne's."""
-        return int.from_bytes(frame[:4], "little") in _FRAME_BYTES
+    def recognizes(payload: bytes) -> bool:
+        """Return whether a datagram is a data packet; position packets have no marks."""
+        return len(payload) == _PACKET.itemsize and payload[:2] in _FLAG_BYTES
 
-    def sweeps(self, sensor: int) -> Iterable[Any]:
-        """Return the sweeps, as velodyne_decoder gives them."""
+    def sweeps(self, sensor: int) -> Iterable[_Sweep]:
+        """Yield the sweeps, as velodyne_decoder returns them."""
         decoder: Any = import_module("velodyne_decoder")
         config = decoder.Config(timestamp_first_packet=True)
-        sweeps: Iterable[Any] = decoder.read_pcap(str(self.path), config, as_pcl_structs=True)
-        return sweeps
+        if self._is_hdl64e(sensor):
+            config.model, config.calibration = self._hdl64e(sensor)
+        stream = decoder.StreamDecoder(config)
+        for packet in self._packets(sensor):
+            sweep = stream.decode(packet.time_ns / 1e9, packet.payload, True)
+            if sweep is not None:
+                yield _Sweep(*sweep)
+        sweep = stream.finish(True)
+        if sweep is not None:
+            yield _Sweep(*sweep)
 
-    def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
+    def columns(self, sensor: int, sweep: _Sweep) -> dict[str, AnyArray]:
         """Return the fields of the points."""
-        return {name: sweep.points[name] for name in sweep.points.dtype.names}
+        return {name: sweep.points[name] for name in sweep.points.dtype.names or ()}
 
-    def time_ns(self, sweep: Any) -> float:
+    def time_ns(self, sweep: _Sweep) -> float:
         """Return the time at which the receiver got the first packet of the sweep."""
         return float(1e9 * sweep.stamp.host)
+
+    def _packets(self, sensor: int | None = None) -> Iterator[CapturedDatagram]:
+        """Yield the data packets of a sensor, or of all."""
+        for datagram in self._capture.datagrams():
+            is_wanted = sensor is None or _unit_of(datagram) == self._units[sensor]
+            if is_wanted and self.recognizes(datagram.payload):
+                yield datagram
+
+    def _is_hdl64e(self, sensor: int) -> bool:
+        """Return whether the last two bytes change, with which an HDL-64E spells its state."""
+        return len({packet.payload[-2:] for packet in islice(self._packets(sensor), 5)}) > 1
+
+    def _hdl64e(self, sensor: int) -> tuple[Any, Any]:
+        """Return model and calibration that an HDL-64E sends along with its packets.
+
+        Raises ValueError if they are not complete.
+        """
+        decoder: Any = import_module("velodyne_decoder")
+        reader: Any = import_module("velodyne_decoder.hdl64e")
+        payloads = (packet.payload for packet in self._packets(sensor))
+        content = reader.status_info_to_calib_dict(reader.read_status_info(payloads))
+        if [laser["laser_id"] for laser in content["lasers"]] != [*range(64)]:
+            raise ValueError("the calibration in its packets is incomplete")
+        is_s2 = content["status"]["Model"] == "S2"
+        model = decoder.Model.HDL64E_S2 if is_s2 else decoder.Model.HDL64E_S3
+        return model, decoder.Calibration.from_string(yaml.dump(content))
+
+
+class _Sweep(NamedTuple):
+    """A revolution, as velodyne_decoder returns it."""
+
+    stamp: Any  # with the times `host` and `device`, seconds
+    points: AnyArray  # structured
+
+
+def _unit_of(datagram: CapturedDatagram) -> tuple[str, int]:
+    """Return what tells a unit from others: its address and the port of the receiver."""
+    return datagram.source, datagram.port

@@ -200,6 +200,33 @@ class Spin:
         turned = 2 * np.pi * self._within(firings) / self.firings_per_turn
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
+    def within(self, start: float, share: float) -> Mirror:
+        """Return a head that fires in a part of each revolution only.
+
+        Time 0 and firing 0 are at the start of this part. A time step is the same share of the
+        firings, and at least one.
+
+        Parameters
+        ----------
+        start
+            Start of the part, as a share of a revolution from firing 0 on.
+        share
+            Length of the part, as a share of a revolution.
+        """
+        firings = max(round(self.firings_per_turn * share), 1)
+        width_deg = 360 * firings / self.firings_per_turn
+        middle_deg = 360 * start + width_deg / 2
+        return Mirror(
+            firings,
+            max(self.step_deg, 360 / firings),
+            self.rate_hz,
+            self.clockwise,
+            self.zero_deg + (-middle_deg if self.clockwise else middle_deg),
+            motion="sawtooth",
+            width_deg=width_deg,
+            duty=width_deg / 360,
+        )
+
     def _within(self, firings: Ints) -> Floats:
         """Return the firings (k,) since the start of their revolution: (k,).
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from ..base.arrays import Floats
 from ..base.elementary import sin_cos
-from ..base.errors import LidarError, message_of
+from ..base.errors import converted
 from ..base.textfile import read_text
 from ..base.words import did_you_mean_each, printable
 from ..base.yamlfile import load_yaml
@@ -24,12 +24,6 @@ from ..sensor_files.livox import is_livox
 from ..sensor_files.livox import rays_of_text as rays_of_livox
 from ..sensor_files.ray_csv import is_ray_table, rays_of_text
 from .beams import Beams
-
-# Errors of files that users write.
-UNUSABLE = (
-    OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
-    yaml.YAMLError, LidarError,
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -46,6 +40,9 @@ class Calibration:
     range_m: tuple[float, float] | None = None  # shortest and longest, if the file states ranges
     sensor: str = ""  # name of the sensor, if the file states it
     head: dict[str, Any] = field(default_factory=dict)  # fields of `SensorModel`
+    # Part of a revolution in which the unit fires, if not all of it: start and length, as shares of
+    # a revolution from firing 0 on.
+    window: tuple[float, float] | None = None
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -67,7 +64,7 @@ def read_calibration(path: Path) -> Calibration:
         If the file has none of these formats, or numbers are missing, not finite or in the wrong
         order.
     """
-    try:
+    with converted(f"{path} is not a usable calibration"):
         if path.suffix.lower() not in (".yaml", ".yml", ".json", ".csv"):
             rays = read_rays(path)
             if rays is not None:
@@ -78,8 +75,6 @@ def read_calibration(path: Path) -> Calibration:
         if path.suffix.lower() == ".json":
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
-    except UNUSABLE as error:
-        raise LidarError(f"{path} is not a usable calibration: {message_of(error)}") from error
 
 
 def _velodyne(name: str, data: Any) -> Calibration:
@@ -140,8 +135,7 @@ def _ouster(name: str, data: Any) -> Calibration:
         )
     present = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for missing beams
     origin_mm = _ouster_origin_mm(data, beam)
-    mode = str(_ouster_section(data, "config_params", data).get("lidar_mode", "1024x10"))
-    columns, rate = (int(number) for number in mode.split("x"))
+    columns, rate = _ouster_mode(data)
     count = int(present.sum())
     return Calibration(
         name,
@@ -157,7 +151,59 @@ def _ouster(name: str, data: Any) -> Calibration:
             "firings_per_turn": columns,
             "rate_hz": float(rate),
         },
+        window=_ouster_window(data, layout, columns),
     )
+
+
+def _ouster_mode(data: dict[str, Any]) -> tuple[int, int]:
+    """Return the columns of a revolution and the revolutions a second of Ouster's metadata."""
+    mode = str(_ouster_section(data, "config_params", data).get("lidar_mode", "1024x10"))
+    numbers = re.fullmatch(r"([1-9]\d{2,4})x([1-9]\d{0,2})", mode)
+    if numbers is None:
+        raise ValueError(
+            f"its lidar_mode is {printable(mode)!r}; columns and revolutions a second are "
+            "expected, such as 1024x10"
+        )
+    return int(numbers[1]), int(numbers[2])
+
+
+def _ouster_window(
+    data: dict[str, Any], layout: dict[str, Any], columns: int
+) -> tuple[float, float] | None:
+    """Return the window in which an Ouster fires (`Calibration.window`), or None for all columns.
+
+    The window of columns counts; without it, the window of azimuths. Azimuths are counter-clockwise
+    in the lidar frame, in which column 0 is at azimuth 0 and columns follow each other clockwise.
+    Windows whose end is below their start contain column 0, or azimuth 0.
+    """
+    configuration = _ouster_section(data, "config_params", data)
+    if (limits := layout.get("column_window")) is not None:
+        first, last = _limits("column_window", limits, columns - 1)
+        count = (last - first) % columns + 1
+        start = first
+    elif (limits := configuration.get("azimuth_window")) is not None:
+        right, left = _limits("azimuth_window", limits, 360_000)
+        if left - right in (0, 360_000):
+            return None
+        start = -(-columns * (360_000 - left) // 360_000) % columns
+        count = max(columns * ((left - right) % 360_000) // 360_000, 1)
+    else:
+        return None
+    return None if count == columns else (start / columns, count / columns)
+
+
+def _limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
+    """Return the two limits of a window.
+
+    Raises ValueError for other values.
+    """
+    is_pair = isinstance(limits, list) and len(limits) == 2
+    if not is_pair or not all(type(limit) is int and 0 <= limit <= maximum for limit in limits):
+        raise ValueError(
+            f"its {name} is {printable(str(limits), 60)}; two whole numbers from 0 to {maximum:,} "
+            "are expected"
+        )
+    return limits[0], limits[1]
 
 
 def _ouster_section(data: dict[str, Any], name: str, default: Any = None) -> dict[str, Any]:
@@ -211,19 +257,26 @@ def _calibration_of(name: str, rays: FiredRays) -> Calibration:
     )
 
 
+# Hesai's own files may begin with a mark and end with a checksum, a SHA-256 of the lines before.
+_HESAI_MARK = "eeff"
+_HESAI_COLUMNS = ["elevation", "azimuth"]  # after the first, Channel or LaserID
+_HESAI_CHECKSUM = re.compile(r"^[0-9a-f]{64}[,\s]*\Z", re.IGNORECASE | re.MULTILINE)
+
+
+def _cells(line: str) -> list[str]:
+    """Return the cells between the commas of a line, in lower case."""
+    return [word.strip().lower() for word in line.split(",")]
+
+
 def _table(name: str, text: str) -> Calibration:
     """Read a comma-separated calibration in the format of its header."""
     if is_ray_table(text):
         return _calibration_of(name, rays_of_text(text))
     if is_livox(text):
         return _livox(name, text)
-    header = [word.strip().lower() for word in text.partition("\n")[0].split(",")]
-    if header[1:] == ["elevation", "azimuth"]:
-        rows = rows_of(text, 1, 3)
-        if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
-            raise ValueError(f"channels must be 1 to {len(rows)}, each once and in order")
-        elevation, azimuth = np.radians(rows[:, 1:]).T
-        return Calibration(name, "hesai", Beams(elevation, -azimuth))
+    header = _cells(text.partition("\n")[0])
+    if header[0] == _HESAI_MARK or header[1:] == _HESAI_COLUMNS:
+        return _hesai(name, text)
     if "elevation_deg" in header:
         names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         unknown = [word for word in header if word not in names]
@@ -252,6 +305,23 @@ def _table(name: str, text: str) -> Calibration:
         ) from None
     elevation, azimuth = np.radians(rows_of(text, 0, 2)).T
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
+
+
+def _hesai(name: str, text: str) -> Calibration:
+    """Return the beams of Hesai's angle corrections, in files of its sensors or of its manuals."""
+    lines = text.splitlines()
+    skip = 2 if _cells(lines[0])[0] == _HESAI_MARK else 1
+    header = lines[skip - 1] if len(lines) >= skip else ""
+    if _cells(header)[1:] != _HESAI_COLUMNS:
+        raise ValueError(
+            f"its second line is {printable(header, 60)!r}; after a line {_HESAI_MARK}, as Hesai "
+            "writes it, Channel,Elevation,Azimuth is expected"
+        )
+    rows = rows_of(_HESAI_CHECKSUM.sub("", text), skip, 3)
+    if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
+        raise ValueError(f"channels must be 1 to {len(rows)}, each once and in order")
+    elevation, azimuth = np.radians(rows[:, 1:]).T
+    return Calibration(name, "hesai", Beams(elevation, -azimuth))
 
 
 def _livox(name: str, text: str) -> Calibration:

@@ -18,7 +18,7 @@ from ..base.arrays import Floats, Ints
 from ..base.declared import UnitShare
 from ..base.elementary import log1p, sin_cos
 from ..base.error_sentences import sentences
-from ..base.errors import LidarError, message_of
+from ..base.errors import LidarError, converted
 from ..base.input_files import read_input_text
 from ..base.model_names import BUILT_IN, GROUP, full_name, maker_folder, model_names, names_in
 from ..base.plugins import Plugin, find_plugin
@@ -26,7 +26,7 @@ from ..base.validation import checked
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
-from .calibrations import UNUSABLE, Calibration, read_calibration
+from .calibrations import Calibration, read_calibration
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
 from .packet_settings import Identifier, PacketSettings, laser_order
@@ -380,13 +380,11 @@ def _read(path: Path | Traversable) -> SensorModel:
 
     Raises LidarError if the file cannot be used.
     """
-    try:
+    with converted(f"{path} is not a usable model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
         with sentences(SensorModel, path, content):
             return SensorModel.model_validate(content)
-    except UNUSABLE as error:
-        raise LidarError(f"{path} is not a usable model: {message_of(error)}") from error
 
 
 class Datasheet(NamedTuple):
@@ -484,6 +482,8 @@ def load_sensor(
         sheet = sensor_model.datasheet()
         common_fields |= {"noise": sheet.noise, "returns": sheet.returns}
     head = Spin(firings, step_deg, rate, sensor_model.clockwise, sensor_model.zero_deg)
+    if unit is not None and unit.window is not None:
+        head = head.within(*unit.window)
     if unit is not None and (unit.rays is not None or sensor_model.listed or sensor_model.prisms):
         common_fields["packets"] = sensor_model.packet_settings(np.arange(1))
         return _listed(sensor_model, unit, head, common_fields)

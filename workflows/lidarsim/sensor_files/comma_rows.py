@@ -17,8 +17,10 @@ def rows_of(text: str, skip: int, columns: int) -> Floats:
     ValueError
         If there are no such lines, or a number is not finite; the message names the line.
     """
+    if not any(line.strip() for line in text.splitlines()[skip:]):
+        raise ValueError(f"it has no lines of {columns} numbers")
     rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skip, ndmin=2)
-    if not len(rows) or rows.shape[1] != columns:
+    if rows.shape[1] != columns:
         raise ValueError(f"it needs lines of {columns} numbers")
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):

@@ -83,6 +83,6 @@ def _header(text: str) -> dict[str, Any]:
         if not line.startswith("#"):
             break
         name, _, value = line.lstrip("# ").partition(":")
-        with suppress(ValueError):
+        with suppress(ValueError, RecursionError):
             header[name.strip()] = json.loads(value)
     return header

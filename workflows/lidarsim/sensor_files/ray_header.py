@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf, isfinite
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..base.arrays import Floats, Ints
+from ..base.errors import reason_of
 from ..base.words import printable
 from .fired_rays import AXES, AZIMUTH, ELEVATION, FRAME_HZ, TIME, FiredRays, directions_of
 
@@ -56,6 +58,20 @@ def _unit(name: str) -> str:
     return "degrees" if name.endswith("_deg") else "radians"
 
 
+def parsed_header(text: str | bytes) -> dict[str, Any]:
+    """Return the header that a file has as JSON.
+
+    Raises ValueError if it is not JSON, or not an object.
+    """
+    try:
+        header = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"its header is not JSON ({reason_of(error)})") from error
+    if not isinstance(header, dict):
+        raise ValueError("its header is not a JSON object, as in files with the rays of a sensor")
+    return header
+
+
 def columns_of(rays: FiredRays) -> dict[str, Floats | Ints]:
     """Return the columns `COLUMNS` of rays."""
     timed = rays.timed()
@@ -81,6 +97,7 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
     if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
         raise ValueError("its columns must have a number for each ray, and the same length")
     for name, values in columns.items():
+        check_numbers(name, values.dtype)
         bad = np.flatnonzero(~np.isfinite(np.asarray(values, np.float64)))
         if len(bad):
             raise ValueError(f"{name} of ray {bad[0] + 1} is not finite")
@@ -108,7 +125,7 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
         cycle_ns=None if cycle_ns is None else _positive(header, "cycle_ns"),
         rate_hz=_positive(header, "rate_hz", FRAME_HZ),
         range_m=(
-            float(header.get("min_range_m") or 0.0),
+            _number(header, "min_range_m") if header.get("min_range_m") else 0.0,
             inf if max_range_m is None else _positive(header, "max_range_m"),
         ),
         name=str(header.get("sensor", "")),
@@ -126,6 +143,18 @@ def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
     if unknown := [name for name in names if name not in known]:
         shown = ", ".join(map(printable, unknown[:5]))
         raise ValueError(f"it has {kind} that are not known: {shown}. Known: {', '.join(known)}")
+
+
+def check_numbers(name: str, dtype: np.dtype[Any]) -> None:
+    """Raise ValueError unless a column has real numbers."""
+    if dtype.kind not in "biuf":
+        raise not_numbers(name, dtype)
+
+
+def not_numbers(name: str, kind: object) -> ValueError:
+    """Return the error of a column without real numbers."""
+    shown = printable(str(kind), 60)
+    return ValueError(f"its column {name} has the type {shown}; real numbers are expected")
 
 
 def check_times(rays: FiredRays) -> None:
@@ -165,6 +194,22 @@ def _directions(columns: Mapping[str, Any]) -> Floats:
     raise ValueError("it needs azimuth_deg and elevation_deg, or direction_x, _y and _z")
 
 
+def _number(header: Mapping[str, Any], name: str) -> float:
+    """Return a number of a header that is not negative.
+
+    Raises ValueError for another value.
+    """
+    value = header[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < inf:
+        raise ValueError(f"{name} of its header is {_shown(value)}; a number from 0 on is expected")
+    return float(value)
+
+
+def _shown(value: Any) -> str:
+    """Return a value of a header in a line."""
+    return printable(repr(value), 60)
+
+
 def _positive(header: Mapping[str, Any], name: str, default: float | None = None) -> float:
     """Return a figure of a header above 0.
 
@@ -172,5 +217,5 @@ def _positive(header: Mapping[str, Any], name: str, default: float | None = None
     """
     value = header.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < inf:
-        raise ValueError(f"{name} of its header is {value!r}; a number above 0 is expected")
+        raise ValueError(f"{name} of its header is {_shown(value)}; a number above 0 is expected")
     return float(value)

@@ -14,9 +14,18 @@ from ..base.allowance import Allowance
 from ..base.input_files import check_input
 from .complete_files import write_bytes_of
 from .fired_rays import FiredRays
-from .ray_header import COLUMNS, check_names, columns_of, header_of, rays_of
+from .ray_header import (
+    COLUMNS,
+    check_names,
+    check_numbers,
+    columns_of,
+    header_of,
+    parsed_header,
+    rays_of,
+)
 
 HEADER = "header"
+_ENCRYPTED = 1  # flag of a file in an archive
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
@@ -50,10 +59,7 @@ def header_in(arrays: dict[str, Any]) -> dict[str, Any]:
 
     Raises ValueError if the arrays are not of a file of rays.
     """
-    header = json.loads(str(arrays.pop(HEADER, np.array("{}"))))
-    if not isinstance(header, dict):
-        raise ValueError("its header is not of a file of rays")
-    return header
+    return parsed_header(str(arrays.pop(HEADER, "{}")))
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
@@ -62,7 +68,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        If the file is not an .npz, or an array is of objects.
+        If the file is not an .npz or is encrypted, or an array is not of numbers.
     LidarError
         If the arrays are larger than the memory.
     OSError
@@ -71,8 +77,15 @@ def read_arrays(path: Path) -> dict[str, Any]:
     allowance = Allowance(check_input(path), "write it again with fewer rays")
     try:
         with ZipFile(path) as archive:
-            allowance.take(sum(entry.file_size for entry in archive.infolist()))
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+            entries = archive.infolist()
+        if any(entry.flag_bits & _ENCRYPTED for entry in entries):
+            raise ValueError("it is encrypted. Write it again without a password")
+        allowance.take(sum(entry.file_size for entry in entries))
+        with np.load(path, allow_pickle=False) as content:
+            arrays = {name: content[name] for name in content.files}
     except BadZipFile as error:
-        raise ValueError("it is no .npz, or its end is missing") from error
+        raise ValueError(f"it is no .npz, or it is damaged ({error})") from error
+    for name, array in arrays.items():
+        if name != HEADER:
+            check_numbers(name, array.dtype)
+    return arrays

@@ -9,13 +9,23 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ..base.allowance import Allowance
 from ..base.errors import message_of
-from ..base.input_files import open_input
+from ..base.input_files import check_input, open_input
 from .complete_files import write_bytes_of
 from .fired_rays import FiredRays
-from .ray_header import COLUMNS, check_names, columns_of, header_of, rays_of
+from .ray_header import (
+    COLUMNS,
+    check_names,
+    columns_of,
+    header_of,
+    not_numbers,
+    parsed_header,
+    rays_of,
+)
 
 _HEADER = b"lidarpool"
+_NUMBERS = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean)
 
 
 def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]:
@@ -38,12 +48,30 @@ def read(path: Path) -> FiredRays | None:
     ------
     ValueError
         If the file is not of Parquet, or a column cannot be used.
+    LidarError
+        If the rays take more than the memory.
     """
     try:
-        with open_input(path) as file:
-            table = pq.read_table(file)
+        allowance = Allowance(check_input(path), "write it again with fewer rays")
+        with open_input(path) as file, pq.ParquetFile(file) as content:
+            schema = content.schema_arrow
+            check_names("columns", schema.names, COLUMNS)
+            for field in schema:
+                if not any(is_kind(field.type) for is_kind in _NUMBERS):
+                    raise not_numbers(field.name, field.type)
+            allowance.take(_bytes_of(content.metadata))
+            table = content.read()
     except pa.ArrowException as error:
         raise ValueError(f"it is not a table of Parquet: {message_of(error)}") from error
-    header = json.loads((table.schema.metadata or {}).get(_HEADER, b"{}"))
-    check_names("columns", table.column_names, COLUMNS)
+    header = parsed_header((schema.metadata or {}).get(_HEADER, b"{}"))
     return rays_of({name: table[name].to_numpy() for name in table.column_names}, header)
+
+
+def _bytes_of(metadata: pq.FileMetaData) -> int:
+    """Return the memory of all columns, each number in 8 bytes, or of the pages if that is larger.
+
+    A column of equal values takes some bytes for any number of rows.
+    """
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
+    return max(8 * rows * metadata.num_columns, sum(group.total_byte_size for group in groups))

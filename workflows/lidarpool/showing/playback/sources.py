@@ -17,6 +17,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import AXES, SCAN
+from lidarsim.packets.capture import ENDINGS as CAPTURE_ENDINGS
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES
@@ -35,7 +36,6 @@ from ...scenario.sections import OutputSection
 from .schedule import casting_threads
 
 CLOUD = "cloud.ply"
-RECORDING = ".pcap"
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def open_source(
         raise LidarError(f"{source} does not exist: give a result, a scenario or a recording.")
     with ExitStack() as stack:
         if isinstance(source, Path) and source.is_file():
-            if source.suffix.lower() == RECORDING:
+            if source.suffix.lower() in CAPTURE_ENDINGS:
                 raise LidarError(
                     f"{source} holds packets: play it with --as packets, or give a result or "
                     "scenario."

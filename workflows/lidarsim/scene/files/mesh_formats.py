@@ -150,7 +150,7 @@ _NOT_READ = (
     ),
     MeshFormat((".csv", ".txt"), advice=f"if it is a point cloud, {_POINTS}"),
     MeshFormat(
-        (".pcap", ".mcap", ".bag", ".db3", ".osf"),
+        (".pcap", ".pcapng", ".mcap", ".bag", ".db3", ".osf"),
         advice="it is a recording, write its points as .ply, .pcd or .las and make a mesh of "
         "these by lidarpool scene points",
     ),

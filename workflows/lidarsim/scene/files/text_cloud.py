@@ -34,6 +34,7 @@ _WORD = re.compile(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?")
 _AXES = {
     **{axis: axis for axis in "xyz"},
     **{f"points{index}": axis for index, axis in enumerate("xyz")},  # names in ParaView
+    **{f"pointsmxyz{index}": axis for index, axis in enumerate("xyz")},  # and in newer VeloViews
     "easting": "x",
     "northing": "y",
     "east": "x",
