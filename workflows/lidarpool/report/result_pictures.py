@@ -31,7 +31,6 @@ from lidarview.render.colouring import with_composed
 from lidarview.render.picture_page import DPI, FONT, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
 from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
-from lidarview.render.stage import make_axis, nice_step
 from lidarview.render.surface import unit
 
 from ..plan.stations import Sight, StationPlan
@@ -184,7 +183,7 @@ def draw_path(
     trials = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
     drawn_trials = [trials[k] for k in even_indices(len(trials), MAX_TRIALS)]
     limits = _limits(best, drawn_trials, planning, size)
-    axes = _path_axes(page, limits, origin)
+    axes = page.map_chart(FRAME, limits, origin)
     pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
     width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # width of the line of the best path
     drawn_trials = [trial for trial in drawn_trials if farthest(trial, best) > width_m]
@@ -226,24 +225,6 @@ def farthest(path: Floats, other: Floats) -> float:
         nearest = start + share[:, None] * way
         distances = np.minimum(distances, np.linalg.norm(positions - nearest, axis=1))
     return float(distances.max())
-
-
-def _path_axes(page: Page, limits: Floats, origin: Floats) -> Axes:
-    """Add axes in world coordinates with local limits (2, 2).
-
-    `origin` (2,) is the local origin.
-    """
-    (x0, y0), (x1, y1) = limits.tolist()
-    axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
-    step = nice_step((x1 - x0) / 8)
-    for side, name, lower, upper, start in (
-        (axes.xaxis, "x", x0, x1, origin[0]),
-        (axes.yaxis, "y", y0, y1, origin[1]),
-    ):
-        ticks = make_axis(name, lower, upper, step, float(start))
-        side.set_ticks(ticks.ticks, ticks.labels)
-        side.set_label_text(ticks.title)
-    return axes
 
 
 def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Line2D]:
