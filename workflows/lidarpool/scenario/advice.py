@@ -14,6 +14,8 @@ from lidarsim.media.materials import MaterialTable
 from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
+from lidarsim.sensor.optics import TWO_RETURNS
+from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
 
 from ..clouds.laser_scan import has_planar_sensors
@@ -60,7 +62,8 @@ def advice(built: Built) -> list[str]:
         note for entry in built.scenario.output.write for note in entry.unlabelled(built.survey)
     ]
     labels = (*unlabelled, *_unnamed_classes(built.survey))
-    settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
+    unused = (*_without_effect(built.scenario), *_single_returns(built))
+    settings = (*coarse, *scanners, *labels, *unused)
     lines = (*notes, *axes, *likely, *settings, *_timing_notes(built))
     return [as_scenario(line) for line in lines]
 
@@ -159,6 +162,34 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
         yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
+
+
+def _single_returns(built: Built) -> Iterator[str]:
+    """Yield a note if sensors report several returns, and no pulse has a second one.
+
+    False alarms do not count, although they are returns, too.
+    """
+    survey = built.survey
+    setups = [setup_of(built.scene, survey, number) for number in range(len(survey.carried))]
+    single = [
+        setup
+        for setup in setups
+        if setup.reporting.mode in (*TWO_RETURNS, "all")
+        and setup.reporting.subrays == 1
+        and not (setup.has_onward_light or survey.returns_light or survey.spray_g_m3)
+    ]
+    if not single:
+        return
+    reporting = single[0].reporting
+    has_divergence = reporting.divergence_mrad or single[0].sensor.optics.divergence_mrad
+    divergence = "" if has_divergence else ", divergence_mrad: 3"
+    names = [survey.carried[setup.number].name for setup in single]
+    of_sensors = f" of {listed(names)}" if all(names) else ""
+    yield (
+        f"the returns mode{of_sensors} is {reporting.mode}, but a pulse never has a second return, "
+        "because each beam is a single ray that meets one surface. Set returns: {subrays: 7"
+        f"{divergence}}}"
+    )
 
 
 def _timing_notes(built: Built) -> Iterator[str]:
