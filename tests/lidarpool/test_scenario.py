@@ -398,6 +398,27 @@ def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
 
 
 @pytest.mark.parametrize(
+    ("weather", "noise", "noted"),
+    [
+        ("visibility_km: 0.06", "", "no light returns from it, because noise.detection_range_m is"),
+        ("visibility_km: 0.06", "detection_range_m: 90", None),
+        (
+            "visibility_km: 0.06, fog_lidar_ratio_sr: null",
+            "detection_range_m: 90",
+            "weather.fog_lidar_ratio_sr is null: fog attenuates light, and no light returns",
+        ),
+        ("visibility_km: 23", "", None),  # the returns of haze are too faint to be detected
+        ("", "", None),
+    ],
+)
+def test_fog_that_returns_no_light_is_in_the_advice(scenario, weather, noise, noted):
+    built = build(scenario(f"weather: {{{weather}}}\nnoise: {{{noise}}}"))
+    notes = [note for note in advice(built) if "fog" in note]
+    assert len(notes) == (noted is not None)
+    assert all(noted in note for note in notes)
+
+
+@pytest.mark.parametrize(
     ("text", "noted"),
     [
         ("returns: {mode: dual}", "is dual, .* Set returns: {subrays: 7, divergence_mrad: 3}$"),
@@ -436,7 +457,7 @@ def test_returns_that_no_pulse_has_are_in_the_advice(scenario, tmp_path, text, n
     [
         ("cloud: {waveform_samples: 40}", "output: {write: [laz]}"),
         (
-            "weather: {fog_lidar_ratio_sr: 65}",
+            "weather: {fog_lidar_ratio_sr: 18.8}",
             "weather: {fog_lidar_ratio_sr: 9, visibility_km: 1}\nnoise: {detection_range_m: 6}",
         ),
         (
