@@ -16,7 +16,7 @@ def counts_of(cloud: CloudLike, objects: int, materials: int = 0) -> CloudCounts
     if isinstance(cloud, StoredCloud):
         origin = cloud.origin
         precision_m = cloud.precision_m
-    counts = CloudCounts(cloud.table, objects, materials, precision_m, origin, from_above=True)
+    counts = CloudCounts(cloud.table, objects, materials, precision_m, origin)
     if not len(cloud):
         return counts
     points = Cloud.joined(list(cloud.chunks()))

@@ -98,7 +98,7 @@ class GrowingOutput(StoredOutput):
         """Begin the file, with the points of an earlier run."""
         job = run.store.only_job
         assert job is not None
-        growing = GrowingCloud(self._folder / "growing.ply", job, from_above=True)
+        growing = GrowingCloud(self._folder / "growing.ply", job)
         self._set(_growing=run.stack.enter_context(growing))
 
     def on_parts(self, parts: Sequence[Receipt]) -> None:

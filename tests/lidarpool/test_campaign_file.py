@@ -436,6 +436,7 @@ KM = "weather.visibility_km"
 WRONG = {
     "no section": ({"wether.visibility_km": {"uniform": [1, 2]}}, "Did you mean 'weather'?"),
     "no field": ({"weather.visibility": {"uniform": [1, 2]}}, "Did you mean 'visibility_km'?"),
+    "other unit": ({"weather.visibility_m": {"choice": [60]}}, "Its unit is km, not m."),
     "no name": ({"sensors.rof.model": {"choice": ["a"]}}, "Did you mean 'roof'?"),
     "no list": ({"poses.0.yaw_deg": {"uniform": [1, 2]}}, "the base has no poses"),
     "low": ({KM: {"uniform": [0, 2]}}, f"{KM} can be 0.0; it must be 0.001 to"),

@@ -11,32 +11,31 @@ from lidarsim.columns.table import TABLE
 NEAR = np.int64(0x15555555)  # added to coordinates
 
 
-def walk(axes: int, points: int, step: int, seed: int) -> np.ndarray:
-    """Cells of points that go anywhere, (points, axes)."""
-    steps = np.random.default_rng(seed).normal(0, step, (points, axes))
+def walk(points: int, step: int, seed: int) -> np.ndarray:
+    """Cells of points that go anywhere, (points, 2)."""
+    steps = np.random.default_rng(seed).normal(0, step, (points, 2))
     return np.cumsum(steps, axis=0).astype(np.int32)
 
 
 def box_of(cells: np.ndarray) -> np.ndarray:
-    """Lowest and highest cells, (2, axes)."""
+    """Lowest and highest cells, (2, n)."""
     return np.stack([cells.min(axis=0), cells.max(axis=0)]).astype(np.int64)
 
 
 def grid_of(cells: np.ndarray, across: int, pieces: int) -> GridCounts:
     """Counts of points that are added piece by piece."""
-    grid = GridCounts(cells.shape[1], across)
+    grid = GridCounts(across)
     for piece in np.array_split(cells, pieces):
         grid.widen(box_of(piece))
         for block in np.array_split(piece, 3):
-            grid.add(list(block.T))
+            grid.add(*block.T)
     return grid
 
 
-@pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("across", [2, 16])
 @pytest.mark.parametrize("step", [0, 0.5, 30, 1e5])
-def test_counts_are_those_of_the_finest_grid_that_holds_all_points(axes, across, step):
-    cells = walk(axes, 3000, step, seed=axes) - 70
+def test_counts_are_those_of_the_finest_grid_that_holds_all_points(across, step):
+    cells = walk(3000, step, seed=2) - 70
     sides = (1 << level for level in range(32))
     boxes = ((side, (box_of(cells) + NEAR) // side) for side in sides)
     side, numbers = next((s, n) for s, n in boxes if (n[1] - n[0] < across).all())
@@ -52,27 +51,24 @@ def test_counts_are_those_of_the_finest_grid_that_holds_all_points(axes, across,
             assert (grid.box == box_of(cells)).all()
 
 
-@pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("step", [0.5, 30, 1e5])
-def test_merged_counts_are_those_of_one_grid(axes, step):
+def test_merged_counts_are_those_of_one_grid(step):
     """Of threads that count pieces far apart, or nothing."""
-    cells = walk(axes, 3000, step, seed=axes)
+    cells = walk(3000, step, seed=2)
     expected = grid_of(cells, 16, 1)
     for order in ([0, 1, 2, 3], [3, 1, 0, 2]):
         pieces = [grid_of(piece, 16, 2) for piece in np.array_split(cells, [100, 150, 2000])]
-        merged = GridCounts(axes, 16)
+        merged = GridCounts(16)
         for k in order:
             merged.merge(pieces[k])
-        merged.merge(GridCounts(axes, 16))
+        merged.merge(GridCounts(16))
         assert merged.side == expected.side
         assert (merged.lowest == expected.lowest).all()
         assert merged.counts.tolist() == expected.counts.tolist()
 
 
 def test_labels_of_no_surface_and_of_no_object_are_told_apart():
-    counts = CloudCounts(
-        [TABLE["object"], TABLE["material"]], 3, 2, 0.01, np.zeros(3), from_above=False
-    )
+    counts = CloudCounts([TABLE["object"], TABLE["material"]], 3, 2, 0.01, np.zeros(3))
     labels = np.array([0, 0, -1, 2, 2, 2, -1, -1, 0], np.int32)
     counts.add({"object": labels, "material": np.array([-1, 1, 1, 0, 0, 0, 0, 1, -1], np.int32)})
     assert counts.by_object.tolist() == [3, 0, 3]
@@ -85,24 +81,14 @@ def test_labels_of_no_surface_and_of_no_object_are_told_apart():
 
 
 def test_farthest_cells_are_counted():
-    limits = np.array([[-(2**31), 0, 5], [2**31 - 2**27, 0, 5]], np.int32)
+    limits = np.array([[-(2**31), 0], [2**31 - 2**27, 0]], np.int32)
     grid = grid_of(limits, 64, 1)
-    assert grid.counts.sum() == 2 and grid.counts[0, 0, 0] == 1
-
-
-def test_a_floor_at_zero_is_in_one_layer():
-    """At any size, and if its points are a few cells above and below."""
-    for extent in (10, 1000, 10**6, 10**9):
-        floor = np.random.default_rng(1).integers(-extent, extent, (500, 3)).astype(np.int32)
-        floor[:, 2] = np.arange(500) % 3 - 1
-        grid = grid_of(floor, 64, 2)
-        if grid.side > 8:
-            assert grid.shape[2] == 1
+    assert grid.counts.sum() == 2 and grid.counts[0, 0] == 1
 
 
 def test_a_picture_from_above_has_a_point_or_two_in_a_pixel():
     cells = np.random.default_rng(2).integers(0, 40_000, (20_000, 3)).astype(np.int32)
-    counts = CloudCounts([], 1, 0, 0.001, np.array([100.0, 0, 0]), from_above=True)
+    counts = CloudCounts([], 1, 0, 0.001, np.array([100.0, 0, 0]))
     counts.widen(box_of(cells))
     counts.add_positions(list(cells.T))
     rows, columns = counts.above.shape

@@ -24,6 +24,10 @@ RINGS = 16
 COLUMNS = 720
 ELEVATION = np.linspace(-15, 15, RINGS)
 CELLS = RINGS * COLUMNS
+ONE_SWEEP = replace(
+    Sweeps.from_survey(Survey(Sensor.grid(360, RINGS), poses=[(0, 0, 0)], steps=36), Scene.seed()),
+    coordinates="sensor",
+)
 
 
 def directions(azimuth_deg, elevation_deg):
@@ -51,9 +55,10 @@ def cloud(
     points = (ranges[..., None] * directions(azimuth, ELEVATION[:, None]))[there]
     rings = np.arange(RINGS) if rings is None else rings
     columns = {names[0]: np.broadcast_to(rings[:, None], there.shape)[there]}
+    columns |= {name: np.zeros(len(points), int) for name in ("scan", "object")}
     if light is not None:
         columns[names[1]] = light[there]
-    return Cloud(points, columns)
+    return Cloud(points, columns, sweeps=lambda: ONE_SWEEP)
 
 
 AZIMUTH = np.arange(COLUMNS) * 360 / COLUMNS + 0.1
@@ -155,7 +160,7 @@ def test_distances_between_parallel_planes():
     score = compare(a, half, distances_m=[0.05]).figures["distances"]["f_scores"][0]
     assert (score["precision"], score["recall"]) == (0.5, 1.0)
     assert score["f1"] == pytest.approx(2 / 3)
-    assert told["range_image"] is None and "no rings" in told["notes"][0]
+    assert told["range_image"] is None and "cloud A has no sweeps" in told["notes"][0]
 
 
 # -- cells ----------------------------------------------------------------------------------------
@@ -213,11 +218,21 @@ def test_rings_are_matched_whatever_their_numbers(numbers, note):
 
 
 def test_what_has_no_range_image_says_why():
-    plain = Cloud(cloud().positions, {})
+    made = cloud()
+    ringless = {name: made[name] for name in ("scan", "object")}
+    whole = Cloud(made.positions, made.columns)  # without sweeps, although zero is the sensor
+    far = np.array([500_000, 5_400_000, 300])  # of UTM
     for a, b, says in (
-        (plain, cloud(), "cloud A has no rings: the range image needs a column ring or channel"),
-        (cloud(), Cloud(cloud().positions + 30, cloud().columns), "not cones around zero"),
-        (cloud(), Cloud(cloud().positions * [1, 1, 9], cloud().columns), "not of the same sensor"),
+        (
+            replace(made, columns=ringless),
+            made,
+            "cloud A has no rings: the range image needs a column ring or channel",
+        ),
+        (made, replace(made, positions=made.positions + 30), "not cones around zero"),
+        (made, replace(made, positions=made.positions + far), "cloud B are 5,423 km from zero"),
+        (made, replace(made, positions=made.positions * [1, 1, 9]), "not of the same sensor"),
+        (whole, whole, "cloud A has no sweeps: all points are compared at once in world"),
+        (made, whole, "cloud B has no sweeps"),
     ):
         found = compare(a, b).figures
         assert found["range_image"] is None and found["distances"]["a_to_b"]["points"] == CELLS
@@ -232,8 +247,11 @@ def test_of_many_points_and_cells_some_are_compared(monkeypatch):
     assert found["range_image"]["no_return"]["returns_in_both"] == CELLS
     assert found["range_image"]["residual"]["rmse_m"] == pytest.approx(0.02, rel=0.07)
     assert "2,000 points and cells" in found["notes"][0]
-    thin = compare(cloud(), cloud(), most_points=3000).figures
-    assert thin["a"]["points"] == 3000 and "11,520 points; 26 % are compared" in thin["notes"][0]
+    whole = Cloud(cloud().positions, {})
+    thin = compare(whole, whole, most_points=3000).figures
+    assert thin["a"]["points"] == 3000 and "11,520 points; 26 % are compared" in thin["notes"][1]
+    assert "from 2,000 points of each cloud" in thin["notes"][3]
+    assert thin["distances"]["a_to_b"]["points"] == 2000
 
 
 # -- formats --------------------------------------------------------------------------------------
@@ -495,19 +513,24 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
     light = rng.uniform(size=RANGES.shape)
     there = rng.uniform(size=RANGES.shape) > 0.1
     noisy = cloud(RANGES + rng.normal(0, 0.02, RANGES.shape), there=there, light=light)
-    save_cloud(noisy, tmp_path / "<b>A & B.ply")
-    found = lidarpool.compare(tmp_path / "<b>A & B.ply", cloud(light=light))
+    folder = tmp_path / "<b>A & B"
+    folder.mkdir()
+    save_cloud(noisy, folder / "cloud.ply")
+    ONE_SWEEP.save(folder / "sweeps.npz")
+    found = lidarpool.compare(folder, cloud(light=light))
+    assert found.figures["range_image"]["residual"]["cells"] == np.count_nonzero(there)
     names = [path.name for path in found.save(tmp_path / "out")]
     assert sorted(names) == sorted(path.name for path in (tmp_path / "out").iterdir())
     assert {"compare.json", "compare.html", "compare-ranges.png", "compare-above.png"} <= {*names}
     assert json.loads((tmp_path / "out/compare.json").read_text()) == found.figures
     page = (tmp_path / "out/compare.html").read_text()
-    assert "<b>A &" not in page and "&lt;b&gt;A &amp; B.ply" in page
+    assert "<b>A &" not in page and "&lt;b&gt;A &amp; B" in page
     assert "<script" not in page and 'src="http' not in page and page.count("<svg") == 4
     assert page.count("data-ring=") == RINGS
     plain = compare(Cloud(cloud().positions, {}), Cloud(cloud().positions, {}))
-    assert len(plain.save(tmp_path / "plain")) == 4  # no pictures of ranges and rings
-    assert "No range image" in (tmp_path / "plain/compare.html").read_text()
+    left = plain.save(tmp_path / "out")  # no pictures of ranges and rings, nor those of before
+    assert len(left) == 4 and {*left} == {*(tmp_path / "out").iterdir()}
+    assert "no sweeps" in (tmp_path / "out/compare.html").read_text()
 
 
 def test_a_ring_that_only_one_sees_is_noted():
@@ -515,6 +538,22 @@ def test_a_ring_that_only_one_sees_is_noted():
     there[3] = False
     notes = compare(cloud(there=there), cloud()).figures["notes"]
     assert "only one of the two has returns of 1 ring" in str(notes)
+
+
+def test_maps_of_georeferenced_clouds_have_short_numbers():
+    """The offset is in the titles of the axes, not above the chart, where the heading is."""
+    corner = np.array([500_000, 5_400_000, 300])
+    positions = corner + np.random.default_rng(6).uniform(0, 40, (50, 3))
+    page = comparison.draw_above(compare(Cloud(positions, {}), Cloud(positions, {})))
+    page.figure.draw_without_rendering()
+    for axes in page.figure.axes[:2]:
+        for axis, title in ((axes.xaxis, axes.get_xlabel()), (axes.yaxis, axes.get_ylabel())):
+            assert axis.get_offset_text().get_text() == ""
+            shown = [float(text.get_text()) for text in axis.get_ticklabels()]
+            assert len(shown) >= 4 and min(shown) >= 0 and max(shown) <= 50
+            if title:  # the second chart shares the title of the first
+                offset = float(title[4:-4].replace("\u2009", ""))
+                np.testing.assert_allclose(axis.get_ticklocs(), np.add(shown, offset))
 
 
 def test_the_axis_of_small_distances_has_numbers_that_can_be_read():

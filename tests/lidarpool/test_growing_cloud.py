@@ -67,7 +67,7 @@ def test_bytes_and_counts_are_those_of_a_cloud_written_at_once(
     firsts = sorted(parts, reverse=order == "reversed")
     if order == "shuffled":
         random.Random(3).shuffle(firsts)
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
         for first in firsts:
             add(store, growing, first, parts[first])
         points = store.only_job.points()
@@ -77,7 +77,7 @@ def test_bytes_and_counts_are_those_of_a_cloud_written_at_once(
     expected = counts_of(points, len(SCENE.all_names), len(SCENE.material_names))
     assert counted(counts) == counted(expected)
     sweeps = Sweeps.from_survey(SURVEY, SCENE)
-    again = write_cloud(tmp_path / "again.ply", points, sweeps, SCENE, from_above=True)
+    again = write_cloud(tmp_path / "again.ply", points, sweeps, SCENE)
     assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
     assert counted(again) == counted(expected)
 
@@ -89,7 +89,7 @@ def test_bytes_and_counts_do_not_depend_on_threads_and_blocks(
 ):
     monkeypatch.setattr(growing_cloud, "processors", lambda: count)
     monkeypatch.setattr(growing_cloud, "_BLOCK_ROWS", block_rows)
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
         for first, counts in FEW.items():
             add(store, growing, first, counts)
         points = store.only_job.points()
@@ -113,7 +113,7 @@ def test_a_disk_that_is_full_for_one_thread_is_told_in_the_end(store, tmp_path, 
 
     monkeypatch.setattr(ply.GrowingPly, "write_rows", faulty)
     path = grown_at(tmp_path / "new")
-    with GrowingCloud(path, store.only_job, from_above=True) as growing:
+    with GrowingCloud(path, store.only_job) as growing:
         for first, counts in FEW.items():
             add(store, growing, first, counts)
         points = store.only_job.points()
@@ -122,13 +122,13 @@ def test_a_disk_that_is_full_for_one_thread_is_told_in_the_end(store, tmp_path, 
     offsets.clear()
     sweeps = Sweeps.from_survey(SURVEY, SCENE)
     with pytest.raises(OSError, match="No space left"):
-        write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE, from_above=True)
+        write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE)
     assert not {thread.name for thread in threading.enumerate() if "cloud" in thread.name}
 
 
 @pytest.mark.parametrize("far_first", [0, 5, 10])
 def test_a_late_part_far_away_makes_all_positions_double(store, tmp_path, far_first):
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
         for first, counts in PARTS.items():
             add(store, growing, first, counts, offset=10**9 * (first == far_first))
         points = store.only_job.points()
@@ -142,7 +142,7 @@ def test_a_late_part_far_away_makes_all_positions_double(store, tmp_path, far_fi
 
 def test_it_grows_by_parts_whose_predecessors_are_committed(store, tmp_path):
     path = grown_at(tmp_path / "new")
-    with GrowingCloud(path, store.only_job, from_above=True) as growing:
+    with GrowingCloud(path, store.only_job) as growing:
         for first in (0, 5, 2):
             add(store, growing, first, PARTS[first])
         row_bytes = 3 * 4 + 4 + 2 + 4 + 8 + 2 + 4  # position, scan, channel, object, and COLUMNS
@@ -158,9 +158,9 @@ def test_it_grows_by_parts_whose_predecessors_are_committed(store, tmp_path):
 def test_a_resumed_run_begins_with_the_parts_that_are_there(store, tmp_path):
     for first in (0, 2, 5):
         add(store, None, first, PARTS[first])
-    with GrowingCloud(grown_at(tmp_path / "killed"), store.only_job, from_above=True) as growing:
+    with GrowingCloud(grown_at(tmp_path / "killed"), store.only_job) as growing:
         add(store, growing, 3, PARTS[3])
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
         for first in (10, 8):
             add(store, growing, first, PARTS[first])
         points = store.only_job.points()
@@ -170,12 +170,12 @@ def test_a_resumed_run_begins_with_the_parts_that_are_there(store, tmp_path):
 
 
 def test_a_survey_without_points(store, tmp_path):
-    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job, from_above=True) as growing:
+    with GrowingCloud(grown_at(tmp_path / "new"), store.only_job) as growing:
         add(store, growing, 0, [0] * 12)
         points = store.only_job.points()
         assert growing.finish(tmp_path / "grown.ply", points) is None
     sweeps = Sweeps.from_survey(SURVEY, SCENE)
-    counts = write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE, from_above=True)
+    counts = write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE)
     assert len(read_cloud(tmp_path / "cloud.ply")) == 0
     assert counts.density is None
 
@@ -184,7 +184,7 @@ def test_a_run_that_ends_early_leaves_no_file_and_no_thread(store, tmp_path):
     path = grown_at(tmp_path / "new")
     with (
         pytest.raises(KeyboardInterrupt),
-        GrowingCloud(path, store.only_job, from_above=True) as growing,
+        GrowingCloud(path, store.only_job) as growing,
     ):
         add(store, growing, 0, PARTS[0])
         raise KeyboardInterrupt
@@ -208,7 +208,7 @@ def test_a_file_that_fails_is_removed_and_the_end_says_the_error(
         write(target, cloud, real)
 
     monkeypatch.setattr(ply, "write_with_open3d", faulty)
-    with GrowingCloud(path, store.only_job, from_above=True) as growing:
+    with GrowingCloud(path, store.only_job) as growing:
         if fault == "read-only":
             path.parent.rmdir()
         for first, counts in PARTS.items():
@@ -225,4 +225,4 @@ def test_a_file_that_fails_is_removed_and_the_end_says_the_error(
     sweeps = Sweeps.from_survey(SURVEY, SCENE)
     message = "No space left" if fault == "full disk" else "The part .* cannot be used"
     with pytest.raises((LidarError, OSError), match=message):
-        write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE, from_above=True)
+        write_cloud(tmp_path / "cloud.ply", points, sweeps, SCENE)

@@ -333,16 +333,49 @@ def test_points_by_class_have_the_names_of_classes(write):
     ]
 
 
-@pytest.mark.parametrize("each", [4, 400])
-def test_the_density_is_that_of_the_surfaces(each):
-    """Of a floor and a wall, sparser than a cell has or denser, wherever they are."""
-    side = np.arange(0, 20, 1 / np.sqrt(each))
-    u, v = (axis.ravel() for axis in np.meshgrid(side, side))
-    zero = np.zeros_like(u)
-    both = np.concatenate([np.stack([u, v, zero], axis=1), np.stack([u, zero, v], axis=1)])
-    columns = {name: np.zeros(len(both), np.int32) for name in ("scan", "channel", "object")}
-    found = counts_of(Cloud(both + np.array([5e5, 0, 100]), columns), 1)
-    assert found.density == pytest.approx(each, rel=0.3)
+def density_of(positions: np.ndarray, cell_m: float) -> tuple[float, float]:
+    """Mean and median of the points per square meter of the cells with points, by a histogram.
+
+    The boundaries of cells are shifted by 0x15555555 steps of a millimeter.
+    """
+    columns = np.round(positions[:, :2] * 1000).astype(np.int64) + 0x15555555
+    _, counts = np.unique(columns // round(1000 * cell_m), axis=0, return_counts=True)
+    return counts.mean() / cell_m**2, float(np.median(counts)) / cell_m**2
+
+
+@pytest.mark.parametrize("each", [4.0, 11.5, 400.0])
+def test_the_density_is_that_of_the_ground_from_above(write, each):
+    """Of a square with a sparser corner, at random and wherever it is."""
+    random = np.random.default_rng(int(each))
+    side = np.sqrt(60_000 / each)
+    ground = random.uniform(0, side, (60_000, 3)) * [1, 1, 0.05]
+    in_corner = (ground[:, :2] < 0.4 * side).all(axis=1) & (random.uniform(size=60_000) < 0.75)
+    positions = (ground[~in_corner] + [-170, 60, 100]).round(3)
+    columns = {name: np.zeros(len(positions), np.int32) for name in ("scan", "channel", "object")}
+    text, report = write(cloud=Cloud(positions, columns))
+    told = report["points_per_m2"]
+    mean, median = density_of(positions, told["cell_m"])
+    assert (told["mean"], told["median"]) == pytest.approx((mean, median), rel=1e-9)
+    # Cells at the border have fewer points, and there are more of these, the larger cells are.
+    whole = (1 - 0.75 * 0.4**2) * each
+    assert told["median"] == pytest.approx(each, rel=0.08)
+    assert 0.85 * whole < told["mean"] < whole < told["median"]
+    assert 30 <= told["median"] * told["cell_m"] ** 2 < 30 * 4 * 1.1
+    assert f"median of the cells of {told['cell_m']:.3g} m that have points" in text
+
+
+def test_clouds_of_other_densities_have_other_numbers(write):
+    """Also where the squares of both are of the same size."""
+    told = []
+    for each in (9.0, 9.1):
+        side = np.arange(0, 40, 1 / np.sqrt(each))
+        x, y = (axis.ravel() for axis in np.meshgrid(side, side))
+        columns = {name: np.zeros(len(x), np.int32) for name in ("scan", "channel", "object")}
+        _, report = write(cloud=Cloud(np.stack([x, y, 0 * x], axis=1), columns))
+        told.append(report["points_per_m2"])
+    assert told[0]["cell_m"] == told[1]["cell_m"]
+    assert told[1]["mean"] / told[0]["mean"] == pytest.approx(9.1 / 9.0, rel=0.01)
+    assert told[1]["mean"] > told[0]["mean"]
 
 
 def lanes(text: str) -> list[str]:

@@ -220,6 +220,17 @@ BAD = [
     ("sensor: {steps: 4}", r"mean 'step_deg'\? Or write steps beside sensor\.$"),
     ("reflectance: 0.3", r"Write materials: \[{objects: …, reflectance: 0\.3}\]\.$"),
     ("scene: {class: 4}", r"Write scene: {copies: \[{name: …, box: …, at: …, class: 4}\]}\.$"),
+    # other units
+    ("weather: {visibility_m: 60}", r"visibility_m is not a field\. Write visibility_km: 0\.06\.$"),
+    ("weather: {visibilty_m: '60'}", r"mean 'visibility_km'\? Its unit is km, not m\.$"),
+    ("visibility_m: 60", r"visibility_m is not a field\. Write weather: {visibility_km: 0\.06}\.$"),
+    ("sensor: {model: vlp16, rate_rpm: 600}", r"Write rate_hz: 10\.$"),
+    ("noise: {range_mm: 20}", r"Write range_m: 0\.02\.$"),
+    ("returns: {divergence_deg: [0.18, 0.09]}", r"mrad: \[3\.14159265359, 1\.57079632679\]\.$"),
+    ("poses: [{position: [0, 0, 1], yaw_rad: 1}]", r"Write yaw_deg: 57\.2957795131\.$"),
+    ("cloud: {precision_metres: 0.01}", r"Did you mean 'precision_m'\?$"),
+    ("weather: {rain_in_h: 1}", r"Write rain_mm_h: 25\.4\.$"),
+    ("weather: {dust_g_m3: 0.1}", r"Write dust_mg_m3: 100\.$"),
     ("points: [[0, 0, 1]]", r"points is not a field\.$"),
     ("sensor: {rain_mm_h: 9}", r"sensor\.rain_mm_h is .* It is a field of weather: write"),
     ("columns: [range]", "It is a field of cloud: write it there"),
@@ -386,13 +397,67 @@ def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     assert advice(build(scenario("output: {write: [nuscenes]}"))) == []
 
 
+@pytest.mark.parametrize(
+    ("weather", "noise", "noted"),
+    [
+        ("visibility_km: 0.06", "", "no light returns from it, because noise.detection_range_m is"),
+        ("visibility_km: 0.06", "detection_range_m: 90", None),
+        (
+            "visibility_km: 0.06, fog_lidar_ratio_sr: null",
+            "detection_range_m: 90",
+            "weather.fog_lidar_ratio_sr is null: fog attenuates light, and no light returns",
+        ),
+        ("visibility_km: 23", "", None),  # the returns of haze are too faint to be detected
+        ("", "", None),
+    ],
+)
+def test_fog_that_returns_no_light_is_in_the_advice(scenario, weather, noise, noted):
+    built = build(scenario(f"weather: {{{weather}}}\nnoise: {{{noise}}}"))
+    notes = [note for note in advice(built) if "fog" in note]
+    assert len(notes) == (noted is not None)
+    assert all(noted in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "noted"),
+    [
+        ("returns: {mode: dual}", "is dual, .* Set returns: {subrays: 7, divergence_mrad: 3}$"),
+        ("sensor: vlp16\nreturns: {mode: two_strongest}", "two_strongest, .* {subrays: 7}$"),
+        ("sensor: own.yaml", "is dual, .* single ray .*{subrays: 7, divergence_mrad: 3}$"),
+        ("sensors: {a: own.yaml, b: {model: vlp16}}", "returns mode of a is dual"),
+        ("sensor: own.yaml\nreturns: {subrays: 7, divergence_mrad: 3}", None),
+        ("sensor: vlp16\nreturns: {mode: dual, subrays: 7}", None),
+        ("returns: {mode: last}", None),
+        (
+            "returns: {mode: dual}\nmaterials: [{objects: '*', specular_reflectance: 0.1}]",
+            None,
+        ),
+        ("returns: {mode: dual}\nmaterials: [{objects: '*', transparent: pass}]", None),
+        (
+            "returns: {mode: dual, divergence_mrad: 3}\nweather: {rain_mm_h: 1}\n"
+            "noise: {detection_range_m: 90}",
+            None,
+        ),
+    ],
+)
+def test_returns_that_no_pulse_has_are_in_the_advice(scenario, tmp_path, text, noted):
+    (tmp_path / "own.yaml").write_text(
+        "name: Own\nsources: {angles: a data sheet, times: even}\nfirings_per_turn: 360\n"
+        "rate_hz: 10\nrange_m: [0.5, 100]\nbeams: {elevation_deg: {first: 0, last: 9, count: 4}}\n"
+        "performance: {mode: dual}\n"
+    )
+    notes = [note for note in advice(build(scenario(text))) if "returns mode" in note]
+    assert len(notes) == (noted is not None)
+    assert all(re.search(noted, note) for note in notes)
+
+
 @pytest.mark.extended
 @pytest.mark.parametrize(
     ("idle", "used"),
     [
         ("cloud: {waveform_samples: 40}", "output: {write: [laz]}"),
         (
-            "weather: {fog_lidar_ratio_sr: 65}",
+            "weather: {fog_lidar_ratio_sr: 18.8}",
             "weather: {fog_lidar_ratio_sr: 9, visibility_km: 1}\nnoise: {detection_range_m: 6}",
         ),
         (

@@ -296,7 +296,10 @@ def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
 
 def test_waveform_settings_become_those_of_returns(imported):
     """HELIOS++ counts the time of one way."""
-    device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10, pulseLength_ns=4)
+    visibility = {"atmosphericVisibility_km": 10}  # at a contrast of 2 %
+    device = scanner(
+        "conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10, pulseLength_ns=4, **visibility
+    )
     legs = "".join(
         f'<leg><platformSettings x="{x}" y="0" z="20" movePerSec_m="10"/>'
         '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20" active="1"/></leg>'
@@ -310,6 +313,9 @@ def test_waveform_settings_become_those_of_returns(imported):
     )
     assert made.left_out == ["maxFullwaveRange_ns: waveforms are as long as their echoes"]
     assert of.returns_each[0].system_ns(of.carried[0].sensor.optics) == pytest.approx(4 / 2.35482)
+    assert of.visibility_km == pytest.approx(10 * np.log(20) / 3.91)
+    nm = of.carried[0].sensor.optics.wavelength_nm
+    assert 1000 * of.extinction_at(nm) == pytest.approx(3.91 / 10 * (nm / 550) ** -1.3)
 
 
 def test_parts_turn_grow_move_and_fall_as_in_helios(imported):

@@ -315,10 +315,10 @@ def test_fog_returns_what_hahner_et_al_have():
     found = cast(
         sensor=sensor,
         visibility_km=visibility_km,
-        fog_lidar_ratio_sr=math.log(20) / 0.046,
+        fog_lidar_ratio_sr=math.log(20) / 0.046,  # 65.1, by default 65
         returns=Returns("all"),
     )
-    mor = 1000 * visibility_km * math.log(20) / 3.91  # of a contrast of 5 % instead of 2 %
+    mor = 1000 * visibility_km
     alpha = math.log(20) / mor
     beta = 0.046 / mor
     begin = 1.0
@@ -353,10 +353,31 @@ def test_fog_ends_at_surfaces_and_competes_with_them():
     assert (thin["cause"] == 0).all()
 
 
-def test_fog_without_a_lidar_ratio_returns_nothing():
-    some = {"visibility_km": 0.04, "returns": Returns("all", pulse_ns=5)}
-    assert len(cast(**some)["range"]) == 0
-    assert same(cast([wall("W", 9)], **some), cast([wall("W", 9)], rain_mm_h=0.0, **some))
+def test_fog_returns_light_by_default():
+    dense = {"visibility_km": 0.04, "returns": Returns("all", pulse_ns=5)}
+    fog = cast(**dense)
+    assert len(fog["range"]) and (fog["cause"] == AIR).all()
+    assert same(fog, cast(fog_lidar_ratio_sr=65.0, **dense))
+
+
+def test_fog_that_is_switched_off_only_attenuates():
+    dense = {"visibility_km": 0.04, "returns": Returns("all", pulse_ns=5)}
+    off = dense | {"fog_lidar_ratio_sr": None}
+    assert len(cast(**off)["range"]) == 0
+    assert (cast([wall("W", 9)], **off)["cause"] != AIR).all()
+    # Without a detection range nothing decides which light the sensor detects.
+    blind = {"noise": Noise()}
+    assert same(cast([wall("W", 9)], **dense, **blind), cast([wall("W", 9)], **off, **blind))
+    lost = cast([wall("W", 9)], **dense, **blind)["intensity"]
+    whole = cast([wall("W", 9)], returns=off["returns"], **blind)["intensity"]
+    per_m = math.log(20) / 40 * (905 / 550) ** (-0.585 * (0.04 * 3.91 / math.log(20)) ** (1 / 3))
+    assert lost / whole == pytest.approx(math.exp(-2 * per_m * 9), rel=0.01)
+
+
+def test_a_lidar_ratio_without_fog_changes_nothing():
+    walls = [wall("W", 9)]
+    clear = [cast(walls, fog_lidar_ratio_sr=ratio) for ratio in (None, 18.8, 65.0)]
+    assert same(clear[0], clear[1]) and same(clear[0], clear[2])
 
 
 @pytest.mark.parametrize("weather", [{"snow_mm_h": 1.0}, {"dust_mg_m3": 40.0}])

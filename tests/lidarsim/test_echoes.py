@@ -85,11 +85,13 @@ def test_energy_falls_with_distance_angle_and_reflectance():
 @pytest.mark.parametrize(
     ("visibility_km", "nm", "per_km"),
     [
-        # 3.91 / V * (wavelength / 0.55 µm)**-q, worked out by hand
-        (60.0, 905, 3.91 / 60 * (905 / 550) ** -1.6),
-        (10.0, 1550, 3.91 / 10 * (1550 / 550) ** -1.3),
-        (1.0, 550, 3.91),
-        (0.2, 905, 3.91 / 0.2 * (905 / 550) ** (-0.585 * 0.2 ** (1 / 3))),
+        # ln 20 / V * (wavelength / 0.55 µm)**-q, worked out by hand: over V, 5 % are left
+        (60.0, 905, math.log(20) / 60 * (905 / 550) ** -1.6),
+        (10.0, 1550, math.log(20) / 10 * (1550 / 550) ** -1.3),
+        (1.0, 550, 2.995732),
+        # q by Kruse's visibility, at a contrast of 2 %: 6.13 km, and 0.2610 km
+        (4.7, 905, 2.995732 / 4.7 * (905 / 550) ** -1.3),
+        (0.2, 905, 2.995732 / 0.2 * (905 / 550) ** (-0.585 * 0.261037 ** (1 / 3))),
     ],
 )
 def test_weather_takes_light_by_kruse(visibility_km, nm, per_km):

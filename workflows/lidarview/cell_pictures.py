@@ -81,14 +81,7 @@ def draw_survey(survey: Survey) -> bytes:
     page = Page(PICTURE_SIZE)
     sensors = sensor_positions(survey)
     limits = _around(np.concatenate([sensor.positions for sensor in sensors])[:, :2])
-    axes = page.chart(
-        _CHART,
-        xlabel="x, metres",
-        ylabel="y, metres",
-        aspect="equal",
-        xlim=limits[:, 0],
-        ylim=limits[:, 1],
-    )
+    axes = page.map_chart(_CHART, limits, tick_count=5)
     colours = theme.object_colours(len(sensors))
     for sensor, colour in zip(sensors, colours, strict=True):
         x, y, _ = sensor.positions.T

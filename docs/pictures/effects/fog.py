@@ -9,7 +9,7 @@ from docs.pictures.effects import _air
 from lidarpool import Survey
 
 DRAWS = "effect-fog.png"
-WEATHER = {"visibility_km": 0.05, "fog_lidar_ratio_sr": 65.0}
+WEATHER = {"visibility_km": 0.05}
 
 
 def with_effect(survey: Survey) -> Survey:

@@ -163,7 +163,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     file = folder / PLAN_FILE
     file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
     with terminal.status("drawing the picture"):
-        draw_stations(built.scene, plan).save(folder / PICTURE_FILE)
+        draw_stations(plan).save(folder / PICTURE_FILE)
     shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
     figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
     note_lines = map("note: {}".format, shortfalls)

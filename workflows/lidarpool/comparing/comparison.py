@@ -26,6 +26,7 @@ from ..report.page.rendering import millimetres, rendered
 from .range_image import RangeImages
 
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
+_PICTURES = ("ranges", "rings", "distances", "above")
 CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")  # without a return, or with
 
 WIDTH = 1600  # width of charts, pixels
@@ -76,7 +77,8 @@ class Comparison:
     def save(self, folder: str | Path) -> list[Path]:
         """Write compare.json, compare.html and pictures, and return their paths.
 
-        LidarError if the folder, which is created, cannot be written to.
+        The folder is created if necessary, and pictures of an earlier comparison are removed.
+        LidarError if it cannot be written to.
         """
         path = Path(folder)
         with (
@@ -94,6 +96,9 @@ class Comparison:
             files |= {f"compare-{name}.png": page.png() for name, page in pages.items()}
             for name, content in files.items():
                 (staged / name).write_bytes(content)
+            for name in _PICTURES:
+                if name not in pages:
+                    (path / f"compare-{name}.png").unlink(missing_ok=True)
             return [(staged / name).replace(path / name) for name in files]
 
 
@@ -229,7 +234,8 @@ def _draw_residual_histogram(axes: Axes, residuals: Floats, limit: float) -> Non
     outer = np.floor(limit / bin_mm) + 0.5
     edges = np.arange(-outer, outer + 1) * bin_mm
     values = np.clip(1000 * residuals, edges[0], edges[-1])
-    axes.hist(values, bins=edges.tolist(), color=A_COLOUR)
+    counts, *_ = axes.hist(values, bins=edges.tolist(), color=A_COLOUR)
+    label_logarithms(axes.yaxis, np.max(counts) < 1000)
 
 
 def _marker_size(page: Page, rings: Sequence[Any]) -> float:
@@ -327,16 +333,16 @@ def draw_above(comparison: Comparison) -> Page:
     lower = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points, _ in measured], axis=0)
     upper = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points, _ in measured], axis=0)
     half_side = 1.06 * max(float((upper - lower).max()), 1e-3) / 2
+    limits = (lower + upper) / 2 + half_side * np.array([[-1.0], [1.0]])
     width = 0.36
     chart_height = 0.36 * WIDTH / height
     scale = _distance_scale(np.concatenate([distances for _, distances in measured]))
-    middle = (lower + upper) / 2
     for number, cloud in enumerate(measured):
         frame = (LEFT + number * (width + 0.045), 0.12, width, chart_height)
-        axes = page.chart(frame, xlabel="x, m", ylabel="" if number else "y, m")
+        axes = page.map_chart(frame, limits, tick_count=6)
+        if number:
+            axes.set_ylabel("")
         _scatter_points(page, axes, cloud, scale)
-        span = np.array([-half_side, half_side])
-        axes.set(xlim=middle[0] + span, ylim=middle[1] + span)
         page.heading(axes, ("A, distance to B", "B, distance to A")[number])
     ramp = theme.mapped(DISTANCE_COLOURS, np.linspace(0, 1, 256))
     page.colour_bar(ramp, scale, "distance, m", (0.875, 0.12, 0.014, chart_height))

@@ -26,6 +26,7 @@ _SECTOR_DEG = 90.0  # a gap as wide as this in all rings is outside the field of
 _BLOCKS = 36  # blocks of a revolution; the pulses of a ring are evenly spaced in a block
 _MIN_SHARE = 0.7  # share of rings whose numbers must fit one rule for it to number all rings
 _FINEST_DEG = 1e-3  # points closer in azimuth are of one pulse
+_MAX_RANGE_M = 20_000.0  # no lidar with rings measures as far; zero is not the sensor then
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +81,17 @@ class _PolarSweep:
     def from_points(cls, sweep: RecordedPoints, name: str) -> _PolarSweep:
         """Convert a sweep into a range image.
 
-        LidarError if the sweep has no rings, or its rings are not cones around zero.
+        LidarError if the sweep has no rings, or zero is not the sensor: the rings are not cones
+        around zero, or the points are too far away.
         """
         if sweep.rings is None:
             raise LidarError(f"{name} has no rings: the range image needs a column ring or channel")
+        ranges = np.linalg.norm(sweep.points, axis=1)
+        if np.median(ranges) > _MAX_RANGE_M:
+            raise LidarError(
+                f"the points of {name} are {np.median(ranges) / 1000:,.0f} km from zero, and the "
+                "range image needs points in the sensor's axes: these are in the world's axes"
+            )
         x, y, z = sweep.points.T
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
         rings, index = np.unique(sweep.rings, return_inverse=True)
@@ -100,7 +108,6 @@ class _PolarSweep:
                 "cones: its points are in the world's axes, or of several poses, or its sensor has "
                 "no rings, as a Livox"
             )
-        ranges = np.linalg.norm(sweep.points, axis=1)
         azimuth = np.degrees(np.arctan2(y, x)) % 360
         return cls(
             azimuth=azimuth,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -52,11 +52,10 @@ def compare(
 ) -> Comparison:
     """Compare two clouds or recordings of the same place.
 
-    B is the reference.
-    Recordings of one sensor are compared sweep by sweep in the sensor's axes: the range image,
-    returns that only A or B has, intensities, and distances to nearest neighbours. A cloud without
-    rings or sweeps has distances alone, in the world frame. Clouds are compared as they are,
-    without alignment.
+    B is the reference. Recordings of one sensor are compared sweep by sweep in the sensor frame:
+    range images, returns that only A or B has, intensities, and distances to nearest neighbors.
+    Without rings there are no range images. Clouds without sweeps, such as .las files, are compared
+    in world coordinates, by distances and intensities only. Nothing is aligned first.
 
     Parameters
     ----------
@@ -107,18 +106,20 @@ def compare(
             pairs = _choose_pairs(pairs, sweeps)
         budget = MAX_VALUES // len(pairs)
         for number_a, number_b in pairs:
-            comparing.add(first.read_points(number_a), second.read_points(number_b), budget)
+            comparing.add_sweeps(first.read_points(number_a), second.read_points(number_b), budget)
         return comparing.result(len(pairs))
     cloud = first if first.is_cloud else second
     if sweeps or match == "time":
         raise LidarError(f"{cloud.name} has no sweeps: leave out --sweep and --match.")
-    if not first.is_cloud or not second.is_cloud:
-        comparing.notes.append(
-            f"{cloud.name} has no sweeps: all points of both are compared at once"
-        )
+    comparing.notes.append(
+        f"{cloud.name} has no sweeps: all points are compared at once in world coordinates, by "
+        "distances and intensities only"
+    )
     points_a = comparing.read_cloud(first, most_points)
     points_b = comparing.read_cloud(second, most_points)
-    comparing.add(points_a, points_b, MAX_VALUES)
+    if max(len(points_a), len(points_b)) > MAX_VALUES:
+        comparing.note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
+    comparing.add_points(points_a, points_b, MAX_VALUES)
     return comparing.result(0)
 
 
@@ -230,17 +231,23 @@ class _Comparing:
             f"{recording.name} has {count:,} points; {100 * share:.3g} % are compared, "
             "chosen evenly: distances to it are too long"
         )
-        return replace(RecordedPoints.joined(parts), rings=None)
+        return RecordedPoints.joined(parts)
 
-    def add(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
-        """Compare two sweeps or clouds, at most `budget` cells and points of each."""
-        self.point_counts += len(a), len(b)
+    def add_sweeps(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+        """Compare two sweeps in the sensor frame, at most `budget` cells and points of each."""
         if max(len(a), len(b)) > budget:
             self.note(f"of each sweep, {budget:,} points and cells are compared, chosen evenly")
-        if not len(a) or not len(b):
+        if len(a) and len(b):
+            self._add_images(a, b, budget)
+        else:
             self.note("pairs with an empty sweep are left out")
+        self.add_points(a, b, budget)
+
+    def add_points(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+        """Compare distances and intensities of two sweeps or clouds, at most `budget` of each."""
+        self.point_counts += len(a), len(b)
+        if not len(a) or not len(b):
             return
-        self._add_images(a, b, budget)
         for pairs, cloud, reference in zip(self.nearest, (a, b), (b, a), strict=True):
             chosen = cloud.part(even_indices(len(cloud), budget))
             distance, index = nearest(chosen.points, reference.points)

@@ -10,7 +10,7 @@ from matplotlib.colors import LogNorm, Normalize
 
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 from lidarview.render import theme
-from lidarview.render.picture_page import Page
+from lidarview.render.picture_page import Page, label_logarithms
 
 from .alignment import AlignedSweep, AlignedSweeps
 from .place import Place
@@ -162,9 +162,13 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
     """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
     page = Page((_WIDTH, _ABOVE_HEIGHT))
     page.title("From above", "grey: what stands; red: left out, because rays passed it")
-    axes = page.chart(_ABOVE_FRAME, xlabel="x, m", ylabel="y, m")
     near = np.concatenate([part.still for part in parts])
     moved = np.concatenate([part.moved for part in parts])
+    low, high = np.quantile(near, (0.01, 0.99), axis=0)
+    # A meter is as long in x as in y.
+    sides = np.array([_ABOVE_FRAME[2] * _WIDTH, _ABOVE_FRAME[3] * _ABOVE_HEIGHT])
+    half = ((high - low) / sides).max() * sides / 2
+    axes = page.map_chart(_ABOVE_FRAME, (low + high) / 2 + [-half, half])
     for points, colour, size, most in (
         (near, theme.UNSEEN, 1.0, STANDING_DOTS),
         (moved, _MOVED_COLOUR, 1.6, _MOVED_DOTS),
@@ -173,15 +177,6 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
         dots = size * page.unit**2
         axes.scatter(some[:, 0], some[:, 1], c=colour, s=dots, lw=0, rasterized=True)
     axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, lw=1.6 * page.unit)
-    low, high = np.quantile(near, (0.01, 0.99), axis=0)
-    # A metre is as long in x as in y.
-    sides = np.array([_ABOVE_FRAME[2] * _WIDTH, _ABOVE_FRAME[3] * _ABOVE_HEIGHT])
-    half = ((high - low) / sides).max() * sides / 2
-    middle = (low + high) / 2
-    axes.set(
-        xlim=(middle[0] - half[0], middle[0] + half[0]),
-        ylim=(middle[1] - half[1], middle[1] + half[1]),
-    )
     return page
 
 
@@ -202,4 +197,6 @@ def draw_errors(figures: Mapping[str, Any]) -> Page:
         axes.vlines(x, half, most, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(x, half, "o", color=theme.OBJECT_COLOURS[0], ms=4 * page.unit, mew=0)
         axes.set_yscale("log")
+        if known:
+            label_logarithms(axes.yaxis, max(most) < 1000 * min(half))
     return page

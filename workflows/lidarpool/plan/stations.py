@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -102,6 +102,7 @@ class StationPlan:
     spacing_m: float  # spacing of the candidates
     visible_m2: Floats  # (objects,) area that candidates see
     covered_m2: Floats  # (objects,) area that the stations see
+    scene: Scene  # the planned scene: all triangles, without instances and actors
     sight: Sight
 
 
@@ -167,7 +168,7 @@ def plan_stations(
     """
     if count is not None and coverage is not None:
         raise LidarError("count and coverage both say when to stop: give one of them.")
-    scene = SimplifiedScene.from_scene(scene).scene
+    scene = replace(SimplifiedScene.from_scene(scene).scene, actors=())
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _default_spacing_m(scene)
@@ -190,6 +191,7 @@ def plan_stations(
         spacing_m=spacing_m,
         visible_m2=np.bincount(owner, visibility.area_m2, objects).astype(np.float64),
         covered_m2=np.bincount(owner, covered_m2, objects).astype(np.float64),
+        scene=scene,
         sight=sight,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,10 +14,18 @@ from lidarsim.columns.table import Column
 
 from .count_loops import SHIFT, count_cells, count_labels
 
-_CUBES = 64  # most cubes along an axis of the grid that measures density, a power of two
 _SQUARES = 1024  # most pixels along an axis of the points from above, a power of two
 _MIN_SQUARES = 50  # pixels along an axis that are not joined, however few the points are
-_MIN_POINTS = 12  # points in a cube that suffice for an estimate of density
+_MIN_POINTS = 30  # points in a square, in the median, that suffice for an estimate of density
+_MIN_DENSITY_SQUARES = 16  # squares along an axis that are not joined for it
+
+
+class Density(NamedTuple):
+    """Points per square meter seen from above, over the squares of a grid that contain points."""
+
+    mean: float  # all points over the area of these squares
+    median: float  # of the squares
+    cell_m: float  # side of a square in meters
 
 
 class CloudCounts:
@@ -35,8 +44,6 @@ class CloudCounts:
         Size of the cells of positions, metres.
     origin
         World position of the cell 0, 0, 0, (3,), metres.
-    from_above
-        Whether `above` is counted.
     """
 
     def __init__(
@@ -46,8 +53,6 @@ class CloudCounts:
         materials: int,
         precision_m: float,
         origin: Floats,
-        *,
-        from_above: bool,
     ) -> None:
         self.table = tuple(table)
         self.by_object = np.zeros(objects, np.int64)
@@ -57,8 +62,8 @@ class CloudCounts:
         self.limits: dict[str, tuple[float, float]] = {}
         self._precision_m = precision_m
         self._origin = origin
-        self._cubes = GridCounts(3, _CUBES)
-        self._squares = GridCounts(2, _SQUARES) if from_above else None
+        self._box: Ints | None = None  # lowest and highest cells, (2, 3); None without points
+        self._squares = GridCounts(_SQUARES)
 
     def add(self, columns: Mapping[str, AnyArray]) -> None:
         """Add points: {name of a column: (n,)}, n > 0."""
@@ -81,18 +86,15 @@ class CloudCounts:
 
     def widen(self, cell_box: Ints) -> None:
         """Make room for points between lowest and highest cells, (2, 3), before they are added."""
-        self._cubes.widen(cell_box)
-        if self._squares is not None:
-            self._squares.widen(cell_box[:, :2])
+        self._box = _joined_box(self._box, cell_box)
+        self._squares.widen(cell_box[:, :2])
 
     def add_positions(self, cells: Sequence[Ints32]) -> None:
-        """Add points by their cells along x, y and z, (n,) each.
+        """Add points by their cells along x and y, (n,) each; further axes are ignored.
 
         Intermediate arrays are as long as these: some 10⁵ points at a time stay in a cache.
         """
-        self._cubes.add(cells)
-        if self._squares is not None:
-            self._squares.add(cells[:2])
+        self._squares.add(cells[0], cells[1])
 
     def merge(self, other: CloudCounts) -> None:
         """Add the points of other counts of the same cloud, whose counts are no longer used."""
@@ -102,9 +104,9 @@ class CloudCounts:
         self.by_material += other.by_material
         for name, (lower, upper) in other.limits.items():
             self._add_limits(name, lower, upper)
-        self._cubes.merge(other._cubes)
-        if self._squares is not None and other._squares is not None:
-            self._squares.merge(other._squares)
+        if other._box is not None:
+            self._box = _joined_box(self._box, other._box)
+        self._squares.merge(other._squares)
 
     @property
     def point_count(self) -> int:
@@ -114,10 +116,9 @@ class CloudCounts:
     @property
     def bounds(self) -> Floats:
         """Lowest and highest coordinates in the world, (2, 3), metres, or zeros without points."""
-        box = self._cubes.box
-        if box is None:
+        if self._box is None:
             return np.zeros((2, 3))
-        return positions_of(box, self._precision_m, self._origin)
+        return positions_of(self._box, self._precision_m, self._origin)
 
     @property
     def above(self) -> Ints:
@@ -137,7 +138,6 @@ class CloudCounts:
     @property
     def _pixels(self) -> GridCounts:
         """Grid of `above`: the more points, the finer, with a point or two in a pixel."""
-        assert self._squares is not None, "counted from above"
         pixels = deepcopy(self._squares)
         across = max(_MIN_SQUARES, (2 * pixels.total) ** 0.5)
         while max(pixels.shape) > across:
@@ -145,48 +145,54 @@ class CloudCounts:
         return pixels
 
     @property
-    def density(self) -> float | None:
-        """Points per square metre, the median over the surfaces, or None without points."""
-        cubes = deepcopy(self._cubes)
-        if not cubes.total:
+    def density(self) -> Density | None:
+        """Points per square meter seen from above, or None without points.
+
+        Squares are joined until half of those with points have 30 points or more, so that gaps
+        between sparse points lie within squares.
+        """
+        squares = deepcopy(self._squares)
+        if not squares.total:
             return None
-        # Gaps between sparse points are within larger cubes.
-        while (median := cubes.median) < _MIN_POINTS and max(cubes.shape) > 2:
-            cubes.coarsen()
-        # A cube that a surface crosses has about the square of its side of that surface.
-        return median / (cubes.side * self._precision_m) ** 2
+        while squares.median < _MIN_POINTS and max(squares.shape) > _MIN_DENSITY_SQUARES:
+            squares.coarsen()
+        cell_m = squares.side * self._precision_m
+        return Density(squares.mean / cell_m**2, squares.median / cell_m**2, cell_m)
+
+
+def _joined_box(box: Ints | None, other: Ints) -> Ints:
+    """Return the box, lowest and highest cells (2, n), around two boxes."""
+    if box is None:
+        return other
+    return np.stack([np.minimum(box[0], other[0]), np.maximum(box[1], other[1])])
 
 
 class GridCounts:
-    """Numbers of points in a grid of squares or cubes, which are larger where points are far apart.
+    """Numbers of points in a grid of squares, which are larger where points are far apart.
 
-    The grid is the finest with at most `across` squares or cubes along each axis. A side is a power
-    of two of cells of positions, and larger cubes consist of whole smaller cubes. So the numbers
-    are the same whatever the order of the points is, and no point is needed again.
+    The grid is the finest with at most `across` squares along each axis. A side is a power of two
+    of cells of positions, and larger squares consist of whole smaller squares. So the numbers are
+    the same whatever the order of the points is, and no point is needed again.
 
     A part of an axis has the number `(cell + SHIFT) >> level`, and the array has the part at this
     number modulo `across`: the array stays as it is while points spread in any direction.
 
     Parameters
     ----------
-    axes
-        Number of axes, 2 or 3.
     across
-        Largest number of squares or cubes along an axis, a power of two.
+        Largest number of squares along an axis, a power of two.
     """
 
-    def __init__(self, axes: int, across: int) -> None:
+    def __init__(self, across: int) -> None:
         self._across = across
         self._level = 0
-        self.box: Ints | None = None  # lowest and highest cells, (2, axes); None without points
-        self._array = np.zeros(axes * (across,), np.int64)
+        self.box: Ints | None = None  # lowest and highest cells, (2, 2); None without points
+        self._array = np.zeros((across, across), np.int64)
 
     def widen(self, cell_box: Ints) -> None:
-        """Make room for points between lowest and highest cells, (2, axes)."""
+        """Make room for points between lowest and highest cells, (2, 2)."""
         earlier = self.box
-        if earlier is not None:
-            lowest = np.minimum(cell_box[0], earlier[0])
-            cell_box = np.stack([lowest, np.maximum(cell_box[1], earlier[1])])
+        cell_box = _joined_box(earlier, cell_box)
         while (np.diff(_numbers(cell_box, self._level), axis=0) >= self._across).any():
             if earlier is None:
                 self._level += 1
@@ -194,11 +200,11 @@ class GridCounts:
                 self.coarsen()
         self.box = cell_box
 
-    def add(self, cells: Sequence[Ints32]) -> None:
+    def add(self, x: Ints32, y: Ints32) -> None:
         """Add points by their cells along each axis, (n,), within the box of `widen`."""
-        contiguous = [np.ascontiguousarray(along_axis) for along_axis in cells]
         bits = self._across.bit_length() - 1
-        count_cells(*contiguous[:2], contiguous[-1], self._level, bits, self._array)
+        x, y = np.ascontiguousarray(x), np.ascontiguousarray(y)
+        count_cells(x, y, self._level, bits, self._array)
 
     def merge(self, other: GridCounts) -> None:
         """Add the points of another grid, which may become coarser by it."""
@@ -229,31 +235,36 @@ class GridCounts:
         return int(self._array.sum())
 
     @property
+    def mean(self) -> float:
+        """Mean of the numbers of points in squares with points."""
+        return float(np.mean(self._array[self._array > 0]))
+
+    @property
     def median(self) -> float:
-        """Median of the numbers of points in squares or cubes with points."""
+        """Median of the numbers of points in squares with points."""
         return float(np.median(self._array[self._array > 0]))
 
     @property
     def side(self) -> int:
-        """Side of a square or cube in cells."""
+        """Side of a square in cells."""
         return 1 << self._level
 
     @property
     def lowest(self) -> Ints:
-        """Lowest cell of `counts` along each axis, (axes,)."""
-        box = np.zeros((2, self._array.ndim), np.int64) if self.box is None else self.box
+        """Lowest cell of `counts` along each axis, (2,)."""
+        box = np.zeros((2, 2), np.int64) if self.box is None else self.box
         return (_numbers(box[0], self._level) << self._level) - SHIFT
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of squares or cubes along each axis, between the lowest and highest points."""
+        """Number of squares along each axis, between the lowest and highest points."""
         if self.box is None:
-            return self._array.ndim * (1,)
+            return 1, 1
         return tuple((np.diff(_numbers(self.box, self._level), axis=0)[0] + 1).tolist())
 
     @property
     def counts(self) -> Ints:
-        """Number of points in each square or cube between the lowest and highest points."""
+        """Number of points in each square between the lowest and highest points."""
         lowest = (self.lowest + SHIFT) >> self._level
         numbers = [low + np.arange(n) for low, n in zip(lowest, self.shape, strict=True)]
         return self._array[self._indices(numbers)]

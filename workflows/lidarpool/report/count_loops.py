@@ -9,7 +9,7 @@ import numpy as np
 from raybeam.compiled import compiled, stage
 
 # Added to coordinates, in binary 101…0101. Multiples of no power of two are near it, so that no
-# grid has a boundary at zero, where floors often are: their points would be in two layers.
+# grid has a boundary at zero, where walls often are: their points would be in two rows.
 SHIFT = 0x15555555
 _SHIFT = np.int32(SHIFT)
 _TILE = 1024  # points at a time: their indices stay in the first cache
@@ -28,10 +28,10 @@ def _find_parts(cells, level, bits, indices):
 
 
 @compiled()
-def count_cells(x, y, z, level, bits, counts):
+def count_cells(x, y, level, bits, counts):
     """Count points by their cells along the axes, (n,) int32 each, in a grid (`GridCounts`).
 
-    `counts` are of two axes, x and y, or three, with 2^`bits` parts along each.
+    `counts` have two axes, x and y, with 2^`bits` parts along each.
     """
     flat = counts.reshape(-1)
     indices = np.empty(_TILE, np.uint32)
@@ -41,8 +41,6 @@ def count_cells(x, y, z, level, bits, counts):
         tile[:] = 0
         _find_parts(x[start:stop], level, bits, tile)
         _find_parts(y[start:stop], level, bits, tile)
-        if counts.ndim == 3:
-            _find_parts(z[start:stop], level, bits, tile)
         for k in range(len(tile)):
             flat[tile[k]] += 1
 

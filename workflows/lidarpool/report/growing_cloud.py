@@ -143,8 +143,6 @@ class CloudWriter:
         Type of positions in the file (`real_type`).
     expected_count
         Expected number of points (`GrowingPly`).
-    from_above
-        Whether the points are counted as seen from above, too.
     """
 
     def __init__(
@@ -155,8 +153,6 @@ class CloudWriter:
         scene: Scene,
         position_type: np.dtype[np.floating],
         expected_count: int,
-        *,
-        from_above: bool,
     ) -> None:
         self.file = GrowingPly(path, points.table, position_type, sweeps, expected_count)
         self._flushed_bytes = 0  # size of the file at the last flush
@@ -169,7 +165,6 @@ class CloudWriter:
                 len(scene.material_names),
                 points.precision_m,
                 points.origin,
-                from_above=from_above,
             )
             self._idle.put(_PartWriter(self.file, points, counts))
         self._executor = ThreadPoolExecutor(self.threads, "write cloud")
@@ -266,12 +261,8 @@ class CloudWriter:
         self.file.close()
 
 
-def write_cloud(
-    path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene, *, from_above: bool
-) -> CloudCounts:
+def write_cloud(path: Path, points: StoredCloud, sweeps: Sweeps, scene: Scene) -> CloudCounts:
     """Write all points to a PLY file, which must not exist, and return their counts.
-
-    `from_above` is as in `CloudWriter`.
 
     Raises
     ------
@@ -282,9 +273,7 @@ def write_cloud(
     """
     position_type = real_type(points.bounds, points.precision_m)
     count = len(points)
-    with CloudWriter(
-        path, points, sweeps, scene, position_type, count, from_above=from_above
-    ) as writer:
+    with CloudWriter(path, points, sweeps, scene, position_type, count) as writer:
         writer.file.check_room(count)
         for name, rows in zip(points.names, points.rows, strict=True):
             if rows:
@@ -306,14 +295,11 @@ class GrowingCloud:
         The file, which must not exist.
     job
         The job. Parts of an earlier run are appended first.
-    from_above
-        As in `CloudWriter`.
     """
 
-    def __init__(self, path: Path, job: JobUnderWay, *, from_above: bool) -> None:
+    def __init__(self, path: Path, job: JobUnderWay) -> None:
         self._path = path
         self._job = job
-        self._from_above = from_above
         self._sweeps = Sweeps.from_survey(job.survey, job.scene)
         # With the cells of appended parts; only their bounds are used.
         self._points = replace(job.points(), cells=None)
@@ -441,7 +427,6 @@ class GrowingCloud:
             self._job.scene,
             position_type,
             expected_count,
-            from_above=self._from_above,
         )
 
     def _check_room(self, part: _Part) -> None:

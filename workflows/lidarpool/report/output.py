@@ -139,7 +139,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         job = run.store.only_job
         assert job is not None, "of a survey"
         folder = run.stack.enter_context(staging(self._folder, self.target))
-        growing = GrowingCloud(folder / CLOUD, job, from_above=self._has_page)
+        growing = GrowingCloud(folder / CLOUD, job)
         self._growing = run.stack.enter_context(growing)
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
@@ -264,7 +264,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 counts = self._growing.finish(path, points)
                 if counts is not None:
                     return counts
-            return write_cloud(path, points, sweeps, result.scene, from_above=self._has_page)
+            return write_cloud(path, points, sweeps, result.scene)
 
     def _report(
         self,

@@ -94,7 +94,7 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
         **({"class_names": dict(survey.classes)} if survey.classes else {}),
         **_points_by_material(scene, cloud),
-        "points_per_m2": cloud.density if survey.coordinates == "world" else None,
+        "points_per_m2": _density(cloud) if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {
             "total": round(result.seconds, 3),
@@ -110,6 +110,12 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "resumed_scans": result.resumed,
         "planning": _planning(result),
     }
+
+
+def _density(cloud: CloudCounts) -> dict[str, float] | None:
+    """Return the density of points seen from above, or None without points."""
+    density = cloud.density
+    return None if density is None else density._asdict()
 
 
 def _points_by_material(scene: Scene, cloud: CloudCounts) -> dict[str, Any]:

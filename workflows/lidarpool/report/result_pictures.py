@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -25,14 +25,13 @@ from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
-from lidarsim.scene.scene import Scene
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
 from lidarview.render.colouring import with_composed
 from lidarview.render.picture_page import DPI, FONT, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
 from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
-from lidarview.render.stage import make_axis, nice_step
+from lidarview.render.surface import unit
 
 from ..plan.stations import Sight, StationPlan
 from .page.rendering import put_picture
@@ -184,7 +183,7 @@ def draw_path(
     trials = [np.concatenate([best[:1], trial, best[-1:]]) for trial in path.trials]
     drawn_trials = [trials[k] for k in even_indices(len(trials), MAX_TRIALS)]
     limits = _limits(best, drawn_trials, planning, size)
-    axes = _path_axes(page, limits, origin)
+    axes = page.map_chart(FRAME, limits, origin)
     pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
     width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # width of the line of the best path
     drawn_trials = [trial for trial in drawn_trials if farthest(trial, best) > width_m]
@@ -226,24 +225,6 @@ def farthest(path: Floats, other: Floats) -> float:
         nearest = start + share[:, None] * way
         distances = np.minimum(distances, np.linalg.norm(positions - nearest, axis=1))
     return float(distances.max())
-
-
-def _path_axes(page: Page, limits: Floats, origin: Floats) -> Axes:
-    """Add axes in world coordinates with local limits (2, 2).
-
-    `origin` (2,) is the local origin.
-    """
-    (x0, y0), (x1, y1) = limits.tolist()
-    axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
-    step = nice_step((x1 - x0) / 8)
-    for side, name, lower, upper, start in (
-        (axes.xaxis, "x", x0, x1, origin[0]),
-        (axes.yaxis, "y", y0, y1, origin[1]),
-    ):
-        ticks = make_axis(name, lower, upper, step, float(start))
-        side.set_ticks(ticks.ticks, ticks.labels)
-        side.set_label_text(ticks.title)
-    return axes
 
 
 def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Line2D]:
@@ -331,12 +312,9 @@ def _draw_ends(axes: Axes, page: Page, planning: PlanningPicture) -> None:
         )
 
 
-def draw_stations(scene: Scene, plan: StationPlan) -> Page:
-    """Draw the scene of a plan, coloured in each pixel by the visibility from its stations.
-
-    Actors are left out.
-    """
-    shot = take_shot(replace(scene, actors=()), plan.stations)
+def draw_stations(plan: StationPlan) -> Page:
+    """Draw the scene of a plan and color each pixel by its visibility from the stations."""
+    shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLOURS, 0.6))
     page.numbers(axes, shot)
@@ -353,23 +331,22 @@ def draw_stations(scene: Scene, plan: StationPlan) -> Page:
 
 def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     """Return the shot with COVERED, UNCOVERED or HIDDEN in place of triangles."""
-    # The shot's scene has been moved a little.
-    sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
     stations, candidates = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
+    visibility = _PixelVisibility.from_shot(shot, plan)
     kinds = np.full(shot.pixel_samples.triangle.size, HIDDEN)
     surface = np.flatnonzero(shot.pixel_samples.triangle >= 0)
-    covered = _visible_from(sight, stations, shot.pixel_samples, surface)
+    covered = visibility.from_any(stations, shot.pixel_samples, surface)
     kinds[surface[covered]] = COVERED
     uncovered = surface[~covered]
-    # Of each triangle one pixel in a block is tested: to test all would take minutes.
+    # To test all pixels would take minutes: only one pixel of each triangle in a block is tested.
     tested, group = _pixels_of_blocks(shot, uncovered)
-    visible = _visible_from(sight, candidates, shot.pixel_samples, uncovered[tested])
+    visible = visibility.from_any(candidates, shot.pixel_samples, uncovered[tested])
     kinds[uncovered[visible[group]]] = UNCOVERED
     samples_per_edge = shot.edge_samples.triangle.size // max(len(shot.edges), 1)
     pixel_kinds = np.where(kinds[shot.edges] == COVERED, HIDDEN, kinds[shot.edges])
     edge_kinds = np.repeat(pixel_kinds, samples_per_edge)
     edge_surface = np.flatnonzero(shot.edge_samples.triangle >= 0)
-    is_covered = _visible_from(sight, stations, shot.edge_samples, edge_surface)
+    is_covered = visibility.from_any(stations, shot.edge_samples, edge_surface)
     edge_kinds[edge_surface[is_covered]] = COVERED
     return replace(
         shot,
@@ -395,11 +372,32 @@ def _painted(samples: Samples, kinds: Ints) -> Samples:
     return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
 
 
-def _visible_from(sight: Sight, positions: Floats, samples: Samples, indices: Ints) -> Bools:
-    """Mark samples (k,) whose visible side can be seen from any of the positions (p, 3)."""
-    points = samples.position[indices].astype(np.float64)
-    normals = samples.normal[indices].astype(np.float64)
-    hidden = np.arange(len(indices))
-    for position in positions:
-        hidden = hidden[sight.sides(position, points[hidden], normals[hidden]) <= 0]
-    return ~np.isin(np.arange(len(indices)), hidden)
+@dataclass(frozen=True, eq=False)
+class _PixelVisibility:
+    """Visibility of the surfaces in pixels of a shot, by the same rules as in the plan's table."""
+
+    sight: Sight
+    eye: Floats  # (3,)
+    face_normals: Floats  # (f, 3), of unit length
+
+    @classmethod
+    def from_shot(cls, shot: SurfaceView, plan: StationPlan) -> _PixelVisibility:
+        """Prepare a shot of the scene of a plan."""
+        # The shot has moved the objects a little, so its rays must meet the moved triangles. The
+        # normals of small triangles would turn: the plan's scene has them as they are. The normals
+        # of samples do not serve, because they are smoothed for shading.
+        sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)
+        a, b, c = plan.scene.vertices[plan.scene.faces[shot.part.parents]].swapaxes(0, 1)
+        return cls(sight, shot.camera.eye, unit(np.cross(b - a, c - a)))
+
+    def from_any(self, positions: Floats, samples: Samples, indices: Ints) -> Bools:
+        """Return a mask (k,) of samples whose drawn side is visible from any position (p, 3)."""
+        points = samples.position[indices].astype(np.float64)
+        normals = self.face_normals[samples.triangle[indices]]
+        facing_away = np.einsum("ij,ij->i", normals, points - self.eye) > 0
+        normals = np.where(facing_away[:, None], -normals, normals)
+        hidden = np.arange(len(indices))
+        for position in positions:
+            sides = self.sight.sides(position, points[hidden], normals[hidden])
+            hidden = hidden[sides <= 0]
+        return ~np.isin(np.arange(len(indices)), hidden)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import UTC, datetime
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +12,13 @@ import numpy as np
 from lidarsim.base.words import as_scenario, listed, plural
 from lidarsim.columns.table import VELOCITY
 from lidarsim.media.materials import MaterialTable
+from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
 from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
+from lidarsim.sensor.optics import TWO_RETURNS
+from lidarsim.simulator.steps.particles import WeatherStep
+from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
 
 from ..clouds.laser_scan import has_planar_sensors
@@ -29,6 +34,7 @@ LARGE_OBJECT_M = 10.0
 LARGE_STATED_M = 100.0
 SMALL_M = 0.2
 _LAST_DATE = datetime(2100, 1, 1, tzinfo=UTC)  # later seconds since 1970 are likely no dates
+HAZE_KM = 10.0  # no lidar detects light that returns from clearer air
 MIN_STEPS = 100  # smallest length of a scene, in steps of the precision
 
 
@@ -61,8 +67,9 @@ def advice(built: Built) -> list[str]:
     ]
     labels = (*unlabelled, *_unnamed_classes(built.survey))
     settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
-    lines = (*notes, *axes, *likely, *settings, *_timing_notes(built))
-    return [as_scenario(line) for line in lines]
+    light = (*_single_returns(built), *_dark_fog(built.survey))
+    groups = (notes, axes, likely, settings, light, _timing_notes(built))
+    return [as_scenario(line) for line in chain.from_iterable(groups)]
 
 
 def _unnamed_classes(survey: Survey) -> Iterator[str]:
@@ -147,7 +154,8 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
             "cloud.waveform_samples: only LAS and LAZ files hold waveforms, and none is "
             "written: add output: {write: [las]}"
         )
-    if scenario.weather.fog_lidar_ratio_sr is not None and scenario.weather.visibility_km is None:
+    is_default = scenario.weather.fog_lidar_ratio_sr in (None, FOG_LIDAR_RATIO_SR)
+    if not is_default and scenario.weather.visibility_km is None:
         yield "weather.fog_lidar_ratio_sr without weather.visibility_km is no fog"
     if scenario.weather.spray_g_m3 and not (scenario.actors or scenario.traffic):
         yield "weather.spray_g_m3 needs actors or traffic that move, and there are none"
@@ -159,6 +167,58 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
         yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
+
+
+def _single_returns(built: Built) -> Iterator[str]:
+    """Yield a note if sensors report several returns, and no pulse has a second one.
+
+    False alarms do not count, although they are returns, too.
+    """
+    survey = built.survey
+    setups = [setup_of(built.scene, survey, number) for number in range(len(survey.carried))]
+    single = [
+        setup
+        for setup in setups
+        if setup.reporting.mode in (*TWO_RETURNS, "all")
+        and setup.reporting.subrays == 1
+        and not (setup.has_onward_light or WeatherStep.applies(setup) or survey.spray_g_m3)
+    ]
+    if not single:
+        return
+    reporting = single[0].reporting
+    has_divergence = reporting.divergence_mrad or single[0].sensor.optics.divergence_mrad
+    divergence = "" if has_divergence else ", divergence_mrad: 3"
+    names = [survey.carried[setup.number].name for setup in single]
+    of_sensors = f" of {listed(names)}" if all(names) else ""
+    yield (
+        f"the returns mode{of_sensors} is {reporting.mode}, but a pulse never has a second return, "
+        "because each beam is a single ray that meets one surface. Set returns: {subrays: 7"
+        f"{divergence}}}"
+    )
+
+
+def _dark_fog(survey: Survey) -> Iterator[str]:
+    """Yield notes if fog attenuates light and returns none."""
+    if survey.visibility_km is None or survey.visibility_km > HAZE_KM:
+        return
+    if survey.fog_lidar_ratio_sr is None:
+        yield (
+            "weather.fog_lidar_ratio_sr is null: fog attenuates light, and no light returns from it"
+        )
+        return
+    without = [
+        carried
+        for carried, noise in zip(survey.carried, survey.noise_each, strict=True)
+        if noise.detection_range_m is None
+    ]
+    if without:
+        names = [carried.name for carried in without]
+        of_sensors = f" of {listed(names)}" if all(names) else ""
+        yield (
+            "fog attenuates light, and no light returns from it, because noise.detection_range_m"
+            f"{of_sensors} is not known. Set it to the range at 10 % reflectance, for example "
+            "noise: {detection_range_m: 90}"
+        )
 
 
 def _timing_notes(built: Built) -> Iterator[str]:

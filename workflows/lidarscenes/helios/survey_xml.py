@@ -17,6 +17,7 @@ import yaml
 
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, prefixed
+from lidarsim.media.materials import MOR_SHARE
 from lidarsim.motion.trajectory import Pose
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import rotation_about
@@ -328,7 +329,10 @@ class _Import:
                     number(detector_settings, "accuracy_m", scanner.number("accuracy_m"))
                 )
             },
-            "weather": {"visibility_km": clean(scanner.number("atmosphericVisibility_km", 23))},
+            # HELIOS++ has the visibility at a contrast of 2 %.
+            "weather": {
+                "visibility_km": clean(MOR_SHARE * scanner.number("atmosphericVisibility_km", 23))
+            },
         }
         ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
         return sections, {

@@ -14,7 +14,9 @@ from pydantic import GetPydanticSchema, ValidationError
 from pydantic.fields import FieldInfo
 
 from .section_fields import FieldPath, classes_in, fields_by_name, is_section
-from .words import did_you_mean, joined
+from .unit_suffixes import converted, factor_between, other_unit
+from .value_texts import shown
+from .words import did_you_mean, joined, most_similar
 
 # Returns True for the content of a file whose fields contradict each other.
 Contradictory = Callable[[Any], bool]
@@ -119,7 +121,30 @@ def place_advice(
                 examples += [] if valid or not owner.names else [_example(owner, name, right)]
         if examples or any(direct):
             break
-    return _in_words(path, did_you_mean(name, field_names), direct, examples)
+    suggestion = _similar_name(name, value, field_names)
+    words = _in_words(path, suggestion, direct, examples)
+    return words or _other_unit_elsewhere(name, value, file)
+
+
+def _similar_name(name: str, value: Any, field_names: Collection[str]) -> str:
+    """Return `did_you_mean`, or the field to write instead if only its unit differs."""
+    similar = most_similar(name, field_names)
+    factor = None if similar is None else factor_between(name, similar)
+    right = None if factor is None else converted(value, factor)
+    return (
+        did_you_mean(name, field_names) if right is None else f" Write {similar}: {shown(right)}."
+    )
+
+
+def _other_unit_elsewhere(name: str, value: Any, file: Any) -> str:
+    """Return an example of a field of another section that differs in its unit only, or ""."""
+    for owner in _inner_sections(owner_of_file(file)):
+        similar = other_unit(name, fields_by_name(owner.kind))
+        factor = None if similar is None else factor_between(name, similar)
+        right = None if factor is None else converted(value, factor)
+        if similar is not None and right is not None:
+            return f" Write {_example(owner, similar, right)}."
+    return ""
 
 
 def _in_words(

@@ -9,17 +9,28 @@ import re
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
+from .unit_suffixes import factor_between, other_unit, unit_of
+
 
 def did_you_mean(word: str, candidates: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the most similar candidate, or empty.
+
+    A candidate with another unit is most similar, and its unit is named.
 
     Examples
     --------
     >>> did_you_mean("layer", ["layers", "step_deg"])
     " Did you mean 'layers'?"
+    >>> did_you_mean("step_rad", ["layers", "step_deg"])
+    " Did you mean 'step_deg'? Its unit is deg, not rad."
     """
-    similar = _most_similar(word, candidates)
-    return f" Did you mean {similar!r}?" if similar is not None else ""
+    similar = most_similar(word, candidates)
+    if similar is None:
+        return ""
+    unit = ""
+    if factor_between(word, similar) is not None:
+        unit = f" Its unit is {unit_of(similar)}, not {unit_of(word)}."
+    return f" Did you mean {similar!r}?{unit}"
 
 
 def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
@@ -33,14 +44,22 @@ def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
     names = [*candidates]
     if len(words) == 1:
         return did_you_mean(words[0], names)
-    similar = {word: _most_similar(word, names) for word in words}
-    pairs = [f"{name!r} for {word}" for word, name in similar.items() if name is not None]
-    return f" Did you mean {', '.join(pairs)}?" if pairs else ""
+    similar = {word: most_similar(word, names) for word in words}
+    pairs = {word: name for word, name in similar.items() if name is not None}
+    if not pairs:
+        return ""
+    suggestions = ", ".join(f"{name!r} for {word}" for word, name in pairs.items())
+    changed = [word for word, name in pairs.items() if factor_between(word, name) is not None]
+    units = f" Convert the units of {joined(changed)}." if changed else ""
+    return f" Did you mean {suggestions}?{units}"
 
 
-def _most_similar(word: str, candidates: Iterable[str]) -> str | None:
+def most_similar(word: str, candidates: Iterable[str]) -> str | None:
     """Return the most similar candidate, or None if none is similar."""
-    lower = {name.lower(): name for name in candidates}
+    names = [*candidates]
+    if (same_quantity := other_unit(word, names)) is not None:
+        return same_quantity
+    lower = {name.lower(): name for name in names}
     matches = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
     return lower[matches[0]] if matches else None
 

@@ -27,6 +27,9 @@ SNOW_LARGEST_MM = 20.0  # Hahner et al. 2022
 SNOW_LIDAR_RATIO_SR = 25.0  # value of ice clouds (Young and Vaughan 2009)
 DUST_M2_G = 0.6  # mass extinction of mineral dust (Ansmann et al. 2019: 0.57 to 0.63)
 DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 46 to 50 at 532 nm, 57 to 69 at 1064 nm
+# β = 0.046 / MOR (Rasshofer et al. 2011; Hahner et al. 2021), and α = ln 20 / MOR. Fog of clean
+# droplets returns more: DROPS_LIDAR_RATIO_SR.
+FOG_LIDAR_RATIO_SR = 65.0
 DROPS_LIDAR_RATIO_SR = 18.8  # value of clean droplets (O'Connor et al. 2004)
 # diameters; of clumps, the mean
 SPRAY_DROP_MM = 0.2
@@ -50,14 +53,15 @@ LARGE = 2.0  # extinction of a large particle, in its cross-sections: half of it
 class Weather:
     """Extinction of the air, and returns from the air.
 
-    Rain, snow, dust, and fog with a lidar ratio return light: they need `Noise.detection_range_m`,
-    which a sensor detects returns by.
+    Rain, snow and dust need `Noise.detection_range_m`, which decides what a sensor detects. Fog
+    attenuates light without it, too, but returns none then.
     """
 
     visibility_km: Annotated[
         float | None,
         about(
-            "meteorological visibility, of fog and haze alone; by default without extinction",
+            "meteorological optical range of fog and haze, over which 5 % of the light is left; "
+            "by default no fog",
             10.0,
             ge=0.001,
             le=1e6,
@@ -66,13 +70,13 @@ class Weather:
     fog_lidar_ratio_sr: Annotated[
         float | None,
         about(
-            "extinction over back-scatter of fog or haze, for returns from it: "
-            "65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
-            65.0,
+            "extinction over backscatter of fog and haze, for returns from it; "
+            "18.8 of clean droplets, null for none",
+            18.8,
             ge=1,
             le=1000,
         ),
-    ] = None
+    ] = FOG_LIDAR_RATIO_SR
     rain_mm_h: Annotated[float, about("rain; drops attenuate and return light", ge=0, le=300)] = 0.0
     snow_mm_h: Annotated[
         float, about("dry snow, melted; flakes attenuate and return light", ge=0, le=50)
@@ -99,9 +103,13 @@ class Weather:
 
     @property
     def returns_light(self) -> bool:
-        """Whether the air may return light."""
-        fog = self.visibility_km is not None and self.fog_lidar_ratio_sr is not None
-        return bool(fog or self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3)
+        """Whether rain, snow, dust or fog may return light."""
+        return bool(self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3) or self.fog_returns_light
+
+    @property
+    def fog_returns_light(self) -> bool:
+        """Whether fog may return light, to sensors with a detection range."""
+        return self.visibility_km is not None and self.fog_lidar_ratio_sr is not None
 
     @property
     def particles(self) -> tuple[Particles, ...]:
@@ -123,7 +131,7 @@ class Weather:
         return alpha
 
     def backscatter_at(self, wavelength_nm: float) -> float:
-        """Return the back-scatter of fog and dust at a wavelength, 1/(m sr)."""
+        """Return the backscatter of fog and dust at a wavelength, 1/(m sr)."""
         beta = dust(self.dust_mg_m3)[1]
         if self.fog_lidar_ratio_sr is not None:
             beta += extinction(self.visibility_km, wavelength_nm) / self.fog_lidar_ratio_sr

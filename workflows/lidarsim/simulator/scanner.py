@@ -24,6 +24,7 @@ from ..base.words import name_hint
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column
 from ..media.materials import Material
+from ..media.weather import FOG_LIDAR_RATIO_SR
 from ..motion.trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
 from ..scene.actors import Actor
 from ..scene.scene import Scene
@@ -105,7 +106,7 @@ class Scanner:
         returns: Returns | None = None,
         noise: Noise | None = None,
         visibility_km: float | None = None,
-        fog_lidar_ratio_sr: float | None = None,
+        fog_lidar_ratio_sr: float | None = FOG_LIDAR_RATIO_SR,
         rain_mm_h: float = 0.0,
         snow_mm_h: float = 0.0,
         dust_mg_m3: float = 0.0,

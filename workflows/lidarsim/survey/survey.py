@@ -387,7 +387,7 @@ class Survey(CloudOptions, Weather):
             raise LidarError(
                 "spray_g_m3 is of wheels on wet ground, and none is: give wet as well, 0 to 1."
             )
-        if self.returns_light or self.spray_g_m3:
+        if self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3 or self.spray_g_m3:
             for number in range(len(self.carried)):
                 self._check_air(number)
 
@@ -434,7 +434,7 @@ class Survey(CloudOptions, Weather):
             missing = "is not given" if carried.noise is None else "its data sheet does not state"
             guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
             raise LidarError(
-                f"Returns from rain, snow, spray, dust or fog need noise.detection_range_m{name}, "
+                f"Returns from rain, snow, spray or dust need noise.detection_range_m{name}, "
                 f"the range at 10 % reflectance, which {missing}: write what is known of it, or "
                 f"half of the sensor's range, noise: {{detection_range_m: {guess:.3g}}}."
             )

@@ -29,6 +29,7 @@ from lidarsim.base.words import shortened
 
 from . import theme
 from .shot import SurfaceView
+from .stage import make_axis, nice_step
 
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib
@@ -276,6 +277,30 @@ class Page:
             width=small,
             labelfontfamily=FONT,
         )
+        return axes
+
+    def map_chart(
+        self,
+        frame: tuple[float, float, float, float],
+        limits: Floats,
+        origin: Sequence[float] | Floats = (0.0, 0.0),
+        tick_count: int = 8,
+    ) -> Axes:
+        """Add axes for a map, with limits (2, 2) in meters: the lowest and the highest corner.
+
+        The ticks are world coordinates, which are the coordinates in the chart plus `origin` (2,).
+        Large coordinates are shortened in the axis titles, as in "x − 500 000 (m)".
+        """
+        (x0, y0), (x1, y1) = limits.tolist()
+        axes = self.chart(frame, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+        step = nice_step((x1 - x0) / tick_count)
+        for side, name, lower, upper, start in (
+            (axes.xaxis, "x", x0, x1, origin[0]),
+            (axes.yaxis, "y", y0, y1, origin[1]),
+        ):
+            ticks = make_axis(name, lower, upper, step, float(start))
+            side.set_ticks(ticks.ticks, ticks.labels)
+            side.set_label_text(ticks.title)
         return axes
 
     def title(self, text: str, *details: str) -> None:

@@ -127,8 +127,8 @@ class WeatherStep(PulseStep):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """Return whether the weather of the survey returns light."""
-        return setup.survey.returns_light
+        """Return whether the weather of the survey returns light that the sensor may detect."""
+        return setup.survey.returns_light and setup.noise.detection_range_m is not None
 
     @staticmethod
     def added(setup: Setup) -> float:
