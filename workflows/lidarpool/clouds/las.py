@@ -30,6 +30,7 @@ from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 from .file_points import FilePoints, check_count
 from .flight_lines import FlightLines
+from .gps_time import gps_start_s
 from .las_header import las_system, noise_classes, open_las
 from .recording import NoiseFilter, Read, Recording, RecordingSource
 from .well_known_text import wkt
@@ -48,8 +49,6 @@ _NAMES = {
     "intensity": "energy",
     **{TABLE[name].in_files: f"Normal{name[-1].upper()}" for name in NORMAL},
 }
-_GPS_NS = 315_964_800 * 10**9  # time between 1970-01-01 and 1980-01-06, the start of GPS time
-_LEAP_S = 18  # GPS time minus UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # GPS time minus adjusted standard GPS time
 _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
 # Fields of the header: offsets of the waveform packets and of the first such record, their number.
@@ -120,7 +119,7 @@ def _start_s(sweeps: Sweeps) -> float:
     """Return the start of a survey in adjusted standard GPS time, seconds, or 0 without a start."""
     if sweeps.start_ns is None:
         return 0.0
-    return (sweeps.start_ns - _GPS_NS) / 1e9 + _LEAP_S - _ADJUSTED_S
+    return gps_start_s(sweeps) - _ADJUSTED_S
 
 
 def _header(columns: set[str], sweeps: Sweeps, packets: _Packets | None) -> laspy.LasHeader:
