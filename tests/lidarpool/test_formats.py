@@ -392,6 +392,43 @@ def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
     np.testing.assert_allclose(found["intensity"], points.intensity)
 
 
+def test_e57_states_when_each_sweep_was_scanned(cloud, sweeps, tmp_path):
+    def times(start_ns):
+        Format("e57").write(
+            tmp_path / "cloud.e57", cloud, replace(sweeps, start_ns=start_ns), overwrite=True
+        )
+        with pye57.E57(str(tmp_path / "cloud.e57")) as file:
+            header = file.get_header(3)  # of sweep 4, because sweep 3 has no points
+            created = file.root["creationDateTime"]
+            return [
+                (node["dateTimeValue"].value(), node["isAtomicClockReferenced"].value())
+                for node in (created, header["acquisitionStart"], header["acquisitionEnd"])
+            ]
+
+    np.testing.assert_allclose(
+        times(None), [(0, 0), (sweeps.begins_ns[4] / 1e9, 0), (sweeps.ends_ns[4] / 1e9, 0)]
+    )
+    # 2026-11-21T10:00:00 UTC, 18 leap seconds after GPS time began
+    start = datetime(2026, 11, 21, 10, tzinfo=UTC)
+    gps_s = (start - datetime(1980, 1, 6, tzinfo=UTC)).total_seconds() + 18
+    assert times(int(start.timestamp()) * 10**9) == [
+        (gps_s, 1),
+        (gps_s + sweeps.begins_ns[4] / 1e9, 1),
+        (gps_s + sweeps.ends_ns[4] / 1e9, 1),
+    ]
+
+
+def test_e57_has_limits_of_the_cloud_and_bounds_in_the_frame_of_the_points(written, cloud):
+    with pye57.E57(str(written("e57"))) as file:
+        raw = file.read_scan_raw(4)
+        header = file.get_header(4)
+        assert (header.intensityMinimum, header.intensityMaximum) == (0, cloud.intensity.max())
+        for axis in "XYZ":
+            bounds = [getattr(header, f"{axis.lower()}{end}") for end in ("Minimum", "Maximum")]
+            values = raw[f"cartesian{axis}"]
+            np.testing.assert_allclose(bounds, [values.min(), values.max()], atol=1e-5)
+
+
 def test_colours_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
     rng = np.random.default_rng(6)
     colours = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLOURS}
