@@ -392,6 +392,95 @@ def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
     np.testing.assert_allclose(found["intensity"], points.intensity)
 
 
+@pytest.mark.parametrize(
+    ("scale", "expected"),
+    [(1.0, 1.0), (30.0, 32.0), (5e-5, 2.0**-14), (0.0, 1.0)],
+)
+def test_las_has_a_scale_of_intensities_that_suits_the_cloud(
+    cloud, sweeps, tmp_path, scale, expected
+):
+    """Intensities from 0 to `scale`, and 0.9 % that are far brighter."""
+    rng = np.random.default_rng(7)
+    intensity = scale * np.linspace(0, 1, len(cloud), dtype=np.float32)
+    intensity[-int(0.009 * len(cloud)) :] *= 100
+    scaled = Cloud(cloud.positions, {**cloud.columns, "intensity": rng.permutation(intensity)})
+    full_scale = Format("laz").write(tmp_path / "a.laz", scaled, sweeps)
+    las = laspy.read(tmp_path / "a.laz")
+    (record,) = [vlr for vlr in las.header.vlrs if (vlr.user_id, vlr.record_id) == ("lidarpool", 2)]
+    assert json.loads(record.record_data) == {"intensity_full_scale": expected}
+    assert full_scale == expected
+    assert (las.intensity == 65_535).mean() <= 0.01
+    np.testing.assert_allclose(
+        las.intensity / 65_535, np.minimum(scaled.intensity / expected, 1), atol=0.51 / 65_535
+    )
+    np.testing.assert_array_equal(las["energy"], scaled.intensity)
+
+
+def test_the_full_scale_is_that_at_which_one_percent_is_saturated(cloud, sweeps, tmp_path):
+    def full_scale(saturated):
+        intensity = np.full(len(cloud), 0.25, np.float32)
+        intensity[:saturated] = 0.5
+        return Format("las").write(
+            tmp_path / "a.las",
+            Cloud(cloud.positions, {**cloud.columns, "intensity": intensity}),
+            sweeps,
+            overwrite=True,
+        )
+
+    one_percent = len(cloud) // 100
+    assert full_scale(one_percent) == 0.5  # at 0.25, the others would be 65,535
+    assert full_scale(one_percent + 1) == 1.0
+
+
+def test_the_full_scale_can_be_set(cloud, sweeps, tmp_path):
+    save_cloud(cloud, tmp_path / "a.las", intensity_full_scale=2.5)
+    las = laspy.read(tmp_path / "a.las")
+    np.testing.assert_allclose(las.intensity / 65_535 * 2.5, cloud.intensity, atol=2e-5)
+    with pytest.raises(LidarError, match="e57 does not have the option `intensity_full_scale`"):
+        Format("e57", intensity_full_scale=1.0)
+    with pytest.raises(LidarError, match="intensity_full_scale"):
+        Format("las", intensity_full_scale=0.0)
+    bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
+    assert Format("las").write(tmp_path / "b.las", bare, sweeps) is None
+
+
+def test_e57_states_when_each_sweep_was_scanned(cloud, sweeps, tmp_path):
+    def times(start_ns):
+        Format("e57").write(
+            tmp_path / "cloud.e57", cloud, replace(sweeps, start_ns=start_ns), overwrite=True
+        )
+        with pye57.E57(str(tmp_path / "cloud.e57")) as file:
+            header = file.get_header(3)  # of sweep 4, because sweep 3 has no points
+            created = file.root["creationDateTime"]
+            return [
+                (node["dateTimeValue"].value(), node["isAtomicClockReferenced"].value())
+                for node in (created, header["acquisitionStart"], header["acquisitionEnd"])
+            ]
+
+    np.testing.assert_allclose(
+        times(None), [(0, 0), (sweeps.begins_ns[4] / 1e9, 0), (sweeps.ends_ns[4] / 1e9, 0)]
+    )
+    # 2026-11-21T10:00:00 UTC, 18 leap seconds after GPS time began
+    start = datetime(2026, 11, 21, 10, tzinfo=UTC)
+    gps_s = (start - datetime(1980, 1, 6, tzinfo=UTC)).total_seconds() + 18
+    assert times(int(start.timestamp()) * 10**9) == [
+        (gps_s, 1),
+        (gps_s + sweeps.begins_ns[4] / 1e9, 1),
+        (gps_s + sweeps.ends_ns[4] / 1e9, 1),
+    ]
+
+
+def test_e57_has_limits_of_the_cloud_and_bounds_in_the_frame_of_the_points(written, cloud):
+    with pye57.E57(str(written("e57"))) as file:
+        raw = file.read_scan_raw(4)
+        header = file.get_header(4)
+        assert (header.intensityMinimum, header.intensityMaximum) == (0, cloud.intensity.max())
+        for axis in "XYZ":
+            bounds = [getattr(header, f"{axis.lower()}{end}") for end in ("Minimum", "Maximum")]
+            values = raw[f"cartesian{axis}"]
+            np.testing.assert_allclose(bounds, [values.min(), values.max()], atol=1e-5)
+
+
 def test_colours_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
     rng = np.random.default_rng(6)
     colours = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLOURS}

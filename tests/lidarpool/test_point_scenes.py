@@ -347,6 +347,110 @@ def test_scans_of_a_ptx_are_joined_and_face_their_scanners(tmp_path):
     assert facing(scene, sides).all()
 
 
+def reds(scene):
+    """Return the red of surfels, and their x."""
+    centres = scene.vertices[scene.faces].mean(axis=1) + scene.origin
+    return scene.meshes()[0].colours.means()[:, 0].astype(int), centres[:, 0]
+
+
+def ptx_scan(x, cells):
+    """Return the text of a scan of a wall at x whose points end with `cells`."""
+    head = "40\n30\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    return head + "".join(f"{x} {y:.6f} {z:.6f} {cells}\n" for y, z in GRID + 1)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "quantity"),
+    [("0.5 200 200 200", "0.5", "color"), ("0.5 200 200 200", "0.5 0 0 0", "color"),
+     ("0.5", "0", "intensity")],
+)  # fmt: skip
+def test_what_one_of_two_scans_lacks_is_grey(tmp_path, first, second, quantity):
+    path = tmp_path / "a.ptx"
+    path.write_text(ptx_scan(1, first) + ptx_scan(50, second))
+    notes = []
+    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    red, x = reds(scene)
+    assert (red[x < 10] == (200 if quantity == "color" else 255)).all()
+    assert (red[x > 10] == 188).all()
+    assert any(f"1,200 of 2,400 points have no {quantity}. Surfels" in note for note in notes)
+
+
+def leica_file(path, intensities):
+    """Write points with intensities."""
+    rows = np.column_stack([plane(), intensities])
+    if path.suffix == ".ply":
+        kinds = [(name, "f8") for name in ("x", "y", "z", "intensity")]
+        records = np.rec.fromarrays(rows.T, np.dtype(kinds))
+        path.write_bytes(header_of(".ply", records) + records.tobytes())
+    else:
+        header = "x y z intensity" if path.suffix == ".txt" else ""
+        np.savetxt(path, rows, "%.6f %.6f %.6f %.0f", header=header, comments="")
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.txt", "a.pts"])
+def test_intensities_of_leica_begin_at_zero(tmp_path, name):
+    intensities = np.where(GRID[:, 0] < 2, 2047, 0)
+    intensities[0] = -2048
+    notes = []
+    scene = scene_of_points(
+        leica_file(tmp_path / name, intensities), voxel_m=1e-3, tell=notes.append
+    )
+    red, x = reds(scene)
+    assert (red[x > 2] == 188).all() and set(red[x < 2].tolist()) == {0, 255}
+    assert notes == []
+
+
+def test_negative_intensities_of_an_unknown_scale_are_noted(tmp_path):
+    """Such as reflectances in decibels."""
+    intensities = np.where(GRID[:, 0] < 2, 5, -10)
+    intensities[0] = -25
+    path = leica_file(tmp_path / "a.ply", intensities)
+    notes = []
+    red, x = reds(scene_of_points(path, voxel_m=1e-3, tell=notes.append))
+    assert (red[x > 2] == 188).all() and set(red[x < 2].tolist()) == {0, 255}
+    note = "has intensities from -25 to 5 on an unknown scale: -25 counts as 0"
+    assert notes == [f"{path} {note}"]
+
+
+def test_all_clouds_of_a_pts_have_the_same_scale(tmp_path):
+    path = tmp_path / "a.pts"
+    for side, intensity in ((-1.0, -1024), (1.0, 0)):  # the second has no negative intensity
+        with path.open("a") as file:
+            points = plane((20 * side, 0, 0))
+            file.write(f"{len(points)}\n")
+            file.writelines(f"{x:.6f} {y:.6f} {z:.6f} {intensity}\n" for x, y, z in points)
+    red, x = reds(scene_of_points(path, voxel_m=1e-3))
+    assert (red[x < 0] == 188).all() and (red[x > 0] == 255).all()
+    intensities = open_recording(path).read_points(0).intensities
+    np.testing.assert_array_equal(np.unique(intensities), [1024, 2048])
+
+
+def test_empty_cells_are_missing_intensities_and_classes(tmp_path):
+    is_known = GRID[:, 0] < 2
+    rows = [
+        f"{x:.6f},{y:.6f},{z:.6f}," + ("100,2" if known else ",")
+        for (x, y, z), known in zip(plane(), is_known, strict=True)
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text("x,y,z,intensity,class\n" + "\n".join(rows))
+    notes = []
+    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    red, x = reds(scene)
+    assert (red[x < 2] == 255).all() and (red[x > 2.5] == 188).all()
+    names = np.array(scene.meshes()[0].materials.names)[scene.meshes()[0].materials.index]
+    assert (names == np.where(x < 2, "class 2", "")).all()
+    assert [note.partition(" have no ")[2].split(".")[0] for note in notes] == [
+        "class", "intensity",
+    ]  # fmt: skip
+
+
+def test_a_cloud_without_points_takes_no_columns_away(tmp_path):
+    path = written(tmp_path / "a.pts", plane())
+    path.write_text("0\n" + path.read_text())
+    assert (open_recording(path).read_points(0).intensities == 0.5).all()
+
+
 def test_pulses_without_a_return_are_left_out_with_a_note(tmp_path):
     points = np.concatenate([plane((1, 0, 0)), np.zeros((20, 3))])
     notes = []

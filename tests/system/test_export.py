@@ -50,6 +50,10 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert len(list((out / "kitti/sequences/01/velodyne").iterdir())) == 3  # turns of 0.1 s
 
     before = laspy.read(out / "cloud.laz")
+    full_scale = report["intensity_full_scale"]["laz"]
+    stored = np.minimum(before["energy"] / full_scale, 1) * 65_535
+    np.testing.assert_allclose(before.intensity, stored, atol=0.51)
+    assert np.quantile(before.intensity, 0.99) > 32_767, "the scale is no larger than needed"
     refused = lidarpool(
         "export", out, "-f", "mcap", "--layout", "autoware", "--out", tmp_path / "no"
     )
@@ -59,6 +63,10 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     mixed = lidarpool(*mixed)
     assert mixed.code == 0 and "note: PCD does not hold time" in mixed.err
     assert b"start of the sweep" in (tmp_path / "mix/pcd/000000.pcd").read_bytes()[:100]
+    scaled = ("export", out, "-f", "pcd", "-f", "las", "--intensity-full-scale", "100")
+    assert lidarpool(*scaled, "--out", tmp_path / "scaled").code == 0
+    faint = laspy.read(tmp_path / "scaled/cloud.las").intensity
+    np.testing.assert_allclose(faint, before["energy"] / 100 * 65_535, atol=0.51)
     refused = lidarpool("export", out, "-f", "kitti", "--compensated", "--out", tmp_path / "no")
     assert refused.code == 2 and "compensated is an option of pcd" in refused.err
     (out / ".lidarpool-writing-01234567").mkdir()  # of an export that was killed
@@ -67,6 +75,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert not (out / "pcd").exists()
     done = lidarpool("export", out, "-f", "pcd", "-f", "laz", "--overwrite")
     assert (done.code, done.out) == (0, f"{out}/pcd\n{out}/cloud.laz\n")
+    assert f"note: LAZ stores the intensity {full_scale:g} as 65,535" in done.err
     again = laspy.read(out / "cloud.laz")
     for name in before.point_format.dimension_names:
         np.testing.assert_array_equal(again[name], before[name])

@@ -49,7 +49,7 @@ SURVEY = """
 sensor: {rays_per_revolution: 90, layers: 8, step_deg: 4}
 poses: [[0, 0, 1], [1, 0, 1]]
 steps: 25
-cloud: {keep_every: 1}
+cloud: {keep_every: 1, columns: [intensity]}
 planning: {trials: 3, iterations: 20}
 output: {write: [las, kitti]}
 pool: {backend: numpy, gpu: 1}

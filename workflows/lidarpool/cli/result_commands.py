@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,6 +18,9 @@ from lidarsim.base.vocabulary import PICTURES, UNITS_M
 from ..clouds.format_table import EXPORTS, LAYOUTS, row_of
 from . import completion
 from . import shared_options as options
+
+if TYPE_CHECKING:
+    from ..clouds.writing import Format
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -131,16 +134,20 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     is_flag=True,
     help="A point for each ray in mcap and rosbag2, NaN without a return.",
 )
+@click.option(
+    "--intensity-full-scale",
+    type=click.FloatRange(0, min_open=True),
+    metavar="INTENSITY",
+    help="Intensity that las and laz store as 65,535 (default: reached by at most 1 % of points).",
+)
 @options.copies
 @options.overwrite
 def export(
     result: Path | Storage,
     formats: tuple[str, ...],
-    layout: str,
-    compensated: bool,
-    organized: bool,
     out: Path | Storage | None,
     overwrite: bool,
+    **settings: Any,
 ) -> None:
     """Write the cloud of a finished result in further formats.
 
@@ -155,7 +162,6 @@ def export(
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 
     from ..clouds.folder import local_result, result_folder, send
-    from ..clouds.writing import Format
 
     # The report of a result is moved into place last.
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
@@ -172,45 +178,65 @@ def export(
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
         pictures = partial(PictureContent.load_from, source)
-        # Formats that have the option; if no format has the option, all, which refuse it.
-        compensated_names = {name for name in formats if row_of(name).raw_or_compensated} or {
-            *formats
-        }
-        organized_names = {name for name in formats if row_of(name).organized_layouts} or {*formats}
-        chosen_formats = [
-            Format(
-                name,
-                layout,
-                compensated and name in compensated_names,
-                organized and name in organized_names,
-            )
-            for name in dict.fromkeys(formats)
-        ]
+        chosen_formats = _chosen_formats(formats, **settings)
         written: list[str] = []
         with result_folder(target) as folder:
             for chosen in chosen_formats:  # before any is written, which may take long
                 chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
-                if (
-                    isinstance(target, Storage)
-                    and not overwrite
-                    and chosen.row.file in target.entries()
-                ):
-                    raise LidarError(
-                        f"{target.path(chosen.row.file)} is there already: give another place with "
-                        "--out, or --overwrite."
-                    )
+                _check_free(target, chosen.row.file, overwrite=overwrite)
             try:
                 for chosen in chosen_formats:
                     file = folder / chosen.row.file
-                    chosen.write(file, cloud, sweeps, overwrite=overwrite, content=pictures)
+                    full_scale = chosen.write(
+                        file, cloud, sweeps, overwrite=overwrite, content=pictures
+                    )
                     written.append(click.format_filename(send(folder / chosen.row.file, target)))
                     for note in chosen.notes(cloud, sweeps):
                         click.echo(f"note: {note}", err=True)
+                    if full_scale is not None:
+                        _tell(f"{chosen.title} stores the intensity {full_scale:g} as 65,535")
                     click.echo(written[-1])
             except (LidarError, KeyboardInterrupt) as error:
                 if written:
                     error.add_note(f"Written before: {', '.join(written)}.")
                 raise
+
+
+def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
+    """Raise LidarError if a storage holds a file that must not be overwritten."""
+    if isinstance(target, Storage) and not overwrite and file in target.entries():
+        raise LidarError(
+            f"{target.path(file)} is there already: give another place with --out, or --overwrite."
+        )
+
+
+def _chosen_formats(
+    names: Iterable[str],
+    layout: str,
+    compensated: bool,
+    organized: bool,
+    intensity_full_scale: float | None,
+) -> list[Format]:
+    """Return formats with the options that each has.
+
+    An option that none of the formats has goes to all of them, which refuse it.
+    """
+    from ..clouds.writing import Format
+
+    rows = {name: row_of(name) for name in names}
+    compensating = {name for name, row in rows.items() if row.raw_or_compensated} or rows
+    organizing = {name for name, row in rows.items() if row.organized_layouts} or rows
+    scaling = {name for name, row in rows.items() if row.integer_intensities} or rows
+    return [
+        Format(
+            name,
+            layout,
+            compensated and name in compensating,
+            organized and name in organizing,
+            intensity_full_scale if name in scaling else None,
+        )
+        for name in rows
+    ]
 
 
 def _tell(note: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from itertools import count
@@ -19,56 +19,83 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
+from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import COLOURS, NORMAL
+from lidarsim.motion.rotations import matrices
+from lidarsim.scene.files.cloud_scan import CloudScan
+from lidarsim.scene.files.intensity_scales import Limits, scales_of
 from lidarsim.scene.files.stated_system import StatedSystem, check_metric_format
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
-from .file_points import FilePoints, check_count, joined
+from .file_points import FilePoints, check_count, of_scans
+from .gps_time import gps_start_s
 from .recording import Read, Recording, RecordingSource, SweepFiles
 from .well_known_text import wkt
 
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _THIN = "thin it first"
 _POINT_BYTES = 24  # least bytes of the coordinates of a point
+_COORDINATES = {
+    "cartesian": ("cartesianX", "cartesianY", "cartesianZ"),
+    "spherical": ("sphericalRange", "sphericalAzimuth", "sphericalElevation"),
+}
+_COLORS = ("Red", "Green", "Blue")
+# Columns of the fields that are read.
 _COLUMNS = {
-    "colorRed": "red",
-    "colorGreen": "green",
-    "colorBlue": "blue",
+    "intensity": "intensity",
+    **{f"color{color}": name for color, name in zip(_COLORS, COLOURS, strict=True)},
     "rowIndex": "row",
     "columnIndex": "column",
 }
+# Columns whose values the flags mark as invalid.
+_FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLOURS}
+_GRAY = 188  # byte of a color that is unknown: half of the light
+_MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
 _FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
 def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write each sweep that has points, in the sensor frame: pose, intensity, colours, normals.
+    """Write each sweep that has points, in the sensor frame: pose, intensity, colors, normals.
 
-    Poses are in the world, whose coordinate system is stored as WKT.
-
-    Normals are in the extension for surface normals; 0, 0, 0 without a surface.
+    Poses are in world coordinates, whose coordinate system is stored as WKT. Normals are in the
+    extension for surface normals; 0, 0, 0 without a surface. The intensity limits of all scans are
+    0 and the highest intensity of the cloud. Acquisition times are GPS times of the first and the
+    last firing, and the creation time is the start of the survey.
     """
     content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
     normals = {*NORMAL} <= {column.name for column in cloud.table}
     file_class, fields = (_WithNormals, _normal_fields) if normals else (_File, nullcontext)
     system = "" if sweeps.epsg is None else wkt(sweeps.epsg)
-    with _named_by(content), fields(), file_class(path, system) as file:
+    highest = _highest_intensity(cloud)
+    with _named_by(content), fields(), file_class(path, system, sweeps) as file:
         if normals:
             file.image_file.extensionsAdd("nor", _NORMALS_URI)
         try:
             for sweep, points in enumerate(sweeps.points(cloud)):
                 if len(points):
-                    _write_scan(file, sweeps, sweep, points)
+                    _write_scan(file, sweeps, sweep, points, highest)
             file.close()
         except libe57.E57Exception as error:
             del file.image_file  # closing it would fail again
             raise OSError(f"{str(error).splitlines()[0]}; the disk may be full") from error
 
 
-def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
-    x, y, z = sweeps.compensated(sweep, points).T.copy()
+def _highest_intensity(cloud: CloudLike) -> float:
+    """Return the highest intensity of a cloud, or 0 without intensities."""
+    if all(column.name != "intensity" for column in cloud.table):
+        return 0.0
+    chunks = cloud.chunks()
+    return max((float(chunk["intensity"].max(initial=0)) for chunk in chunks), default=0.0)
+
+
+def _write_scan(
+    file: Any, sweeps: Sweeps, sweep: int, points: Cloud, highest_intensity: float
+) -> None:
+    positions = sweeps.compensated(sweep, points)
+    x, y, z = positions.T.copy()
     data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     if "intensity" in points.columns:
         data["intensity"] = points["intensity"]
@@ -79,21 +106,39 @@ def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
         data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
     quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
     position = sweeps.pose.positions[sweep]
+    start_s = gps_start_s(sweeps)
+    # Fields that pye57 would fill with zeros, with the limits of each scan, or with corners of the
+    # bounds in world coordinates, which the format has in the frame of the points.
+    header: dict[str, Any] = {
+        "acquisitionStart_dateTimeValue": start_s + float(sweeps.begins_ns[sweep]) / 1e9,
+        "acquisitionEnd_dateTimeValue": start_s + float(sweeps.ends_ns[sweep]) / 1e9,
+        "acquisitionStart_isAtomicClockReferenced": sweeps.start_ns is not None,
+        "acquisitionEnd_isAtomicClockReferenced": sweeps.start_ns is not None,
+        "intensityMinimum": 0.0,
+        "intensityMaximum": highest_intensity,
+    }
+    for axis, low, high in zip("xyz", positions.min(axis=0), positions.max(axis=0), strict=True):
+        header |= {f"{axis}Minimum": float(low), f"{axis}Maximum": float(high)}
     file.write_scan_raw(
-        data, name=f"sweep {sweep}, motion compensated", rotation=quaternion, translation=position
+        data,
+        name=f"sweep {sweep}, motion compensated",
+        rotation=quaternion,
+        translation=position,
+        scan_header=SimpleNamespace(**header),
     )
 
 
 class _File(pye57.E57):
-    """A new file whose header states a coordinate system, which pye57 leaves empty."""
+    """A new file whose header states coordinate system and time, which pye57 leaves empty."""
 
-    def __init__(self, path: Path, system: str) -> None:
+    def __init__(self, path: Path, system: str, sweeps: Sweeps) -> None:
         self._system = system
+        self._sweeps = sweeps
         self._in_header = False
         super().__init__(str(path), mode="w")
 
     def write_default_header(self) -> None:
-        """Write the header, with the system as its coordinateMetadata."""
+        """Write the header, with the system as coordinateMetadata, and the creation time."""
         self._in_header = True
         super().write_default_header()
         self._in_header = False
@@ -106,6 +151,12 @@ class _File(pye57.E57):
     def _set_field(self, name: str, node: Any) -> None:
         if name == "coordinateMetadata":  # no field can be set twice
             node = libe57.StringNode(self.image_file, self._system)
+        if name == "creationDateTime":
+            has_start = self._sweeps.start_ns is not None
+            time = libe57.FloatNode(self.image_file, gps_start_s(self._sweeps))
+            node = libe57.StructureNode(self.image_file)
+            node.set("dateTimeValue", time)
+            node.set("isAtomicClockReferenced", libe57.IntegerNode(self.image_file, has_start))
         super().root.set(name, node)
 
 
@@ -155,13 +206,11 @@ def _named_by(content: str) -> Iterator[None]:
 # -- reading ---------------------------------------------------------------------------------
 
 
-class _Scan(NamedTuple):
-    """A scan of an E57 in the axes of its scanner, without its invalid points."""
+class _Scale(NamedTuple):
+    """How the intensities of the scans of a file are brought to the same scale."""
 
-    positions: Floats  # (n, 3)
-    columns: dict[str, AnyArray]  # {field: (n,)}
-    pose: Floats | None  # (4, 4), to the frame of the file
-    unread: list[str]  # fields that pye57 does not read
+    limits: Sequence[Limits | None]  # None for scans whose intensities stay as they are
+    notes: tuple[str, ...] = ()  # clauses that follow the name of the file
 
 
 def open_file(source: RecordingSource) -> Recording:
@@ -169,28 +218,35 @@ def open_file(source: RecordingSource) -> Recording:
     with reading(source.name):
         size = input_size(source.path)
         file = pye57.E57(str(source.path))
+        headers = [file.get_header(number) for number in range(file.scan_count)]
         # A column of equal values takes no bytes, whatever the number of points.
         total = Allowance(size, _THIN, in_parts=True)
-        for number in range(file.scan_count):
-            total.take(_bytes_of_scan(file.get_header(number)))
+        for header in headers:
+            total.take(_bytes_of_scan(header))
+        scale = _scale(headers)
 
         def read(number: int) -> Read:
-            header = file.get_header(number)
-            Allowance(size, _THIN).take(_bytes_of_scan(header))
-            scan = _read_scan(file, number, header)
-            columns = {_COLUMNS.get(name, name): values for name, values in scan.columns.items()}
+            Allowance(size, _THIN).take(_bytes_of_scan(headers[number]))
+            scan = _read_scan(file, headers, number, scale)
+            columns = dict(scan.columns)
+            if {*COLOURS} <= columns.keys():
+                for name in COLOURS:
+                    columns[name] = np.nan_to_num(columns[name], nan=_GRAY).astype(np.uint8)
             return scan.positions, columns, np.eye(4) if scan.pose is None else scan.pose
 
-        notes: tuple[str, ...] = ()
+        notes = list(scale.notes)
+        for number, header in enumerate(headers):
+            _, pose_notes = _pose(header, _name(header, number))
+            notes += pose_notes
         epsg = None
         system = _system(file)
-        if system is not None and file.scan_count:
+        if system is not None and headers:
             points, _, pose = read(0)
             assert pose is not None  # every scan has a pose
-            notes = tuple(check_metric_format(system, points @ pose[:3, :3].T + pose[:3, 3]))
+            notes += check_metric_format(system, points @ pose[:3, :3].T + pose[:3, 3])
             # Else the points are in no such system.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
-        sweeps = SweepFiles(file.scan_count, read, notes=notes, epsg=epsg)
+        sweeps = SweepFiles(len(headers), read, notes=tuple(notes), epsg=epsg)
     return source.of_sensors({"": sweeps})
 
 
@@ -199,59 +255,210 @@ def read_points(path: Path) -> FilePoints:
     file = pye57.E57(str(path))
     try:
         headers = [file.get_header(number) for number in range(file.scan_count)]
+        if not headers:
+            raise ValueError("it has no scans")
         point_count = sum(header.point_count for header in headers)
         check_count(point_count)
         Allowance(input_size(path), _THIN).take(_POINT_BYTES * point_count)
-        scans = [
-            _in_file(_read_scan(file, number, header)) for number, header in enumerate(headers)
-        ]
+        scale = _scale(headers)
+        points = of_scans(
+            [_read_scan(file, headers, number, scale) for number in range(len(headers))]
+        )
         system = _system(file)
     finally:
         file.close()
-    if not scans:
-        raise ValueError("it has no scans")
-    return replace(joined(scans), system=system, in_metres=True)
-
-
-def _in_file(scan: _Scan) -> FilePoints:
-    """Return a scan in the frame of the file."""
-    scanner = np.full(3, np.nan)
-    positions = scan.positions
-    if scan.pose is not None:
-        positions = positions @ scan.pose[:3, :3].T + scan.pose[:3, 3]
-        scanner = scan.pose[:3, 3]
-    return FilePoints(positions, scan.columns, np.tile(scanner, (len(positions), 1)), scan.unread)
-
-
-def _read_scan(file: Any, number: int, header: Any) -> _Scan:
-    """Read a scan of an open `pye57.E57`."""
-    columns = file.read_scan_raw(number, ignore_unsupported_fields=True)
-    unread = [name for name in header.point_fields if name not in columns]
-    kind = "cartesian" if "cartesianX" in columns else "spherical"
-    positions = _positions_of_scan(columns, kind)
-    invalid = columns.pop(f"{kind}InvalidState", None)
-    if invalid is not None and invalid.any():
-        rows = np.flatnonzero(invalid == 0)
-        positions = positions[rows]
-        columns = {name: values[rows] for name, values in columns.items()}
-    pose = affine(header.rotation_matrix, header.translation) if header.has_pose() else None
-    return _Scan(positions, columns, pose, unread)
-
-
-def _positions_of_scan(columns: dict[str, AnyArray], kind: str) -> Floats:
-    """Take the coordinates of an E57 scan out of its columns.
-
-    Returns Cartesian positions (n, 3).
-    """
-    if kind == "cartesian":
-        return np.stack([columns.pop(f"cartesian{axis}") for axis in "XYZ"], axis=1)
-    range_m = columns.pop("sphericalRange")
-    azimuth = columns.pop("sphericalAzimuth")
-    elevation = columns.pop("sphericalElevation")
-    across = range_m * np.cos(elevation)
-    return np.stack(
-        [across * np.cos(azimuth), across * np.sin(azimuth), range_m * np.sin(elevation)], axis=1
+    return replace(
+        points, system=system, in_metres=True, notes=[*scale.notes, *points.notes], units_m=None
     )
+
+
+def _read_scan(file: Any, headers: Sequence[Any], number: int, scale: _Scale) -> CloudScan:
+    """Read a scan of an open `pye57.E57` in the axes of its scanner, without invalid points.
+
+    Colors and intensities that are marked as invalid are NaN, and columns of these alone are left
+    out. Other colors are from 0 to 255.
+    """
+    header = headers[number]
+    scan_name = _name(header, number)
+    pose, notes = _pose(header, scan_name)
+    fields = header.point_fields
+    kind = next((kind for kind, axes in _COORDINATES.items() if {*axes} <= {*fields}), None)
+    if kind is None:
+        raise ValueError(f"{scan_name} has neither Cartesian nor spherical coordinates")
+    read = _read_fields(file, header)
+    columns = {name: read[field] for field, name in _COLUMNS.items() if field in read}
+    if {*COLOURS} <= columns.keys():
+        columns |= _color_columns(header, columns)
+    if (limits := scale.limits[number]) is not None:
+        columns["intensity"] = limits.apply(columns["intensity"])
+    for flag, names in _FLAGS.items():
+        invalid = flag in read and read[flag] != 0
+        for column in {*names} & columns.keys() if np.any(invalid) else ():
+            columns[column] = np.where(invalid, np.nan, columns[column]).astype(np.float32)
+            if np.all(invalid):
+                del columns[column]
+    positions = _positions(read, kind)
+    states = [read[state] for state in _states(kind) if state in read]
+    if states and states[0].any():
+        rows = np.flatnonzero(states[0] == 0)
+        positions = positions[rows]
+        columns = {column: values[rows] for column, values in columns.items()}
+    unread = tuple(field for field in fields if field not in read)
+    scanner = None if pose is None else pose[:3, 3]
+    return CloudScan(positions, columns, pose, scanner, unread=unread, notes=notes)
+
+
+def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
+    """Read the fields of a scan that have a meaning here, {name: (n,)}.
+
+    pye57 would read into types that do not hold every value: bytes of colors, 16 bits of rows.
+    """
+    points = header.points
+    prototype = libe57.StructureNode(points.prototype())
+    known = {*_COLUMNS, *_FLAGS, *sum(_COORDINATES.values(), ()), *_states("")}
+    columns: dict[str, AnyArray] = {}
+    buffers = libe57.VectorSourceDestBuffer()
+    for field in header.point_fields:
+        node = prototype[field]
+        if field not in known or isinstance(node, libe57.StringNode):
+            continue
+        letter = "d"
+        if isinstance(node, libe57.IntegerNode):
+            letter = "q"  # pye57 takes "l", the letter of np.int64, for 32 bits
+        elif isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE:
+            letter = "f"
+        columns[field] = np.zeros(header.point_count, letter)
+        buffer = (file.image_file, field, columns[field], header.point_count, True, True)
+        buffers.append(libe57.SourceDestBuffer(*buffer))
+    if header.point_count:
+        points.reader(buffers).read()
+    return columns
+
+
+def _states(kind: str) -> list[str]:
+    """Return the fields that mark points as invalid, that of the coordinates' kind first."""
+    return [f"{of}InvalidState" for of in sorted(_COORDINATES, key=lambda of: of != kind)]
+
+
+def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
+    """Return the Cartesian positions (n, 3) of a scan with coordinates of a kind."""
+    first, second, third = (read[axis].astype(np.float64) for axis in _COORDINATES[kind])
+    if kind == "cartesian":
+        return np.stack([first, second, third], axis=1)
+    across = first * np.cos(third)
+    return np.stack(
+        [across * np.cos(second), across * np.sin(second), first * np.sin(third)], axis=1
+    )
+
+
+def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
+    """Return the colors of a scan from 0 to 255, as bytes or, with NaN, as real numbers."""
+    values = [columns[name] for name in COLOURS]
+    full = _full_color(header, max(float(np.nanmax(color, initial=0)) for color in values))
+    scaled = [np.rint(np.clip(color * (255 / full), 0, 255)) for color in values]
+    has_nan = any(np.isnan(color).any() for color in scaled)
+    dtype = np.float32 if has_nan else np.uint8
+    return {name: color.astype(dtype) for name, color in zip(COLOURS, scaled, strict=True)}
+
+
+def _full_color(header: Any, highest: float) -> float:
+    """Return the value of full color of a scan, by its limits and its highest color."""
+    prototype = libe57.StructureNode(header.points.prototype())
+    nodes = [prototype[f"color{color}"] for color in _COLORS]
+    are_real = not all(isinstance(node, libe57.IntegerNode) for node in nodes)
+    names = [f"color{color}Maximum" for color in _COLORS]
+    limits = [_limit(header, "colorLimits", name) for name in names]
+    stated = [limit for limit in limits if limit is not None]
+    if not stated and not are_real:
+        stated = [float(node.maximum()) for node in nodes]
+    full = max(stated, default=0.0)
+    if full >= max(highest, 255) and full + 1 in {2.0**bits for bits in range(8, 33)}:
+        return full
+    scales = (1.0, 255.0, 65_535.0) if are_real else (255.0, 65_535.0)
+    return next((scale for scale in scales if highest <= scale), highest)
+
+
+def _scale(headers: Sequence[Any]) -> _Scale:
+    """Return how the intensities of scans are brought to the same scale, by their limits."""
+    limits: list[Limits | None] = []
+    for header in headers:
+        low, high = (
+            _limit(header, "intensityLimits", f"intensity{end}") for end in ("Minimum", "Maximum")
+        )
+        if "intensity" not in header.point_fields or low is None or high is None or low >= high:
+            limits.append(None)
+        else:
+            limits.append(Limits(low, high))
+    scales = scales_of([limit for limit in limits if limit is not None])
+    if scales is None:
+        return _Scale([None] * len(headers))
+    pairs = zip(headers, limits, strict=True)
+    if any("intensity" in header.point_fields and limit is None for header, limit in pairs):
+        note = "has scans with and without intensityLimits: their intensities are used as stored"
+        return _Scale([None] * len(headers), (note,))
+    following = iter(scales)
+    applied = [None if limit is None else next(following) for limit in limits]
+    note = "has intensities whose scale is stated by intensityLimits: they were brought to 0 to 1"
+    return _Scale(applied, (note,))
+
+
+def _limit(header: Any, group: str, name: str) -> float | None:
+    """Return a limit that a scan states, or None."""
+    if not header.node.isDefined(f"{group}/{name}"):
+        return None
+    value = _number(header.node[group][name])
+    return value if np.isfinite(value) else None
+
+
+def _number(node: Any) -> float:
+    """Return the value of a node that is a number."""
+    is_scaled = isinstance(node, libe57.ScaledIntegerNode)
+    return float(node.scaledValue() if is_scaled else node.value())
+
+
+def _name(header: Any, number: int) -> str:
+    """Return the name of a scan in messages."""
+    name = str(header.node["name"].value()) if header.node.isDefined("name") else ""
+    return f"scan {number + 1}" + (f" ({printable(name)!r})" if name else "")
+
+
+def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
+    """Return the pose (4, 4) of a scan, and notes on it, or None for a scan without a pose.
+
+    ValueError if the pose is not finite.
+    """
+    node = header.node
+    if not node.isDefined("pose"):
+        return None, ()
+    quaternion, position = (
+        np.array(
+            [
+                _number(node["pose"][part][axis])
+                if node.isDefined(f"pose/{part}/{axis}")
+                else default
+                for axis, default in zip(axes, defaults, strict=True)
+            ]
+        )
+        for part, axes, defaults in (
+            ("rotation", "xyzw", (0.0, 0.0, 0.0, float(not node.isDefined("pose/rotation")))),
+            ("translation", "xyz", (0.0, 0.0, 0.0)),
+        )
+    )
+    if not (np.isfinite(quaternion).all() and np.isfinite(position).all()):
+        raise ValueError(
+            f"the pose of {name} has the quaternion {_listed(quaternion)} (x, y, z, w) and the "
+            f"position {_listed(position)}, which are not finite"
+        )
+    length = np.sqrt((quaternion**2).sum())
+    if length < _MIN_QUATERNION:
+        note = f"has a zero quaternion in the pose of {name}, which is read as no rotation"
+        return affine(np.eye(3), position), (note,)
+    (rotation,) = matrices(quaternion[None] / length)
+    return affine(rotation, position), ()
+
+
+def _listed(numbers: Floats) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)
 
 
 def _bytes_of_scan(header: Any) -> int:

@@ -18,6 +18,9 @@ MIN_POINTS = 12  # least points of a scene: a surfel lies in the plane of as man
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
 NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 ORIGINS = (("origin_x", "origin_y", "origin_z"),)
+# Names of columns in files of various programs; the first name that a file has is read.
+INTENSITIES = ("intensity", "scalar_Intensity", "scalar_intensity", "reflectivity", "i")
+COLOURS = (("red", "green", "blue"), ("colorRed", "colorGreen", "colorBlue"))
 
 Columns = dict[str, AnyArray]  # {name in the file: (n,)}
 Vectors = tuple[str, str, str]
@@ -37,6 +40,7 @@ class FilePoints:
     noise_classes: tuple[int, ...] = NOISE_CLASSES
     left_out: LeftOut = field(default_factory=LeftOut)  # withheld points and noise
     no_returns: int = 0  # points at zero that are left out
+    notes: list[str] = field(default_factory=list)  # clauses that follow the name of the file
 
 
 def from_columns(columns: Columns) -> FilePoints:
@@ -89,6 +93,7 @@ def _placed(scan: CloudScan) -> FilePoints:
         np.tile(scanner, (len(positions), 1)),
         list(scan.unread),
         no_returns=no_returns,
+        notes=list(scan.notes),
     )
 
 
@@ -107,25 +112,44 @@ def _rotated(
 def joined(scans: Sequence[FilePoints]) -> FilePoints:
     """Return the content of scans in the frame of one file.
 
-    A quantity that only some scans have is zero in the others.
+    A quantity that only some scans have is NaN in the others.
     """
-    kinds = {name: values.dtype for scan in scans for name, values in scan.columns.items()}
-    columns = {
-        name: np.concatenate(
-            [scan.columns.get(name, np.zeros(len(scan.positions), kind)) for scan in scans]
-        )
-        for name, kind in kinds.items()
-    }
+    columns_of_scans = [scan.columns for scan in scans]
+    if len(scans) > 1:
+        columns_of_scans = [_measured(scan.columns) for scan in scans]
+    names = dict.fromkeys(name for columns in columns_of_scans for name in columns)
+    counts = [len(scan.positions) for scan in scans]
+    joined_columns = {}
+    for name in names:
+        parts = [
+            columns.get(name, np.full(count, np.nan))
+            for columns, count in zip(columns_of_scans, counts, strict=True)
+            if count
+        ]
+        joined_columns[name] = np.concatenate(parts) if parts else np.zeros(0)
     positions = np.concatenate([scan.positions for scan in scans])
     scanners = np.concatenate([scan.scanners for scan in scans if scan.scanners is not None])
     has_scanner = np.isfinite(scanners).any()
     return FilePoints(
         positions,
-        columns,
+        joined_columns,
         scanners if has_scanner else None,
         list(dict.fromkeys(name for scan in scans for name in scan.ignored)),
         no_returns=sum(scan.no_returns for scan in scans),
+        notes=list(dict.fromkeys(note for scan in scans for note in scan.notes)),
     )
+
+
+def _measured(columns: Columns) -> Columns:
+    """Return the columns of a scan without intensities and colors that are zero throughout.
+
+    Some programs write zeros for quantities that a scan does not have.
+    """
+    missing: list[str] = []
+    for names in (*((name,) for name in INTENSITIES), *COLOURS):
+        if {*names} <= columns.keys() and not any(columns[name].any() for name in names):
+            missing += names
+    return {name: values for name, values in columns.items() if name not in missing}
 
 
 def check_count(count: int) -> None:

@@ -74,6 +74,10 @@ class FormatRow:
         Name that the first sensor has there, whatever its own name, because readers expect it.
     laser_scans
         Whether it has a LaserScan of 2D scanners.
+    integer_intensities
+        Whether intensities are integers. The function that writes the format then takes
+        `intensity_full_scale`, the intensity that is stored as the highest integer, as well; None
+        for a cloud without intensities.
     with_scene
         Whether it has scene and planned path. The function that writes it then takes `content`, the
         content of pictures, as well; None if unknown.
@@ -113,6 +117,7 @@ class FormatRow:
     compensates: bool = False
     first_sensor: str = ""
     laser_scans: bool = False
+    integer_intensities: bool = False
     with_scene: bool = False
     inside: str = ""
     data_set: str = ""
@@ -204,6 +209,7 @@ def _las(name: str) -> FormatRow:
         packages=("laspy", "lazrs"),
         extra="las",
         one_system=True,
+        integer_intensities=True,
         suffixes=(f".{name}",),
         reads=("sweeps", "points"),
     )

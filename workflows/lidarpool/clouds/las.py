@@ -17,8 +17,9 @@ import laspy
 import lazrs
 import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
+from numpy.typing import NDArray
 
-from lidarsim.base.arrays import Floats
+from lidarsim.base.arrays import Floats, Floats32
 from lidarsim.base.errors import CutShortError, LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.interrupts import deferred_interrupts
@@ -30,6 +31,7 @@ from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 from .file_points import FilePoints, check_count
 from .flight_lines import FlightLines
+from .gps_time import gps_start_s
 from .las_header import las_system, noise_classes, open_las
 from .recording import NoiseFilter, Read, Recording, RecordingSource
 from .well_known_text import wkt
@@ -40,7 +42,8 @@ _SAMPLE_RUNS = 40
 _LAZ_CHUNK = 50_000
 _SYSTEM_POINTS = 5  # whose places say where a file is
 ANGLE_DEG = 0.006  # step of the format's scan angle
-FULL_INTENSITY = 65_535  # the format's intensity for 1 and above
+_HIGHEST_INTENSITY = 65_535
+_FULL_SCALE = 2  # number of lidarpool's record with the intensity that is stored as the highest
 _FORMAT_FIELDS = ("return_number", "returns")  # columns stored only in fields of the format
 # Names of columns in the extra bytes: a field of the format is called intensity, and normals have
 # the names of PDAL's dimensions.
@@ -48,8 +51,6 @@ _NAMES = {
     "intensity": "energy",
     **{TABLE[name].in_files: f"Normal{name[-1].upper()}" for name in NORMAL},
 }
-_GPS_NS = 315_964_800 * 10**9  # time between 1970-01-01 and 1980-01-06, the start of GPS time
-_LEAP_S = 18  # GPS time minus UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # GPS time minus adjusted standard GPS time
 _EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
 # Fields of the header: offsets of the waveform packets and of the first such record, their number.
@@ -68,23 +69,30 @@ def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
     return laspy.ExtraBytesParams(_name(column.in_files), column.dtype, description)
 
 
-def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> None:
+def _write(
+    path: Path,
+    cloud: CloudLike,
+    sweeps: Sweeps,
+    *,
+    compress: bool,
+    intensity_full_scale: float | None = None,
+) -> None:
     """Write a cloud: columns to fields of the format, further columns to extra bytes.
 
     `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
     start. A coordinate system is stored as WKT. `return_number` and `returns` are unchanged. Scan
     angle (steps of 0.006 degrees), scan direction, edge of flight line and point source are from
     `FlightLines`. With `red`, `green` and `blue` the point format is 7, and colours are 257 times
-    these, 16 bits. Intensity is the column `intensity` times 65,535, at most that, and
-    classification `class` if it is below 256; because of these limits, both columns are in the
-    extra bytes as well. Of these classes, the lookup has 15 letters of the names, ASCII. Names of
-    materials are a record of lidarpool, a list as JSON. Return numbers are 15 at most. A text area
-    record names the frame of the points. Recorded waveforms make the point format 9, or 10 with
-    colours (`_Packets`).
+    these, 16 bits. Intensity is the column `intensity`, where `intensity_full_scale` and above
+    are 65,535; a record of lidarpool states this number as JSON. Classification is `class` if it is
+    below 256. Because of these limits, both columns are in the extra bytes as well. The lookup has
+    the names of these classes, ASCII, at most 15 letters. Names of materials are a record of
+    lidarpool, a list as JSON. Return numbers are 15 at most. A text area record names the frame of
+    the points. Recorded waveforms make the point format 9, or 10 with colours (`_Packets`).
     """
     packets = _Packets.from_cloud(cloud)
     columns = {column.name for column in cloud.table}
-    header = _header(columns, sweeps, packets)
+    header = _header(columns, sweeps, packets, intensity_full_scale)
     _set_grid(header, cloud, sweeps.precision_m, path.suffix[1:].upper())
     format_fields = (*_FORMAT_FIELDS, *COLOURS) if {*COLOURS} <= columns else _FORMAT_FIELDS
     extra = [column for column in cloud.table if column.name not in format_fields]
@@ -100,6 +108,8 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
             ) as writer:
                 for chunk, lines in FlightLines(sweeps).with_fields(cloud.chunks()):
                     points = _points(chunk, header, names, _start_s(sweeps))
+                    if intensity_full_scale is not None:
+                        points.intensity = _as_integers(chunk["intensity"], intensity_full_scale)
                     points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype(np.int16)
                     points.scan_direction_flag = lines.direction
                     points.edge_of_flight_line = lines.edge
@@ -120,10 +130,18 @@ def _start_s(sweeps: Sweeps) -> float:
     """Return the start of a survey in adjusted standard GPS time, seconds, or 0 without a start."""
     if sweeps.start_ns is None:
         return 0.0
-    return (sweeps.start_ns - _GPS_NS) / 1e9 + _LEAP_S - _ADJUSTED_S
+    return gps_start_s(sweeps) - _ADJUSTED_S
 
 
-def _header(columns: set[str], sweeps: Sweeps, packets: _Packets | None) -> laspy.LasHeader:
+def _as_integers(intensities: Floats32, full_scale: float) -> NDArray[np.uint16]:
+    """Return the format's intensities (n,)."""
+    shares = np.clip(intensities.astype(np.float64) / full_scale, 0, 1)
+    return np.round(shares * _HIGHEST_INTENSITY).astype(np.uint16)
+
+
+def _header(
+    columns: set[str], sweeps: Sweeps, packets: _Packets | None, intensity_full_scale: float | None
+) -> laspy.LasHeader:
     """Return the header of a file with its records, without grid and extra bytes."""
     point_format = (6 if packets is None else 9) + int({*COLOURS} <= columns)
     header = laspy.LasHeader(version="1.4", point_format=point_format)
@@ -147,6 +165,11 @@ def _header(columns: set[str], sweeps: Sweeps, packets: _Packets | None) -> lasp
     header.vlrs.append(
         laspy.VLR("LASF_Spec", _TEXT_AREA, "frame", _FRAMES[sweeps.coordinates].encode() + b"\0")
     )
+    if intensity_full_scale is not None:
+        scale_json = json.dumps({"intensity_full_scale": intensity_full_scale}).encode()
+        header.vlrs.append(
+            laspy.VLR("lidarpool", _FULL_SCALE, "intensity of 65535, JSON", scale_json)
+        )
     if packets is not None:
         header.vlrs.extend(packets.descriptors)
         header.global_encoding.waveform_data_packets_internal = True
@@ -252,10 +275,6 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: fl
     record.number_of_returns = np.minimum(columns.get("returns", single), 15)
     if "time" in columns:
         record.gps_time = columns["time"] / 1e9 + start_s
-    if "intensity" in columns:
-        record.intensity = np.round(np.clip(columns["intensity"], 0, 1) * FULL_INTENSITY).astype(
-            np.uint16
-        )
     if "class" in columns:
         record.classification = np.where(columns["class"] < 256, columns["class"], 0).astype(
             np.uint8

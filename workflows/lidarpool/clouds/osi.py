@@ -24,9 +24,9 @@ from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from .boxes import Boxes, SweepBoxes
+from .gps_time import GPS_NS
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
-_GPS_NS = 315_964_800 * 10**9  # 1980-01-06 after 1970-01-01: the start of surveys without a date
 # Numbers of fields, by osi_sensordata.proto and osi_featuredata.proto of OSI 3.
 _FEATURE_DATA = 26
 _LIDAR_SENSOR = 3
@@ -146,7 +146,7 @@ class _Messages:
     def __init__(self, osi: Any, sweeps: Sweeps) -> None:
         self._osi = osi
         self._sweeps = sweeps
-        self.start_ns = _GPS_NS if sweeps.start_ns is None else sweeps.start_ns
+        self.start_ns = GPS_NS if sweeps.start_ns is None else sweeps.start_ns
         self._host = osi.Identifier(value=len(sweeps.all_names))
         major, minor, patch = map(int, osi.__version_osi__.split("."))
         self._version = osi.InterfaceVersion(

@@ -78,16 +78,26 @@ class RecordedPoints:
     def joined(cls, recorded: list[RecordedPoints]) -> RecordedPoints:
         """Concatenate parts of the same recording, without the keys of their rays.
 
-        All parts have the same columns.
+        Intensities that only some parts have are NaN in the others. Rings that only some parts have
+        are left out.
         """
-        if not recorded:
+        parts = [part for part in recorded if len(part)]
+        if not parts:
             return cls(np.empty((0, 3)))
-        rings = [part.rings for part in recorded if part.rings is not None]
-        intensities = [part.intensities for part in recorded if part.intensities is not None]
+        rings = [part.rings for part in parts if part.rings is not None]
+        intensities = None
+        if any(part.intensities is not None for part in parts):
+            unknown = [np.full(len(part), np.nan) for part in parts]
+            intensities = np.concatenate(
+                [
+                    nothing if part.intensities is None else part.intensities
+                    for part, nothing in zip(parts, unknown, strict=True)
+                ]
+            )
         return cls(
-            np.concatenate([part.points for part in recorded]),
-            np.concatenate(rings) if rings else None,
-            np.concatenate(intensities) if intensities else None,
+            np.concatenate([part.points for part in parts]),
+            np.concatenate(rings) if len(rings) == len(parts) else None,
+            intensities,
         )
 
 

@@ -25,6 +25,8 @@ def open_file(source: RecordingSource) -> Recording:
 
     def read(_: int) -> Read:
         scans = SCAN_READERS[source.path.suffix.lower()](source.path)
+        # Clouds without points have no columns.
+        scans = [scan for scan in scans if len(scan.positions)] or scans
         units_m = METRES if source.unit is not None else scans[0].units_m or METRES
         shared = set.intersection(*(set(scan.columns) for scan in scans))
         columns = {

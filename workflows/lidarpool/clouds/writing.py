@@ -24,6 +24,7 @@ from lidarview.picture_file import PictureContent
 from ..columns.parts import StoredCloud
 from .folder import staging
 from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow, row_of
+from .intensity_full_scale import full_scale_of
 from .laser_scan import COLUMNS as LASER_SCAN_COLUMNS
 from .laser_scan import has_laser_scans
 from .pieces import RangeWorkers, RangeWriter
@@ -60,6 +61,15 @@ class Format:
             "as the driver of the layout has them (velodyne, ouster, images, robosense)"
         ),
     ] = False
+    intensity_full_scale: Annotated[
+        float | None,
+        about(
+            "intensity that las and laz store as 65,535 (default: chosen from the cloud, so that "
+            "at most 1 % of the points reach it)",
+            gt=0,
+            le=1e9,
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         row = self.row  # LidarError for an unknown format
@@ -69,7 +79,12 @@ class Format:
                 f"compensated is an option of {', '.join(choices)}, not of {self.format}: leave it "
                 "out."
             )
-
+        if self.intensity_full_scale is not None and not row.integer_intensities:
+            choices = [name for name, row in FORMATS.items() if row.integer_intensities]
+            raise LidarError(
+                f"{self.format} does not have the option `intensity_full_scale`. It can be set for "
+                f"{' and '.join(choices)} only."
+            )
         if self.organized and self.layout not in row.organized_layouts:
             self._refuse_organized(row)
 
@@ -227,11 +242,16 @@ class Format:
         overwrite: bool = False,
         workers: RangeWorkers | None = None,
         content: Callable[[], PictureContent | None] = lambda: None,
-    ) -> None:
+    ) -> float | None:
         """Write a cloud to a file or folder completely, or not at all.
 
         Points are read in order, a chunk at a time. Workers write a multi-file format, as far as
         they see its folder. `content` returns scene and planned path for formats that hold these.
+
+        Returns
+        -------
+        The intensity that is stored as the highest integer, or None if the format has real numbers
+        or the cloud has no intensities.
 
         Raises
         ------
@@ -247,8 +267,12 @@ class Format:
             }
         if self.row.with_scene:
             options["content"] = content()
+        full_scale: float | None = None
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
+            if self.row.integer_intensities and (full_scale := full_scale_of(cloud)) is not None:
+                full_scale = self.intensity_full_scale or full_scale
+                options["intensity_full_scale"] = full_scale
             with staging(path.parent) as staging_folder:
                 staged = staging_folder / path.name  # bags contain the name of their file
                 if self.row.in_pieces:
@@ -262,6 +286,7 @@ class Format:
                     Storage.at(path.parent).discard(path.name)
                 staged.replace(path)
                 flush(path.parent)
+        return full_scale
 
     def _range_writer(self, cloud: CloudLike, sweeps: Sweeps, storage: Storage) -> RangeWriter:
         return RangeWriter(self.format, cloud, sweeps, storage, self.compensated)
@@ -306,6 +331,7 @@ def save_cloud(
     layout: str = "velodyne",
     compensated: bool = False,
     organized: bool = False,
+    intensity_full_scale: float | None = None,
     precision_m: float | None = None,
 ) -> list[str]:
     """Write points in the format of the path's ending, completely or not at all.
@@ -333,6 +359,9 @@ def save_cloud(
     organized
         In mcap and rosbag2, a point for each ray, NaN without a return, in lines as the driver
         of the layout has them: velodyne, ouster, images and robosense.
+    intensity_full_scale
+        Intensity that .las and .laz store as 65,535. By default it is the smallest power of two at
+        which at most 1 % of the points are stored as 65,535.
     precision_m
         Step of stored positions, metres; by default the survey's precision, else 0.001.
 
@@ -354,7 +383,7 @@ def save_cloud(
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarError(f"precision_m is {precision_m}; it must be a length in metres.")
-    file_format = Format(name, layout, compensated, organized)
+    file_format = Format(name, layout, compensated, organized, intensity_full_scale)
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     with explained(f"{path} cannot be written"):

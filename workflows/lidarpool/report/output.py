@@ -217,26 +217,14 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             sweeps = _write_sweeps(staged, result, sweeps)
             counts = self._write_cloud(staged / CLOUD, result, sweeps, show)
             timeline.mark(timeline.CLOUD_WRITTEN)
-            for output_format in sorted(self.formats, key=lambda entry: entry.row.in_pieces):
-                file = output_format.row.file
-                points = _shown_points(result, file, show)
-                if storage and workers and output_format.row.in_pieces:
-                    clear()
-                    output_format.write_to_storage(storage, points, sweeps, workers)
-                else:
-                    format_workers = None if storage else workers
-                    output_format.write(
-                        staged / file,
-                        points,
-                        sweeps,
-                        workers=format_workers,
-                        content=partial(picture_content, result),
-                    )
+            full_scales = self._write_formats(staged, result, sweeps, clear, workers, show)
             if workers:
                 result = workers.recorded(result)
             report = make_report(result, counts)
             for output_format in self.formats:
                 report["notes"] += output_format.notes(result.points, sweeps)
+            if full_scales:
+                report["intensity_full_scale"] = full_scales
             if self._has_page:
                 self._report(result, report, counts, staged, show)
             _write_report(staged, report, further)
@@ -265,6 +253,40 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 if counts is not None:
                     return counts
             return write_cloud(path, points, sweeps, result.scene)
+
+    def _write_formats(
+        self,
+        staged: Path,
+        result: RunResult,
+        sweeps: Sweeps,
+        clear: Callable[[], object],
+        workers: LidarWorkers | None,
+        show: WritingProgress,
+    ) -> dict[str, float]:
+        """Write the further formats to a temporary folder, or through workers to a storage.
+
+        Returns the intensity that each format with integer intensities stores as its highest
+        integer. `clear` removes an earlier result.
+        """
+        storage = self.target if isinstance(self.target, Storage) else None
+        full_scales: dict[str, float] = {}
+        for output_format in sorted(self.formats, key=lambda entry: entry.row.in_pieces):
+            file = output_format.row.file
+            points = _shown_points(result, file, show)
+            if storage and workers and output_format.row.in_pieces:
+                clear()
+                output_format.write_to_storage(storage, points, sweeps, workers)
+                continue
+            full_scale = output_format.write(
+                staged / file,
+                points,
+                sweeps,
+                workers=None if storage else workers,
+                content=partial(picture_content, result),
+            )
+            if full_scale is not None:
+                full_scales[output_format.format] = full_scale
+        return full_scales
 
     def _report(
         self,

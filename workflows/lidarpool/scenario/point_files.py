@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints
+from lidarsim.base.arrays import AnyArray, Floats, Floats32, Indices, Ints
 from lidarsim.base.errors import LidarError, explained, prefixed, unreadable
 from lidarsim.base.input_files import check_input
 from lidarsim.base.words import plural, printable
+from lidarsim.scene.files.intensity_scales import from_zero
 from lidarsim.scene.files.mesh_formats import advice_on
 from lidarsim.scene.files.noise_points import LeftOut, usable_points
 from lidarsim.scene.files.stated_system import (
@@ -22,17 +23,25 @@ from lidarsim.scene.files.stated_system import (
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
-from ..clouds.file_points import MIN_POINTS, NORMALS, ORIGINS, Columns, FilePoints, Vectors
+from ..clouds.file_points import (
+    COLOURS,
+    INTENSITIES,
+    MIN_POINTS,
+    NORMALS,
+    ORIGINS,
+    Columns,
+    FilePoints,
+    Vectors,
+)
 from ..clouds.format_table import point_suffixes, points_reader
 
 _SAMPLE = 1000  # points that tell whether another system has true metres there
+NO_CLASS = np.iinfo(np.int64).min  # class of a point without a class
 # Names of columns in files of various programs; the first name that a file has is read.
 CLASSES = (
     "class", "classification", "scalar_Classification", "scalar_classification", "label",
     "scalar_Label", "scalar_label",
 )  # fmt: skip
-_INTENSITIES = ("intensity", "scalar_Intensity", "scalar_intensity", "reflectivity", "i")
-_COLOURS = (("red", "green", "blue"), ("colorRed", "colorGreen", "colorBlue"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +57,18 @@ class ScannedPoints:
     outward
         float64 (n, 3): direction to the scanner, or the normal of the file; zero if unknown.
     classes
-        int64 (n,).
+        int64 (n,); `NO_CLASS` for points without a class.
     intensities
-        float64 (n,), in the scale of the file.
+        float64 (n,), from 0, in the scale of the file; NaN for points without an intensity.
     colours
-        uint8 (n, 3), sRGB.
+        float32 (n, 3), sRGB from 0 to 255; NaN for points without a color.
     """
 
     positions: Floats
     outward: Floats | None = None
     classes: Ints | None = None
     intensities: Floats | None = None
-    colours: Bytes | None = None
+    colours: Floats32 | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -119,12 +128,15 @@ def read_points(
             content = reader(path)
             if not keep_noise:
                 content = _without_noise(path, content, tell)
-            points = _scanned_points(content, _to_metres(path, content, unit, epsg, tell))
+            to_metres = _to_metres(path, content, unit, epsg, tell)
+            points, notes = _scanned_points(content, to_metres)
     except LidarError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
         raise LidarError(unreadable(path, error)) from error
     _check_points(path, points, content.left_out)
+    for note in (*content.notes, *notes):
+        tell(f"{path} {note}")
     if content.no_returns:
         tell(
             f"{path}: {content.no_returns:,} points at zero are left out, as pulses without a "
@@ -203,11 +215,17 @@ def _to_metres(
     return convert
 
 
-def _scanned_points(content: FilePoints, to_metres: Callable[[Floats], Floats]) -> ScannedPoints:
-    """Return the finite points of a file's content in metres, with the columns that are kept."""
+def _scanned_points(
+    content: FilePoints, to_metres: Callable[[Floats], Floats]
+) -> tuple[ScannedPoints, list[str]]:
+    """Return the finite points of a file's content in metres, and notes on them.
+
+    Notes are clauses that follow the name of the file.
+    """
     columns = content.columns
+    notes = []
     positions = to_metres(content.positions)
-    colours = _first_vectors(columns, _COLOURS)
+    colours = _first_vectors(columns, COLOURS)
     outward = _first_vectors(columns, NORMALS)
     scanners = content.scanners
     if scanners is None:
@@ -219,17 +237,21 @@ def _scanned_points(content: FilePoints, to_metres: Callable[[Floats], Floats]) 
             outward = None
             content.ignored.append("positions of scanners without a place in that system")
     classes = _first(columns, CLASSES)
-    intensities = _first(columns, _INTENSITIES)
+    intensities = _first(columns, INTENSITIES)
+    if intensities is not None:
+        values = intensities.astype(np.float64)
+        intensities, note = from_zero(np.where(np.isfinite(values), values, np.nan))
+        notes += [note] if note else []
     points = ScannedPoints(
         positions,
         None if outward is None else np.nan_to_num(outward.astype(np.float64)),
         None if classes is None else _as_integers(classes),
-        None if intensities is None else np.nan_to_num(intensities.astype(np.float64)),
-        None if colours is None else _as_srgb_bytes(colours),
+        intensities,
+        None if colours is None else _as_srgb(colours),
     )
     # Depth cameras write NaN for pixels without a return.
     finite = np.isfinite(positions).all(axis=1)
-    return points if finite.all() else points.take(np.flatnonzero(finite))
+    return points if finite.all() else points.take(np.flatnonzero(finite)), notes
 
 
 def _first(columns: Columns, names: Iterable[str]) -> AnyArray | None:
@@ -238,7 +260,7 @@ def _first(columns: Columns, names: Iterable[str]) -> AnyArray | None:
     LAS has a column for each quantity, zero where the quantity was not measured.
     """
     present = (columns[name] for name in names if name in columns)
-    return next((values for values in present if values.any()), None)
+    return next((values for values in present if _has_values(values)), None)
 
 
 def _first_vectors(columns: Columns, names: Iterable[Vectors]) -> AnyArray | None:
@@ -246,42 +268,52 @@ def _first_vectors(columns: Columns, names: Iterable[Vectors]) -> AnyArray | Non
     for axes in names:
         if all(name in columns for name in axes):
             vectors = np.stack([columns[name] for name in axes], axis=1)
-            if vectors.any():
+            if _has_values(vectors):
                 return vectors
     return None
 
 
+def _has_values(values: AnyArray) -> bool:
+    """Return True if a value is neither 0 nor NaN."""
+    return bool((values[values == values] != 0).any())
+
+
 def _as_integers(classes: AnyArray) -> Ints:
-    """Return classes as integers.
+    """Return classes as integers, `NO_CLASS` for NaN.
 
     ValueError if a class is not a whole number.
     """
+    if classes.dtype.kind == "f":
+        classes = np.where(np.isnan(classes), float(NO_CLASS), classes)
     numbers = classes.astype(np.int64)
     if not np.array_equal(numbers, classes):
         raise ValueError("classes of its points are not whole numbers")
     return numbers
 
 
-def _as_srgb_bytes(colours: AnyArray) -> Bytes:
-    """Return colours (n, 3) as bytes: of 8 or 16 bits, or real numbers from 0 to 1 or 255."""
+def _as_srgb(colours: AnyArray) -> Floats32:
+    """Return colors (n, 3) from 0 to 255: of 8 or 16 bits, or real numbers from 0 to 1 or 255."""
     if colours.dtype == np.uint8:
-        return colours
-    values = np.nan_to_num(colours.astype(np.float64))
-    highest = values.max()
+        return colours.astype(np.float32)
+    values = colours.astype(np.float64)
+    values[~np.isfinite(values).all(axis=1)] = np.nan
+    highest = np.nanmax(values, initial=0)
     if highest <= 1 and colours.dtype.kind == "f":
         values = 255 * values
     elif highest > 255:
         values = values / 257  # 16 bits; several programs write 8 bits into the 16 of LAS
-    return np.rint(np.clip(values, 0, 255)).astype(np.uint8)
+    return np.rint(np.clip(values, 0, 255)).astype(np.float32)
 
 
 def _left_out(content: FilePoints) -> list[str]:
     """Return the names of the columns that surfels do not keep and that are not zero."""
     columns = content.columns
     used: set[str] = set()
-    for names in (CLASSES, _INTENSITIES):
+    for names in (CLASSES, INTENSITIES):
         used.update([name for name in names if name in columns][:1])
-    for axes in (*_COLOURS, *NORMALS, *ORIGINS):
+    for axes in (*COLOURS, *NORMALS, *ORIGINS):
         used.update(axes)
-    remaining = [name for name, values in columns.items() if name not in used and np.any(values)]
+    remaining = [
+        name for name, values in columns.items() if name not in used and _has_values(values)
+    ]
     return [printable(name) for name in [*remaining, *content.ignored]]

@@ -16,11 +16,12 @@ import numpy as np
 from pydantic import Field
 
 from lidarsim.base.allowance import bytes_of, memory
-from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
+from lidarsim.base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.scene.colours import LINEAR, Colours, as_srgb
+from lidarsim.base.words import plural
+from lidarsim.scene.colours import GREY, LINEAR, Colours, as_srgb
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import warn
 from lidarsim.scene.scene import Scene
@@ -28,7 +29,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..base.open3d_module import load_open3d
 from ..clouds.file_points import MIN_POINTS, POINT_BYTES
-from .point_files import ScannedPoints, read_points
+from .point_files import NO_CLASS, ScannedPoints, read_points
 
 # Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.
@@ -40,6 +41,7 @@ _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _MAX_VOXELS = 1 << 62  # voxels of the box around the points: 64 bits number voxels
 CLASS_MATERIAL = "class "  # and the number: name of the material of surfels with a class
+_GRAY = "take the mean color of their neighbors, or are gray"  # in notes
 _WHITE_QUANTILE = 0.99  # share of intensities up to white: mirrors return more
 
 
@@ -128,15 +130,31 @@ def _coloured(
     if colour is not None and not present[colour]:
         quantity = "colours" if colour == "rgb" else "intensities"
         raise LidarError(f"{path} has no {quantity}: leave out colour {colour}.")
+    if points.classes is not None:
+        _note_unknown(path, "class", points.classes == NO_CLASS, "have no material", tell)
     if not any(present.values()):
         return points
     colour = colour or next(name for name, is_present in present.items() if is_present)
     if all(present.values()):
         other, choice = ("intensities", "intensity") if colour == "rgb" else ("colours", "rgb")
         tell(f"{path}: {other} are not kept, because surfels have a colour: choose colour {choice}")
-    if colour == "rgb":
+    if points.colours is not None and colour == "rgb":
+        _note_unknown(path, "color", np.isnan(points.colours[:, 0]), _GRAY, tell)
         return replace(points, intensities=None)
+    if points.intensities is not None:
+        _note_unknown(path, "intensity", np.isnan(points.intensities), _GRAY, tell)
     return replace(points, colours=None)
+
+
+def _note_unknown(
+    path: Path, quantity: str, unknown: Bools, outcome: str, tell: Callable[[str], None]
+) -> None:
+    """Call `tell` if points (n,) lack a quantity that others have."""
+    if count := int(unknown.sum()):
+        tell(
+            f"{path}: {count:,} of {plural(len(unknown), 'point')} have no {quantity}. Surfels of "
+            f"such points {outcome}."
+        )
 
 
 def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: float) -> SceneMesh:
@@ -172,7 +190,7 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
         path.stem,
         corners.reshape(-1, 3) + origin,
         surfel_faces(count),
-        colours=_surfel_colours(points, voxels),
+        colours=_surfel_colours(o3d, points, voxels, np.asarray(cloud.points)),
         materials=surfel_materials(points, voxels),
     )
 
@@ -221,14 +239,22 @@ class Voxels:
         means: Floats = sums / self.counts[:, None]
         return means
 
-    def most_frequent(self, numbers: Ints, distinct: int) -> Ints:
+    def known_means(self, values: AnyArray) -> Floats:
+        """Return the means (v, k) in each voxel of the values (n, k) that are not NaN, or NaN."""
+        known = ~np.isnan(values)
+        with np.errstate(invalid="ignore"):  # 0 / 0 of voxels without values
+            return self.means(np.where(known, values, 0.0)) / self.means(known)
+
+    def most_frequent(self, numbers: Ints, distinct: int, unknown: int | None = None) -> Ints:
         """Return the most frequent number (v,) in each voxel, of several the lowest.
 
-        `numbers` (n,) of the points are from 0 to below `distinct`.
+        `numbers` (n,) of the points are from 0 to below `distinct`. The number `unknown` is
+        returned only for voxels that have no other.
         """
         voxel = np.repeat(np.arange(len(self.counts)), self.counts)
         pairs, repeats = np.unique(voxel * distinct + numbers[self.order], return_counts=True)
         voxel_of_pair, number = np.divmod(pairs, distinct)
+        repeats[number == unknown] = 0
         by_frequency = np.lexsort((number, -repeats, voxel_of_pair))
         _, firsts = np.unique(voxel_of_pair[by_frequency], return_index=True)
         modes: Ints = number[by_frequency][firsts]
@@ -241,19 +267,47 @@ def _directions(vectors: Floats) -> Floats:
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
 
-def _surfel_colours(points: ScannedPoints, voxels: Voxels) -> Colours | None:
-    """Return the mean colours of surfels in linear light, or greys of their mean intensities."""
+def _surfel_colours(
+    o3d: Any, points: ScannedPoints, voxels: Voxels, centers: Floats
+) -> Colours | None:
+    """Return the mean colors of surfels in linear light, or grays of their mean intensities.
+
+    `centers` (v, 3) are the centers of the surfels. A surfel whose points have neither has the mean
+    of its neighbors, or, if these have neither, the gray of a file without colors.
+    """
     light: Floats
     if points.colours is not None:
-        light = voxels.means(LINEAR[points.colours])
+        light = voxels.known_means(_light(points.colours))
     elif points.intensities is not None:
-        white = np.quantile(points.intensities, _WHITE_QUANTILE)
-        intensities = voxels.means(points.intensities[:, None])
+        white = np.nanquantile(points.intensities, _WHITE_QUANTILE)
+        intensities = voxels.known_means(points.intensities[:, None])
         light = np.clip(intensities / (white if white > 0 else 1.0), 0, 1).repeat(3, axis=1)
     else:
         return None
-    colours: Bytes = as_srgb(light)
+    _fill_from_neighbors(o3d, light, centers)
+    colours: Bytes = np.where(np.isnan(light), GREY[0], as_srgb(light))
     return Colours.of_faces(colours.repeat(2, axis=0))
+
+
+def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
+    """Replace NaN in the light (v, 3) of surfels by the mean of the neighbors that have light."""
+    unknown = np.flatnonzero(np.isnan(light[:, 0]))
+    if not 0 < len(unknown) < len(light):
+        return
+    tree = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(centers))
+    tree.knn_index()
+    neighbors, _ = tree.knn_search(o3d.core.Tensor(centers[unknown]), _NEIGHBOURS)
+    around = light[neighbors.numpy()]
+    known = ~np.isnan(around)
+    with np.errstate(invalid="ignore"):  # 0 / 0 of surfels without such neighbors
+        light[unknown] = np.where(known, around, 0.0).sum(axis=1) / known.sum(axis=1)
+
+
+def _light(colours: Floats32) -> Floats:
+    """Return the linear light (n, 3) of sRGB colors from 0 to 255, NaN of NaN."""
+    known = np.isfinite(colours)
+    light = LINEAR[np.where(known, colours, 0).astype(np.uint8)]
+    return np.where(known, light, np.nan)
 
 
 def surfel_materials(points: ScannedPoints, voxels: Voxels) -> FaceMaterials | None:
@@ -261,9 +315,13 @@ def surfel_materials(points: ScannedPoints, voxels: Voxels) -> FaceMaterials | N
     if points.classes is None:
         return None
     classes, numbers = np.unique(points.classes, return_inverse=True)
-    modes = voxels.most_frequent(numbers, len(classes))
+    unknown = 0 if classes[0] == NO_CLASS else None  # the lowest of all classes
+    modes = voxels.most_frequent(numbers, len(classes), unknown)
     present, rows = np.unique(modes, return_inverse=True)
-    names = tuple(f"{CLASS_MATERIAL}{number}" for number in classes[present].tolist())
+    names = tuple(
+        "" if number == NO_CLASS else f"{CLASS_MATERIAL}{number}"
+        for number in classes[present].tolist()
+    )
     return FaceMaterials(names, rows.astype(np.int32).repeat(2))
 
 

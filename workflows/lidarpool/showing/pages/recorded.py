@@ -66,13 +66,18 @@ class Pieces:
         }  # zeros take long to be looked at, and are not joined
 
     def cloud(self, **columns: AnyArray) -> Cloud:
-        """Join the points with the columns that all pieces have, and further columns."""
+        """Join the points with the columns that all pieces have, and further columns.
+
+        Pieces without points may lack columns.
+        """
         if not self.positions:
             return Cloud(np.zeros((0, 3)), columns)
-        shared = set.intersection(*({*piece} for piece in self.columns))
+        pairs = zip(self.positions, self.columns, strict=True)
+        filled = [piece for positions, piece in pairs if len(positions)] or self.columns
+        shared = set.intersection(*({*piece} for piece in filled))
         joined = {
-            name: np.concatenate([piece[name] for piece in self.columns])
-            for name in self.columns[0]
+            name: np.concatenate([piece[name] for piece in filled])
+            for name in filled[0]
             if name in shared & self._used
         }
         joined = _with_known_names(joined, shared) | columns

@@ -33,6 +33,7 @@ class CloudScan(NamedTuple):
     scanner: Floats | None = None  # (3,): position in the frame of the file; None if unknown
     units_m: tuple[float, float, float] | None = None  # one for each axis, if the file states them
     unread: tuple[str, ...] = ()  # columns without numbers or names
+    notes: tuple[str, ...] = ()  # clauses that follow the name of the file
 
 
 def usual_names(names: Iterable[str]) -> list[str]:

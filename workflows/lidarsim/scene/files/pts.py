@@ -18,6 +18,7 @@ from ...base.errors import CutShortError
 from ...base.input_files import check_input, open_input
 from ...base.words import plural, printable
 from .cloud_scan import CloudScan
+from .intensity_scales import LEICA_LOWEST
 from .text_rows import RowReader
 
 COLOURS = ("red", "green", "blue")
@@ -27,13 +28,13 @@ _NAMES = {  # {cells of a line: names}
     6: ("x", "y", "z", *COLOURS),
     7: ("x", "y", "z", "intensity", *COLOURS),
 }
-_LOWEST_INTENSITY = -2048  # lowest value of Leica's scale, which is 4096 wide
 
 
 def read_pts(path: Path) -> list[CloudScan]:
     """Read the clouds of a .pts, all in one frame.
 
-    Intensities are shifted to begin at 0 if some are negative.
+    If an intensity of any cloud is negative, the intensities of all clouds are shifted by 2048, the
+    lowest value of Leica's scale.
 
     Raises
     ------
@@ -60,6 +61,10 @@ def read_pts(path: Path) -> list[CloudScan]:
             scans.append(_read_cloud(following, number, count))
     if not scans:
         raise ValueError("it is empty: the number of points was expected")
+    intensities = [scan.columns["intensity"] for scan in scans if "intensity" in scan.columns]
+    if any((values < 0).any() for values in intensities):
+        for values in intensities:
+            values -= LEICA_LOWEST
     return scans
 
 
@@ -80,11 +85,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
     if count is not None and len(values) < count:
         raise CutShortError(f"line {number} announces {count:,} points, and {len(values):,} follow")
-    columns = point_columns(values, names)
-    intensities = columns.get("intensity")
-    if intensities is not None and intensities.min() < 0:
-        columns["intensity"] = intensities - _LOWEST_INTENSITY
-    return CloudScan(values[:, :3], columns)
+    return CloudScan(values[:, :3], point_columns(values, names))
 
 
 def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:
