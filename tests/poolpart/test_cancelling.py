@@ -8,7 +8,7 @@ import pytest
 from distributed import Client, Event, get_worker
 from tests.poolpart.helpers import LONG_S, wait_for
 
-from poolpart import Partition, PoolError, cancelled
+from poolpart import Partition, PipeFailed, PoolError, cancelled
 
 
 def until_cancelled(started, ended):
@@ -95,6 +95,23 @@ def test_a_worker_with_nothing_but_cancelled_tasks_is_restarted(processes, event
     outcomes = gpu.cancel([future, waiting], running="restart")
     assert outcomes == {future.key: "restarted: worker GPU-0", waiting.key: "cancelled"}
     assert gpu.submit(os.getpid).result(LONG_S) != pid
+
+
+def put_and_sleep(pipe):
+    pipe.put("started")
+    time.sleep(3600)
+
+
+def test_the_pipe_of_a_producer_whose_worker_is_restarted_fails(processes, make_pipe):
+    gpu = Partition("GPU", processes)
+    pipe = make_pipe(processes)
+    producer = gpu.submit(put_and_sleep, pipe)
+    assert pipe.get(LONG_S) == "started"
+    outcomes = gpu.cancel(producer, running="restart")
+    assert outcomes == {producer.key: "restarted: worker GPU-0"}
+    reason = f"^Task '{producer.key}', which uses the pipe, was cancelled, and its worker was rest"
+    with pytest.raises(PipeFailed, match=reason):
+        pipe.get(LONG_S)
 
 
 def test_a_worker_with_another_task_or_result_is_not_restarted(processes, event, wait_until):
