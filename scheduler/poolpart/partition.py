@@ -428,15 +428,18 @@ class Partition:
             their function returns, which can look whether it was `cancelled`. With "restart", a
             worker that runs nothing but such tasks is restarted by its nanny, and comes back to
             the partition. A worker is never restarted if it has another task, an actor, or a
-            result that no other worker has.
+            result that no other worker has. Neither is a worker that does not answer within 5 s,
+            for instance because a function holds the interpreter lock. The call returns after 80 s
+            at the latest, even if a restarted worker has not come back.
 
         Returns
         -------
         dict
-            {key: what happened}, a text that begins with one of these words. ``cancelled``: it
-            will not run. ``ended``: it had ended before; its result is gone. ``running: …``: it
-            still runs, on which worker, and why that was not restarted. ``restarted: …``: its
-            worker was restarted. ``kept: …``: somebody else wants its result.
+            {key: what happened}. Each text begins with one of these words. ``cancelled``: the task
+            will not run. ``ended``: it had ended before, and its result is gone. ``running: …``: it
+            still runs, or may run on a worker that does not answer; the text names the worker and
+            the reason why it was not restarted. ``restarted: …``: its worker was restarted.
+            ``kept: …``: another client wants its result.
 
         Raises
         ------
