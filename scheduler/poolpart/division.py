@@ -17,6 +17,7 @@ from distributed import Client
 from .errors import PoolError
 from .features import FEATURES, begin_features, features_settled, names_with_features
 from .fence import enclose, lower
+from .internals.client import ANSWER_S
 from .internals.scheduler import asks_for, lift_restrictions
 from .membership import release
 from .registration import forget_registrations
@@ -39,7 +40,11 @@ def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
     `question` is a coroutine function of this module, such as `grow`. If it raises a PoolError on
     the scheduler, a PoolError with the same message is raised here.
     """
-    result, complaint = on_scheduler(client, _answer, question=question, arguments=arguments)
+    # The steward waits for tasks, and then for workers, for `timeout_s` each.
+    answer_s = ANSWER_S + 2 * arguments.get("timeout_s", 0.0)
+    result, complaint = on_scheduler(
+        client, _answer, question=question, arguments=arguments, answer_s=answer_s
+    )
     if complaint:
         raise PoolError(complaint)
     return result

@@ -26,7 +26,7 @@ from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PoolError
-from .internals.client import slots_lent, when_done
+from .internals.client import gather, slots_lent, when_done
 from .membership import Prospects, prospects
 from .worker_wait import WAIT_S, WorkerWait, check_wait
 
@@ -473,7 +473,7 @@ class Results(Iterator[Any]):
             else:
                 chunk = self._running.pop(future)
                 self._undelivered[chunk.first] = chunk, future
-        answers = self._stages[-1].client.gather(finished) if finished else ()
+        answers = gather(self._stages[-1].client, finished) if finished else ()
         for future, answer in zip(finished, answers, strict=True):
             chunk = self._running.pop(future)
             self._undelivered[chunk.first] = chunk, answer

@@ -5,7 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from contextvars import ContextVar
 from typing import Any, Literal, Self, overload
 
@@ -25,6 +25,7 @@ from .mapping import Results, Stage
 from .membership import MemberName, register
 from .partition_stats import PartitionStats
 from .pipe import Pipe
+from .pipe_states import USES_PIPES
 from .rules import check_count
 from .stats import stats_of, tasks_of
 from .task_context import own_client
@@ -197,17 +198,19 @@ class Partition:
                 )
             # LocalCluster's are numbers.
             workers = [MemberName(name) if asks else str(name) for name in several]
-        return self.client.submit(
-            function,
-            *args,
-            key=key,
-            pure=False,
-            priority=priority,
-            retries=retries or None,
-            resources=resources,
-            workers=workers,
-            **kwargs,
-        )
+        pipes = _names_of_pipes([*args, *kwargs.values()])
+        with dask.annotate(**{USES_PIPES: pipes}) if pipes else nullcontext():
+            return self.client.submit(
+                function,
+                *args,
+                key=key,
+                pure=False,
+                priority=priority,
+                retries=retries or None,
+                resources=resources,
+                workers=workers,
+                **kwargs,
+            )
 
     def _taking(self, slots: int, asks: bool = True) -> dict[str, int]:
         """Check and return the resources of a task.
@@ -425,15 +428,18 @@ class Partition:
             their function returns, which can look whether it was `cancelled`. With "restart", a
             worker that runs nothing but such tasks is restarted by its nanny, and comes back to
             the partition. A worker is never restarted if it has another task, an actor, or a
-            result that no other worker has.
+            result that no other worker has. Neither is a worker that does not answer within 5 s,
+            for instance because a function holds the interpreter lock. The call returns after 80 s
+            at the latest, even if a restarted worker has not come back.
 
         Returns
         -------
         dict
-            {key: what happened}, a text that begins with one of these words. ``cancelled``: it
-            will not run. ``ended``: it had ended before; its result is gone. ``running: …``: it
-            still runs, on which worker, and why that was not restarted. ``restarted: …``: its
-            worker was restarted. ``kept: …``: somebody else wants its result.
+            {key: what happened}. Each text begins with one of these words. ``cancelled``: the task
+            will not run. ``ended``: it had ended before, and its result is gone. ``running: …``: it
+            still runs, or may run on a worker that does not answer; the text names the worker and
+            the reason why it was not restarted. ``restarted: …``: its worker was restarted.
+            ``kept: …``: another client wants its result.
 
         Raises
         ------
@@ -666,6 +672,13 @@ def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> 
     for option, advice in instead.items():
         if option in options:
             raise PoolError(f"Partition.{method} sets {option} itself: {advice}.")
+
+
+def _names_of_pipes(arguments: Iterable[Any]) -> list[str]:
+    """Return the names of pipes among arguments, or in lists, that fail with their tasks."""
+    members = (a if isinstance(a, list | tuple) else [a] for a in arguments)
+    pipes = (pipe for group in members for pipe in group if isinstance(pipe, Pipe))
+    return [pipe.name for pipe in pipes if pipe.fails_with_tasks]
 
 
 def _check_function(name: str, function: Callable[..., Any]) -> None:

@@ -22,6 +22,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import islice
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -68,7 +69,18 @@ class Pipe:
     After `fail`, every `put` raises `PipeFailed`. A `get` first hands out what this object has
     already taken, and then raises; waiting calls raise within a second. A pipe that does not exist,
     or was deleted, raises the same error, `close` and `fail` included. If the scheduler has died,
-    calls raise OSError, after Dask's ``distributed.comm.timeouts.connect``.
+    calls raise OSError, after Dask's ``distributed.comm.timeouts.connect``. If the scheduler does
+    not answer, they raise OSError after five minutes.
+
+    An open pipe also fails when a task that uses it is lost, because the other end would wait
+    forever. This applies to tasks of `Partition.submit` and `Partition.for_each` that have the pipe
+    as an argument, directly or in a list. The pipe fails if such a task fails after all retries, or
+    if it is cancelled before it has used the pipe, for instance because no future of it was kept.
+    A running task is not stopped by cancelling it, so it can go on using the pipe. If
+    `Partition.cancel` restarts its worker, the pipe fails, unless the task is a consumer. A task
+    that Dask runs again because its worker has died does not affect the pipe. After
+    `Client.restart`, all open pipes of the cluster fail. A task that returns without calling
+    `close` is not an error: other producers may follow.
 
     A consumer takes all queued items, up to about `capacity`, in one request; `get` and
     iteration hand them out one by one. At most ``capacity * (1 + consumers)`` items are
@@ -94,6 +106,9 @@ class Pipe:
         The client to use. By default, on a worker, the worker's own.
     producers
         Number of producers. Each producer calls `close` when it is done.
+    fails_with_tasks
+        Whether the pipe fails when a task that has it as an argument is lost. Pass False if the
+        program submits lost tasks again.
 
     Notes
     -----
@@ -120,7 +135,13 @@ class Pipe:
     """
 
     def __init__(
-        self, name: str, capacity: int = 16, client: Client | None = None, producers: int = 1
+        self,
+        name: str,
+        capacity: int = 16,
+        client: Client | None = None,
+        producers: int = 1,
+        *,
+        fails_with_tasks: bool = True,
     ) -> None:
         for quantity, number in (("capacity", capacity), ("number of producers", producers)):
             if not isinstance(number, int) or number < 1:
@@ -129,6 +150,7 @@ class Pipe:
         self.name = name
         self.capacity = capacity
         self.producers = producers
+        self.fails_with_tasks = fails_with_tasks
         self._client = client
         # Items that the scheduler has handed over and no call has returned yet. The event loop of
         # the client appends them, threads that share this object remove them.
@@ -136,7 +158,8 @@ class Pipe:
         self._advice: int | None = None  # advice of the last reply
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Pipe, (self.name, self.capacity, None, self.producers)
+        arguments = (self.name, self.capacity, None, self.producers)
+        return partial(Pipe, fails_with_tasks=self.fails_with_tasks), arguments
 
     def __repr__(self) -> str:
         return f"<Pipe {self.name!r} capacity {self.capacity}>"
@@ -239,7 +262,7 @@ class Pipe:
             if self.name in replies:
                 on_reply(replies[self.name])
 
-        options = {"names": [self.name], **arguments}
+        options = {"names": [self.name], "task": _key_of_task(), **arguments}
         return self._reply(
             _ask_until(self.client, deadline, has_settled_reply, question, pass_on, **options)
         )
@@ -445,6 +468,10 @@ class Pipe:
             raise PipeFailed(reply["failure"])
         return reply
 
+    def put_back(self, item: Any) -> None:
+        """Make an item that this object has returned the next item that it returns."""
+        self._buffer.appendleft(dumps(item))
+
     def _remove(self, limit: float = math.inf) -> list[Packed]:
         """Remove and return the first items of the buffer, at most `limit`, still pickled."""
         packed: list[Packed] = []
@@ -499,8 +526,9 @@ class Pipe:
         Returns
         -------
         Listener
-            Its `close` waits for the end of the pipe and of the last call, and raises the error of
-            the function. A ``with`` block closes it.
+            Its `join` waits for the end of the pipe and of the last call, and raises the error of
+            the function; its `close` stops listening. At the end of a ``with`` block, it is joined,
+            or closed if the block raises an error.
 
         Examples
         --------
@@ -521,10 +549,15 @@ def _is_answered(reply: Reply) -> bool:
     return bool(reply["answer"])
 
 
+def _key_of_task() -> str:
+    """Return the key of this thread's task, or "" elsewhere."""
+    running = task_of_thread()
+    return "" if running is None else str(running[1].key)
+
+
 def _producer() -> str:
     """Return an id of the producer: the key of this thread's task, or a random id elsewhere."""
-    running = task_of_thread()
-    return uuid.uuid4().hex if running is None else str(running[1].key)
+    return _key_of_task() or uuid.uuid4().hex
 
 
 def forget_pipes(client: Client, names: Sequence[str]) -> None:

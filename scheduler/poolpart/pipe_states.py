@@ -12,6 +12,7 @@ takes items only if its client is still there.
 
 from __future__ import annotations
 
+import asyncio
 import sys
 from collections import defaultdict
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
@@ -35,6 +36,8 @@ CHANGE, PUT, TAKE = (f"poolpart_pipes_{name}" for name in ("change", "put", "tak
 Reply = dict[str, Any]  # state of a pipe, and the answer to a request
 Replies = dict[str, Reply]  # {pipe that exists: its reply}
 
+USES_PIPES = "poolpart-pipes"  # annotation of tasks: the names of their pipes
+_UNFINISHED = ("waiting", "queued", "no-worker", "processing")  # states before the end of a task
 _ENDED = ("memory", "erred", "forgotten")  # states of tasks that nobody need wait for
 _SETTABLE = ("closed", "failure", "advice")  # what any client may set
 
@@ -60,6 +63,8 @@ class PipeState:
     ) -> None:
         self.name = name
         self.owner = owner  # cannot change, and outlasts a Variable that a client has deleted
+        self.putters: set[str] = set()  # keys of the tasks that have put items
+        self.takers: set[str] = set()  # keys of the tasks that have requested items
         self.queue = BoundedQueue(capacity, self.why_no_put, self.why_no_get)
         value = {
             "owner": owner,
@@ -207,6 +212,12 @@ def answer_pipes(dask_scheduler: Any = None) -> None:
         handlers_of(dask_scheduler).setdefault(question, no_pipes)
 
 
+def fail_pipes_of_killed(scheduler: Any, key: Any, annotations: Mapping[str, Any] | None) -> None:
+    """Let the pipes of a cancelled task fail whose worker was restarted under it."""
+    if NAME in scheduler.plugins:
+        scheduler.plugins[NAME].fail_for_killed(key, (annotations or {}).get(USES_PIPES, ()))
+
+
 def delete_pipes(names: Collection[str], dask_scheduler: Any = None) -> None:
     """Delete pipes, as far as they exist. Runs on the scheduler."""
     if NAME in dask_scheduler.plugins:
@@ -223,6 +234,9 @@ class Pipes(SchedulerPlugin):
         self.states: dict[str, PipeState] = {}
         # {key of a task that requests wait for: those requests}
         self._awaited: defaultdict[str, Waiters] = defaultdict(Waiters)
+        # Keys of tasks with pipes that have left their worker, or the queue, before they had ended:
+        # they are either run again or forgotten.
+        self._released: set[str] = set()
         handlers = handlers_of(scheduler)
         handlers.update({CHANGE: self.change, PUT: self.put, TAKE: self.take})
         self._end_interception = intercept_variable_set(handlers, self._check, self._notify)
@@ -238,6 +252,66 @@ class Pipes(SchedulerPlugin):
         # A look every 5 ms took the scheduler of a run 2 % of a core.
         if finish in _ENDED and key in self._awaited:
             self._awaited[key].notify()
+        task = self.scheduler.tasks[key]
+        if task.annotations and (names := task.annotations.get(USES_PIPES)):
+            self._follow(task, names, start, finish)
+
+    def _follow(self, task: Any, names: Sequence[str], start: str, finish: str) -> None:
+        """Let the pipes of a task fail if the task is lost."""
+        # Without this, a consumer of a producer that had raised an error waited until the pipe was
+        # deleted, and so did a producer whose consumer was gone.
+        if finish == "erred":
+            blamed = task.exception_blame or task
+            error = blamed.exception_text or "the workers that ran it have died"
+            self._fail_soon(names, f"Task {task.key!r}, which uses the pipe, has failed: {error}.")
+        elif finish == "forgotten" and task.key in self._released:
+            reason = (
+                f"Task {task.key!r}, which uses the pipe, was cancelled before it had used the "
+                "pipe. Dask also cancels a task if no future of it is kept."
+            )
+            self._fail_soon(names, reason, cancelled=str(task.key))
+        if finish == "released" and start in _UNFINISHED:
+            self._released.add(task.key)
+        else:
+            self._released.discard(task.key)
+
+    def _fail_soon(self, names: Sequence[str], reason: str, cancelled: str = "") -> None:
+        """Let open pipes fail after this step of the event loop.
+
+        `cancelled` is the key of a cancelled task. If the task has used a pipe, the task is running
+        and can go on using the pipe, because Dask does not stop functions.
+        """
+
+        def fail() -> None:
+            for state in self._existing(names).values():
+                if not state.has_ended and cancelled not in state.putters | state.takers:
+                    state.fail(reason)
+
+        # `Scheduler.restart` and the end of a client first cancel the tasks, and then call
+        # `restart` and `remove_client`, which know the reason.
+        asyncio.get_running_loop().call_soon(fail)
+
+    def fail_for_killed(self, key: Any, names: Sequence[str]) -> None:
+        """Let the open pipes of a cancelled task fail whose worker was restarted under it."""
+        for state in self._existing(names).values():
+            if not state.has_ended and str(key) not in state.takers:  # other consumers can go on
+                state.fail(
+                    f"Task {key!r}, which uses the pipe, was cancelled, and its worker "
+                    "was restarted."
+                )
+
+    def restart(self, scheduler: Any) -> None:
+        """Let all open pipes fail: `Client.restart` has ended the tasks at their ends."""
+        # Dask keeps queues and variables over a restart. In a test on two worker processes, `get`,
+        # `put`, `for_each` and listeners waited until the pipe was deleted, while futures and maps
+        # raised a CancelledError at once.
+        self._released.clear()
+        for state in self.states.values():
+            if not state.has_ended:
+                state.fail(
+                    "The cluster was restarted by Client.restart, which ends all tasks. Create the "
+                    "pipe again, and submit the tasks again."
+                )
 
     def delete(self, names: Collection[str]) -> None:
         """Delete pipes, as far as they exist, and leave the scheduler after the last pipe."""
@@ -281,7 +355,13 @@ class Pipes(SchedulerPlugin):
         return self._replies(states, lambda state: state.queue.qsize())
 
     def put(
-        self, names: Sequence[str], asker: str, items: list[bytes], unbounded: bool, seconds: float
+        self,
+        names: Sequence[str],
+        asker: str,
+        items: list[bytes],
+        unbounded: bool,
+        seconds: float,
+        task: str = "",
     ) -> Replies | Awaitable[Replies]:
         """Put items into a pipe as soon as there is room for any, and answer their number.
 
@@ -303,6 +383,8 @@ class Pipes(SchedulerPlugin):
             return self._replies(states, put_into)
 
         states = self._existing(names)
+        for state in states.values():
+            state.putters |= {task} - {""}
         return self._replies(states, put_into) if ready() else later()
 
     async def take(
@@ -310,10 +392,12 @@ class Pipes(SchedulerPlugin):
         names: Sequence[str],
         asker: str,
         seconds: float,
+        *,
         linger_s: float = 0.0,
         keys: Sequence[str] = (),
         puts: Mapping[str, list[bytes]] | None = None,
         limit: int = sys.maxsize,
+        task: str = "",
     ) -> Replies:
         """Take items of pipes, after a wait for an item, or for the end of a pipe or a task.
 
@@ -334,6 +418,8 @@ class Pipes(SchedulerPlugin):
         limit
             Number of items to take of each pipe; with 0, the request waits for the end of a pipe
             or a task.
+        task
+            Key of the task that asks, or "" outside tasks.
         """
         for name, items in (puts or {}).items():
             self.put([name], asker, items, unbounded=True, seconds=0.0)
@@ -342,11 +428,11 @@ class Pipes(SchedulerPlugin):
             return limit > 0 and not state.queue.empty()
 
         def has_news() -> bool:
-            tasks = (self.scheduler.tasks.get(key) for key in keys)
+            awaited = (self.scheduler.tasks.get(key) for key in keys)
             return (
                 len(states) < len(names)
                 or any(has_items(state) or state.has_ended for state in states.values())
-                or any(task is None or task.state in _ENDED for task in tasks)
+                or any(found is None or found.state in _ENDED for found in awaited)
             )
 
         def is_full_or_ended() -> bool:
@@ -355,7 +441,7 @@ class Pipes(SchedulerPlugin):
         def take_from(state: PipeState) -> list[Any]:
             return state.take(limit) if asker in self.scheduler.clients else []
 
-        states = self._existing(names)
+        states = self._taken_by(task, names)
         pipe_waiters = [state.queue.waiters for state in states.values()]
         try:
             task_waiters = [self._awaited[key] for key in keys]
@@ -367,6 +453,13 @@ class Pipes(SchedulerPlugin):
         if linger_s:
             await wait_until(is_full_or_ended, pipe_waiters, min(linger_s, seconds))
         return self._replies(states, take_from)
+
+    def _taken_by(self, task: str, names: Sequence[str]) -> dict[str, PipeState]:
+        """Return the states of pipes that exist, and record the task that takes their items."""
+        states = self._existing(names)
+        for state in states.values():
+            state.takers |= {task} - {""}
+        return states
 
     def _existing(self, names: Sequence[str]) -> dict[str, PipeState]:
         states = {name: self.states[name] for name in names if name in self.states}

@@ -11,7 +11,7 @@ from distributed import Client
 from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
-from .internals.client import ask
+from .internals.client import answer_of_scheduler, ask
 from .internals.worker import resources_here as resources_here  # records of tasks use it
 
 SILENT_S = 20.0  # without a heartbeat, after which a worker counts as stopped or stuck
@@ -68,17 +68,30 @@ class WorkerInfo:
         )
 
 
-def on_scheduler(client: Client, function: Callable[..., Any], **kwargs: Any) -> Any:
+def on_scheduler(
+    client: Client, function: Callable[..., Any], *, answer_s: float | None = None, **kwargs: Any
+) -> Any:
     """Call `function(**kwargs, dask_scheduler=…)` in the scheduler's event loop.
+
+    `answer_s` is the longest wait for the answer in seconds, by default that of
+    `answer_of_scheduler`.
 
     Raises
     ------
     PoolError
         If the scheduler's environment lacks this package, or the client cannot be asked.
+    OSError
+        If the scheduler is gone, or does not answer in time.
     """
     check_client(client)
+
+    async def request() -> Any:
+        return await answer_of_scheduler(
+            client, client.run_on_scheduler(function, **kwargs), answer_s
+        )
+
     try:
-        return client.run_on_scheduler(function, **kwargs)
+        return client.sync(request)
     except ModuleNotFoundError as error:
         raise PoolError(
             f"The scheduler at {client.scheduler.address} has no module {error.name!r}: start "

@@ -1,14 +1,17 @@
 """Cancelling tasks: those that wait, those that run and look, and those that do not."""
 
+import asyncio
 import os
 import signal
+import threading
 import time
+from contextlib import suppress
 
 import pytest
 from distributed import Client, Event, get_worker
 from tests.poolpart.helpers import LONG_S, wait_for
 
-from poolpart import Partition, PoolError, cancelled
+from poolpart import Partition, PipeFailed, Pool, PoolError, cancelled
 
 
 def until_cancelled(started, ended):
@@ -97,6 +100,23 @@ def test_a_worker_with_nothing_but_cancelled_tasks_is_restarted(processes, event
     assert gpu.submit(os.getpid).result(LONG_S) != pid
 
 
+def put_and_sleep(pipe):
+    pipe.put("started")
+    time.sleep(3600)
+
+
+def test_the_pipe_of_a_producer_whose_worker_is_restarted_fails(processes, make_pipe):
+    gpu = Partition("GPU", processes)
+    pipe = make_pipe(processes)
+    producer = gpu.submit(put_and_sleep, pipe)
+    assert pipe.get(LONG_S) == "started"
+    outcomes = gpu.cancel(producer, running="restart")
+    assert outcomes == {producer.key: "restarted: worker GPU-0"}
+    reason = f"^Task '{producer.key}', which uses the pipe, was cancelled, and its worker was rest"
+    with pytest.raises(PipeFailed, match=reason):
+        pipe.get(LONG_S)
+
+
 def test_a_worker_with_another_task_or_result_is_not_restarted(processes, event, wait_until):
     io = Partition("IO", processes)
     names = [event(processes).name for _ in range(4)]
@@ -136,3 +156,64 @@ def test_a_worker_that_does_not_answer_is_not_restarted(processes, event, monkey
     assert outcomes == {future.key: "running: worker GPU-0 does not answer"}
     assert ended.wait(LONG_S)
     assert gpu.submit(os.getpid).result(LONG_S) == pid
+
+
+def test_each_of_many_tasks_is_accounted_for_beside_a_worker_that_does_not_answer(
+    nannies, event, monkeypatch
+):
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 1.0)
+    both, _ = Pool.from_client(nannies).partition("P", n_workers=2, slots=1)
+    pids = dict(nannies.gather([both.submit(name_and_pid, workers=n) for n in both_names(both)]))
+    running = {}
+    for name in pids:
+        started = event(nannies)
+        running[name] = both.submit(sleep_long, started.name, workers=name)
+        assert started.wait(LONG_S)
+    waiting = [both.submit(abs, number) for number in range(18)]
+    silent, restarted = running
+    os.kill(pids[silent], signal.SIGSTOP)
+    try:
+        outcomes = both.cancel([*running.values(), *waiting], running="restart")
+    finally:
+        os.kill(pids[silent], signal.SIGKILL)
+    assert outcomes[running[restarted].key] == f"restarted: worker {restarted}"
+    assert outcomes[running[silent].key] == f"running: worker {silent} does not answer"
+    unknown = {outcomes[task.key] for task in waiting}
+    assert unknown <= {"cancelled", f"running: worker {silent} does not answer"}
+    assert len(outcomes) == 20
+    assert both.submit(pow, 2, 10).result(LONG_S) == 1024
+
+
+def name_and_pid():
+    return str(get_worker().name), os.getpid()
+
+
+def both_names(partition):
+    return [worker.name for worker in partition.workers]
+
+
+def test_a_request_that_goes_on_after_its_cancellation_is_not_waited_for(client, b, monkeypatch):
+    """Closing a connection may take as long as the worker that does not read from it."""
+    ended = threading.Event()
+
+    async def call(*_):
+        while not ended.is_set():
+            with suppress(asyncio.CancelledError):
+                await asyncio.sleep(0.05)
+
+    monkeypatch.setattr("poolpart.extras.cancelling.ANSWER_S", 0.05)
+    monkeypatch.setattr("poolpart.extras.cancelling.call", call)
+    # If cancel waits for the request, the request ends at last, and an empty answer counts as load.
+    timer = threading.Timer(5.0, ended.set)
+    timer.start()
+    future = b.submit(until_released, key=f"asked-{os.urandom(4).hex()}")
+    outcomes = b.cancel(future)
+    assert not ended.is_set()
+    assert outcomes == {future.key: "running: worker B-0 does not answer"}
+    ended.set()
+    timer.cancel()
+
+
+def until_released():
+    while not cancelled():
+        time.sleep(0.01)

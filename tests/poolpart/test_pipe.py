@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from tests.daemons import wait_until
 from tests.poolpart.helpers import LONG_S
 
-from poolpart import Pipe, PipeClosed, PipeFailed
+from poolpart import Pipe, PipeClosed, PipeFailed, cancelled
 from poolpart import pipe as pipe_module
 from poolpart.pipe import take_news
 from poolpart.pipe_states import PipeState, no_pipes, open_pipe, pipes_of
@@ -155,6 +155,98 @@ def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool):
     for future in waiting:
         with pytest.raises(PipeFailed, match=r"^the disk is full$"):
             future.result(LONG_S)
+
+
+def take_one_and_fail(pipes):
+    for pipe in pipes:
+        pipe.get()
+    raise OSError("the disk is full")
+
+
+def test_a_consumer_that_fails_ends_its_producers(client, b, make_pipe, pool):
+    pipes = [make_pipe(client, capacity=1) for _ in range(2)]
+    kept = Pipe(pipes[1].name, 1, client, fails_with_tasks=False)
+    for pipe in pipes:
+        pipe.put("taken")
+    consumer = b.submit(take_one_and_fail, [pipes[0], kept], key=f"consumer-{pipes[0].name}")
+    with pytest.raises(OSError, match="the disk is full"):
+        consumer.result(LONG_S)
+    reason = (
+        rf"^Task '{consumer.key}', which uses the pipe, has failed: OSError\('the disk is full'"
+    )
+    with pytest.raises(PipeFailed, match=reason):
+        produce(pipes[0], range(9))
+    kept.put("the program submits another consumer")
+    assert pipes[1].get(LONG_S) == "the program submits another consumer"
+
+
+def test_a_task_of_for_each_that_fails_ends_the_consumers_of_its_pipe(client, a, make_pipe):
+    results = make_pipe(client)
+    with pytest.raises(ValueError, match="bad item"):
+        a.for_each([1], put_or_fail, results=results)
+    with pytest.raises(
+        PipeFailed, match=r"^Task 'put_or_fail-.*has failed: ValueError\('bad item'"
+    ):
+        results.get(LONG_S)
+
+
+def put_or_fail(item, results):
+    raise ValueError("bad item")
+
+
+def test_a_producer_that_is_cancelled_ends_its_consumers(client, b, make_pipe, wait_until):
+    """Dask cancels a task also when its last future is gone."""
+    pipe = make_pipe(client)
+    gate = make_pipe(client)
+    running = b.submit(gate.get)  # keeps the only slot
+    key = f"producer-{pipe.name}"
+    waiting = b.submit(produce, pipe, range(3), key=key)
+    wait_until(lambda: key in client.cluster.scheduler.tasks)
+    del waiting
+    reason = f"^Task '{key}', which uses the pipe, was cancelled before it had used the pipe"
+    with pytest.raises(PipeFailed, match=reason):
+        pipe.get(LONG_S)
+    gate.put("go on")
+    assert running.result(LONG_S) == "go on"
+
+
+def test_a_consumer_that_is_cancelled_leaves_the_pipe_to_others(client, b, make_pipe, wait_until):
+    pipe = make_pipe(client)
+    scheduler = client.cluster.scheduler
+    consumer = b.submit(consume, pipe)
+    wait_until(lambda: len(scheduler.extensions["queues"].queues[pipe.name].waiters) == 1)
+    consumer.cancel()
+    wait_until(lambda: consumer.key not in scheduler.tasks)
+    pipe.put_many([1, 2])
+    pipe.close()
+    # Dask does not stop the function: it shares the items with this one.
+    assert {*consume(other_end(pipe))} <= {1, 2}
+
+
+def put_until_cancelled(pipe):
+    pipe.put("started")
+    while not cancelled():
+        time.sleep(0.01)
+    pipe.put("cancelled")
+    pipe.close()
+
+
+def test_a_running_producer_that_is_cancelled_can_go_on(client, b, make_pipe):
+    pipe = make_pipe(client)
+    producer = b.submit(put_until_cancelled, pipe)
+    assert pipe.get(LONG_S) == "started"
+    producer.cancel()
+    assert list(pipe) == ["cancelled"]
+
+
+def test_a_task_that_ends_without_closing_its_pipe_is_no_failure(client, a, make_pipe, wait_until):
+    pipe = make_pipe(client, capacity=9)
+    for item in range(2):
+        assert a.submit(pipe.put, item).result(LONG_S) is None
+        assert a.submit(produce, pipe, [item]).result(LONG_S) is None
+    wait_until(lambda: not client.cluster.scheduler.tasks)
+    assert sorted(pipe.get_all(LONG_S)) == [0, 0, 1, 1]
+    pipe.put(3)
 
 
 def test_advice_can_return_to_what_it_was(client, make_pipe):

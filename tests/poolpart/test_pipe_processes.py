@@ -11,7 +11,7 @@ import pytest
 from distributed import Client
 from tests.poolpart.helpers import LONG_S
 
-from poolpart import Partition, Pipe, PipeFailed
+from poolpart import Partition, Pipe, PipeFailed, Pool, rest
 from poolpart.pipe_states import pipes_of
 
 
@@ -116,3 +116,74 @@ with Client("{processes.scheduler.address}") as client:
     answer = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=True)
     assert answer.stdout == b"2 {1, 2} {'scan': 7} 3\n"
     assert list(pipe) == [{"plain": 8}]
+
+
+SCHEDULER = """
+import asyncio
+from distributed import Scheduler, Worker
+async def main():
+    options = {"host": "127.0.0.1", "dashboard": False}
+    async with Scheduler(port=0, **options) as scheduler:
+        async with Worker(scheduler.address, resources={"P": 1}, nthreads=1, **options):
+            print(scheduler.address, flush=True)
+            await scheduler.finished()
+asyncio.run(main())
+"""
+
+
+def test_a_scheduler_that_does_not_answer_is_an_error_of_each_call(monkeypatch):
+    """A process that is stopped keeps its connections open."""
+    scheduler = subprocess.Popen(
+        [sys.executable, "-c", SCHEDULER], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    )
+    try:
+        address = scheduler.stdout.readline().decode().strip()
+        client = Client(address, set_as_default=False)
+        part = Partition("P", client)
+        full = Pipe("full", 1, client).create()
+        empty = Pipe("empty", 1, client).create()
+        full.put(1)
+        monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.1)
+        computed = part.map(abs, [-1], chunk=1)
+        assert part.submit(pow, 2, 10).result(LONG_S) == 1024  # after the map, on the same slot
+        running = part.map(time.sleep, [LONG_S])
+        pool = Pool.from_client(client)
+        monkeypatch.setattr("poolpart.internals.client.ANSWER_S", 0.03)
+        monkeypatch.setattr("poolpart.division.ANSWER_S", 0.03)
+        monkeypatch.setattr("poolpart.extras.for_each.LOOK_S", 0.1)
+        os.kill(scheduler.pid, signal.SIGSTOP)
+        calls = {
+            "get": empty.get,
+            "get with a time limit": lambda: empty.get(timeout_s=LONG_S),
+            "put": lambda: full.put(2),
+            "poll": empty.poll,
+            "iteration": lambda: list(empty),
+            "close of a pipe": empty.close,
+            "delete": empty.delete,
+            "listener": lambda: empty.listen(print).join(),
+            "for_each": lambda: part.for_each(empty, print),
+            "map": lambda: list(running),
+            "map whose tasks have ended": lambda: list(computed),
+            "stats": part.stats,
+            "tasks": part.tasks,
+            "partitions": pool.partitions,
+            "grow": lambda: part.grow(1, timeout_s=0.1),
+            "shrink": lambda: part.shrink(1, timeout_s=0.1),
+            "dissolve": lambda: pool.dissolve(timeout_s=0.1),
+            "divide": lambda: pool.divide({"Q": rest()}),
+            "adapt": lambda: part.adapt(0, 1),
+            "want": lambda: part.want(1),
+            "first submit": lambda: Partition("Q", client).submit(abs, 1),
+        }
+        message = f"^The scheduler at {address} has not answered for 0.[0-9]+ s. Check that"
+        for name, call in calls.items():
+            with pytest.raises(OSError, match=message):
+                call()
+                pytest.fail(f"{name} has returned")
+        empty.listen(print).close()  # does not raise
+    finally:
+        os.kill(scheduler.pid, signal.SIGCONT)
+        client.close()
+        scheduler.kill()
+        scheduler.wait(LONG_S)
+        scheduler.stdout.close()

@@ -29,9 +29,10 @@ from ..choosing import WorkerChoice
 from ..errors import PoolError
 from ..features import FEATURES, Feature
 from ..internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
-from ..internals.names import CHOOSING, NESTED, SHUFFLES, require
+from ..internals.names import CHOOSING, NESTED, READING, SHUFFLES, require
 from ..internals.scheduler import Resources, tell_of_plugin
 from .lending import lending_plugin
+from .unreadable import UnreadableInputs
 
 logger = logging.getLogger(__name__)
 
@@ -50,9 +51,11 @@ class Inheritance(SchedulerPlugin):
         self.note = ""  # remark for users: what does not work with this version of Dask
         self._rules = Rules()
         self._choice: WorkerChoice | None = None
+        self._unreadable: UnreadableInputs | None = None
         self.lends = self._begin(NESTED, "tasks from inside tasks may run anywhere", self._nest)
         self._begin(SHUFFLES, "shuffles may leave their partition", self._shuffle)
         self._begin(CHOOSING, "placing a task takes longer in larger clusters", self._choose)
+        self._begin(READING, "tasks wait for inputs that cannot be unpickled", self._read)
         scheduler.add_plugin(self)
 
     def _begin(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
@@ -78,6 +81,9 @@ class Inheritance(SchedulerPlugin):
     def _choose(self) -> None:
         self._choice = WorkerChoice(self.scheduler, self.names)
 
+    def _read(self) -> None:
+        self._unreadable = UnreadableInputs(self.scheduler, self.names)
+
     def _bequeath(self, task: Any) -> Resources:
         """Return the resources of tasks that a task submits, empty outside partitions."""
         resources = task.resource_restrictions
@@ -88,6 +94,8 @@ class Inheritance(SchedulerPlugin):
         self._rules.take_back()
         if self._choice is not None:
             self._choice.uninstall()
+        if self._unreadable is not None:
+            self._unreadable.uninstall()
         self.scheduler.remove_plugin(NAME)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,55 +16,104 @@ from .background import in_background
 if TYPE_CHECKING:
     from ..pipe import Pipe
 
-_LOOK_S = 1.0  # between looks whether the listener was stopped
+_CHECK_S = 1.0  # interval at which the thread checks whether the listener was closed
 
 
 class Listener:
-    """Thread that calls a function for each item of a pipe, as `Pipe.listen` starts it.
+    """Thread that calls a function for each item of a pipe, as started by `Pipe.listen`.
 
-    At the end of a ``with`` block it is closed. If the block raises an error, the function is not
-    called again, and the block does not wait for the end of the pipe.
+    `join` waits until the pipe has ended; `close` stops listening. At the end of a ``with`` block,
+    the listener is joined, or closed if the block raises an error.
+
+    Notes
+    -----
+    If a task at either end of the pipe fails, the pipe fails, and `join` raises `PipeFailed`; see
+    `Pipe`. The same applies after `Client.restart`.
     """
 
     def __init__(self, pipe: Pipe, function: Callable[[Any], Any]) -> None:
         self._pipe = pipe
         self._function = function
-        self._stopped = threading.Event()
+        self._closed = threading.Event()
+        self._calling = threading.Lock()  # held while the function runs
+        self._thread: threading.Thread | None = None  # thread ids are used again, objects are not
         self._done = in_background(self._listen)
 
-    def close(self) -> None:
-        """Wait until the pipe has ended and the function has got all items.
+    def join(self, timeout_s: float | None = None) -> None:
+        """Wait until the pipe has ended and the function has been called for all items.
+
+        Returns immediately after `close`.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait in seconds. By default, the wait is not limited.
 
         Raises
         ------
         PipeFailed
-            If the pipe was failed or deleted.
+            If the pipe has failed, was deleted, or the cluster was restarted.
+        TimeoutError
+            If the pipe has not ended in time. The listener continues.
+        RuntimeError
+            If the function itself calls this method.
         Exception
-            What the function has raised.
+            The error that the function has raised.
         """
+        if threading.current_thread() is self._thread:
+            raise RuntimeError(
+                f"{funcname(self._function)} waits for the end of its own listener. Call join in "
+                "another thread, or stop listening with close."
+            )
+        concurrent.futures.wait([self._done], timeout_s)
+        if not self._done.done():
+            raise TimeoutError(f"Pipe {self._pipe.name!r} has not ended within {timeout_s} s.")
         self._done.result()
+
+    def close(self) -> None:
+        """Stop listening, without waiting for the end of the pipe.
+
+        A call of the function that is running is waited for; the function is not called again.
+        Remaining items stay in the pipe. Errors of the function or of the pipe are not raised here;
+        `join` raises them.
+        """
+        self._closed.set()
+        if threading.current_thread() is self._thread:
+            return
+        with self._calling:
+            pass
+        # The thread ends at its next check, unless it waits for a scheduler that does not answer.
+        concurrent.futures.wait([self._done], 2 * _CHECK_S)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if error is None:
-            self.close()
+            self.join()
         else:
-            self._stopped.set()
-            self._done.exception()  # waits for a call that runs
+            self.close()
 
     def _listen(self) -> None:
-        """Call the function until the pipe ends, or this is stopped."""
+        """Call the function until the pipe ends or the listener is closed."""
+        self._thread = threading.current_thread()
         try:
-            while not self._stopped.is_set():
+            while not self._closed.is_set():
                 try:
-                    item = self._pipe.get(timeout_s=_LOOK_S)
+                    item = self._pipe.get(timeout_s=_CHECK_S)
                 except PipeClosed:
                     return
                 except TimeoutError:
                     continue
-                self._function(item)
+                except (PipeFailed, OSError):  # the pipe or the scheduler is gone
+                    if self._closed.is_set():
+                        return
+                    raise
+                with self._calling:
+                    if self._closed.is_set():
+                        self._pipe.put_back(item)
+                        return
+                    self._function(item)
         except BaseException as error:
             with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
                 self._pipe.fail(f"{funcname(self._function)} has failed: {error!r}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
-from collections.abc import Callable, Collection
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from typing import Any, Protocol
@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import distributed
 from distributed import Client, Future, as_completed, futures_of
 
+ANSWER_S = 300.0  # longest wait for an answer of the scheduler, in seconds
 REQUEST_S = 0.05  # a call of the scheduler that takes longer waits for something
 _OPTIONS_OF_SYNC = {"asynchronous", "callback_timeout"}  # the others are of the called function
 
@@ -128,10 +129,57 @@ async def take_from_worker(client: Client, address: str, keys: Collection[str]) 
 async def ask(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
     """Call a handler of a worker, or of the scheduler if the address is None.
 
-    Returns None if the scheduler lacks the handler; the log of the scheduler then says so.
+    Returns None if the scheduler lacks the handler; the log of the scheduler then says so. The
+    caller limits the time of a worker; `answer_of_scheduler` limits that of the scheduler.
     """
-    server = client.scheduler if address is None else client.rpc(address)
-    return await getattr(server, question)(**arguments)
+    if address is None:
+        return await answer_of_scheduler(client, getattr(client.scheduler, question)(**arguments))
+    return await getattr(client.rpc(address), question)(**arguments)
+
+
+async def answer_of_scheduler(
+    client: Client, request: Awaitable[Any], seconds: float | None = None
+) -> Any:
+    """Await a request to the scheduler, for `ANSWER_S` seconds by default.
+
+    Raises
+    ------
+    OSError
+        If the scheduler does not answer in time.
+    """
+    # A scheduler process that is stopped (SIGSTOP), or whose machine is suspended, keeps its
+    # connections open: tried, `Pipe.get`, `Partition.stats` and `Pool.partitions` never returned.
+    seconds = ANSWER_S if seconds is None else seconds
+    try:
+        async with asyncio.timeout(seconds) as limit:
+            return await request
+    except TimeoutError as error:
+        if not limit.expired():
+            raise
+        # Not a TimeoutError, which `Pipe.get` raises if no item comes.
+        raise OSError(
+            f"The scheduler at {client.scheduler.address} has not answered for {seconds:g} s. "
+            "Check that its process is running."
+        ) from error
+
+
+def gather(client: Client, futures: Sequence[Future]) -> list[Any]:
+    """Return the results of finished tasks, as `Client.gather` does.
+
+    Raises OSError, as `answer_of_scheduler` does, where `Client.gather` would wait forever.
+    """
+
+    async def watch() -> list[Any]:
+        results = asyncio.ensure_future(client.gather(futures, asynchronous=True))
+        try:
+            # Large results may take longer than an answer of the scheduler.
+            while not (await asyncio.wait([results], timeout=ANSWER_S))[0]:
+                await ask(client, None, "identity", n_workers=0)
+            return list(results.result())
+        finally:
+            results.cancel()
+
+    return list(client.sync(watch))
 
 
 def as_bytes(data: Any) -> Any:

@@ -245,6 +245,21 @@ def rule_for_choice(rules: Rules, scheduler: Any, choose: Callable[[Any], Any]) 
     rules.call_instead(scheduler, "decide_worker_non_rootish", choose, "ts")
 
 
+def rule_for_failed_fetches(
+    rules: Rules, scheduler: Any, report: Callable[[Any, str], None]
+) -> None:
+    """Call `report(task, address)` if a worker could not fetch a result that another worker has."""
+
+    def look(key: Any, worker: str, **message: Any) -> Any:
+        task = scheduler.tasks.get(key)
+        holders = [h.address for h in task.who_has or ()] if task is not None else []
+        if holders and worker not in holders:
+            report(task, worker)
+        return NotImplemented  # Dask ignores the message
+
+    rules.call_instead(scheduler, "stimulus_task_erred", look, "key")
+
+
 def take_back_fences(rules: Rules, scheduler: Any) -> None:
     """Remove the rule for fences from the scheduler."""
     rules.take_back()

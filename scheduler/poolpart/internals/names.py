@@ -35,6 +35,7 @@ PAGE = "the page of partitions"
 CLUSTERS = "clusters with several kinds of workers"
 ADAPTING = "adaptive partitions"
 CANCELLING = "Partition.cancel"
+READING = "errors for inputs that cannot be unpickled"
 
 
 @dataclass(frozen=True)
@@ -216,6 +217,19 @@ PRIVATE_NAMES = (
         ),
     ),
     PrivateNames(
+        PIPES,
+        (
+            f"{_SCHEDULER_TASK}.annotations",
+            f"{_SCHEDULER_TASK}.exception_blame",
+            f"{_SCHEDULER_TASK}.exception_text",
+        ),
+        "a pipe fails with the tasks that use it",
+        (
+            "test_listening.py::test_a_producer_that_fails_ends_the_listener",
+            "test_pipe.py::test_a_producer_that_is_cancelled_ends_its_consumers",
+        ),
+    ),
+    PrivateNames(
         FETCHING,
         ("distributed.utils_comm:gather_from_workers", "distributed.worker:Worker.handlers"),
         "a dead worker is not waited for",
@@ -295,6 +309,22 @@ PRIVATE_NAMES = (
             "test_cancelling.py::test_a_worker_with_nothing_but_cancelled_tasks_is_restarted",
             "test_cancelling.py::test_a_function_sees_that_it_was_cancelled",
         ),
+    ),
+    PrivateNames(
+        READING,
+        (
+            f"{_SCHEDULER}.stimulus_task_erred(worker, stimulus_id, key, run_id)",
+            f"{_SCHEDULER}.handle_task_erred(key, stimulus_id)",
+            f"{_SCHEDULER}.transitions(recommendations, stimulus_id)",
+            f"{_SCHEDULER}.stream_comms",
+            f"{_SCHEDULER_TASK}.run_id",
+            f"{_SCHEDULER_TASK}.processing_on",
+            "distributed.core:error_message",
+            "distributed.core:connect(addr)",
+            "distributed.core:send_recv(comm)",
+        ),
+        "a task fails whose worker cannot unpickle its input",
+        ("test_unreadable.py::test_a_task_whose_worker_cannot_unpickle_its_input_fails",),
     ),
 )
 

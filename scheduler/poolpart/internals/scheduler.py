@@ -242,6 +242,26 @@ async def restart(scheduler: Any, worker: Any, seconds: float) -> bool:
     return True
 
 
+def fail_task(scheduler: Any, task: Any, worker: str, error: Exception) -> None:
+    """Let a task fail that waits for its inputs on a worker, or run again if it has retries."""
+    from distributed.core import error_message
+
+    stimulus = f"poolpart-failed-{time.time()}"
+    message = {name: part for name, part in error_message(error).items() if name != "status"}
+    scheduler.handle_task_erred(
+        key=task.key, stimulus_id=stimulus, worker=worker, run_id=task.run_id, **message
+    )
+    if task.state == "erred":  # the worker still waits for the inputs, and would keep the task
+        free = {"op": "free-keys", "keys": [task.key], "stimulus_id": stimulus}
+        scheduler.stream_comms[worker].send(free)
+
+
+def run_again(scheduler: Any, tasks: Collection[Any]) -> None:
+    """Take tasks from their workers, and place them anew."""
+    stimulus = f"poolpart-again-{time.time()}"
+    scheduler.transitions({task.key: "waiting" for task in tasks}, stimulus)
+
+
 def is_bound(task: Any) -> bool:
     """Return whether a task may run on certain workers only."""
     return bool(task.worker_restrictions or task.host_restrictions) and not task.loose_restrictions

@@ -128,3 +128,31 @@ def slots_here(worker: Any, name: str) -> tuple[float, float]:
 def answer_to(worker: Any, question: str, answer: Callable[..., Any]) -> None:
     """Add a handler to a worker that lacks the handler."""
     worker.handlers.setdefault(question, answer)
+
+
+# -- inputs ------------------------------------------------------------------------------
+
+
+async def why_unreadable(key: Any, holder: str, dask_worker: Any = None) -> str:
+    """Return why a worker cannot unpickle a result that another worker holds, or "" if it can.
+
+    Raises OSError if the holder does not answer.
+    """
+    from distributed.core import connect, send_recv
+
+    # Not a connection of the worker's pool. If a result cannot be unpickled, Dask returns the
+    # connection to its pool in the middle of an exchange, so that the next request on it fails.
+    connection = await connect(holder, **dask_worker.connection_args)
+    try:
+        await send_recv(connection, op="get_data", keys=[key], who=dask_worker.address)
+    except OSError:
+        raise
+    except Exception as error:
+        reason = repr(error)
+    else:
+        reason = ""
+    try:
+        await connection.write("OK")  # the holder waits for it
+    finally:
+        connection.abort()
+    return reason

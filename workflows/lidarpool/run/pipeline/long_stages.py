@@ -98,8 +98,11 @@ class LongStages:
         # A file in the storage. Collectors look for the file to find out whether they see the
         # storage.
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
-        self._scans = Pipe(f"lidarpool-{run}-scans", queue_capacity, self.client)
-        self._news = Pipe(f"lidarpool-{run}-news", 64, self.client)  # news of stages 3 and 4
+        # Not pipes that fail with their tasks: `_restart` submits lost stages again.
+        scans, news = f"lidarpool-{run}-scans", f"lidarpool-{run}-news"
+        self._scans = Pipe(scans, queue_capacity, self.client, fails_with_tasks=False)
+        # News of stages 3 and 4.
+        self._news = Pipe(news, 64, self.client, fails_with_tasks=False)
         self.inbox: list[Message] = []  # received messages, for the driver to take
         self._outbox: dict[str, list[Order]] = {}  # {name of a pipe: messages}
         self._looked_at = 0.0  # time of the last `look`
@@ -352,7 +355,9 @@ class LongStages:
         earlier = self._tasks.get(name)
         if earlier is not None:
             forget_pipes(self.client, [earlier.inlet.name])
-        inlet = Pipe(f"lidarpool-{self.run}-{name}-{number}", 1_000_000, self.client).create()
+        inlet = Pipe(
+            f"lidarpool-{self.run}-{name}-{number}", 1_000_000, self.client, fails_with_tasks=False
+        ).create()
         start = StageStart(self.run, name.partition("-")[0], number)
         work: dict[str, tuple[Any, ...]] = {
             GENERATE: (generate, start, inlet, self._scans),
