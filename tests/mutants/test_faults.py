@@ -3,7 +3,6 @@
 import ast
 
 import pytest
-
 from tests.mutants.faults import choose, faults_in, function_spans
 
 SOURCE = '''
