@@ -38,7 +38,7 @@ PACKAGES = [
     )),
 ]  # fmt: skip
 _SELECTION = "not slow"  # what CI runs
-_FIRST_S = 20.0  # estimated time of the tests that are tried first
+_FIRST_S = 10.0  # estimated time of the tests that are tried first
 _EXTRA_S = 120.0  # a fault that makes tests this much slower counts as noticed
 
 
@@ -113,8 +113,8 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--budget",
         type=float,
-        default=240.0,
-        help="Estimated seconds of tests for a fault (default: 240).",
+        default=60.0,
+        help="Estimated seconds of tests for a fault (default: 60).",
     )
     add(
         "--record",
@@ -172,7 +172,7 @@ def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[st
     for test in tests:
         cost = lines.cost(test)
         if total + cost > budget_s:
-            break
+            continue
         if group and spent + cost > limit:
             yield group
             group, spent, limit = [], 0.0, budget_s

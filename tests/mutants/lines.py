@@ -5,8 +5,8 @@ import json
 import os
 import subprocess
 import sys
-from collections import defaultdict
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
@@ -31,6 +31,8 @@ class Lines:
         First and last line of the functions of each file, when it was recorded.
     checksums
         Checksums of the files, when they were recorded.
+    counts
+        Number of lines that each test executes.
     """
 
     tests: list[str]
@@ -38,6 +40,13 @@ class Lines:
     lines: dict[str, dict[int, set[int]]]
     spans: dict[str, dict[str, tuple[int, int]]]
     checksums: dict[str, str]
+    counts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        """Count the lines of each test."""
+        for by_line in self.lines.values():
+            for tests in by_line.values():
+                self.counts.update(self.tests[number] for number in tests)
 
     @classmethod
     def record(cls, root: Path, folder: Path, pytest_options: list[str]) -> "Lines":
@@ -62,7 +71,7 @@ class Lines:
             merged.spans[path] = function_spans(source)
             merged.checksums[path] = _checksum(source)
         merged._write(folder / "lines.json")
-        return merged
+        return cls.read(folder / "lines.json")
 
     @classmethod
     def read(cls, path: Path) -> "Lines":
@@ -75,7 +84,7 @@ class Lines:
         return cls(lines=lines, **content)
 
     def tests_of(self, root: Path, fault: Fault) -> list[str]:
-        """Return the tests that may notice a fault, quickest first.
+        """Return the tests that may notice a fault; first those that are quick and execute little.
 
         These are the tests that execute its line; for a compiled loop, or a line that is only
         executed by the processes of clusters, those that execute a function of a module that
@@ -87,7 +96,8 @@ class Lines:
             for path in _importers(root, fault.path):
                 for span in self.spans.get(path, {}).values():
                     numbers |= self._in_span(path, span)
-        return sorted((self.tests[number] for number in numbers), key=self.cost)
+        tests = [self.tests[number] for number in numbers]
+        return sorted(tests, key=lambda test: self.cost(test) * self.counts[test])
 
     def cost(self, test: str) -> float:
         """Return the time of a test, in seconds, with a share of the time of its process."""
@@ -118,7 +128,9 @@ class Lines:
             file: {line: sorted(tests) for line, tests in by_line.items()}
             for file, by_line in self.lines.items()
         }
-        path.write_text(json.dumps({**vars(self), "lines": lines}))
+        content = {**vars(self), "lines": lines}
+        del content["counts"]
+        path.write_text(json.dumps(content))
 
 
 def _importers(root: Path, path: str) -> set[str]:
