@@ -42,7 +42,7 @@ def test_options_are_named_with_the_formats_that_have_them():
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"file": "a.tif", "step_mm": 2}, "step_mm is not a field. Did you mean 'step_m'?"),
+        ({"file": "a.tif", "step_mm": 2}, "step_mm is not a field. Write step_m: 0.002."),
         ({"file": "a.tif", "step_m": -2}, "step_m is -2; it must be above 0, at most 1000000."),
         ({"file": "a.tif", "epsg": 25832}, "It is a field of world: write it there."),
         ({"file": "a.glb", "animation": "Walk"}, "animation is not a field."),

@@ -566,5 +566,7 @@ def test_names_of_materials_are_in_reports_and_files(cluster_client, house, tmp_
         assert "material" not in save_cloud(cloud, tmp_path / name)
     las = laspy.read(tmp_path / "c.las")
     np.testing.assert_array_equal(las["material"], cloud["material"])
-    (names,) = (vlr.record_data for vlr in las.vlrs if vlr.user_id == "lidarpool")
+    (names,) = (
+        vlr.record_data for vlr in las.vlrs if (vlr.user_id, vlr.record_id) == ("lidarpool", 1)
+    )
     assert json.loads(names) == ["Brick", "Glass", "Grass"]

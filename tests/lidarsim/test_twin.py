@@ -33,7 +33,7 @@ GAP = 0.75
 KEYS = Keys(3, np.array([0, 40, 41, 300]))
 FIRST = 11  # number of the first pulse, for keys
 RETRO = Material("1", 0.8, retro=True)
-FOG = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
+FOG = {"visibility_km": 0.153, "fog_lidar_ratio_sr": 20.0}
 NAMES = "distance", "energy", "velocity"
 KINDS = "nothing", "wall", "edge", "grazed", "panes", "clutter"
 
