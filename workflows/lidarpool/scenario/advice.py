@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from lidarsim.base.words import as_scenario, listed, plural
 from lidarsim.columns.table import VELOCITY
 from lidarsim.media.materials import MaterialTable
+from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
@@ -61,7 +62,8 @@ def advice(built: Built) -> list[str]:
     ]
     labels = (*unlabelled, *_unnamed_classes(built.survey))
     settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
-    lines = (*notes, *axes, *likely, *settings, *_timing_notes(built))
+    headings = _heading_notes(built.findings.without_angles)
+    lines = (*notes, *axes, *likely, *headings, *settings, *_timing_notes(built))
     return [as_scenario(line) for line in lines]
 
 
@@ -159,6 +161,28 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
         yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
         yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
+
+
+def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
+    """Yield notes on trajectories without angles: {name: whether the path has corners}."""
+    if not without_angles:
+        return
+    names = [*without_angles]
+    note = (
+        f"the trajectory of {listed(names)} has no angles: it is level and faces the direction of "
+        "travel"
+    )
+    if names[1:]:
+        note = (
+            f"the trajectories of {listed(names)} have no angles: they are level and face the "
+            "direction of travel"
+        )
+    if any(without_angles.values()):
+        note += (
+            f". At a corner between straight lines, the turn takes {CORNER_M:g} m before and after "
+            "it; interpolation: smooth makes a path without corners"
+        )
+    yield note
 
 
 def _timing_notes(built: Built) -> Iterator[str]:
