@@ -390,6 +390,34 @@ def test_a_trajectory_since_1970_is_told_that_its_date_is_not_kept(scenario, sec
     assert all(noted in note for note in notes)
 
 
+def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenario):
+    legs = [{"time_s": t, "position": [x, y, 1]} for t, x, y in ((0, 0, 0), (2, 9, 0), (4, 9, 9))]
+    turned = [point | {"yaw_deg": 0} for point in legs]
+    vans = [
+        {"name": name, "box": [4, 2, 2], "trajectory": {"points": points} | options}
+        for name, points, options in (
+            ("Van", legs[:2], {}),
+            ("Bus", legs, {"interpolation": "smooth"}),
+            ("Cab", turned, {}),
+        )
+    ]
+    faces = "it is level and faces the direction of travel"
+    turns = (
+        ". At a corner between straight lines, the turn takes 1 m before and after it; "
+        "interpolation: smooth makes a path without corners"
+    )
+    for points, actors, notes in (
+        (legs, [], [f"the trajectory of the carrier has no angles: {faces}{turns}"]),
+        (legs[:2], [], [f"the trajectory of the carrier has no angles: {faces}"]),
+        (turned, [], []),
+        (turned, vans, ["the trajectories of Van, Bus have no angles: they are level and face "
+                        "the direction of travel"]),
+    ):  # fmt: skip
+        data = {"trajectory": {"points": points}, "actors": actors, "steps": 36}
+        read = scenario(json.dumps({"scene": {"preset": "seed"}} | data))
+        assert [note for note in advice(build(read)) if "angles" in note] == notes
+
+
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     sensors = "sensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
     (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, pcd]}")))

@@ -1,5 +1,7 @@
 """Poses of many actors at once have the bits of each trajectory's own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -37,6 +39,7 @@ WAYS = ActorTrajectories(
         Stations((Pose((1, 2, 3), 20),)),
         Stations((Pose((1, 2, 3)),)),
         track(9, beyond="absent"),
+        *(replace(track(10, smooth=s, beyond="hold"), quaternions=None) for s in (False, True)),
     ]
 )
 

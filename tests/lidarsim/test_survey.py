@@ -162,6 +162,105 @@ def test_without_angles_a_carrier_faces_its_way():
     assert np.allclose(ends, [0, np.degrees(1)], atol=0.01), "of the curve, not of its chords"
 
 
+def yaws_of(rotations):
+    """Yaws of level rotations (k, 3, 3), degrees."""
+    assert np.allclose(rotations[:, 2], [0, 0, 1]), "not level"
+    return np.degrees(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
+
+
+# Legs to the east, north and back to the west, at 10 m/s, 5 m/s and 10 m/s.
+LEGS = Track([0, 6, 18, 24], [[0, 0, 1], [60, 0, 1], [60, 60, 1], [0, 60, 1]])
+
+
+def test_on_straight_legs_yaw_is_the_direction_of_the_leg():
+    seconds = np.linspace(0, 24, 2401)
+    positions, rotations = LEGS.poses(0, seconds * 1e9)
+    yaws = yaws_of(rotations)
+    x, y, _ = positions.T
+    east, north, west = y < 1e-9, (x > 60 - 1e-9), y > 60 - 1e-9
+    for leg, yaw, away in (
+        (east, 0, 60 - x),
+        (north, 90, np.minimum(y, 60 - y)),
+        (west, 180, 60 - x),
+    ):
+        on = leg & (away > 1)
+        assert on.sum() > 500
+        off = (yaws[on] - yaw + 180) % 360 - 180
+        assert np.abs(off).max() < 1e-6
+    # It turns evenly from 1 m before a corner, 0.1 s, until 1 m behind it, 0.2 s.
+    moments = np.array([5.9, 6.0, 6.1, 6.2])
+    assert np.allclose(yaws_of(LEGS.poses(0, moments * 1e9)[1]), [0, 30, 60, 90])
+    linear, angular = LEGS.velocities(0, np.array([3, 6.05]) * 1e9)
+    assert np.allclose(linear, [[10, 0, 0], [0, 5, 0]])
+    assert np.allclose(angular, [[0, 0, 0], [0, 0, np.radians(300)]])
+
+
+def test_short_legs_are_turned_from_middle_to_middle():
+    """So that a curve of many poses has nearly its tangents."""
+    angles = np.linspace(0, 3, 61)
+    circle = np.stack([20 * np.sin(angles), -20 * np.cos(angles), 0 * angles], axis=1)
+    track = Track(1.4e9 + 2 * angles, circle)
+    seconds = np.linspace(0.06, 5.94, 500)
+    yaws = yaws_of(track.poses(0, seconds * 1e9)[1])
+    assert np.abs(yaws - np.degrees(seconds / 2)).max() < 0.01
+    rates = track.velocities(0, seconds * 1e9)[1]
+    assert np.allclose(rates, [0, 0, 0.5], atol=1e-3)
+
+
+def smooth_drive():
+    """An uneven smooth drive without angles, with a stop of 3 s at a corner."""
+    times = np.array([0, 1, 2.5, 3, 4, 7, 8, 9, 9.5, 11])
+    x = [0, 3, 9, 10, 12, 12, 12, 11, 9, 4.0]
+    y = [0, 0, 1, 1, 0, 0, 2, 6, 8, 9.0]
+    z = [1, 1, 2, 3, 3, 3, 3, 2, 2, 2.0]
+    return Track(times, np.column_stack([x, y, z]), smooth=True)
+
+
+def test_on_a_smooth_path_yaw_is_the_tangent():
+    track = smooth_drive()
+    assert track.quaternions is None, "the poses are as given"
+    step_s = 1e-6
+    seconds = np.linspace(0.01, 10.99, 5000)
+    seconds = seconds[(seconds < 3.98) | (seconds > 7.02)]
+    linear, angular = track.velocities(0, seconds * 1e9)
+    yaws = yaws_of(track.poses(0, seconds * 1e9)[1])
+    off = yaws - np.degrees(np.arctan2(linear[:, 1], linear[:, 0]))
+    assert np.abs(off).max() < 1e-6
+    later, sooner = (
+        yaws_of(track.poses(0, (seconds + sign * step_s) * 1e9)[1]) for sign in (1, -1)
+    )
+    rates = np.radians((later - sooner + 180) % 360 - 180) / (2 * step_s)
+    assert np.ptp(rates) > 1
+    assert np.allclose(angular[:, 2], rates, atol=1e-4) and not angular[:, :2].any()
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_a_carrier_that_stands_turns_in_the_last_second(smooth):
+    track = replace(smooth_drive(), smooth=smooth)
+    before, first, early, middle, end = yaws_of(
+        track.poses(0, np.array([3.9, 4.0, 5.9, 6.5, 7.0]) * 1e9)[1]
+    )
+    assert first == early == pytest.approx(before, abs=2 if smooth else 1e-9)
+    assert end == pytest.approx(90, abs=1)
+    assert middle == pytest.approx((first + end) / 2)
+    at = np.linspace(6.01, 6.99, 99)
+    turned = yaws_of(track.poses(0, at * 1e9)[1])
+    rates = np.degrees(track.velocities(0, at * 1e9)[1][:, 2])
+    assert (np.diff(turned) > 0).all()
+    assert np.allclose(np.gradient(turned, at)[1:-1], rates[1:-1], atol=0.5)
+
+
+def test_a_carrier_that_rises_keeps_its_heading():
+    for smooth in (False, True):
+        rise = [[0, 0, 0], [0, 3, 0], [0, 3, 0], [0, 3, 5], [0, 3, 5]]
+        track = Track(range(5), rise, smooth=smooth)
+        moments = np.array([0.5, 2.7, 4]) * 1e9
+        assert yaws_of(track.poses(0, moments)[1]) == pytest.approx([90] * 3)
+        still = Track([0, 1, 2], [[0, 0, 0]] * 3, smooth=smooth)
+        assert yaws_of(still.poses(0, np.array([0, 0.7, 2]) * 1e9)[1]).tolist() == [0, 0, 0]
+        assert not still.velocities(0, np.array([0, 0.7]) * 1e9)[1].any()
+
+
 @pytest.fixture
 def files(tmp_path):
     """The same drive in all formats: along x, turning to the left, from second 100 on."""

@@ -117,7 +117,7 @@ CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
 class TimedPose(Section, Pose):
     """A pose at a time.
 
-    If no pose has an angle, the carrier faces its direction of travel.
+    If no pose has an angle, the carrier is level and faces its direction of travel.
     """
 
     # Any number: `seconds_of` names the unit that too large numbers probably have.
@@ -217,7 +217,13 @@ class TrajectorySection(Section):
     _one_source = one_of("file", "points", "vehicle")
 
     def track(
-        self, path: PathOf, standing: StandingSurfaces, start_s: float | None = None
+        self,
+        path: PathOf,
+        standing: StandingSurfaces,
+        start_s: float | None = None,
+        *,
+        name: str,
+        without_angles: dict[str, bool],
     ) -> Track:
         """Return the trajectory in a scene's local coordinates.
 
@@ -229,6 +235,10 @@ class TrajectorySection(Section):
             Surfaces of the scene, for a trajectory that follows surfaces.
         start_s
             Start of the survey, in seconds by the clock of its trajectory.
+        name
+            What has the trajectory, for notes.
+        without_angles
+            Gets {name: whether the path has corners} if the poses have no angles.
 
         Raises
         ------
@@ -236,6 +246,8 @@ class TrajectorySection(Section):
             If a file cannot be read, or the trajectory leaves its surfaces.
         """
         track = self._track_without_surfaces(path, standing.origin, start_s)
+        if track.quaternions is None:
+            without_angles[name] = len(track.with_turns.times_s) > len(track.times_s)
         if self.surfaces is None:
             return track
         # Pieces may end before the survey does.
@@ -365,10 +377,17 @@ class ActorSection(DeformingSection):
         """File of the actor, if the file is a robot's, else None."""
         return self.file if self.file and self.file.file.lower().endswith(ROBOTS) else None
 
-    def track(self, path: PathOf, standing: StandingSurfaces, carrier: Track | None) -> Track:
+    def track(
+        self,
+        path: PathOf,
+        standing: StandingSurfaces,
+        carrier: Track | None,
+        without_angles: dict[str, bool],
+    ) -> Track:
         """Return the trajectory of the actor from the survey's start, in local coordinates.
 
-        `path` returns the path of a file in the scenario; `carrier` is the survey's trajectory.
+        `path` returns the path of a file in the scenario; `carrier` is the survey's trajectory;
+        `without_angles` is extended as by `TrajectorySection.track`.
         """
         start_s = 0.0 if carrier is None else carrier.start_s or 0.0
         if self.at is not None:
@@ -381,4 +400,6 @@ class ActorSection(DeformingSection):
             assert carrier is not None, "checked with the scenario"
             return carrier
         with prefixed(f"actor {self.name!r}"):
-            return self.trajectory.track(path, standing, start_s)
+            return self.trajectory.track(
+                path, standing, start_s, name=self.name, without_angles=without_angles
+            )

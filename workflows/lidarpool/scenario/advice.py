@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
@@ -13,6 +13,7 @@ from lidarsim.base.words import as_scenario, listed, plural
 from lidarsim.columns.table import VELOCITY
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
+from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
@@ -68,7 +69,8 @@ def advice(built: Built) -> list[str]:
     labels = (*unlabelled, *_unnamed_classes(built.survey))
     settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
     light = (*_single_returns(built), *_dark_fog(built.survey))
-    groups = (notes, axes, likely, settings, light, _timing_notes(built))
+    headings = _heading_notes(built.findings.without_angles)
+    groups = (notes, axes, likely, headings, settings, light, _timing_notes(built))
     return [as_scenario(line) for line in chain.from_iterable(groups)]
 
 
@@ -219,6 +221,28 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
             f"{of_sensors} is not known. Set it to the range at 10 % reflectance, for example "
             "noise: {detection_range_m: 90}"
         )
+
+
+def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
+    """Yield notes on trajectories without angles: {name: whether the path has corners}."""
+    if not without_angles:
+        return
+    names = [*without_angles]
+    note = (
+        f"the trajectory of {listed(names)} has no angles: it is level and faces the direction of "
+        "travel"
+    )
+    if names[1:]:
+        note = (
+            f"the trajectories of {listed(names)} have no angles: they are level and face the "
+            "direction of travel"
+        )
+    if any(without_angles.values()):
+        note += (
+            f". At a corner between straight lines, the turn takes {CORNER_M:g} m before and after "
+            "it; interpolation: smooth makes a path without corners"
+        )
+    yield note
 
 
 def _timing_notes(built: Built) -> Iterator[str]:

@@ -293,7 +293,12 @@ def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
     if entry is None:
         return None
     if entry.vehicle is None:
-        return entry.track(scenario.path, standing)
+        return entry.track(
+            scenario.path,
+            standing,
+            name="the carrier",
+            without_angles=shapes.findings.without_angles,
+        )
     section = scenario.traffic
     assert section is not None, "checked with the scenario"
     content = _traffic_content(scenario, -np.inf, np.inf, TravellerChoice(only=entry.vehicle))
@@ -458,7 +463,10 @@ def _build_actors(shapes: Shapes, standing: StandingSurfaces, track: Track | Non
     scenario = shapes.scenario
     actors = list[Actor]()
     with prefixed(scenario.source):
-        trajectories = [e.track(scenario.path, standing, track) for e in scenario.actors]
+        without_angles = shapes.findings.without_angles
+        trajectories = [
+            entry.track(scenario.path, standing, track, without_angles) for entry in scenario.actors
+        ]
     for entry, trajectory in zip(scenario.actors, trajectories, strict=True):
         if entry.robot:
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):

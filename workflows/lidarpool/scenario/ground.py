@@ -141,6 +141,7 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
     LidarError
         If the trajectory is too long.
     """
+    track = track.with_turns
     times = _step_times(track)
     moved = replace(track, start_s=float(times[0]), duration_s=None)
     positions, rotations = moved.poses(0, (times - times[0]) * 1e9)

@@ -60,6 +60,8 @@ class Findings:
     landscapes: list[str] = field(default_factory=list)  # files of land, never of single objects
     # {file of the scene: {number: class}} of files whose format gives classes to objects
     classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
+    # {the carrier or an actor: whether its path has corners} of trajectories without angles
+    without_angles: dict[str, bool] = field(default_factory=dict)
 
     def copy(self) -> Findings:
         """Return a copy whose lists and dictionaries can be extended separately."""

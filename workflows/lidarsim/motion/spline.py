@@ -105,9 +105,9 @@ class _Polynomials(NamedTuple):
 
 
 def on_curve(
-    knots: Floats, steps: Floats, segment: Indices, since: Floats, slopes: bool
-) -> tuple[Floats, Floats]:
-    """Return values (d, k) and slopes (d, k) of a curve, `since` (k,) after knots `segment` (k,).
+    knots: Floats, steps: Floats, segment: Indices, since: Floats, order: int = 0
+) -> list[Floats]:
+    """Return the values of a curve and its derivatives up to an order, (d, k) each.
 
     Parameters
     ----------
@@ -119,8 +119,8 @@ def on_curve(
         (k,): numbers of the knots before the points.
     since
         (k,): times since these knots.
-    slopes
-        Whether slopes are computed; they are 0 otherwise.
+    order
+        Highest derivative, 0 to 2.
     """
     # Times mostly come in order: coefficients are computed once for all points of a run in one
     # segment.
@@ -129,12 +129,18 @@ def on_curve(
     run_segments = segment.take(run_starts)
     step = steps.take(run_segments)
     share = since / step.repeat(counts)
-    value, slope = np.zeros((2, knots.shape[1], len(segment)))
-    for term in reversed(_polynomials(knots, run_segments, step)):  # Horner's method
-        if slopes:
-            slope = slope * share + value
-        value = value * share + term.repeat(counts, axis=1)
-    return value, slope / step.repeat(counts)
+    # Horner's method; a row is a derivative, divided by the factorial of its order
+    rows = [*np.zeros((order + 1, knots.shape[1], len(segment)))]
+    for term in reversed(_polynomials(knots, run_segments, step)):
+        for row in range(order, 0, -1):
+            rows[row] = rows[row] * share + rows[row - 1]
+        rows[0] = rows[0] * share + term.repeat(counts, axis=1)
+    scale = step.repeat(counts)
+    for row, factor in enumerate([1.0, 2.0][:order], 1):
+        for _ in range(row):
+            rows[row] = rows[row] / scale
+        rows[row] = factor * rows[row]
+    return rows
 
 
 def _polynomials(knots: Floats, segments: Indices, step: Floats) -> _Polynomials:

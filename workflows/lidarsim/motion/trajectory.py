@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
@@ -23,6 +23,7 @@ from ..base.vectors import (
     matmul,
     matmul_of_components,
 )
+from .headings import CurveHeadings, Heading, headed_poses
 from .rotations import (
     check_rotations,
     matrices,
@@ -298,7 +299,11 @@ class Track:
         float64 (k, 3): metres, in scene coordinates.
     quaternions
         float64 (k, 4): x, y, z, w of the rotations from the carrier frame to the scene frame, of
-        unit length within 1e-3. None if the carrier is level and faces its direction of travel.
+        unit length within 1e-3. None for a level carrier that faces its direction of travel, the
+        tangent of its path. On straight lines it turns at corners, within 1 m before and after
+        them, or from the middle of one line to the middle of the next if they are shorter than
+        2 m. A carrier that stands still, or moves vertically, keeps its heading and turns to the
+        next one in the last second.
     smooth
         Positions and quaternions follow cubic splines, whose accelerations do not jump, and stand
         still between equal poses. Otherwise positions follow straight lines, and the carrier
@@ -368,7 +373,7 @@ class Track:
         return [_BatchTrack.of_batch(batch, number) for number in range(len(matrices))]
 
     def _set_poses(self) -> None:
-        """Check and freeze times, positions and quaternions, and compute missing quaternions."""
+        """Check and freeze times, positions and quaternions."""
         times = as_array("times_s", self.times_s).copy()
         positions = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or positions.shape != (len(times), 3):
@@ -379,25 +384,20 @@ class Track:
         finite = np.isfinite(positions[:, 0] + positions[:, 1] + positions[:, 2])
         _check_poses(~finite, "the position of pose {} is not finite")
         _check_times(times)
-        if self.quaternions is None:
-            if self.smooth:
-                slopes = knots_of(times, positions.T)[1]
-            else:
-                slopes = np.gradient(positions, times, axis=0).T
-            quaternions = _travel_quaternions(slopes)
-        else:
+        arrays = {"times_s": times, "positions": positions}
+        if self.quaternions is not None:
             quaternions = as_array("quaternions", self.quaternions).copy()
             if quaternions.shape != (len(times), 4):
                 raise LidarError(
                     f"quaternions are x, y, z and w of each of the {len(times)} poses, not "
                     f"{quaternions.shape}."
                 )
-        lengths = length(quaternions)
-        # Written so that NaN is an error.
-        bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
-        _check_poses(bad, "the quaternion of pose {} is not of length 1")
-        quaternions /= lengths[:, None]
-        arrays = {"times_s": times, "positions": positions, "quaternions": quaternions}
+            lengths = length(quaternions)
+            # Written so that NaN is an error.
+            bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
+            _check_poses(bad, "the quaternion of pose {} is not of length 1")
+            quaternions /= lengths[:, None]
+            arrays["quaternions"] = quaternions
         for name, array in arrays.items():
             array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -453,9 +453,13 @@ class Track:
         LidarError
             If a time is not within the trajectory.
         """
+        if self.with_turns is not self:
+            return self.with_turns.poses(station, times_ns)
         segment, since, _ = self._segments_at(times_ns)
         if self.smooth:
-            values, _ = on_curve(*self._spline, segment, since, False)
+            (values,) = on_curve(*self._spline, segment, since)
+            if self._headings is not None:
+                return values.T, _level_rotations(self._headings.at(segment, since))
             quaternions = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
             return values[:3].T, matrices(quaternions.T)
         if len(segment) and segment.max() == segment.min():
@@ -480,9 +484,15 @@ class Track:
         LidarError
             If a time is not within the trajectory.
         """
+        if self.with_turns is not self:
+            return self.with_turns.velocities(station, times_ns)
         segment, since, within = self._segments_at(times_ns)
-        if self.smooth:
-            q, p = on_curve(*self._spline, segment, since, True)
+        if self.smooth and self._headings is not None:
+            _, speeds = on_curve(*self._spline, segment, since, 1)
+            rates = np.zeros_like(speeds)
+            rates[2] = self._headings.at(segment, since).rates
+        elif self.smooth:
+            q, p = on_curve(*self._spline, segment, since, 1)
             # 2 p conjugate(q); q may have any length, and the length may change.
             vector_part = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
             speeds = p[:3]
@@ -513,27 +523,47 @@ class Track:
         return _SegmentTimes(segment, moments_s - times.take(segment), within)
 
     @cached_property
-    def _spline(self) -> tuple[Floats, Floats]:
-        """Knots (3, 7, k) of positions and quaternions, and steps (k - 1,), s, for `on_curve`.
+    def with_turns(self) -> Track:
+        """The same motion with quaternions, and with poses where turns begin and end.
 
-        Of the two quaternions of a rotation, each knot has the nearer to the knot before.
+        The track itself if it has quaternions, or is smooth.
+        """
+        if self.smooth or self.quaternions is not None:
+            return self
+        return replace(self, **headed_poses(self.times_s, self.positions)._asdict())
+
+    @cached_property
+    def _headings(self) -> CurveHeadings | None:
+        """Headings on a smooth track without quaternions, None on other tracks."""
+        if not self.smooth or self.quaternions is not None:
+            return None
+        return CurveHeadings.from_knots(self.times_s, self._spline[0])
+
+    @cached_property
+    def _spline(self) -> tuple[Floats, Floats]:
+        """Knots (3, d, k) of positions and quaternions, and steps (k - 1,), s, for `on_curve`.
+
+        d is 7, or 3 without quaternions. Of the two quaternions of a rotation, each knot has the
+        nearer to the knot before.
         """
         quaternions = self.quaternions
-        assert quaternions is not None  # set above
-        flips = np.cumsum((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0)
-        groups = self.positions.T, quaternions.T * (1.0 - 2 * np.append(0, flips % 2))
+        groups = [self.positions.T]
+        if quaternions is not None:
+            flips = np.cumsum((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0)
+            groups.append(quaternions.T * (1.0 - 2 * np.append(0, flips % 2)))
         knots = [knots_of(self.times_s, group) for group in groups]
         return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
     def segments(self) -> Segments:
-        """Coefficients of poses on straight lines."""
-        quaternions = self.quaternions
-        assert quaternions is not None  # set above
+        """Coefficients of the poses of `with_turns` on straight lines."""
+        track = self.with_turns
+        quaternions = track.quaternions
+        assert quaternions is not None  # of a track on straight lines
         return _segments(
-            np.diff(self.times_s),
-            self.positions[:-1],
-            self.positions[1:],
+            np.diff(track.times_s),
+            track.positions[:-1],
+            track.positions[1:],
             quaternions[:-1],
             quaternions[1:],
         )
@@ -669,19 +699,14 @@ class _SegmentTimes(NamedTuple):
     within: Bools  # (k,): whether the time is within the track, so that the carrier moves
 
 
-def _travel_quaternions(slopes: Floats) -> Floats:
-    """Return the quaternions (k, 4) of a level carrier that faces its direction of travel.
-
-    `slopes` (3, k) are its velocities. While it stands, the carrier keeps its direction; before it
-    first moves, it faces its first direction.
-    """
-    x, y, _ = slopes
-    moving = np.flatnonzero(hypot(x, y) > 1e-9)
-    if not len(moving):
-        moving = np.zeros(1, np.intp)
-    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(x)), "right") - 1, 0)]
-    half = arctan2(y[last], x[last]) / 2
-    return np.stack([np.zeros_like(half), np.zeros_like(half), *sin_cos(half)], axis=1)
+def _level_rotations(heading: Heading) -> Floats:
+    """Return the rotations (k, 3, 3) of a level carrier."""
+    rotations = np.zeros((3, 3, len(heading.cosines)))
+    rotations[0, 0] = rotations[1, 1] = heading.cosines
+    rotations[1, 0] = heading.sines
+    rotations[0, 1] = -heading.sines
+    rotations[2, 2] = 1.0
+    return rotations.transpose(2, 0, 1)
 
 
 def _check_times(times_s: Floats) -> None:

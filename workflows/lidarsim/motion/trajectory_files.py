@@ -391,8 +391,9 @@ def _table(
 
 def _from_camera(track: Track) -> Track:
     """Convert poses of a camera frame (z ahead, y down) to a carrier frame (x ahead, z up)."""
-    assert track.quaternions is not None  # every track has quaternions
+    positions = turned(track.positions, _CAMERA)
+    if track.quaternions is None:
+        return replace(track, positions=positions)
     x, y, z, w = track.quaternions.T
     quaternions = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
-    positions = turned(track.positions, _CAMERA)
     return replace(track, positions=positions, quaternions=quaternions)

@@ -174,7 +174,8 @@ class Actor:
         positions, rotations = trajectory.poses(0, times_ns.clip(*presence_ns(trajectory)))
         steps = np.diff(positions, axis=0)
         steps_m = length(steps)
-        if rotations is not None:
+        faces_travel = isinstance(trajectory, Track) and trajectory.quaternions is None
+        if rotations is not None and not faces_travel:
             backward = products(steps.T, rotations[:-1, :, 0].T) < 0
             steps_m = np.where(backward, -steps_m, steps_m)
         return times_ns, np.append(0.0, np.cumsum(steps_m))

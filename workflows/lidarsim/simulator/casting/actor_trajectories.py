@@ -64,6 +64,7 @@ def _limits_of(track: Track) -> tuple[float, float, float, float]:
 
 def _single_track(actor: int, track: Track) -> _StraightTracks:
     """Return the straight track of an actor."""
+    track = track.with_turns
     counts = np.array([len(track.times_s) - 1], np.int64)
     limits = np.array([_limits_of(track)])
     return _StraightTracks([actor], counts, limits, track.times_s[:-1], track.segments)

@@ -1,0 +1,241 @@
+"""Headings of carriers that face their direction of travel, because their poses have no angles.
+
+A heading is the direction of the horizontal velocity. It is undefined while a carrier stands still
+or moves vertically: the carrier then keeps its heading, and turns to its next one in the last
+second. Straight legs meet at corners, where the carrier turns evenly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..base.arrays import Bools, Floats, Indices
+from ..base.elementary import arctan2, interp, sin_cos
+from ..base.vectors import hypot
+from .spline import on_curve
+
+# A carrier turns within this distance before and after a corner, or from the middle of one leg to
+# the middle of the next if a leg is shorter than twice the distance.
+CORNER_M = 1.0
+STAND_S = 1.0  # longest time in which a carrier that stands turns to its next heading
+
+_SAME = 1e-9  # horizontal distances, meters, and speeds, m/s, below which nothing moves
+_ROOM = 1.001  # legs hardly longer than two corners are divided in the middle
+_NEAR_END = 2.0**-10  # share of a step next to a stop, where velocities are mostly rounding
+
+
+class _Turns(NamedTuple):
+    """Changes of heading, one after the other."""
+
+    starts_s: Floats  # (n,), ascending
+    stops_s: Floats  # (n,): at most the next start
+    yaws: Floats  # (n + 1,), radians: before, between and after the turns
+
+
+class HeadedPoses(NamedTuple):
+    """Poses of a carrier on straight legs, at the given times and where its turns begin and end."""
+
+    times_s: Floats  # (n,)
+    positions: Floats  # (n, 3), meters
+    quaternions: Floats  # (n, 4)
+
+
+def headed_poses(times_s: Floats, positions: Floats) -> HeadedPoses:
+    """Return the poses of a level carrier that travels from position to position on straight legs.
+
+    Parameters
+    ----------
+    times_s
+        (k,), ascending.
+    positions
+        (k, 3), meters.
+    """
+    turns = _turns_between_legs(times_s, positions)
+    times = np.unique(np.concatenate([times_s, turns.starts_s, turns.stops_s]))
+    yaws = np.full(len(times), turns.yaws[0])
+    if len(turns.starts_s):
+        moments = np.stack([turns.starts_s, turns.stops_s], axis=1).reshape(-1)
+        yaws = interp(times, moments, turns.yaws.repeat(2)[1:-1])
+    columns = [interp(times, times_s, np.ascontiguousarray(column)) for column in positions.T]
+    sine, cosine = sin_cos(yaws / 2)
+    level = np.zeros_like(sine)
+    quaternions = np.stack([level, level, sine, cosine], axis=1)
+    return HeadedPoses(times, np.stack(columns, axis=1), quaternions)
+
+
+def _turns_between_legs(times_s: Floats, positions: Floats) -> _Turns:
+    """Return the turns at the corners of straight legs."""
+    legs = np.diff(positions[:, :2], axis=0)
+    lengths = hypot(*legs.T)
+    moving = np.flatnonzero(lengths > _SAME)
+    if not len(moving):
+        return _Turns(np.zeros(0), np.zeros(0), np.zeros(1))
+    before = moving[:-1]
+    after = moving[1:]
+    arrive = times_s[before + 1]
+    leave = times_s[after]
+    # Expressions that are equal for both ends of a leg: turns never overlap by a rounding.
+    middles = (times_s[:-1] + times_s[1:]) / 2
+    is_long = lengths > 2 * CORNER_M * _ROOM
+    corner_s = CORNER_M * np.diff(times_s) / np.where(is_long, lengths, 1.0)
+    starts = np.where(is_long[before], arrive - corner_s[before], middles[before])
+    stops = np.where(is_long[after], leave + corner_s[after], middles[after])
+    stands = after > before + 1
+    starts[stands] = np.where(leave - arrive > STAND_S * _ROOM, leave - STAND_S, arrive)[stands]
+    stops[stands] = leave[stands]
+    yaws = arctan2(legs[moving, 1], legs[moving, 0])
+    return _without_straight(starts, stops, yaws)
+
+
+def _without_straight(starts: Floats, stops: Floats, yaws: Floats) -> _Turns:
+    """Return the turns that change the heading, by the shorter way."""
+    changes = np.diff(yaws)
+    changes -= 2 * np.pi * np.round(changes / (2 * np.pi))
+    turning = np.abs(changes) > 1e-12
+    followed = np.append(yaws[0], yaws[0] + np.cumsum(changes[turning]))
+    return _Turns(starts[turning], stops[turning], followed)
+
+
+class Heading(NamedTuple):
+    """Headings at k times."""
+
+    cosines: Floats  # (k,)
+    sines: Floats  # (k,)
+    rates: Floats  # (k,), rad/s
+
+
+class _Stands(NamedTuple):
+    """Times at which a carrier stands still, with its headings on arrival and departure.
+
+    The first row is before the carrier first travels, and the last row is after it last does, even
+    if these take no time.
+    """
+
+    arrivals_s: Floats  # (n,), ascending
+    departures_s: Floats  # (n,)
+    yaws: Floats  # (n, 2), radians
+
+    @classmethod
+    def between(cls, times_s: Floats, travels: Bools, first: Floats, last: Floats) -> _Stands:
+        """Return where a carrier stands that travels after some of the knots at times (n,).
+
+        Parameters
+        ----------
+        travels
+            (n - 1,): whether it travels after each knot.
+        first, last
+            (n - 1, 2): its first and last velocity until the next knot.
+        """
+        moving = np.flatnonzero(travels)
+        if not len(moving):
+            return cls(times_s[:1], times_s[-1:], np.zeros((1, 2)))
+        gaps = np.flatnonzero(np.diff(moving) > 1)
+        arrived = np.append(moving[gaps], moving[-1])
+        left = np.append(moving[0], moving[gaps + 1])
+        arrival_yaws = arctan2(last[arrived, 1], last[arrived, 0])
+        departure_yaws = arctan2(first[left, 1], first[left, 0])
+        return cls(
+            arrivals_s=np.append(times_s[0], times_s[arrived + 1]),
+            departures_s=np.append(times_s[left], times_s[-1]),
+            yaws=np.stack(
+                [
+                    np.append(departure_yaws[0], arrival_yaws),
+                    np.append(departure_yaws, arrival_yaws[-1]),
+                ],
+                axis=1,
+            ),
+        )
+
+    def at(self, times_s: Floats) -> Heading:
+        """Return the headings at times (k,) at which the carrier stands."""
+        row = np.clip(np.searchsorted(self.arrivals_s, times_s, "right") - 1, 0, None)
+        stops_s = self.departures_s.take(row)
+        duration = np.minimum(stops_s - self.arrivals_s.take(row), STAND_S)
+        duration = np.where(duration > 0, duration, STAND_S)
+        first, last = self.yaws.take(row, axis=0).T
+        change = last - first
+        change = change - 2 * np.pi * np.round(change / (2 * np.pi))
+        share = ((times_s - (stops_s - duration)) / duration).clip(0.0, 1.0)
+        # A polynomial whose first and second derivatives are 0 at both ends.
+        progress = share * share * share * (10 - 15 * share + 6 * share * share)
+        sine, cosine = sin_cos(first + change * progress)
+        slope = 30 * (share * (1 - share)) * (share * (1 - share))
+        return Heading(cosine, sine, change * slope / duration)
+
+
+@dataclass(frozen=True, eq=False)
+class CurveHeadings:
+    """Headings of a carrier on a smooth curve: the curve's tangent, seen from above.
+
+    Attributes
+    ----------
+    times_s
+        (n,): times of the knots.
+    knots
+        (3, 3, n): of `knots_of`, positions and their first two derivatives.
+    still
+        (n,): whether the curve stands still at a knot.
+    travels
+        (n - 1,): whether the carrier moves horizontally after a knot, so that it has a tangent.
+    first
+        (n - 1, 2): horizontal velocities where the carrier sets out after each knot.
+    stands
+        Where the carrier stands still, or moves vertically.
+    """
+
+    times_s: Floats
+    knots: Floats
+    still: Bools
+    travels: Bools
+    first: Floats
+    stands: _Stands
+
+    @classmethod
+    def from_knots(cls, times_s: Floats, knots: Floats) -> CurveHeadings:
+        """Return the headings on a curve through knots (3, 3, n) at times (n,)."""
+        steps = np.diff(times_s)
+        still = ~knots[1:].any(axis=(0, 1))
+        count = len(steps)
+        shares = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
+        since = (steps[:, None] * shares).reshape(-1)
+        slopes = on_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
+        velocities = slopes[:2].T.reshape(count, 3, 2)
+        moves = hypot(velocities[..., 0], velocities[..., 1]) > _SAME
+        moves[still[:-1] & still[1:]] = False
+        travels = moves.any(axis=1)
+        rows = np.arange(count)
+        first = velocities[rows, moves.argmax(axis=1)]
+        last = velocities[rows, 2 - moves[:, ::-1].argmax(axis=1)]
+        stands = _Stands.between(times_s, travels, first, last)
+        return cls(times_s, knots, still, travels, first, stands)
+
+    def at(self, segment: Indices, since: Floats) -> Heading:
+        """Return the headings `since` (k,) seconds after the knots `segment` (k,)."""
+        tangent = self._tangent(segment, since)
+        if self.travels.all():
+            return tangent
+        travels = self.travels.take(segment)
+        standing = self.stands.at(self.times_s.take(segment) + since)
+        pairs = zip(tangent, standing, strict=True)
+        return Heading(*(np.where(travels, one, other) for one, other in pairs))
+
+    def _tangent(self, segment: Indices, since: Floats) -> Heading:
+        """Return the headings on steps where the carrier travels."""
+        steps = np.diff(self.times_s)
+        step = steps.take(segment)
+        near_start = np.where(self.still.take(segment), _NEAR_END * step, 0.0)
+        near_stop = np.where(self.still.take(segment + 1), step - _NEAR_END * step, step)
+        inside = since.clip(near_start, near_stop)
+        _, velocity, change = on_curve(self.knots[:, :2], steps, segment, inside, 2)
+        speed = hypot(*velocity)
+        slow = np.flatnonzero(speed <= _SAME)
+        velocity[:, slow] = self.first[segment[slow]].T
+        speed[slow] = hypot(*velocity[:, slow])
+        x, y = velocity / np.where(speed > 0, speed, 1.0)
+        rates = (x * change[1] - y * change[0]) / np.where(speed > 0, speed, 1.0)
+        rates[inside != since] = 0.0
+        rates[slow] = 0.0
+        return Heading(x, y, rates)
