@@ -69,8 +69,10 @@ def advice(built: Built) -> list[str]:
     labels = (*unlabelled, *_unnamed_classes(built.survey))
     settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
     light = (*_single_returns(built), *_dark_fog(built.survey))
-    headings = _heading_notes(built.findings.without_angles)
-    groups = (notes, axes, likely, headings, settings, light, _timing_notes(built))
+    groups = (
+        *(notes, axes, likely, _heading_notes(built.findings.without_angles)),
+        *(settings, light, _timing_notes(built)),
+    )
     return [as_scenario(line) for line in chain.from_iterable(groups)]
 
 
