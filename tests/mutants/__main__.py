@@ -17,6 +17,7 @@ from pathlib import Path
 from queue import Queue
 
 from tests.mutants.faults import ROOTS, Fault, choose
+from tests.mutants.forks import PYTEST, Forks
 from tests.mutants.lines import Lines
 
 ROOT = Path(__file__).parents[2]
@@ -37,7 +38,6 @@ PACKAGES = [
         "report/merging.py", "report/growing_cloud.py", "base/shard.py",
     )),
 ]  # fmt: skip
-_SELECTION = "not slow"  # what CI runs
 _FIRST_S = 10.0  # estimated time of the tests that are tried first
 _EXTRA_S = 120.0  # a fault that makes tests this much slower counts as noticed
 
@@ -74,7 +74,9 @@ def main() -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     record = FOLDER / "lines.json"
     if options.record or not record.is_file():
-        lines = Lines.record(ROOT, FOLDER, ["-m", _SELECTION, "-n", str(options.jobs)])
+        lines = Lines.record(
+            ROOT, FOLDER, ["-m", "not slow", "-n", str(options.jobs), "--dist", "loadfile"]
+        )
     else:
         lines = Lines.read(record)
     if options.again:
@@ -87,8 +89,8 @@ def main() -> None:
         faults = choose(ROOT, options.packages or PACKAGES, options.count, options.seed)
     outcomes = []
     out = options.out or FOLDER / f"{options.seed}.json"
-    with _copies(options.jobs) as copies, ThreadPoolExecutor(options.jobs) as pool:
-        tasks = [pool.submit(_try, copies, lines, fault, options.budget) for fault in faults]
+    with _places(options.jobs) as places, ThreadPoolExecutor(options.jobs) as pool:
+        tasks = [pool.submit(_try, places, lines, fault, options.budget) for fault in faults]
         for task in tasks:
             outcomes.append(task.result())
             print(outcomes[-1], flush=True)
@@ -130,37 +132,50 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+@dataclass
+class Place:
+    """Where a fault is tried: a process that has imported everything, and a copy of the project."""
+
+    forks: Forks
+    copy: Path
+
+
 @contextmanager
-def _copies(count: int) -> Iterator["Queue[Path]"]:
-    """Yield copies of the project in which faults are planted."""
-    copies: Queue[Path] = Queue()
+def _places(count: int) -> Iterator["Queue[Place]"]:
+    """Yield places for faults that are tried at the same time."""
+    places: Queue[Place] = Queue()
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         for number in range(count):
             copy = Path(folder) / str(number) / "project"
             ignored = shutil.ignore_patterns(".venv", ".git", "lidarpool-out", "build", "*_cache")
             shutil.copytree(ROOT, copy, ignore=ignored, symlinks=True)
-            copies.put(copy)
-        yield copies
+            places.put(Place(Forks(), copy))
+        yield places
+        for _ in range(count):
+            places.get().forks.close()
 
 
-def _try(copies: "Queue[Path]", lines: Lines, fault: Fault, budget_s: float) -> Outcome:
-    """Plant a fault in a copy, run tests, and restore the copy."""
+def _try(places: "Queue[Place]", lines: Lines, fault: Fault, budget_s: float) -> Outcome:
+    """Plant a fault, run the tests that execute it in groups, and say what became of it."""
     start = time.monotonic()
-    tests = lines.tests_of(ROOT, fault)
-    copy = copies.get()
-    path = copy / fault.path
+    groups = list(_groups(lines, lines.tests_of(ROOT, fault), budget_s))
+    place = places.get()
+    noticed = ""
+    tried = 0
     try:
-        path.write_text(fault.plant((ROOT / fault.path).read_text()))
-        noticed, tried = "", 0
-        for group in _groups(lines, tests, budget_s):
+        for group in [] if fault.compiled else groups:
+            limit_s = 3 * sum(map(lines.cost, group)) + _EXTRA_S
             tried += len(group)
-            noticed = _failure(copy, group, sum(map(lines.cost, group)))
+            noticed = place.forks.failure(fault, group, limit_s) or ""
             if noticed:
                 break
+        if not noticed and groups:  # compiled, or only seen by processes that tests start
+            tried = sum(map(len, groups))
+            noticed = _failure(
+                place.copy, fault, lines, [test for group in groups for test in group]
+            )
     finally:
-        shutil.copy2(ROOT / fault.path, path)
-        _restore_loops(copy, fault)
-        copies.put(copy)
+        places.put(place)
     return Outcome(fault, noticed, tried, time.monotonic() - start)
 
 
@@ -183,42 +198,36 @@ def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[st
         yield group
 
 
-def _failure(copy: Path, tests: list[str], expected_s: float) -> str:
-    """Run tests in a copy, and return which one failed first, "hangs", or "" if all passed."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-x",
-        "-p",
-        "no:cacheprovider",
-        "-m",
-        _SELECTION,
-    ]
+def _failure(copy: Path, fault: Fault, lines: Lines, tests: list[str]) -> str:
+    """Plant a fault in a copy, and return which test failed first, "hangs", or ""."""
+    path = copy / fault.path
+    path.write_text(fault.plant((ROOT / fault.path).read_text()))
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(str(copy / root) for root in (*ROOTS, ".")),
         "PYTEST_TIMEOUT": str(int(_EXTRA_S)),
     }
     try:
         done = subprocess.run(
-            [*command, *tests],
+            [sys.executable, "-m", "pytest", *PYTEST, *tests],
             cwd=copy,
             env=environment,
             capture_output=True,
             text=True,
-            timeout=3 * expected_s + _EXTRA_S,
+            timeout=3 * sum(map(lines.cost, tests)) + _EXTRA_S,
             check=False,
         )
     except subprocess.TimeoutExpired:
         return "hangs"
+    finally:
+        shutil.copy2(ROOT / fault.path, path)
+        _restore_loops(copy)
     if done.returncode in (0, 5):
         return ""
     failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
     return f"by {failed[0].split(' - ')[0]}" if failed else f"exit status {done.returncode}"
 
 
-def _restore_loops(copy: Path, fault: Fault) -> None:
+def _restore_loops(copy: Path) -> None:
     """Bring back the compiled loops that the fault's tests have replaced."""
     for root in ROOTS:
         for cached in (copy / root).rglob("__pycache__/*.nb[ic]"):
