@@ -16,7 +16,7 @@ help:  ## list the targets
 dev:
 	@VENV=$(VENV) sh .ci/setup dev
 
-demo:  ## the default survey, then a drive through a city; results in $(OUT)/ and $(OUT)/drive/
+demo:  ## the demo survey, then a drive through a city; results in $(OUT)/ and $(OUT)/drive/
 	@VENV=$(VENV) sh .ci/setup run
 	$(BIN)/lidarpool demo --out $(OUT)
 	@mkdir -p $(OUT)/drive && cp examples/drive.yaml $(OUT)/drive

@@ -123,7 +123,7 @@ def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
         "pictures": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q"],
     }[side]
     if side != "script":
-        command += ["--no-plan", "--out", str(out_folder)]
+        command += ["--out", str(out_folder)]
     usage_before = resource.getrusage(resource.RUSAGE_CHILDREN)
     began = time.perf_counter()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -129,7 +129,7 @@ def scenario_page() -> str:
     schema = scenario_schema()
     head = (
         "# Scenario files\n\n"
-        f"{schema['description']} All of it may be left out: an empty file is the default survey. "
+        f"{schema['description']} All of it but the scene may be left out. "
         "Fields that are not in these tables are refused. `lidarpool init --all` writes a file "
         "with all of them, and `lidarpool schema` prints this as JSON Schema.\n"
     )

@@ -8,7 +8,7 @@ import pytest
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
-SCENARIO = "sensor: {rays_per_revolution: 100, layers: 8}\n"
+SCENARIO = "scene: seed\nsensor: {rays_per_revolution: 100, layers: 8}\n"
 PLACE = """(() => {
   const figure = document.querySelector('figure[data-picture=scene]'); figure.scrollIntoView();
   const box = figure.querySelector('svg').getBoundingClientRect();
@@ -18,7 +18,7 @@ PLACE = """(() => {
 
 def test_pictures_are_dark_where_the_browser_is(new_tab, tmp_path):
     (tmp_path / "small.yaml").write_text(SCENARIO)
-    run = [sys.executable, "-m", "lidarpool", "run", "small.yaml", "--no-plan", "--pictures"]
+    run = [sys.executable, "-m", "lidarpool", "run", "small.yaml", "--pictures"]
     subprocess.run(run, cwd=tmp_path, check=True, timeout=180, capture_output=True)
     tab = new_tab((tmp_path / "lidarpool-out" / "report.html").as_uri())
     tab.wait_for(lambda text: "Sensor and scene" in text)

@@ -26,8 +26,7 @@ BASE = """
 sensor: {rays_per_revolution: 720, layers: 8, step_deg: 2}
 poses: [[0, 0, 1], [2, 0, 2]]
 steps: 180
-cloud: {keep_every: 1}
-planning: {enabled: false}
+scene: seed
 """
 CAMPAIGN = """
 base: base.yaml

@@ -47,8 +47,7 @@ sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}
 poses: [[0, 0, 1]]
 steps: 25
 actors: [{name: Car, box: [4, 2, 1.5], at: {position: [6, 0, 0]}}]
-cloud: {keep_every: 1}
-planning: {enabled: false}
+scene: seed
 pool: {backend: numpy, gpu: 1}
 """
 CAMPAIGN = """

@@ -33,6 +33,7 @@ from raybeam.compiled import compiled
 RECORDINGS = {"mcap": "cloud.mcap", "pcap": "packets"}  # {format: file, or folder of files}
 TRACES = {"osi": "trace_gt.osi", "osi_mcap": "trace.mcap"}  # {format: file}
 TRAFFIC = """
+scene: seed
 sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}
 poses: [[0, 0, 1]]
 steps: 25

@@ -33,16 +33,15 @@ SURVEY = """
 sensor: {rays_per_revolution: 720, layers: 8, step_deg: 2}
 poses: [[0, 0, 1], [2, 0, 2], [4, 0, 2], [6, 1, 2], [4, 2, 2], [2, 2, 2]]
 steps: 180
-cloud: {keep_every: 1}
-planning: {trials: 3, iterations: 20}
+scene: seed
+planning: {start: [25, 25], target: [-30, -20], trials: 3, iterations: 20}
 output: {write: [las]}
 """
 JOB = """
 sensor: {rays_per_revolution: 90, layers: 4, step_deg: 4}
 poses: [[0, 0, 1]]
 steps: 9
-cloud: {keep_every: 1}
-planning: {enabled: false}
+scene: seed
 """
 CAMPAIGN = """
 base: job.yaml

@@ -16,7 +16,7 @@ POSES = [[x, 0, 1] for x in range(30)]
 
 def words(**sections):
     """Return the fields of the survey of a scenario."""
-    built = build(Scenario.from_data({"poses": [[0, 0, 1]]} | sections))
+    built = build(Scenario.from_data({"scene": "seed", "poses": [[0, 0, 1]]} | sections))
     return fields_of(built.scene, built.survey, built.planning)
 
 

@@ -103,7 +103,7 @@ def test_the_scenario_of_the_page_labels_its_points():
     ],
 )
 def test_labelled_formats_without_classes_are_noted(materials, notes):
-    data = {"output": {"write": ["kitti", "las"]}, "materials": materials}
+    data = {"scene": "seed", "output": {"write": ["kitti", "las"]}, "materials": materials}
     told = [note for note in advice(build(Scenario.from_data(data))) if "class" in note]
     assert len(told) == len(notes) and all(map(str.startswith, told, notes))
 

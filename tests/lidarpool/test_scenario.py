@@ -18,7 +18,9 @@ from lidarpool import Pose, Scene, SceneInstance
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import Job, build
+from lidarpool.scenario.demo import demo_scenario
 from lidarpool.scenario.scenario import Scenario
+from lidarpool.scenario.static_scene import SceneCache
 from lidarsim.base.errors import LidarError
 from lidarsim.media.materials import MaterialTable, SurfaceKinds
 from lidarsim.scene.actors import box
@@ -55,12 +57,11 @@ def everything(loaded):
     return built.scene, built.survey, built.planning
 
 
-@pytest.mark.parametrize("source", ["python", "file", "empty sections"])
-def test_the_default_survey(source, scenario):
+@pytest.mark.parametrize("source", ["python", "file"])
+def test_the_survey_of_the_demo(source):
     loaded = {
-        "python": Scenario,
+        "python": demo_scenario,
         "file": lambda: Scenario.load(EXAMPLES / "seed.yaml"),
-        "empty sections": lambda: scenario("scene:\nsensor:\nposes:\ncloud:\nplanning:\npool:\n"),
     }[source]()
     scene, survey, planning = everything(loaded)
     assert fingerprint(survey) == fingerprint(DEFAULT)
@@ -75,12 +76,89 @@ def test_the_default_survey(source, scenario):
     assert (pool.queue_capacity, pool.collectors, pool.backend) == (10, 2, "auto")
 
 
+@pytest.mark.parametrize("scene", ["seed", {"preset": "seed"}, {"preset": "seed", "files": []}])
+def test_the_objects_of_the_demo_come_without_its_thinning_and_planning(scene):
+    built = build(Scenario.from_data({"scene": scene}))
+    assert built.scene.names == ("Sphere", "Vase", "Bell", "Pawn", "Spindle", "Bowl")
+    assert (built.survey.keep_every, built.survey.precision_m, built.planning) == (1, 0.001, None)
+    assert [pose.position[2] for pose in built.survey.poses] == [1, 2, 3]
+
+
+@pytest.mark.parametrize("scene", ["", "scene:", "scene: {}", "scene: []", "scene: {files: []}"])
+def test_without_a_scene_nothing_is_made_up(scenario, tmp_path, scene):
+    text = f"{scene}\nposes: [[0, 0, 1]]\n"
+    with pytest.raises(LidarError) as raised:
+        build(scenario(text))
+    assert str(raised.value) == (
+        f"{tmp_path / 's.yaml'}: The scenario has no scene. Add mesh files as `scene.files`, or "
+        "`scene: seed` for the six objects of `lidarpool demo`."
+    )
+    actors = "actors: [{name: Crate, box: [2, 2, 2], at: [6, 0, 0]}]"
+    with pytest.raises(LidarError, match=r"has actors, but nothing that stands still\. Add"):
+        build(scenario(text + actors))
+
+
+LANE = "{points: [{time_s: 0, position: [-8, 0, 1]}, {time_s: 9, position: [40, 0, 1]}]%s}"
+
+
+@pytest.mark.parametrize(
+    ("text", "rectangle"),
+    [
+        ("poses: [[0, 0, 1], [4, 3, 1]]", [-5, -5, 9, 8]),
+        (
+            "poses: [[0, 0, 1]]\nactors: [{name: A, box: [1, 1, 1], at: [9, 2, 0]}, "
+            "{name: B, box: [1, 1, 1], at: {position: [0, -7, 0], yaw_deg: 9}}]",
+            [-5, -12, 14, 7],
+        ),
+        ("trajectory: " + LANE % "", [-13, -5, 45, 5]),
+        ("trajectory: " + LANE % ", start_s: 3, duration_s: 1.5", [3, -5, 21, 5]),
+        (
+            "poses: [[0, 20, 1]]\nactors: [{name: A, box: [1, 1, 1], trajectory: "
+            + LANE % ", surfaces: Ground, beyond: hold"
+            + "}]",
+            [-13, -5, 45, 25],
+        ),
+    ],
+)
+def test_the_ground_lies_under_poses_trajectories_and_actors(scenario, text, rectangle):
+    built = build(scenario(f"scene: {{ground: {{height_m: -1}}}}\n{text}"))
+    scene = built.scene
+    assert scene.names == ("Ground",)
+    (bounds,) = scene.object_bounds + scene.origin
+    assert [*bounds[0], *bounds[1]] == pytest.approx([*rectangle[:2], -1, *rectangle[2:], -1])
+    assert (built.survey.keep_every, built.planning) == (1, None)
+    wide = text.replace("poses", "scene: {ground: {margin_m: 50}}\nposes")
+    if wide != text:
+        scene = build(scenario(wide)).scene
+        assert np.ptp(scene.bounds, axis=0)[:2] == pytest.approx(
+            np.add([rectangle[2] - rectangle[0], rectangle[3] - rectangle[1]], 90)
+        )
+
+
+def test_a_ground_under_nothing_is_refused(scenario):
+    with pytest.raises(LidarError, match=r"s\.yaml: `scene\.ground` lies under .* Add `poses`"):
+        build(scenario("scene: {ground: {}}"))
+
+
+def test_scenarios_share_a_scene_if_their_ground_is_the_same():
+    """Poses within the scene leave the ground as it is."""
+    cache = SceneCache()
+    scene = {"preset": "seed", "ground": {}}
+    scenarios = [Scenario.from_data({"scene": scene, "poses": [[x, 0, 1]]}) for x in (0, 3, 30, 0)]
+    inside, beside, outside, again = (build(one, cache=cache).scene for one in scenarios)
+    assert inside is beside is again
+    assert outside.names == inside.names and outside.vertices.shape == inside.vertices.shape
+    ends = [(scene.bounds + scene.origin)[1, 0] for scene in (inside, outside)]
+    assert ends == pytest.approx([27, 35])
+
+
 def test_a_model_and_a_unit_of_it(tmp_path):
     (tmp_path / "unit.csv").write_text(
         "Channel,Elevation,Azimuth\n" + "\n".join(f"{i},{16.1 - i},0" for i in range(1, 33))
     )
     (tmp_path / "s.yaml").write_text(
-        "sensor: {calibration: unit.csv, rate_hz: 20, max_range_m: 60, step_deg: 30}\nsteps: 12\n"
+        "scene: seed\nsensor: {calibration: unit.csv, rate_hz: 20, max_range_m: 60, step_deg: 30}\n"
+        "steps: 12\n"
     )
     survey = build(Scenario.load(tmp_path / "s.yaml")).survey
     sensor = survey.sensor
@@ -89,7 +167,7 @@ def test_a_model_and_a_unit_of_it(tmp_path):
     (tmp_path / "mine.yaml").write_text(
         "{name: Mine, sources: {}, firings_per_turn: 90, beams: {elevation_deg: [0]}}"
     )
-    mine = Scenario.from_data({"sensor": {"model": "mine.yaml"}}, folder=tmp_path)
+    mine = Scenario.from_data({"scene": "seed", "sensor": {"model": "mine.yaml"}}, folder=tmp_path)
     assert build(mine).survey.ray_count == 3 * 90
 
 
@@ -138,14 +216,15 @@ def test_georeferenced_poses_and_plans_are_local(scenario, crate):
 def test_obstacles(scenario):
     def plan(text):
         ground = "scene: {preset: seed, ground: {margin_m: 20}}"  # flat, so it is no obstacle
-        return everything(scenario(f"{ground}\nplanning: {text}"))[2]
+        ends = "start: [25, 25], target: [-30, -20]"
+        return everything(scenario(f"{ground}\nplanning: {{{ends}, {text}}}"))[2]
 
-    assert len(plan("{obstacles: auto}").radii) == 6
-    assert len(plan("{obstacles: []}").radii) == 0
-    assert len(plan('{obstacles: ["*e*", {object: Vase}]}').radii) == 4  # Vase once
-    disc = plan("{obstacles: [{centre: [1, 2], radius_m: 3}], clearance_m: 0.5}")
+    assert len(plan("obstacles: auto").radii) == 6
+    assert len(plan("obstacles: []").radii) == 0
+    assert len(plan('obstacles: ["*e*", {object: Vase}]').radii) == 4  # Vase once
+    disc = plan("obstacles: [{centre: [1, 2], radius_m: 3}], clearance_m: 0.5")
     assert (disc.centres.tolist(), disc.radii.tolist()) == ([[1, 2]], [3.5])
-    assert plan("{enabled: false}") is None
+    assert plan("enabled: false") is None
 
 
 def test_numbers_as_everybody_writes_them(scenario):
@@ -155,17 +234,18 @@ def test_numbers_as_everybody_writes_them(scenario):
 
 def test_short_forms_say_the_same(scenario):
     short = (
-        "sensors: {a: vlp16, b: {model: ouster/os1-64, mount: [0, 0, 1]}}\n"
+        "scene: seed\nsensors: {a: vlp16, b: {model: ouster/os1-64, mount: [0, 0, 1]}}\n"
         "navigation: {imu: {mount: [1, 0, 0]}}\nposes: [[0, 0, 1]]\n"
     )
     long = (
-        "sensors: {a: {model: velodyne/vlp16}, b: {model: ouster/os1-64, mount: {position: "
-        "[0, 0, 1]}}}\nnavigation: {imu: {mount: {position: [1, 0, 0]}}}\nposes: [[0, 0, 1]]\n"
+        "scene: seed\nsensors: {a: {model: velodyne/vlp16}, b: {model: ouster/os1-64, "
+        "mount: {position: [0, 0, 1]}}}\nnavigation: {imu: {mount: {position: [1, 0, 0]}}}\n"
+        "poses: [[0, 0, 1]]\n"
     )
     one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
     assert one == other
-    short = "sensor: vlp16\nmount: [0, 0, 2]"
-    long = "sensor: {model: velodyne/vlp16}\nmount: {position: [0, 0, 2]}"
+    short = "scene: seed\nsensor: vlp16\nmount: [0, 0, 2]"
+    long = "scene: seed\nsensor: {model: velodyne/vlp16}\nmount: {position: [0, 0, 2]}"
     one, other = (fingerprint(build(scenario(text)).survey) for text in (short, long))
     assert one == other
 
@@ -173,13 +253,13 @@ def test_short_forms_say_the_same(scenario):
 def test_a_model_of_ones_own_is_a_file_beside_the_scenario(scenario, tmp_path):
     data = files("lidarsim.sensor") / "data" / "velodyne" / "vlp16.yaml"
     (tmp_path / "mine.yaml").write_text(data.read_text().replace("VLP-16", "Mine"))
-    made = scenario("sensor: mine.yaml")
+    made = scenario("scene: seed\nsensor: mine.yaml")
     assert made.files == (tmp_path / "mine.yaml",)
     assert build(made).survey.carried[0].sensor.name == "Velodyne Mine"
 
 
 def test_actors_that_stand(scenario):
-    text = "actors:\n  - {name: A, box: [2, 1, 1], at: [9, 8, 1]}\n"
+    text = "scene: seed\nactors:\n  - {name: A, box: [2, 1, 1], at: [9, 8, 1]}\n"
     text += "  - {name: B, box: [2, 1, 1], at: {position: [9, 8, 1], yaw_deg: 90}}\n"
     straight, turned = build(scenario(text)).scene.actors
     for time in (0, 1e9, 1e12):
@@ -257,9 +337,18 @@ BAD = [
     ("scene: {files: [{file: a.stl, scale: 0}]}", "scale must not be 0"),
     ("scene: {files: [{file: a.stl, scale: 2, matrix: " + IDENTITY + "}]}", "either matrix or"),
     ("scene: {files: [{file: a.stl, matrix: " + IDENTITY.replace("1", "0") + "}]}", "0 0 0 1"),
-    ("scene: {preset: sead}", r"preset is 'sead'\. Did you mean 'seed'\? It must be 'seed' or"),
-    ("planning: {start: [5, 5]}", r"planning\.start lies .* middle of Bowl"),
-    ("planning: {obstacles: [Bel]}", "Did you mean 'Bell'"),
+    ("scene: {preset: sead}", r"preset is 'sead'\. Did you mean 'seed'\? It must be 'seed'"),
+    (
+        "scene: seed\nplanning: {start: [5, 5], target: [9, 9]}",
+        r"planning\.start lies .* middle of Bowl",
+    ),
+    (
+        "scene: seed\nplanning: {start: [25, 25], target: [-30, -20], obstacles: [Bel]}",
+        "Did you mean 'Bell'",
+    ),
+    ("scene: seed\nplanning: {trials: 5}", r"planning needs a start and a target: give planning"),
+    ("scene: seed\nplanning: {start: [5, 5]}", r"give planning\.start and planning\.target\."),
+    ("scene: {preset: none}", r"preset is 'none'; it must be 'seed'"),
     ("planning: {obstacles: [{centre: [0, 0]}]}", "both centre and radius_m"),
     ("scene: a.stl\nplanning: {enabled: true}", r"give planning\.start and planning\.target"),
     ("pool: {backend: opengl}", "must be 'auto', 'cuda', 'tiles' or 'numpy'"),
@@ -305,7 +394,7 @@ def test_all_faults_are_told_at_once(scenario, tmp_path):
     did_you_mean = "sensor.layer is not a field. Did you mean 'layers'?"
     for text, words in (
         (of_fields, ["sensor.layers is 0", did_you_mean, "steps is 0", "cloud.keep_every is 0"]),
-        (of_sections, ["planning is enabled", "either poses or a trajectory", "no divergence"]),
+        (of_sections, ["planning needs a start", "either poses or a trajectory", "no divergence"]),
     ):
         with pytest.raises(LidarError) as raised:
             scenario(text)
@@ -333,15 +422,23 @@ def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
     ("text", "field", "file"),
     [
         ("scene: no.glb", "scene.files[0].file", "no.glb"),
-        ("actors: [{name: A, file: no.urdf, at: [1, 1, 0]}]", "actors[0].file.file", "no.urdf"),
+        (
+            "scene: seed\nactors: [{name: A, file: no.urdf, at: [1, 1, 0]}]",
+            "actors[0].file.file",
+            "no.urdf",
+        ),
         (
             "scene: {preset: seed, copies: [{name: T, box: [1, 1, 1], table: no.csv}]}",
             "scene.copies[0].table.file",
             "no.csv",
         ),
-        ("trajectory: no.tum", "trajectory.file", "no.tum"),
-        ("traffic: {file: no.xml, vehicles: [{box: [1, 1, 1]}]}", "traffic.file", "no.xml"),
-        ("sensor: {calibration: no.json}", "sensor.calibration", "no.json"),
+        ("scene: seed\ntrajectory: no.tum", "trajectory.file", "no.tum"),
+        (
+            "scene: seed\ntraffic: {file: no.xml, vehicles: [{box: [1, 1, 1]}]}",
+            "traffic.file",
+            "no.xml",
+        ),
+        ("scene: seed\nsensor: {calibration: no.json}", "sensor.calibration", "no.json"),
         ("sensors: {roof: unit-17.yaml}", "sensors.roof.model", "unit-17.yaml"),
     ],
 )
@@ -367,11 +464,13 @@ def test_a_file_that_is_lost_is_told_beside_other_faults_and_a_similar_name(scen
 
 
 def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario):
-    read = scenario("cloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}")
+    read = scenario(
+        "scene: seed\ncloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}"
+    )
     las, kitti = (note for note in advice(build(read)) if "class" not in note)
     assert "expect points in one coordinate system" in las and "use world" in las
     assert "KITTI holds points compensated for motion" in kitti
-    assert advice(build(scenario("output: {write: [laz, pcd]}"))) == []
+    assert advice(build(scenario("scene: seed\noutput: {write: [laz, pcd]}"))) == []
 
 
 @pytest.mark.parametrize(
@@ -384,7 +483,9 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
 )
 def test_a_trajectory_since_1970_is_told_that_its_date_is_not_kept(scenario, seconds, start, noted):
     points = [{"time_s": seconds + t, "position": [t, 0, 1]} for t in (0, 1)]
-    read = scenario(f"trajectory: {json.dumps({'points': points})}\nsteps: 36\n{start}")
+    read = scenario(
+        f"scene: seed\ntrajectory: {json.dumps({'points': points})}\nsteps: 36\n{start}"
+    )
     notes = [note for note in advice(build(read)) if "since 1970" in note]
     assert len(notes) == bool(noted)
     assert all(noted in note for note in notes)
@@ -419,10 +520,10 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
 
 
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
-    sensors = "sensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
+    sensors = "scene: seed\nsensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
     (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, pcd]}")))
     assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuScenes")
-    assert advice(build(scenario("output: {write: [nuscenes]}"))) == []
+    assert advice(build(scenario("scene: seed\noutput: {write: [nuscenes]}"))) == []
 
 
 @pytest.mark.parametrize(
@@ -496,10 +597,10 @@ def test_returns_that_no_pulse_has_are_in_the_advice(scenario, tmp_path, text, n
     ],
 )
 def test_settings_without_effect_are_in_the_advice(scenario, idle, used):
-    read = scenario(idle)
+    read = scenario(f"scene: seed\n{idle}")
     (note,) = advice(build(read))
     assert idle.split("{")[1].split(": ")[-2].split(", ")[-1] in note
-    both = scenario(used if used[:5] == idle[:5] else f"{idle}\n{used}")
+    both = scenario("scene: seed\n" + (used if used[:5] == idle[:5] else f"{idle}\n{used}"))
     assert advice(build(both)) == []
 
 
@@ -540,6 +641,7 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
     points = [{"time_s": 0, "position": [0, 0, 0]}, {"time_s": 9, "position": [1, 0, 0]}]
     scenario = Scenario.from_data(
         {
+            "scene": "seed",
             "sensor": {"model": "ouster/os1-64"},
             "materials": [
                 {"objects": ["V*", "Bowl"], "transparent": "pass"},
@@ -594,8 +696,6 @@ def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, e
         {"scene": "hall.stl", "sensor": {"model": "velodyne/vlp16"}}, folder=tmp_path
     )
     assert build(coarse).survey.precision_m == 0.002, "the sensor's resolution"
-    default = build(Scenario()).survey
-    assert (default.keep_every, default.precision_m) == (5, 0.01)
 
 
 @pytest.mark.parametrize(
@@ -632,7 +732,9 @@ def test_notes_say_settings_as_in_a_scenario_or_as_in_python(tmp_path, caplog):
 
 def test_a_start_is_a_time_of_yaml_or_text(scenario):
     for text in ("2026-11-21T10:00:00Z", "'2026-11-21T12:00:00+02:00'"):
-        survey = build(scenario(f"world: {{epsg: 25832}}\ncloud: {{start: {text}}}")).survey
+        survey = build(
+            scenario(f"scene: seed\nworld: {{epsg: 25832}}\ncloud: {{start: {text}}}")
+        ).survey
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
     with pytest.raises(LidarError, match=r"cloud\.start"):
         scenario("cloud: {start: 2026-11-21T10:00:00}")
@@ -689,9 +791,9 @@ WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in r
     ],
 )
 def test_what_would_disappoint_is_in_the_advice(scenario, text, words):
-    assert words in " ".join(advice(build(scenario(text))))
+    assert words in " ".join(advice(build(scenario(f"scene: seed\n{text}"))))
     calm = text.replace("red", "range").replace("linear", "smooth")
-    assert words not in " ".join(advice(build(scenario(calm))))
+    assert words not in " ".join(advice(build(scenario(f"scene: seed\n{calm}"))))
 
 
 def test_an_object_far_from_all_others_is_named_where_points_would_be_too_coarse():

@@ -31,6 +31,7 @@ CAMPAIGNS = [path for path in FILES if is_campaign(path)]
 EXAMPLES = [path for path in FILES if path not in CAMPAIGNS]
 
 TEXT = scenario_template({}, "")
+SEED = Scenario.from_data({"scene": "seed"})
 GOOD: list[dict[str, Any]] = [
     {},
     {"scene": ["hall.glb", {"file": "part.stl", "scale": 0.001}]},
@@ -51,7 +52,8 @@ GOOD: list[dict[str, Any]] = [
                {"file": "a.xml", "keyframe": "home", "groups": [0, 5], "exclude": ["robot"]},
                {"file": "a.sdf", "geometry": "collision"}]},
     {"poses": [[0, 0, 1], {"position": [0, 0, 2], "yaw_deg": 90}]},
-    {"planning": {"obstacles": ["Shelf*", {"centre": [1, 2], "radius_m": 3}], "start": [1, 1]}},
+    {"planning": {"obstacles": ["Shelf*", {"centre": [1, 2], "radius_m": 3}], "start": [1, 1],
+                  "target": [9, 9]}},
     {"pool": {"gpu": 2, "backend": "numpy"}},
     {"sensor": {"max_range_m": float("inf")}},
     {"sensor": "velodyne/vlp16", "mount": [0, 0, 1.9]},
@@ -180,9 +182,9 @@ def test_the_example_of_a_campaign_is_valid(of_campaigns):
 OFF = re.compile(r"^( *)# ([a-z_]+: \S.*)$")
 
 
-def test_it_is_valid_and_is_the_default_survey(tmp_path):
+def test_it_is_valid_and_has_the_defaults(tmp_path):
     (tmp_path / "scenario.yaml").write_text(TEXT)
-    assert Scenario.load(tmp_path / "scenario.yaml").model_dump() == Scenario().model_dump()
+    assert Scenario.load(tmp_path / "scenario.yaml").model_dump() == SEED.model_dump()
 
 
 def test_every_field_is_in_it_with_a_comment_of_its_own():
@@ -203,18 +205,24 @@ def test_every_field_is_in_it_with_a_comment_of_its_own():
 )
 def test_what_is_commented_out_is_valid_too(line):
     assert TEXT.count(line) == 1
-    data = yaml.safe_load(TEXT.replace(line, OFF.sub(r"\1\2", line)))
+    lines = [line]
+    if line.split()[1] in ("enabled:", "start:", "target:", "obstacles:"):  # a path has both ends
+        lines = [one for one in TEXT.splitlines() if re.match(" +# (start|target): ", one)]
+    text = TEXT
+    for one in {line, *lines}:
+        text = text.replace(one, OFF.sub(r"\1\2", one))
+    data = yaml.safe_load(text)
     scenario = Scenario.from_data(data)
     # What cannot be told from a default that follows from other things says it in words.
-    assert "auto" in line or scenario.model_dump() != Scenario().model_dump()
+    assert "auto" in line or scenario.model_dump() != SEED.model_dump()
 
 
-def test_a_short_one_is_the_default_survey_and_its_examples_are_valid(tmp_path):
+def test_a_short_one_has_the_defaults_and_its_examples_are_valid(tmp_path):
     text = short_scenario({}, "")
     assert len(text.splitlines()) < 15
     (tmp_path / "scenario.yaml").write_text(text)
     made = build(Scenario.load(tmp_path / "scenario.yaml"))
-    assert fingerprint(made.survey) == fingerprint(build(Scenario()).survey)
+    assert fingerprint(made.survey) == fingerprint(build(SEED).survey)
     on = [OFF.sub(r"\1\2", line) for line in text.splitlines() if "$schema" not in line]
     scenario = Scenario.from_data(yaml.safe_load("\n".join(on)))
     given = {"scene", "sensor", "poses", "cloud", "output"}

@@ -27,10 +27,14 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
     "not YAML": ("s.yaml", b"scene: [seed\n", "s.yaml, line 2: "),
     "misspelt field": ("s.yaml", b"sensor: {layer: 3}\n", "Did you mean 'layers'?"),
     "misspelt mesh": ("s.yaml", b"scene: {files: [b.stl]}\n", "Did you mean 'a.stl'?"),
-    "two fields": ("s.yaml", b"planning: {target: [25, 25]}\n", "path are both (25.0, 25.0)"),
+    "two fields": (
+        "s.yaml",
+        b"scene: seed\nplanning: {start: [25, 25], target: [25, 25]}\n",
+        "path are both (25.0, 25.0)",
+    ),
     "too fine": (
         "s.yaml",
-        b"scene: {ground: {margin_m: 1000000}}\ncloud: {precision_m: 0.000001}\n",
+        b"scene: {preset: seed, ground: {margin_m: 1000000}}\ncloud: {precision_m: 0.000001}\n",
         "too fine",
     ),
 }
@@ -45,7 +49,7 @@ RETURNS = {
     "noise: {range_m: -0.01}": "noise.range_m is -0.01",
     "cloud: {columns: [intensities]}": "Did you mean 'intensity'?",
 }
-FILES |= {text: ("s.yaml", text.encode(), says) for text, says in RETURNS.items()}
+FILES |= {text: ("s.yaml", f"scene: seed\n{text}".encode(), says) for text, says in RETURNS.items()}
 
 OPTIONS: dict[str, tuple[list[str], str]] = {
     "no scenario": (["run"], "Usage: lidarpool run"),
@@ -105,7 +109,10 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
 @pytest.fixture
 def place(tmp_path: Path) -> Path:
     """A working folder with a good scenario and files in its output folder."""
-    (tmp_path / "good.yaml").write_text("sensor: {layers: 2}\nsteps: 2\n")
+    (tmp_path / "good.yaml").write_text(
+        "scene: seed\nsensor: {layers: 2}\nsteps: 2\n"
+        "planning: {start: [25, 25], target: [-30, -20]}\n"
+    )
     (tmp_path / "a.stl").write_bytes(BOX.export(file_type="stl"))
     (tmp_path / "good.ply").touch()
     (tmp_path / "lidarpool-out").mkdir()
@@ -196,7 +203,7 @@ CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
         [{"GPU": 1}, {"LIDAR": 3}, {"OTHER": 1}],
         "Partition 'LIDAR' has 3 of the 4 slots",
     ),
-    "no OTHER": ([{"GPU": 1}, {"LIDAR": 4}], "--no-plan"),
+    "no OTHER": ([{"GPU": 1}, {"LIDAR": 4}], "or remove planning from the scenario"),
     "two resources": ([{"GPU": 1, "LIDAR": 4}, {"OTHER": 1}], "declares GPU and LIDAR"),
 }
 
@@ -222,13 +229,13 @@ TOO_LARGE: dict[str, str] = {
 @pytest.mark.slow(keep=("steps: 100000*",))
 @pytest.mark.parametrize("scenario", TOO_LARGE)
 def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused, scenario):
-    (place / "s.yaml").write_text(scenario)
+    (place / "s.yaml").write_text(f"scene: seed\n{scenario}")
     workers = {
         "caster": {"resources": {"GPU": 2}, "memory_limit": 1_000_000_000},
         "others": {"resources": {"LIDAR": 4}},
     }
     with cluster_of(workers, {}, host="127.0.0.1") as cluster:
-        options = ["s.yaml", "--no-plan", "--scheduler", cluster.scheduler_address]
+        options = ["s.yaml", "--scheduler", cluster.scheduler_address]
         refused(["run", *options], TOO_LARGE[scenario])
         outcome = lidarpool("check", *options)
         assert outcome.code == 2 and TOO_LARGE[scenario] in outcome.err

@@ -22,8 +22,8 @@ splits: {train: 0.5, test: 0.5}
 
 @pytest.fixture
 def campaign(tmp_path):
-    """Write a campaign on the default objects, and return its file."""
-    (tmp_path / "base.yaml").write_text("steps: 4\npool: {backend: numpy}\n")
+    """Write a campaign on the objects of the demo, and return its file."""
+    (tmp_path / "base.yaml").write_text("scene: seed\nsteps: 4\npool: {backend: numpy}\n")
     (tmp_path / "campaign.yaml").write_text(CAMPAIGN)
     return tmp_path / "campaign.yaml"
 

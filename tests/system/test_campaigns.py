@@ -46,8 +46,7 @@ BASE = """
 sensor: {rays_per_revolution: 180, layers: 4, step_deg: 4}
 poses: [[0, 0, 1]]
 steps: 45
-cloud: {keep_every: 1}
-planning: {enabled: false}
+scene: seed
 pool: {backend: numpy, gpu: 1}
 """
 CAMPAIGN = """
@@ -198,8 +197,8 @@ TWICE_BASE = """
 trajectory: way.tum
 sensors: {roof: {model: velodyne/vlp16}, nose: {model: velodyne/vlp16, mount: [1, 0, 0]}}
 actors: [{name: Car, box: [4, 2, 1.5], at: {position: [6, 0, 0]}}]
-cloud: {keep_every: 1, columns: [class, time, intensity]}
-planning: {enabled: false}
+cloud: {columns: [class, time, intensity]}
+scene: seed
 pool: {backend: numpy, gpu: 1}
 """
 
@@ -344,7 +343,7 @@ def test_a_job_that_cannot_be_written_fails_alone_and_leaves_nothing(client, tmp
 
 @pytest.mark.extended
 def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
-    (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
+    (files / "base.yaml").write_text(BASE.replace("scene: seed", "scene: {files: {file: a.obj}}"))
     vary = "scene.files.0.file: {each: [a.obj, b.obj]}"
     (files / "c.yaml").write_text(f"base: base.yaml\ncount: 4\nvary: {{{vary}}}\nkeep: folder\n")
     (files / "a.obj").write_text("v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n")
@@ -477,7 +476,7 @@ SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
 
 @pytest.mark.slow
 def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, slots):
-    (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
+    (files / "base.yaml").write_text(BASE.replace("scene: seed", "scene: {files: {file: a.obj}}"))
     vary = "scene.files.0.file: {each: [a.obj, b.obj, c.obj]}"
     (files / "c.yaml").write_text(f"base: base.yaml\nvary: {{{vary}}}\nkeep: folder\n")
     a, b, c = (files / f"{name}.obj" for name in "abc")

@@ -25,7 +25,9 @@ from lidarpool.cli.terminal import Terminal
 from lidarpool.report.output import FILES
 
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
-SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
+PLAIN = "scene: seed\nsensor: {layers: 8}\n"
+ENDS = "start: [25, 25], target: [-30, -20]"
+SHORT = f"{PLAIN}planning: {{{ENDS}, trials: 4, iterations: 20}}\n"
 
 
 # A run does without the records of stages that end too late on a busy machine.
@@ -160,7 +162,7 @@ def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
     (tmp_path / "out").mkdir()
     for name in ("path.png", "mine.txt"):
         (tmp_path / "out" / name).write_text("earlier")
-    outcome = run("--no-plan", "--quiet", "--overwrite")
+    outcome = run("--quiet", "--overwrite", text=PLAIN)
     assert (outcome.code, outcome.err) == (0, "")
     assert names_in(tmp_path / "out") == {*MADE, "mine.txt"} - DRAWN
     assert "path of" not in outcome.out and "path.png" not in outcome.out
@@ -171,14 +173,14 @@ def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
 def test_a_path_that_there_is_not(run):
     ring = [f"{{centre: [{25 + 6 * np.cos(a):.3f}, {25 + 6 * np.sin(a):.3f}], radius_m: 3}}"
             for a in np.arange(0, 6.28, 0.5)]  # fmt: skip
-    planning = f"planning: {{trials: 2, iterations: 5, obstacles: [{', '.join(ring)}]}}\n"
-    outcome = run(text="sensor: {layers: 2}\n" + planning)
+    planning = f"planning: {{{ENDS}, trials: 2, iterations: 5, obstacles: [{', '.join(ring)}]}}\n"
+    outcome = run(text="scene: seed\nsensor: {layers: 2}\n" + planning)
     assert outcome.code == 0, outcome.err
     assert "no path free of collisions was found; no path is possible" in outcome.out
 
 
 def test_a_run_that_hits_nothing_says_so(run):
-    outcome = run("--no-plan", text="steps: 1\nposes: [[0, 0, 1000]]\n")
+    outcome = run(text="scene: seed\nsteps: 1\nposes: [[0, 0, 1000]]\n")
     assert outcome.code == 0
     assert "warning: the cloud has no points: no ray hit anything" in outcome.err
 
@@ -207,7 +209,7 @@ def test_warnings_of_libraries_are_not_on_the_terminal(run, monkeypatch):
         return progress(terminal)
 
     monkeypatch.setattr(Terminal, "progress", warn)
-    outcome = run("--no-plan")
+    outcome = run(text=PLAIN)
     assert outcome.code == 0
     assert "memory is nearly full" not in outcome.err + outcome.out
 
@@ -255,14 +257,14 @@ def hidden(page: Path) -> list[str]:
 @pytest.mark.slow
 def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_path):
     out = tmp_path / "out"
-    assert run("--no-plan", "--quiet").code == 0
+    assert run("--quiet", text=PLAIN).code == 0
     assert names_in(out) == {*MADE} - DRAWN
     assert hidden(out / "report.html") == ["scene", "hits", "intensity", "cloud", "path"]
     outcome = lidarpool("plot", out, "--only", "hits", "--only", "cloud")
     assert outcome.out.split() == [str(out / "hits.png"), str(out / "cloud.png")]
     assert hidden(out / "report.html") == ["scene", "intensity", "path"]
     # What was drawn of an earlier run is of the same result, and goes with it.
-    assert run("--no-plan", "--quiet").code == 0
+    assert run("--quiet", text=PLAIN).code == 0
     assert names_in(out) == {*MADE} - DRAWN
     assert run("--quiet", "--pictures").code == 0
     assert json.loads((out / "report.json").read_text())["files"] == MADE
@@ -293,7 +295,7 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     [["sensors"], pytest.param(["run", "s.yaml", "--only", "cloud", "-q"], marks=pytest.mark.slow)],
 )
 def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
-    (tmp_path / "s.yaml").write_text("sensor: {layers: 8}\nplanning: {enabled: false}\n")
+    (tmp_path / "s.yaml").write_text(PLAIN)
     with subprocess.Popen(
         [sys.executable, "-m", "lidarpool", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,

@@ -5,14 +5,14 @@ import json
 import pytest
 
 SCENARIO = """
-cloud: {keep_every: 1, precision_m: 0.0001, columns: [intensity]}
-planning: {enabled: false}
+scene: seed
+cloud: {precision_m: 0.0001, columns: [intensity]}
 """
 
 
 @pytest.fixture(scope="module")
 def surveys(tmp_path_factory, cluster):
-    """The default survey without noise and with."""
+    """A survey without noise and with."""
     from lidarpool.cli.commands import main
 
     folder = tmp_path_factory.mktemp("surveys")

@@ -48,7 +48,7 @@ BAD = [
 @pytest.mark.parametrize(("text", "content", "said"), BAD, ids=str)
 def test_what_cannot_be_is_one_line_and_exit_code_2(tmp_path, lidarpool, text, content, said):
     (tmp_path / "t.txt").write_text(content)
-    (tmp_path / "s.yaml").write_text("planning: {enabled: false}\n" + text)
+    (tmp_path / "s.yaml").write_text("scene: seed\n" + text)
     done = lidarpool("check", tmp_path / "s.yaml", "--out", tmp_path / "out")
     assert done.code == 2
     assert len(done.err.splitlines()) == 1

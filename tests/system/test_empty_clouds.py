@@ -15,10 +15,10 @@ from tests.shapes import room
 from lidarpool import Campaign, Job, Sensor, Survey, merge, simulate
 
 SURVEY: dict[str, Any] = {
+    "scene": "seed",
     "sensor": {"rays_per_revolution": 90, "layers": 4, "vertical_fov_deg": 20, "step_deg": 30},
     "poses": [[0, 0, 1000]],
     "steps": 12,
-    "planning": {"enabled": False},
     "pool": {"backend": "numpy", "gpu": 1},
 }
 NOTHING = "no ray hit anything at any distance: check poses and units; the sensor begins at ("

@@ -23,7 +23,7 @@ sensors:
   rear: {model: velodyne/vlp16}
 cloud: {columns: [intensity], keep_every: 7}
 output: {write: [ply, laz, {format: mcap, layout: ouster}, kitti]}
-planning: {enabled: false}
+scene: seed
 """
 
 

@@ -18,8 +18,8 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
 SCENARIO = """
-cloud: {keep_every: 1}
-planning: {trials: 2, iterations: 20}
+scene: seed
+planning: {start: [25, 25], target: [-30, -20], trials: 2, iterations: 20}
 pool: {backend: tiles}
 """
 

@@ -7,11 +7,11 @@ import pytest
 from tests.clusters import thread_cluster
 
 BASE = {
+    "scene": "seed",
     "sensor": {"rays_per_revolution": 90, "layers": 2, "vertical_fov_deg": 20, "step_deg": 30},
     "poses": [[0, 0, 1]],
     "steps": 12,
     "noise": {"range_m": 20.0},
-    "planning": {"enabled": False},
     "pool": {"backend": "numpy", "gpu": 1},
 }
 CAMPAIGN = {"base": "base.yaml", "count": 3, "vary": {"steps": {"each": [12, 24, 36]}}}

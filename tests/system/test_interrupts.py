@@ -21,13 +21,16 @@ pytestmark = pytest.mark.skipif(
 
 # Hours of work; and work of a second.
 LONG = f"""
+scene: seed
 sensor: {{rays_per_revolution: 3600, layers: 16, step_deg: 1}}
 poses: {[[0, 0, 1 + i / 100] for i in range(100)]}
 steps: 3600
-planning: {{trials: 100000}}
+planning: {{start: [25, 25], target: [-30, -20], trials: 100000}}
 pool: {{gpu: 1, other: 1}}
 """
-SHORT = "sensor: {layers: 4}\nplanning: {trials: 2, iterations: 20}\n"
+PLAIN = "scene: seed\nsensor: {layers: 4}\n"
+ENDS = "start: [25, 25], target: [-30, -20]"
+SHORT = f"{PLAIN}planning: {{{ENDS}, trials: 2, iterations: 20}}\n"
 
 SURVEYING = r"survey  [1-9]"
 WRITING = r"writing the cloud"
@@ -157,9 +160,9 @@ def test_ctrl_c_when_the_result_is_whole(lidarpool, cluster, tmp_path, monkeypat
             os.kill(os.getpid(), signal.SIGINT)
         return replace(path, to)
 
-    (tmp_path / "s.yaml").write_text(SHORT)
+    (tmp_path / "s.yaml").write_text(PLAIN)
     monkeypatch.setattr(Path, "replace", interrupted)
-    run = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster, "-q", "--no-plan")
+    run = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster, "-q")
     assert run.code == 130
     assert run.err.strip() == (
         "lidarpool: interrupted; everything was stopped. The result in out is complete."

@@ -33,7 +33,7 @@ pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
 server = pytest.importorskip("moto.server", reason="the object store of these tests is moto's")
 
 BUCKET = "s3://surveys"
-SCENARIO = "planning: {enabled: false}\n"
+SCENARIO = "scene: seed\ncloud: {keep_every: 5, precision_m: 0.01}\n"
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def environment() -> Iterator[dict[str, str]]:
 
 @pytest.fixture
 def run(environment, cluster, lidarpool, tmp_path) -> Callable[..., Any]:
-    """Run the default survey without planning, with its parts in a folder of the bucket."""
+    """Run the survey of the demo without planning, with its parts in a folder of the bucket."""
     (tmp_path / "s.yaml").write_text(SCENARIO)
 
     def run(folder: str, *options: str, scheduler: str = cluster) -> Any:

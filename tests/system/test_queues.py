@@ -18,10 +18,17 @@ from tests.system.test_tls import new_files
 pytestmark = pytest.mark.slow
 
 SCHEDULER = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0"}
-FEWER = {"planning": {"trials": 10}}  # beside the default survey
+ENDS = {"start": [25, 25], "target": [-30, -20]}
+THINNED = {"keep_every": 5, "precision_m": 0.01}
+# The survey of the demo, with fewer trials
+FEWER = {"scene": "seed", "cloud": THINNED, "planning": ENDS | {"trials": 10}}
 # A minute of casting, by NumPy on two cores.
-MINUTE = {"sensor": {"rays_per_revolution": 3600, "layers": 32, "step_deg": 1}, "steps": 1440}
-LONG = {"steps": 100_000, "planning": {"trials": 100_000}}  # hours of work
+MINUTE = {
+    "scene": "seed",
+    "sensor": {"rays_per_revolution": 3600, "layers": 32, "step_deg": 1},
+    "steps": 1440,
+}
+LONG = {"scene": "seed", "steps": 100_000, "planning": ENDS | {"trials": 100_000}}  # hours of work
 
 
 @pytest.fixture(scope="module")

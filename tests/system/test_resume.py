@@ -22,11 +22,12 @@ from lidarpool.scenario.scenario import Scenario
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 
 SCENARIO = """
+scene: seed
 sensor: {rays_per_revolution: 900, layers: 8, step_deg: 2}
 poses: [[0, 0, 1], [3, 0, 1]]
 steps: 180
 cloud: {keep_every: 2}
-planning: {trials: 4, iterations: 20}
+planning: {start: [25, 25], target: [-30, -20], trials: 4, iterations: 20}
 pool: {backend: numpy, gpu: 1, other: 1}
 """
 SCANS = 2 * 180
@@ -100,7 +101,9 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
         rf"lidarpool: \S+/out/run {KEPT} --resume \(.*\), or drop it with --fresh \(.*\)\.\n",
         refused.err,
     )
-    other = lidarpool(*arguments, "--resume", "--no-plan")
+    path, *rest = arguments[1:]
+    path.with_name("t.yaml").write_text(SCENARIO.replace("trials: 4", "enabled: false"))
+    other = lidarpool("run", path.with_name("t.yaml"), *rest, "--resume")
     assert other.code == 2 and "is of another planning: " in other.err
     wrong = lidarpool(*arguments, "--resume", "--backend", "tiles")
     assert wrong.code == 2 and "were cast with 'numpy': continue with that" in wrong.err
@@ -128,7 +131,7 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
 
 @pytest.mark.extended
 def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
-    (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {trials: 2}\n")
+    (tmp_path / "s.yaml").write_text("scene: seed\nsensor: {layers: 4}\n")
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
     done = lidarpool(*arguments, "--only", "cloud", "-q", "--resume")
     assert (done.code, done.err) == (0, "")

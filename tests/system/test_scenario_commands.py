@@ -19,7 +19,10 @@ def test_init_writes_a_scenario_and_says_what_to_do_next(tmp_path, lidarpool):
     assert (outcome.code, outcome.err) == (0, "")
     assert {path.name for path in folder.iterdir()} == {"scenario.schema.json", "scenario.yaml"}
     assert outcome.out.endswith(f"next: lidarpool check '{folder / 'scenario.yaml'}'\n")
-    assert Scenario.load(folder / "scenario.yaml").model_dump() == Scenario().model_dump()
+    assert (
+        Scenario.load(folder / "scenario.yaml").model_dump()
+        == Scenario.from_data({"scene": "seed"}).model_dump()
+    )
     first = (folder / "scenario.yaml").read_text().splitlines()[0]
     assert first == "# yaml-language-server: $schema=scenario.schema.json"
     assert lidarpool("schema").out == (folder / "scenario.schema.json").read_text()

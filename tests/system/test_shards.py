@@ -41,16 +41,16 @@ poses: [[0, 0, 1]]
 steps: 20
 sensor: {model: velodyne/vlp16}
 actors: [{name: Car, box: [4, 2, 1.5], at: {position: [6, 0, 0]}}]
-cloud: {keep_every: 1}
-planning: {enabled: false}
+scene: seed
 pool: {backend: numpy, gpu: 1}
 """
 SURVEY = """
 sensor: {rays_per_revolution: 90, layers: 8, step_deg: 4}
 poses: [[0, 0, 1], [1, 0, 1]]
 steps: 25
-cloud: {keep_every: 1, columns: [intensity]}
-planning: {trials: 3, iterations: 20}
+cloud: {columns: [intensity]}
+scene: seed
+planning: {start: [25, 25], target: [-30, -20], trials: 3, iterations: 20}
 output: {write: [las, kitti]}
 pool: {backend: numpy, gpu: 1}
 """

@@ -85,7 +85,10 @@ def test_an_encrypted_local_cluster():
 
 @pytest.mark.extended
 def test_a_survey_on_an_encrypted_cluster(lidarpool, encrypted, tmp_path):
-    (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {trials: 2}\n")
+    (tmp_path / "s.yaml").write_text(
+        "scene: seed\nsensor: {layers: 4}\n"
+        "planning: {start: [25, 25], target: [-30, -20], trials: 2}\n"
+    )
     address, files = encrypted
     given = ["--scheduler", address]
     given += ["--tls-ca", files.ca, "--tls-cert", files.cert, "--tls-key", files.key]

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-SCENARIO = "poses: [[0, 0, 1]]\nplanning: {enabled: false}\ncloud: {keep_every: 5}\n"
+SCENARIO = "scene: seed\nposes: [[0, 0, 1]]\ncloud: {keep_every: 5}\n"
 EVERYTHING_ELSE = """
 import sys
 from pathlib import Path

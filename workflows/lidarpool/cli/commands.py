@@ -225,17 +225,19 @@ def cli() -> None:
 @_common_options
 @_with_run_options
 def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
-    """Run the default survey and plan a path, on this machine, and draw the pictures.
+    """Scan six objects, plan a path and draw the pictures, on this machine.
+
+    It runs examples/seed.yaml.
 
     \b
     Examples:
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    from ..scenario.scenario import Scenario
+    from ..scenario.demo import demo_scenario
     from .run_command import run_scenario
 
-    run_scenario(Scenario(), terminal, options, extent=extent or "pictures")
+    run_scenario(demo_scenario(), terminal, options, extent=extent or "pictures")
 
 
 @cli.command(cls=_LiveCommand)
@@ -245,7 +247,6 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
 @shared.scheduler
 @shared.cluster
 @shared.backend
-@shared.no_plan
 @shared.flag("--pictures", help="Draw the pictures, too, as lidarpool plot does later.")
 @shared.flag("--resume", help="Resume an unfinished run, if there is one.")
 @shared.flag("--fresh", help="Delete an unfinished run.")
@@ -297,7 +298,7 @@ def run(
     \b
     Examples:
       lidarpool run examples/seed.yaml --out seed
-      lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
+      lidarpool run hall.glb --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9 --format las
       lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
       lidarpool run examples/campaign.yaml --out dataset

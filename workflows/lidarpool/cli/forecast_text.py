@@ -44,7 +44,6 @@ def forecast_scenario(
     options: RunOptions,
     backend: str | None,
     *,
-    no_plan: bool,
     quiet: bool,
 ) -> tuple[dict[str, Any], Iterator[str]]:
     """Forecast the run of a scenario, of a campaign or of a job of a campaign.
@@ -69,7 +68,7 @@ def forecast_scenario(
         )
         assert scenario is not None, "of a file"
         with terminal.status("reading the scene", logged=False):
-            built = build(scenario, plans=campaign is None and not no_plan)
+            built = build(scenario, plans=campaign is None)
             job = built.job()
         with terminal.status("casting some rays"):
             figures = forecast(

@@ -46,7 +46,6 @@ def run_scenario(
     options: RunOptions,
     backend: str | None = None,
     *,
-    no_plan: bool = False,
     extent: str | None = None,
     shard: Shard | None = None,
     made_of: Mapping[str, Any] = MappingProxyType({}),
@@ -60,7 +59,7 @@ def run_scenario(
     if options.starts_workers:  # before reading the scene, which may take long
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
-        built = build(scenario, plans=not no_plan)
+        built = build(scenario)
         job = built.job()
     timeline.mark(timeline.SCENE)
     for warning in implausibilities(built):
@@ -69,7 +68,7 @@ def run_scenario(
         _run_survey(built, job, options, terminal, extent)
         return
     assert options.out is not None, "commands write"
-    run_notes = {"plans": not no_plan, "extent": extent or "page", "scans": job.survey.scan_count}
+    run_notes = {"extent": extent or "page", "scans": job.survey.scan_count}
     jobs = OneJob(job, shard)
     output = StoredOutput({**made_of, **run_notes})
     with result_folder(options.out), page_of(jobs, options.live) as page:

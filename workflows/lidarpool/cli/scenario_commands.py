@@ -102,7 +102,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
         for note in notes:
             click.echo(f"note: {note}")
     else:
-        click.echo(f"{name} is the default survey: change what you like.")
+        click.echo(f"{name} is a survey of the six objects of the demo: change what you like.")
         click.echo("for a mesh of your own: lidarpool init DIR --mesh FILE [--unit mm]")
     click.echo(f"next: lidarpool check {shlex.quote(str(target))}")
 
@@ -183,7 +183,6 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 @options.scheduler
 @options.cluster
 @options.backend
-@options.no_plan
 @options.job
 @options.strict
 @options.as_json
@@ -196,7 +195,6 @@ def check(
     files: TlsFiles,
     cluster: Path | None,
     backend: str | None,
-    no_plan: bool,
     number: int | None,
     strict: bool,
     as_json: bool,
@@ -214,7 +212,7 @@ def check(
     Examples:
       lidarpool check scenario.yaml
       lidarpool check campaign.yaml --job 17
-      lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
+      lidarpool check hall.glb --scheduler tcp://127.0.0.1:8786 --json
       lidarpool check part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9
     """  # noqa: D301 - click wants the character, not its name
     begin("reading the scene", quiet=as_json)
@@ -234,7 +232,6 @@ def check(
                 client,
                 run_options,
                 backend,
-                no_plan=no_plan,
                 quiet=as_json,
             )
     except LidarError as error:
@@ -256,7 +253,7 @@ def check(
         for name, value in settings.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
-        click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
+        click.echo(f"it can run: {shlex.join(words)}")
     if strict and figures["warnings"]:
         sys.exit(WARNED)
 

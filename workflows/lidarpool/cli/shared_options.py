@@ -58,7 +58,6 @@ shard = click.option(
     help="Do one of several equal shares, such as 3/10, for lidarpool merge; auto: the task of a "
     "Slurm array; auto/10: the index of a Kubernetes job.",
 )
-no_plan = flag("--no-plan", help="Leave out path planning.")
 cluster = path(
     "--cluster", help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md."
 )

@@ -177,8 +177,7 @@ class Twin:
         if materials:
             scenario["materials"] = materials
         columns = ["time", "intensity", *(["class"] if classes else [])]
-        scenario["cloud"] = {"keep_every": 1, "columns": columns}
-        scenario["planning"] = {"enabled": False}
+        scenario["cloud"] = {"columns": columns}
         head = (
             f"# The place of {self.figures['name']}, rebuilt by lidarpool {__version__}.\n"
             "# Another sensor on the same drive: lidarpool run scenario.yaml --sensor MODEL\n"

@@ -519,7 +519,7 @@ def _merge_survey(
     if not path.exists():
         raise LidarError(f"{path}, of which these shards are, does not exist: give --scenario.")
     with screen.status("reading the scene"):
-        built = build(Scenario.load(path, made_of["options"]), plans=made_of["plans"])
+        built = build(Scenario.load(path, made_of["options"]))
         job = built.job()
         jobs = OneJob(job)
         identity = jobs.identity

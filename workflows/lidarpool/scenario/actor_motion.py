@@ -264,6 +264,21 @@ class TrajectorySection(Section):
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
         )
 
+    def footprint(self, path: PathOf) -> Floats:
+        """Return positions on the trajectory seen from above, (n, 2), world metres.
+
+        There are none on the trajectory of a vehicle of traffic. `path` returns the path of a file
+        in the scenario. LidarError if a file cannot be read.
+        """
+        if self.vehicle is not None:
+            return np.zeros((0, 2))
+        track = self._track_without_surfaces(path, np.zeros(3), None)
+        assert track.start_s is not None  # every track has a start
+        stop_s = track.start_s + track.duration_ns / 1e9
+        within = (track.start_s <= track.times_s) & (track.times_s <= stop_s)
+        ends, _ = track.poses(0, np.array([0.0, track.duration_ns]))
+        return np.concatenate([ends, track.positions[within]])[:, :2]
+
     def _track_without_surfaces(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
         """Return the trajectory in local coordinates, with heights as given."""
         options: dict[str, Any] = {

@@ -63,20 +63,14 @@ from .traffic import (
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
 
-# Defaults of scenes with the default objects (scene.preset: seed): x and y of the planned path's
-# ends, and poses of the sensor, world metres.
-SEED_START = (25.0, 25.0)
-SEED_TARGET = (-30.0, -20.0)
+# Default poses of the sensor among the objects of the demo, world metres.
 SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
-
-# Of the returns in a scene with the default objects, every fifth is in the cloud.
-SEED_KEEP_EVERY = 5
 
 # Class of buildings by ASPRS LAS: sensors are not placed inside objects of this class.
 BUILDING = 6
 ROAD_SURFACE = 11
 
-# Precision of points in scenes without the default objects, if no sensor states a resolution.
+# Precision of points in scenarios, if no sensor states a resolution.
 MESH_PRECISION_M = 0.001
 
 
@@ -251,7 +245,7 @@ class Built:
         world coordinates of the scene are the scenario's, without `world.origin`.
     placing
         Poses that `place_sensor` chose in a scene of mesh files; None if the scenario gives poses
-        or a trajectory, or has the default objects.
+        or a trajectory, or has the objects of the demo.
     findings
         Notes about the files, and their content in words.
     """
@@ -629,11 +623,7 @@ def _build_survey(
     format_columns = scenario.output.needs
     cloud = declared(scenario.cloud, CloudOptions)
     cloud["columns"] = (*scenario.cloud.columns, *format_columns, *columns)
-    if scenario.scene.has_seed:
-        cloud["keep_every"] = cloud["keep_every"] or (
-            1 if "ray" in format_columns else SEED_KEEP_EVERY
-        )
-    elif not any(mounted.sensor.optics.resolution_m for mounted in sensors):
+    if not any(mounted.sensor.optics.resolution_m for mounted in sensors):
         cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
     check_whole((*format_columns, *columns), cloud["keep_every"] or 1)
     track_or_poses = survey_parts.track_or_poses
@@ -692,9 +682,6 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
     x0, y0, _ = scene.origin
     start = section.start
     target = section.target
-    if scenario.scene.has_seed:
-        start = start or SEED_START
-        target = target or SEED_TARGET
     if section.enabled is False or start is None or target is None:
         return None
     discs, labels = _obstacle_discs(scenario, scene)

@@ -111,7 +111,8 @@ def survey_of(mesh_file: Path) -> str:
 class Scenario(Section):
     """A survey and its path planning, as described by a scenario file.
 
-    Without arguments it is the default survey: six objects, 108 scans from three poses.
+    Without arguments it has no scene, which a survey needs. `lidarpool.scenario.demo` has the
+    scenario of the demo.
 
     Parameters
     ----------
@@ -120,7 +121,7 @@ class Scenario(Section):
         See `lidarpool.scenario.sections`.
     poses
         Poses of the sensor, in the coordinates of the scene. By default the sensor is at the origin
-        (default objects), 1, 2 and 3 metres above the ground; in mesh files chosen by
+        (objects of the demo), 1, 2 and 3 metres above the ground; in other scenes chosen by
         `place_sensor`: in the middle of a room or landscape, or around an object.
     steps, classes
         Time steps from each pose, and names of semantic classes, {number: name}.
@@ -140,7 +141,7 @@ class Scenario(Section):
         Several[PoseEntry] | None,
         about(
             "poses of the sensor in the scene, metres, Z-up; by default 1, 2 and 3 m "
-            "above the origin (default objects) or the middle of the floor (files), below the "
+            "above the origin (objects of the demo) or the middle of the floor (files), below the "
             "ceiling, or around an object that is no place to stand in",
             [[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}],
             min_length=1,
@@ -228,7 +229,7 @@ class Scenario(Section):
     pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
 
     _folder: Path = PrivateAttr(default=Path())  # folder that relative file names start from
-    _source: str = PrivateAttr(default="the default survey")  # source for messages
+    _source: str = PrivateAttr(default="the scenario")  # source for messages
 
     @property
     def title(self) -> str:
@@ -331,12 +332,10 @@ class Scenario(Section):
     def _planning_contradictions(self) -> Iterator[str]:
         """Yield the reasons why the planning lacks a start or target."""
         planning = self.planning
-        # The default objects have a start and a target.
-        lacking = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
-        if planning.enabled and lacking:
-            yield "planning is enabled: give planning.start and planning.target."
-        if planning.enabled is None and lacking == 1:
-            yield "give both planning.start and planning.target, or neither."
+        if planning.enabled is False or (planning.start and planning.target):
+            return
+        if planning != PlanningSection():
+            yield "planning needs a start and a target: give planning.start and planning.target."
 
     def _carrier_contradictions(self) -> Iterator[str]:
         """Yield the reasons why trajectory, poses, carrier and mounts do not fit together."""

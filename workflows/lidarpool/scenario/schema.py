@@ -133,7 +133,7 @@ def scenario_template(data: Mapping[str, Any], note: str) -> str:
     `data` is the result of `mesh_data`, and replaces defaults; `note` is a remark on its poses.
     """
     lines = [_FULL_HEAD]
-    values = dict(data)
+    values = {"scene": {"preset": "seed"}} | dict(data)
     if isinstance(values.get("sensor"), str):
         values["sensor"] = {"model": values["sensor"]}
     for name, field in Scenario.model_fields.items():

@@ -359,23 +359,28 @@ class CopiesSection(ShapeSection):
 
 
 class Ground(Section):
-    """A horizontal rectangle under the scene, `margin_m` wider on each side."""
+    """A horizontal rectangle under the objects, poses, trajectories and actors of a scenario."""
 
     height_m: Annotated[Coordinate, about("z of the rectangle, metres")] = 0.0
     margin_m: Annotated[
-        float, about("how much it extends beyond the scene, metres", ge=0, le=1e6)
+        float,
+        about(
+            "how far it extends beyond the objects, poses, trajectories and actors on each side, "
+            "metres",
+            ge=0,
+            le=1e6,
+        ),
     ] = 5.0
 
 
 class SceneSection(Section):
-    """The scene: mesh files, copies of meshes, the six default objects, or a mixture.
+    """The scene: mesh files, copies of meshes, a ground, the six objects of the demo, or a mixture.
 
-    `preset` is 'seed' without files and copies, else 'none'.
+    In YAML, a file's name, a list of files, or seed for the objects of the demo alone will do.
     """
 
     preset: Annotated[
-        Literal["seed", "none"] | None,
-        about("seed (six objects); none is the default with files", "seed"),
+        Literal["seed"] | None, about("seed: the six objects of `lidarpool demo`", "seed")
     ] = None
     files: Annotated[
         MeshEntries,
@@ -402,20 +407,16 @@ class SceneSection(Section):
     ] = "number"
     ground: Annotated[
         Ground | None,
-        about("a horizontal rectangle below the scene, metres", {"height_m": 0, "margin_m": 5}),
+        about(
+            "a horizontal rectangle under the objects, poses, trajectories and actors, metres",
+            {"height_m": 0, "margin_m": 5},
+        ),
     ] = None
-
-    @model_validator(mode="after")
-    def _check_not_empty(self) -> SceneSection:
-        """Raise ValueError for a scene without meshes."""
-        if self.preset == "none" and not (self.files or self.copies):
-            raise ValueError("the scene is empty: give files, or preset: seed.")
-        return self
 
     @property
     def has_seed(self) -> bool:
-        """Whether the scene has the six default objects."""
-        return self.preset == "seed" or (self.preset is None and not (self.files or self.copies))
+        """Whether the scene has the six objects of the demo."""
+        return self.preset == "seed"
 
 
 class WorldSection(Section):
@@ -677,14 +678,10 @@ class _Route:
     """Fields in world coordinates and by names, which come before the fields of `Search`."""
 
     enabled: Annotated[
-        bool | None, about("by default true if start and target are given", True)
+        bool | None, about("by default whether start and target are given", True)
     ] = None
-    start: Annotated[
-        Pair | None, about("x and y, metres; the default objects have one", [25, 25])
-    ] = None
-    target: Annotated[
-        Pair | None, about("x and y, metres; the default objects have one", [-30, -20])
-    ] = None
+    start: Annotated[Pair | None, about("x and y, metres", [25, 25])] = None
+    target: Annotated[Pair | None, about("x and y, metres", [-30, -20])] = None
     obstacles: Annotated[
         Obstacles | None,
         short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
@@ -702,9 +699,9 @@ class _Route:
 class PlanningSection(Section, Search, _Route):
     """Path planning in the plane, in world coordinates.
 
-    `enabled` is by default whether there are a start and a target. `obstacles` is 'auto' (the
-    bounding circle of each object that is not flat) or a list; `clearance_m` is added to each
-    radius.
+    A path is planned if there are a start and a target, unless `enabled` is false. `obstacles` is
+    'auto' (the bounding circle of each object that is not flat) or a list; `clearance_m` is added
+    to each radius.
     """
 
 
@@ -760,6 +757,6 @@ def may_be_empty(kind: Any) -> Any:
 # Short form of a scene: the name of a mesh file or preset, or a list of files.
 scene_in_short = short(
     lambda v: v is None or isinstance(v, (str, list)),
-    lambda v: {"preset" if v in ("seed", "none") else "files": v} if v else {},
+    lambda v: {"preset" if v == "seed" else "files": v} if v else {},
     Text | MeshEntries | SceneSection | None,
 )

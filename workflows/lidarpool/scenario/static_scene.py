@@ -1,11 +1,11 @@
-"""The static part of a scenario's scene: mesh files, copies, the ground and the default objects."""
+"""The static part of a scenario's scene: mesh files, copies, the ground and the demo's objects."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -47,6 +47,9 @@ from .sections import (
 
 # Fields of a mesh file's entry that are allowed if the file is a robot.
 _ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "scale", "matrix"}
+
+
+Kept = TypeVar("Kept")
 
 
 @dataclass
@@ -96,29 +99,54 @@ class StaticScene(NamedTuple):
     findings: Findings
 
 
+class _StaticObjects(NamedTuple):
+    """Objects of a static scene, without the ground."""
+
+    objects: Objects
+    findings: Findings
+    corners: Floats  # (n, 2): corners of the objects, seen from above, world metres
+
+
 class SceneCache:
     """Cache of the last `max_scenes` static scenes.
 
-    Scenarios with the same scene section, unchanged files and the same options of reading share a
-    scene.
+    Scenarios with the same scene section, unchanged files, the same options of reading and the same
+    ground share a scene.
     """
 
     def __init__(self, max_scenes: int = 4) -> None:
-        self._max_scenes = max_scenes
-        self._scenes = dict[object, StaticScene]()
+        self._objects = _LastUsed[_StaticObjects](max_scenes)
+        self._scenes = _LastUsed[StaticScene](max_scenes)
 
     def find(self, scenario: Scenario) -> StaticScene:
         """Return the static scene of a scenario, from the cache or read from its files."""
         key = _key(scenario)
-        static = self._scenes.pop(key, None) or read_static_scene(scenario)
-        self._scenes[key] = static  # at the end: the first scene is the least recently used
-        while len(self._scenes) > self._max_scenes:
-            del self._scenes[next(iter(self._scenes))]
-        return static
+        if scenario.scene.ground is None:
+            return self._scenes.find(key, lambda: read_static_scene(scenario))
+        static = self._objects.find(key, lambda: _read_objects(scenario))
+        ground = _ground(scenario, static)
+        rectangle = ground.vertices.tobytes()
+        return self._scenes.find((key, rectangle), lambda: _static_scene(static, ground))
+
+
+class _LastUsed(Generic[Kept]):
+    """The last used values of a number of keys."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._values = dict[object, Kept]()
+
+    def find(self, key: object, make: Callable[[], Kept]) -> Kept:
+        """Return the value of a key, made if it is not there."""
+        value = self._values.pop(key) if key in self._values else make()
+        self._values[key] = value  # at the end: the first value is the least recently used
+        while len(self._values) > self._count:
+            del self._values[next(iter(self._values))]
+        return value
 
 
 def _key(scenario: Scenario) -> object:
-    """Return the key of a static scene: equal for scenarios that may share the scene.
+    """Return the key of static objects: equal for scenarios that may share the objects.
 
     The key has the scene section, the options of reading, and size and time of the files.
     """
@@ -139,15 +167,34 @@ def _key(scenario: Scenario) -> object:
 def read_static_scene(scenario: Scenario) -> StaticScene:
     """Read the mesh files of a scenario, and place its copies and ground.
 
-    The scene has the default objects, if any, the files' objects, the copies, and the ground. Its
-    actors are objects that move in their files.
+    The scene has the objects of the demo, if asked for, the files' objects, the copies, and the
+    ground. Its actors are objects that move in their files.
 
     Raises
     ------
     LidarError
-        If a file cannot be read, or copies have no surface to stand on or no room.
+        If the scenario has no scene, a file cannot be read, or copies have no surface to stand on
+        or no room.
     """
+    static = _read_objects(scenario)
+    has_ground = scenario.scene.ground is not None
+    return _static_scene(static, _ground(scenario, static) if has_ground else None)
+
+
+def _static_scene(static: _StaticObjects, ground: SceneMesh | None) -> StaticScene:
+    """Return the scene of objects, and of a ground if there is one."""
+    objects = static.objects
+    findings = static.findings.copy()
+    if ground is not None:
+        objects = objects._replace(static=(*objects.static, ground))
+    scene = Scene.from_objects(objects, findings.notes.append)
+    return StaticScene(scene, StandingSurfaces(scene), findings)
+
+
+def _read_objects(scenario: Scenario) -> _StaticObjects:
+    """Read the mesh files of a scenario, and place its copies."""
     section = scenario.scene
+    _check_not_empty(scenario)
     findings = Findings()
     shapes = Shapes(scenario, findings)
     meshes: list[SceneMesh | SceneInstance] = list(seed_objects()) if section.has_seed else []
@@ -165,11 +212,26 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     if section.copies:
         meshes += _place_copies(shapes, meshes)
     objects = Objects(tuple(meshes), tuple(moving))
-    if section.ground is not None:
-        below = Scene.from_meshes(meshes or objects.at_start(lambda _: None))
-        objects = objects._replace(static=(*meshes, _ground_mesh(section, below)))
-    scene = Scene.from_objects(objects, findings.notes.append)
-    return StaticScene(scene, StandingSurfaces(scene), findings)
+    corners = np.zeros((0, 2))
+    if section.ground is not None and (meshes or moving):
+        corners = _corners(Scene.from_meshes(meshes or objects.at_start(lambda _: None)))
+    return _StaticObjects(objects, findings, corners)
+
+
+def _check_not_empty(scenario: Scenario) -> None:
+    """Raise LidarError if a scenario has nothing that is static."""
+    section = scenario.scene
+    if section.has_seed or section.files or section.copies or section.ground is not None:
+        return
+    if scenario.actors or scenario.traffic is not None:
+        raise LidarError(
+            f"{scenario.source}: The scene has actors, but nothing that stands still. Add "
+            "`scene: {ground: {}}`, or mesh files as `scene.files`."
+        )
+    raise LidarError(
+        f"{scenario.source}: The scenario has no scene. Add mesh files as `scene.files`, or "
+        "`scene: seed` for the six objects of `lidarpool demo`."
+    )
 
 
 class Shapes:
@@ -297,13 +359,15 @@ def _place_copies(
 ) -> list[SceneInstance]:
     """Place the copies, which stand on `static_objects` and on the ground, not on copies.
 
-    `static_objects` are the default objects and the objects of files, in world coordinates.
+    `static_objects` are the objects of the demo and of files, in world coordinates.
     """
     scenario = shapes.scenario
     section = shapes.scenario.scene
     scene = Scene.from_meshes(static_objects) if static_objects else None
     if section.ground is not None and (static_objects or _copy_extents(section)):
-        scene = Scene.from_meshes([*static_objects, _ground_mesh(section, scene)])
+        corners = [] if scene is None else [_corners(scene)]
+        ground = _ground_mesh(section, [*corners, *_copy_extents(section)])
+        scene = Scene.from_meshes([*static_objects, ground])
     standing = StandingSurfaces(scene)
     copies: list[SceneInstance] = []
     mistakes = Mistakes()
@@ -330,16 +394,50 @@ def _copy_extents(section: SceneSection) -> list[Floats]:
     ]
 
 
-def _ground_mesh(section: SceneSection, scene: Scene | None) -> SceneMesh:
-    """Return the ground in world coordinates: two triangles under a scene and its copies.
+def _footprints(scenario: Scenario) -> list[Floats]:
+    """Return points that the ground of a scenario lies under, (n, 2) each, world metres.
 
-    The rectangle contains the scene, the positions of listed copies and the rectangles of scattered
-    copies, with a margin.
+    These are the copies' rectangles and positions, the poses, and the trajectories and poses of the
+    carrier and of actors. Vehicles of traffic are not among them.
     """
+    footprints = _copy_extents(scenario.scene)
+    poses = [*(scenario.poses or ()), *(entry.at for entry in scenario.actors if entry.at)]
+    footprints.append(np.reshape([pose.position[:2] for pose in poses], (-1, 2)))
+    with prefixed(scenario.source):
+        if scenario.trajectory is not None:
+            footprints.append(scenario.trajectory.footprint(scenario.path))
+        for entry in scenario.actors:
+            if entry.trajectory is not None:
+                with prefixed(f"actor {entry.name!r}"):
+                    footprints.append(entry.trajectory.footprint(scenario.path))
+    return footprints
+
+
+def _corners(scene: Scene) -> Floats:
+    """Return the lowest and the highest x and y of a scene, (2, 2), world metres."""
+    return (scene.bounds + scene.origin)[:, :2]
+
+
+def _ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
+    """Return the ground of a scenario.
+
+    Raises LidarError if the scenario has nothing that the ground could lie under.
+    """
+    footprints = [static.corners, *_footprints(scenario)]
+    if not any(map(len, footprints)):
+        raise LidarError(
+            f"{scenario.source}: `scene.ground` lies under the objects, poses, trajectories and "
+            "actors of the scenario, which has none of them. Add `poses`, or mesh files as "
+            "`scene.files`."
+        )
+    return _ground_mesh(scenario.scene, footprints)
+
+
+def _ground_mesh(section: SceneSection, footprints: Sequence[Floats]) -> SceneMesh:
+    """Return the ground in world coordinates: two triangles under points (n, 2), with a margin."""
     ground = section.ground
     assert ground is not None, "of a section with a ground"
-    corners_xy = [] if scene is None else [(scene.bounds + scene.origin)[:, :2]]
-    points = np.concatenate([*corners_xy, *_copy_extents(section)])
+    points = np.concatenate(footprints)
     x0, y0 = points.min(axis=0) - ground.margin_m
     x1, y1 = points.max(axis=0) + ground.margin_m
     z = ground.height_m

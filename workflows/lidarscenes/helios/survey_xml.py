@@ -291,11 +291,9 @@ class _Import:
             **({"materials": self._materials} if self._materials else {}),
             **light,
             "cloud": {
-                "keep_every": 1,
                 "precision_m": 0.001,
                 "columns": ["time", "range", "intensity", "return_number", "returns", *classes],
             },
-            "planning": {"enabled": False},
         }
         head = [
             f"From the HELIOS++ survey {self._name!r} by lidarpool import.",

@@ -197,7 +197,7 @@ class CurveHeadings:
     def from_knots(cls, times_s: Floats, knots: Floats) -> CurveHeadings:
         """Return the headings on a curve through knots (3, 3, n) at times (n,)."""
         steps = np.diff(times_s)
-        still = ~knots[1:].any(axis=(0, 1))
+        still: Bools = np.asarray(~knots[1:].any(axis=(0, 1)))
         count = len(steps)
         shares = np.array([_NEAR_END, 0.5, 1 - _NEAR_END])
         since = (steps[:, None] * shares).reshape(-1)

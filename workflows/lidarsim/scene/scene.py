@@ -144,7 +144,7 @@ class Scene:
 
     @classmethod
     def seed(cls) -> Scene:
-        """Return the default scene: six surfaces of revolution, 76,800 triangles.
+        """Return the scene of the demo: six surfaces of revolution, 76,800 triangles.
 
         Examples
         --------

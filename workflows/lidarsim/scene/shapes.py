@@ -1,4 +1,4 @@
-"""Generated objects: surfaces of revolution, and the six objects of the default survey."""
+"""Generated objects: surfaces of revolution, and the six objects of the demo."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
 
 
 def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tuple[SceneMesh, ...]:
-    """Make the six objects of the default survey: sphere, vase, bell, pawn, spindle, bowl.
+    """Make the six objects of the demo: sphere, vase, bell, pawn, spindle, bowl.
 
     Each stands on z = 0 at its position in `SEED_POSITIONS`, has a radius of `SEED_RADIUS_M` and
     `2 * rings * segments` triangles: by default 76,800 in all.

@@ -155,8 +155,7 @@ class CloudOptions:
         int,
         FILLED_IN,
         about(
-            "keep every n-th hit of a scan; by default every hit, of a scene with the "
-            "default objects every 5th",
+            "keep every n-th hit of a scan; by default every hit",
             5,
             ge=1,
             le=1_000_000,
@@ -167,7 +166,7 @@ class CloudOptions:
         FILLED_IN,
         about(
             "step in metres that points are rounded to; by default the sensor's resolution of "
-            "ranges; if it states none 0.001, with the default objects and in Python 0.01",
+            "ranges; if it states none 0.001, and in Python 0.01",
             0.001,
         ),
     ] = None  # type: ignore[assignment]

@@ -170,7 +170,7 @@ def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: boo
         GPU: "stage 2 casts the rays",
         LIDAR: f"{GENERATE}, {SORT} and {required_slots.get(LIDAR, 0) - 2 - writing} x {COLLECT}"
         f"{', and writing jobs of a campaign' if writing else ''}",
-        OTHER: "path planning; or leave it out with --no-plan",
+        OTHER: "path planning; or remove planning from the scenario",
     }
     try:
         pool.require(required_slots, purpose)

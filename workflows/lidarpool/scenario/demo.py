@@ -1,0 +1,21 @@
+"""The scenario of `lidarpool demo`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .scenario import Scenario
+
+# Also written out in examples/seed.yaml.
+_DATA: dict[str, Any] = {
+    "scene": "seed",
+    "poses": [[0, 0, 1], [0, 0, 2], [0, 0, 3]],
+    "steps": 36,
+    "cloud": {"keep_every": 5, "precision_m": 0.01},
+    "planning": {"start": [25, 25], "target": [-30, -20], "trials": 100},
+}
+
+
+def demo_scenario() -> Scenario:
+    """Return the scenario of the demo: six objects, 108 scans from three poses, a planned path."""
+    return Scenario.from_data(_DATA, source="the demo")
