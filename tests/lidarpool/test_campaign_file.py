@@ -568,7 +568,7 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
 @pytest.mark.extended
 def test_a_grid_that_is_too_large(campaign):
     many = {"each": list(range(1, 1001))}
-    vary = {"steps": many, "planning.seed": many, "noise.seed": many}
+    vary = {"steps": many, "cloud.keep_every": many, "noise.seed": many}
     with pytest.raises(LidarError, match=r"all values of each are 1,000,000,000 jobs"):
         campaign(vary, count=None)
     assert campaign(vary, count=5).count == 5

@@ -252,11 +252,13 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
 
 @pytest.mark.parametrize("entry", ["images", "{format: mcap, layout: images}"])
 def test_a_scenario_keeps_every_return(entry):
-    survey = build(Scenario.from_data(load_yaml(f"output: {{write: [{entry}]}}"))).survey
+    survey = build(
+        Scenario.from_data(load_yaml(f"scene: seed\noutput: {{write: [{entry}]}}"))
+    ).survey
     assert survey.keep_every == 1
     assert {"ray", "range"} <= {column.name for column in survey.stored_columns}
     thinned = Scenario.from_data(
-        load_yaml(f"{{output: {{write: [{entry}]}}, cloud: {{keep_every: 5}}}}")
+        load_yaml(f"{{scene: seed, output: {{write: [{entry}]}}, cloud: {{keep_every: 5}}}}")
     )
     with pytest.raises(LidarError, match=r"keep_every is 5: set cloud\.keep_every to 1"):
         build(thinned)

@@ -108,7 +108,9 @@ def test_what_cannot_be_packets_is_refused_before_a_file_is_written(tmp_path):
 
 
 def scenario_of(**sections):
-    return Scenario.model_validate({"poses": [{"position": [0, 0, 1]}], "steps": 2, **sections})
+    return Scenario.model_validate(
+        {"scene": "seed", "poses": [{"position": [0, 0, 1]}], "steps": 2, **sections}
+    )
 
 
 def test_a_scenario_that_writes_packets_keeps_what_they_hold():

@@ -17,7 +17,18 @@ from lxml import html
 from PIL import Image
 from tests.cloud_counting import counts_of
 
-from lidarpool import Cloud, Mounted, Noise, Planning, Result, Returns, Scene, Survey, load_sensor
+from lidarpool import (
+    Cloud,
+    Mounted,
+    Noise,
+    Planning,
+    Result,
+    Returns,
+    Scene,
+    Survey,
+    Track,
+    load_sensor,
+)
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.page.rendering import MAX_ROWS, put_picture, sentence, write_page
@@ -288,6 +299,23 @@ def test_figures_have_the_digits_that_are_read(write):
     assert (told["detection_range_m"], told["visibility_km"]) == ("100.9", "3.333")
     assert told["local origin"] == "(500,000.123, 0, 1.5) m"
     assert told["survey and planning overlap"] == "0 s"
+
+
+def test_scanning_of_a_flight_is_on_its_lines(write):
+    """Of 20 s, a turn of 4 s."""
+    rates = np.radians(np.where((np.arange(401) > 160) & (np.arange(401) <= 240), 45, 0))
+    headings = np.cumsum(rates) * 0.05
+    steps = 3.0 * np.stack([np.cos(headings), np.sin(headings), 0 * headings], axis=1)
+    track = Track(np.arange(401) * 0.05, np.cumsum(steps, axis=0))
+    text, report = write(survey=Survey(load_sensor("airborne/riegl-vq780i"), trajectory=track))
+    assert "<dt>of scanning on 2 flight lines</dt>" in text
+    lines = report["parameters"]["flight_lines"]
+    assert lines["count"] == 2
+    assert lines["seconds"] == pytest.approx(16, abs=0.5)
+    assert lines["length_m"] == pytest.approx(60 * 16, rel=0.04)
+    text, report = write(survey=Survey(Sensor.grid(), trajectory=track))
+    assert re.search("<dd>20[^<]*</dd><dt>of scanning</dt>", text)
+    assert report["parameters"]["flight_lines"] is None
 
 
 def test_hits_on_nothing_are_told_from_those_on_surfaces(write):

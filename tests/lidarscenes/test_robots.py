@@ -271,7 +271,9 @@ def test_a_scenario_names_the_assets_of_a_robot(tmp_path, packages):
             with pytest.raises(LidarError, match="as assets"):
                 build(scenario)
     actor = {"name": "R", "file": file | {"assets": "ws"}, "at": [3, 0, 0]}
-    scenario = Scenario.from_data({"actors": [actor], "poses": poses}, folder=tmp_path)
+    scenario = Scenario.from_data(
+        {"scene": "seed", "actors": [actor], "poses": poses}, folder=tmp_path
+    )
     assert len(build(scenario).scene.actors) == 1
 
 

@@ -95,7 +95,7 @@ def test_stated_false_alarms_are_a_share_of_the_pulses():
 
 
 def carried(**sections):
-    survey = build(Scenario.from_data({"poses": [[0, 0, 1]], **sections})).survey
+    survey = build(Scenario.from_data({"scene": "seed", "poses": [[0, 0, 1]], **sections})).survey
     return list(zip(survey.noise_each, survey.returns_each, strict=True))
 
 
@@ -157,7 +157,8 @@ def test_each_of_several_sensors_has_its_own():
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "ouster/os1-64"])
 def test_figures_that_a_data_sheet_lacks_are_told_only_on_request(model):
     sheet = {"model": model, "performance": "datasheet"}
-    assert advice(build(Scenario.from_data({"poses": [[0, 0, 1]], "sensor": sheet}))) == []
+    data = {"scene": "seed", "poses": [[0, 0, 1]], "sensor": sheet}
+    assert advice(build(Scenario.from_data(data))) == []
     shown = CliRunner().invoke(sensors, [model]).output
     (unknown,) = re.findall("^unknown .*", shown, re.MULTILINE)
     assert unknown.endswith("false alarms (noise.false_alarm_hz)")

@@ -349,7 +349,7 @@ def test_what_is_no_fault(words, fields):
 def test_scenarios_and_campaigns(tmp_path):
     base = tmp_path / "base.yaml"
     base.write_text(
-        "poses: [[0, 0, 1]]\nsensor: velodyne/vlp16\n"
+        "scene: seed\nposes: [[0, 0, 1]]\nsensor: velodyne/vlp16\n"
         "faults:\n  - {kind: dirt, azimuth_deg: [-20, 20], transmission: 0.3}\n"
         "  - {kind: frozen, from_s: 0.05}\n"
     )

@@ -116,5 +116,6 @@ def test_what_does_not_fit():
 def test_scenarios_have_them_beside_a_data_sheet():
     noise = {"channel_bias_m": [0.01] * 16, "warm_up_m": 0.02, "ripple_deg": 0.02}
     sensor = {"model": "velodyne/vlp16", "performance": "datasheet"}
-    made = build(Scenario.from_data({"sensor": sensor, "noise": noise})).survey.noise_each[0]
+    made = build(Scenario.from_data({"scene": "seed", "sensor": sensor, "noise": noise}))
+    made = made.survey.noise_each[0]
     assert made.range_m == 0.03 and made.warm_up_s == 600 and len(made.channel_bias_m) == 16

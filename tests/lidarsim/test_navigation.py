@@ -393,6 +393,7 @@ def test_a_cloud_by_itself_has_no_instruments(tmp_path):
 
 def test_scenarios(tmp_path):
     text = """
+    scene: seed
     trajectory: {points: [{time_s: 0, position: [0, 0, 1]}, {time_s: 1, position: [1, 0, 1]}]}
     navigation:
       imu: {rate_hz: 100, gyroscope_random_walk: 2.0e-5, mount: {yaw_deg: 10}}

@@ -430,7 +430,9 @@ def test_binary_files_of_times_are_named(tmp_path):
 
 def test_a_scenario_depends_on_the_files_of_a_folder(oxts, tmp_path):
     path = tmp_path / "drive.yaml"
-    path.write_text(f"trajectory: {{file: {oxts.parent.name}, origin: [49, 8.4, 100]}}\n")
+    path.write_text(
+        f"scene: seed\ntrajectory: {{file: {oxts.parent.name}, origin: [49, 8.4, 100]}}\n"
+    )
     names = [file.name for file in Scenario.load(path).files]
     assert names == [f"{number:010}.txt" for number in range(3)] + ["timestamps.txt"]
     assert np.isclose(build(Scenario.load(path)).job().survey.pose(0).position[2], 12.8)

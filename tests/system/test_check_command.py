@@ -330,6 +330,31 @@ def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     assert {"range", "intensity"} <= cloud.columns.keys()
 
 
+def test_a_flight_is_told_by_its_lines_without_turns(check):
+    """Lines of 200 cycles a second at 60 m/s, and a turn at half that speed."""
+    way = [(0, 0, 0), (2, 120, 0), (6, 360, 0), (8, 480, 0), (14, 560, 60), (20, 480, 120)]
+    way += [(22, 360, 120), (26, 120, 120), (28, 0, 120)]
+    points = [{"time_s": t, "position": [x, y, 300]} for t, x, y in way]
+    scenario = {
+        "scene": {"ground": {}},
+        "trajectory": {"points": points},
+        "sensor": "airborne/riegl-vq780i",
+        "pool": {"backend": "numpy"},
+    }
+    drive = json.loads(check("--json", text=json.dumps(scenario)).out)["drive"]
+    assert drive["lines"]["count"] == 4, "straight lines between poses, two of them in the turn"
+    scenario["trajectory"]["interpolation"] = "smooth"
+    drive = json.loads(check("--json", text=json.dumps(scenario)).out)["drive"]
+    assert drive["lines"]["count"] == 2
+    assert drive["lines"]["seconds"] == pytest.approx(15, abs=1.5)
+    [scanner] = drive["sensors"]
+    assert scanner["metres_a_turn"] == pytest.approx(60 / 200, rel=0.02)
+    assert drive["metres"] / drive["seconds"] / 200 < 0.95 * scanner["metres_a_turn"]
+    told = check(text=json.dumps(scenario)).out
+    assert re.search(r"^trajectory  .* s; 2 flight lines, [\d,]+ m in 1\d\.\d s$", told, re.M)
+    assert re.search(r"in one the carrier moves 0\.30\d m on the flight lines$", told, re.M)
+
+
 def test_an_unfinished_run_is_told_of(check, tmp_path):
     (tmp_path / "out" / "run").mkdir(parents=True)
     (tmp_path / "out" / "run" / "run.db").write_bytes(b"")

@@ -258,12 +258,17 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
 
 def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
     """Yield the length of the trajectory, and the firings of each sensor."""
-    yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
+    lines = drive["lines"]
+    of_lines = ""
+    if lines:
+        of_lines = f"; {plural(lines['count'], 'flight line')}, "
+        of_lines += f"{lines['length_m']:,.0f} m in {lines['seconds']:,.1f} s"
+    yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s{of_lines}"
     for sensor in drive["sensors"]:
         cycles = ""
         if sensor["turns"]:
             cycles = f", {sensor['turns']:,.2f} {sensor['cycle']}s; in one the carrier moves "
-            cycles += f"{sensor['metres_a_turn']:,.3f} m"
+            cycles += f"{sensor['metres_a_turn']:,.3f} m{' on the flight lines' if lines else ''}"
         firings = plural(sensor["firings"], "firing")
         yield f"{sensor['name'] or 'sensor':<11} {sensor['model']}, {firings}{cycles}"
 

@@ -76,7 +76,8 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     notes = []
     if data and not target.exists():
         # From here: the scenario's folder need not be there yet.
-        scenario = Scenario.from_data(mesh_data(meshes, Path(), of_mesh), source=str(target))
+        content = {"scene": "seed"} | mesh_data(meshes, Path(), of_mesh)
+        scenario = Scenario.from_data(content, source=str(target))
         built = build(scenario, plans=False)
         notes = advice(built)
         if (placing := built.placing) is not None:

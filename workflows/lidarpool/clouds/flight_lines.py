@@ -11,16 +11,28 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Bytes, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
+from lidarsim.motion.straight_lines import StraightLines
+from lidarsim.sensor.sensor import LineSensor
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
 _MAX_SOURCE = 65_535  # largest number of a source in the format
-# A flight line begins where the direction of flight has changed by the first angle, and then stays
-# within the second angle for this time.
-_TURN_DEG = 20.0
-_STEADY_DEG = 5.0
-_STEADY_NS = 1e9
 _MIN_STEP_M = 1e-6  # a carrier that moves by more in 2 ms, or a sweep, counts as moving
+_SAMPLE_S = 0.05  # of trajectories, to find flight lines
+_MAX_SAMPLES = 200_000
 _LINES = 1 << 40  # numbers reserved for the lines of a station
+
+
+def flight_lines(survey: Survey) -> StraightLines | None:
+    """Return the flight lines of an airborne survey, None without any."""
+    airborne = any(isinstance(mounted.sensor, LineSensor) for mounted in survey.carried)
+    if not (airborne and survey.path.moves):
+        return None
+    count = int(min(survey.duration_ns / 1e9 / _SAMPLE_S, _MAX_SAMPLES)) + 2
+    times_ns = np.linspace(0.0, survey.duration_ns, count)
+    positions, _ = survey.path.poses(0, times_ns)
+    lines = StraightLines.find(times_ns / 1e9, positions)
+    return lines if len(lines.starts_s) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +164,11 @@ class FlightLines:
         for sensor, lidar in enumerate(sweeps.lidars):
             rows = np.flatnonzero(sweeps.sensor == sensor)
             if lidar.lines is not None and len(sweeps.knots) and sweeps.stations == 1:
-                source[rows] = _flight_lines(self._directions[rows], sweeps.begins_ns[rows])
+                begins_s = sweeps.begins_ns[rows] / 1e9
+                lines = StraightLines.find(begins_s, sweeps.pose.positions[rows])
+                # Sweeps in a turn belong to the line before.
+                line = np.searchsorted(lines.starts_s, begins_s, "right") - 1
+                source[rows] = np.maximum(line, 0)
         return source * max(len(sweeps.sensors), 1) + sweeps.sensor + 1
 
 
@@ -166,23 +182,3 @@ def _level(moves: Floats, axes: Floats) -> Floats:
     lengths = np.linalg.norm(ahead, axis=1)
     ahead[lengths < 1e-9] = (1.0, 0.0, 0.0)
     return np.asarray(ahead / np.where(lengths < 1e-9, 1.0, lengths)[:, None])
-
-
-def _flight_lines(directions: Floats, begins_ns: Floats) -> Ints:
-    """Return the flight line of each sweep (n,), from 0, by unit vectors `directions` (n, 3).
-
-    Sweeps in a turn of the carrier belong to the line before.
-    """
-    heading_deg = np.degrees(np.unwrap(np.arctan2(directions[:, 1], directions[:, 0])))
-    window = np.searchsorted(begins_ns, begins_ns + _STEADY_NS)
-    lines = np.zeros(len(heading_deg), np.int64)
-    start = 0
-    while True:
-        turned = np.abs(heading_deg[start:] - heading_deg[start]) > _TURN_DEG
-        candidates = start + np.flatnonzero(turned)
-        steady = (k for k in candidates if np.ptp(heading_deg[k : window[k]]) < _STEADY_DEG)
-        following = next(steady, None)
-        if following is None:
-            return lines
-        lines[following:] += 1
-        start = int(following)

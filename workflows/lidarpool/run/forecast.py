@@ -18,6 +18,7 @@ from distributed.system import MEMORY_LIMIT
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import CHUNK_POINTS
+from lidarsim.motion.straight_lines import StraightLines
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.casting.visibility import unseen_objects
@@ -35,6 +36,7 @@ from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
+from ..clouds.flight_lines import flight_lines
 from ..clouds.navigation_files import instrument_bytes
 from ..scenario.build import Job
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
@@ -276,12 +278,16 @@ def _unseen(job: Job) -> dict[str, list[str]]:
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
-    """Describe the length of a moving carrier's trajectory, and the revolutions of each sensor."""
+    """Describe the length of a moving carrier's trajectory, and the revolutions of each sensor.
+
+    The distance of lines of an airborne scanner is the distance on flight lines, not in turns.
+    """
     if not survey.path.moves:
         return None
     seconds = survey.duration_ns / 1e9
     positions, _ = survey.path.poses(0, np.linspace(0, survey.duration_ns, TRAJECTORY_POSES))
     metres = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    lines = flight_lines(survey)
     sensors = []
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
         sensor = carried.sensor
@@ -296,10 +302,20 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
                 "scans": steps * survey.path.stations,
                 "firings": firings * survey.path.stations,
                 "turns": rate_hz and on_ns / 1e9 * rate_hz,
-                "metres_a_turn": rate_hz and metres / seconds / rate_hz,
+                "metres_a_turn": rate_hz and _speed(lines, seconds, metres) / rate_hz,
             }
         )
-    return {"seconds": seconds, "metres": metres, "sensors": sensors}
+    return {
+        "seconds": seconds,
+        "metres": metres,
+        "lines": lines and lines.summary(),
+        "sensors": sensors,
+    }
+
+
+def _speed(lines: StraightLines | None, seconds: float, metres: float) -> float:
+    """Return the mean speed on flight lines, or without any along the trajectory, m/s."""
+    return lines.length_m / lines.seconds if lines else metres / seconds
 
 
 def _existing(folder: Path) -> Path:

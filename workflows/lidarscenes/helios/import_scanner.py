@@ -202,9 +202,9 @@ def _write(
         entries[name or "lidar"] = _entry(file, mounted)
     only = next(iter(entries.values()))
     if len(entries) == 1 and "mount" not in only:
-        content: dict[str, Any] = {"sensor": only}
+        content: dict[str, Any] = {"scene": "seed", "sensor": only}
     else:
-        content = {"sensors": entries}
+        content = {"scene": "seed", "sensors": entries}
     if accuracy_m := clean(first.number("accuracy_m")):
         content["noise"] = {"range_m": accuracy_m}
     waveforms = first.child("FWFSettings")

@@ -55,7 +55,7 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     ray_npz.write(folder / _RAYS_FILE, rays.timed(), lines)
     head = [f"From {path.name} by lidarpool import.", *(f"Not as there: {line}." for line in lines)]
     text = "".join(f"# {line}\n" for line in head)
-    text += yaml.safe_dump({"sensor": _section(rays)}, sort_keys=False)
+    text += yaml.safe_dump({"scene": "seed", "sensor": _section(rays)}, sort_keys=False)
     (folder / SCENARIO_FILE).write_text(text, encoding="utf-8", newline="\n")
     return lines
 

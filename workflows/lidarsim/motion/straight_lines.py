@@ -1,0 +1,119 @@
+"""Straight lines of a trajectory, such as the flight lines of an airborne survey."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..base.arrays import Bools, Floats
+from ..base.elementary import interp
+
+_STEP_S = 0.1  # positions are resampled to this interval, so that jitter does not count as turning
+_MAX_STEPS = 1_000_000
+_STEADY_S = 1.0  # shortest line
+# On a line, the direction of travel stays within this angle for twice `_STEADY_S`, and within this
+# angle of the line's median direction. Aircraft turn by 1.5 to 3 degrees a second and more.
+_STEADY_DEG = 2.0
+_TURN_DEG = 20.0  # between two lines the direction changes by more, otherwise they are one
+_MOVES_M_S = 0.05
+
+
+class StraightLines(NamedTuple):
+    """Straight lines of a trajectory, one after the other, without the turns between them."""
+
+    starts_s: Floats  # (n,)
+    stops_s: Floats  # (n,)
+    lengths_m: Floats  # (n,)
+
+    @property
+    def seconds(self) -> float:
+        """Total duration of the lines."""
+        return float((self.stops_s - self.starts_s).sum())
+
+    @property
+    def length_m(self) -> float:
+        """Total length of the lines, meters."""
+        return float(self.lengths_m.sum())
+
+    def summary(self) -> dict[str, float]:
+        """Return number, total duration and total length of the lines as plain data."""
+        return {"count": len(self.starts_s), "seconds": self.seconds, "length_m": self.length_m}
+
+    @classmethod
+    def find(cls, times_s: Floats, positions: Floats) -> StraightLines:
+        """Find the lines of at least a second, seen from above.
+
+        Parameters
+        ----------
+        times_s
+            (k,), ascending.
+        positions
+            (k, 3), meters.
+
+        Examples
+        --------
+        >>> times = np.arange(0.0, 21.0, 0.5)
+        >>> there_and_back = np.minimum(times, 20 - times)
+        >>> lines = StraightLines.find(times, np.stack([60 * there_and_back] * 3, axis=1))
+        >>> len(lines.starts_s), round(lines.seconds)
+        (2, 20)
+        """
+        span_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0
+        if span_s < _STEADY_S:
+            return cls(np.zeros(0), np.zeros(0), np.zeros(0))
+        count = min(int(np.ceil(span_s / _STEP_S)), _MAX_STEPS) + 1
+        grid = np.linspace(times_s[0], times_s[-1], count)
+        x, y, z = (interp(grid, times_s, np.ascontiguousarray(row)) for row in positions.T)
+        step_s = span_s / (count - 1)
+        velocities = np.gradient(np.stack([x, y]), step_s, axis=1)
+        headings = np.degrees(np.unwrap(np.arctan2(velocities[1], velocities[0])))
+        moves: Bools = np.hypot(*velocities) > _MOVES_M_S
+        pairs = _merged(headings, _steady_runs(headings, moves, round(_STEADY_S / step_s)))
+        passed_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff([x, y, z]), axis=0)))
+        starts, stops = np.reshape(pairs, (-1, 2)).astype(np.intp).T
+        long = grid[stops] - grid[starts] >= _STEADY_S - 1e-9
+        starts, stops = starts[long], stops[long]
+        return cls(grid[starts], grid[stops], passed_m[stops] - passed_m[starts])
+
+
+def _steady_runs(headings: Floats, moves: Bools, reach: int) -> list[tuple[int, int]]:
+    """Return first and last indices of runs in which the direction of travel is steady.
+
+    `headings` (n,) are degrees; the direction is steady where it hardly changes for `reach` steps
+    before and after, and as long as it stays near the median of that run.
+    """
+    last = len(headings) - 1
+    reach = max(min(reach, last // 2), 1)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(headings, reach, mode="edge"), 2 * reach + 1
+    )
+    steady = (np.ptp(windows, axis=1) < _STEADY_DEG) & moves
+    edges = np.flatnonzero(np.diff(steady, prepend=False, append=False)).reshape(-1, 2)
+    runs: list[tuple[int, int]] = []
+    for start, stop in edges.tolist():
+        near = np.abs(headings - np.median(headings[start:stop])) < _STEADY_DEG
+        away = np.flatnonzero(~(near & moves))
+        before = away[away < start]
+        after = away[away >= stop]
+        first = int(before[-1]) + 1 if len(before) else 0
+        final = int(after[0]) - 1 if len(after) else last
+        if not runs or first > runs[-1][1]:
+            runs.append((first, final))
+        else:
+            runs[-1] = (runs[-1][0], max(final, runs[-1][1]))
+    return runs
+
+
+def _merged(headings: Floats, runs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Join runs between which the direction of travel hardly changes."""
+    lines: list[tuple[int, int]] = []
+    for start, stop in runs:
+        if lines:
+            first, final = lines[-1]
+            turned = np.abs(headings[first : stop + 1] - np.median(headings[first : final + 1]))
+            if turned.max() < _TURN_DEG:
+                lines[-1] = (first, stop)
+                continue
+        lines.append((start, stop))
+    return lines
