@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import re
 import subprocess
 import sys
 from collections import Counter, defaultdict
@@ -87,15 +88,12 @@ class Lines:
         """Return the tests that may notice a fault; first those that are quick and execute little.
 
         These are the tests that execute its line; for a compiled loop, or a line that is only
-        executed by the processes of clusters, those that execute a function of a module that
-        imports the fault's module.
+        executed by the processes of clusters, those that execute a function that names something
+        of the fault's module, directly or through other compiled loops.
         """
         numbers = self._executing(root, fault)
         if not numbers:
-            numbers = set()
-            for path in _importers(root, fault.path):
-                for span in self.spans.get(path, {}).values():
-                    numbers |= self._in_span(path, span)
+            numbers = self._using(root, fault.path)
         tests = [self.tests[number] for number in numbers]
         return sorted(tests, key=lambda test: self.cost(test) * self.counts[test])
 
@@ -108,6 +106,17 @@ class Lines:
             return self.lines[fault.path].get(fault.line, set())
         span = self.spans.get(fault.path, {}).get(fault.function)
         return self._in_span(fault.path, span) if span else set()
+
+    def _using(self, root: Path, module: str) -> set[int]:
+        """Return the tests that execute functions which name something of a module."""
+        numbers: set[int] = set()
+        for path, module_names in _importers(root, module).items():
+            lines = (root / path).read_text().splitlines()
+            for first, last in self.spans.get(path, {}).values():
+                words = set(re.findall(r"\w+", "\n".join(lines[first - 1 : last])))
+                if words & module_names:
+                    numbers |= self._in_span(path, (first, last))
+        return numbers
 
     def _in_span(self, path: str, span: tuple[int, int]) -> set[int]:
         by_line = self.lines.get(path, {})
@@ -133,21 +142,36 @@ class Lines:
         path.write_text(json.dumps(content))
 
 
-def _importers(root: Path, path: str) -> set[str]:
-    """Return the files that import a file, directly or through modules of compiled loops."""
+def _importers(root: Path, path: str) -> dict[str, set[str]]:
+    """Return the files that import a file, directly or through modules of compiled loops.
+
+    Each comes with the public names of the modules by which it does.
+    """
     imports = _imports(root)
-    found: set[str] = set()
+    found: dict[str, set[str]] = defaultdict(set)
     waiting = [path]
+    seen = {path}
     while waiting:
         module = waiting.pop()
+        names = {Path(module).stem, *_public_names((root / module).read_text())}
         for importer, imported in imports.items():
-            if module in imported and importer not in found:
-                found.add(importer)
-                if "raybeam.compiled" in (text := (root / importer).read_text()) or (
-                    "from .compiled import" in text
-                ):
-                    waiting.append(importer)
+            if module not in imported:
+                continue
+            found[importer] |= names
+            if importer not in seen and _has_loops((root / importer).read_text()):
+                seen.add(importer)
+                waiting.append(importer)
     return found
+
+
+def _public_names(source: str) -> list[str]:
+    """Return the names of the functions and classes of a module."""
+    kinds = ast.FunctionDef | ast.ClassDef
+    return [node.name for node in ast.parse(source).body if isinstance(node, kinds)]
+
+
+def _has_loops(source: str) -> bool:
+    return "raybeam.compiled" in source or "from .compiled import" in source
 
 
 _known_imports: dict[Path, dict[str, set[str]]] = {}
