@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from tests.shapes import CPU, box, cast, level, solid
 
 from lidarpool import Beams, LidarError, Material, Optics, Pose, Returns, Scene, Sensor, Spin
 from lidarsim.media.materials import extinction, fresnel
+from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.simulator.steps.cast import MAX_PASSES, MAX_REFLECTIONS
 
 WATER = {"transparent": "pass", "refractive_index": 1.33}
 SURFACE = level("Water", 0, 90)
@@ -213,3 +217,190 @@ def test_water_in_the_thickest_fog_has_no_energy_that_is_no_number():
     with np.errstate(over="raise", invalid="raise"):
         found = cast([water, floor], ray(), behind, materials=materials, visibility_km=0.001)
     assert np.isfinite(found["intensity"]).all()
+
+
+# -- bodies within bodies ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A convex body, by the planes of its faces: independent of meshes and of casting."""
+
+    mesh: SceneMesh
+    material: Material
+
+    @cached_property
+    def planes(self):
+        """Normals (f, 3) that point out of the body, and their distances from the origin (f,)."""
+        corners = self.mesh.vertices[self.mesh.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        # Bodies of media are larger by 15 µm, so that light meets what they touch.
+        grown = 1.5e-5 if self.material.refractive_index else 0.0
+        return normals, (normals * corners[:, 0]).sum(axis=1) + grown
+
+    def holds(self, point):
+        normals, offsets = self.planes
+        return (normals @ point < offsets).all()
+
+    def crossing(self, origin, ahead):
+        """Distance of the next face on a ray, and the face's normal and offset."""
+        normals, offsets = self.planes
+        slopes = normals @ ahead
+        distances = (offsets - normals @ origin) / slopes
+        enter = np.where(slopes < 0, distances, -np.inf).argmax()
+        leave = np.where(slopes > 0, distances, np.inf).argmin()
+        if distances[enter] > distances[leave]:
+            return math.inf, None, None
+        face = enter if distances[enter] > 1e-9 else leave
+        far = distances[face] if distances[face] > 1e-9 else math.inf
+        return far, normals[face], offsets[face]
+
+
+@dataclass(frozen=True)
+class Path:
+    """Light on its way: where it is, and what has become of it."""
+
+    origin: np.ndarray
+    ahead: np.ndarray
+    first: tuple  # where it started, and into which direction
+    # Of each surface crossed: normal, offset, and index before over behind; None for mirrors.
+    turns: tuple = ()
+    optical: float = 0.0
+    depth: float = 0.0
+    share: float = 1.0
+    ghosts: int = 0
+
+    def area(self, normal, offset):
+        """Area at a plane, across the light, of a cone of light of one steradian: differences."""
+        start, ahead = self.first
+        across = np.linalg.svd(ahead[None])[2][1:]
+        step = 1e-5
+        places = []
+        for sign in (1, -1):
+            ways = ahead + sign * step * across
+            ways /= np.linalg.norm(ways, axis=1)[:, None]
+            at = np.tile(start, (2, 1))
+            for face, far, ratio in (*self.turns, (normal, offset, 1.0)):
+                at = at + ((far - at @ face) / (ways @ face))[:, None] * ways
+                ways = turned_by(ways, face, ratio)
+            places.append(at)
+        one, other = (places[0] - places[1]) / (2 * step)
+        return abs(np.cross(one, other) @ self.ahead)
+
+
+def turned_by(ways, normal, ratio):
+    """Directions behind a plane: mirrored, or by Snell's law along and across the plane."""
+    upright = (ways @ normal)[:, None] * normal
+    if ratio is None:
+        return ways - 2 * upright
+    along = ratio * (ways - upright)
+    rest = np.sqrt(1 - (along**2).sum(axis=1))
+    return along + (np.sign(ways @ normal) * rest)[:, None] * normal
+
+
+def reflected_share(angle, ratio):
+    """Fresnel's sine and tangent laws; 1 beyond the critical angle."""
+    sine = ratio * math.sin(angle)
+    if sine >= 1:
+        return 1.0
+    behind = math.asin(sine)
+    minus, plus = angle - behind, angle + behind
+    s_wave, p_wave = math.sin(minus) / math.sin(plus), math.tan(minus) / math.tan(plus)
+    return (s_wave**2 + p_wave**2) / 2
+
+
+def medium(bodies, point):
+    """Index and attenuation of the last body that holds a point."""
+    within = [b.material for b in bodies if b.material.refractive_index and b.holds(point)]
+    return (within[-1].refractive_index, within[-1].attenuation_per_m) if within else AIR
+
+
+AIR = (1.0, extinction(0.2, 905))
+
+
+def traced(bodies, path, passes=MAX_PASSES):
+    """Yield what returns from a path: object, optical range, energy, and whether it is a ghost."""
+    crossings = [body.crossing(path.origin, path.ahead) for body in bodies]
+    number = min(range(len(bodies)), key=lambda k: crossings[k][0])
+    step, normal, offset = crossings[number]
+    material = bodies[number].material
+    end = path.origin + step * path.ahead
+    before, attenuation = medium(bodies, end - 1e-7 * path.ahead)
+    behind, _ = medium(bodies, end + 1e-7 * path.ahead)
+    optical = path.optical + before * step
+    depth = path.depth + attenuation * step
+    cosine = abs(normal @ path.ahead)
+    if material.reflectance:
+        start, _ = medium(bodies, path.first[0])
+        area = path.area(normal, offset) * (before / start) ** 2
+        energy = material.reflectance * cosine * path.share * math.exp(-2 * depth) * 100 / area
+        yield number, optical, energy, path.ghosts > 0
+    if material.transparent != "pass" or passes == 1:
+        return
+    mirrors = material.specular_reflectance == "fresnel"
+    share = reflected_share(math.acos(cosine), before / behind)
+    ways = [] if share == 1 else [(before / behind, 1 - share, 0)]
+    if mirrors and path.ghosts < MAX_REFLECTIONS:
+        ways.append((None, share, 1))
+    elif share == 1 and not mirrors:
+        ways.append((None, 1.0, 0))
+    for ratio, light, ghost in ways:
+        onward = Path(
+            end,
+            turned_by(path.ahead[None], normal, ratio)[0],
+            path.first,
+            (*path.turns, (normal, offset, ratio)),
+            optical,
+            depth,
+            path.share * (light * (1 - material.reflectance)) ** 2,
+            path.ghosts + ghost,
+        )
+        yield from traced(bodies, onward, passes - 1)
+
+
+def turned_body(name, mesh, material, at, angles=(0, 0, 0)):
+    mesh.apply_transform(trimesh.transformations.euler_matrix(*angles))
+    return Body(solid(name, mesh, at), replace(material, objects=name))
+
+
+def bodies_in_a_room():
+    """A room with a prism of glass, water around a bead of glass, and a pane that mirrors."""
+    shape = trimesh.creation
+    glass = Material("*", 0.0, transparent="pass", refractive_index=1.5, attenuation_per_m=0.05)
+    water = Material("*", 0.04, attenuation_per_m=0.1, **WATER)
+    mirror = replace(glass, specular_reflectance="fresnel", reflectance=0.1)
+    return [
+        turned_body("Room", shape.box((40, 30, 20)), Material("*", 0.5), (5, 1, 2), (0.1, 0.2, 0)),
+        turned_body("Prism", shape.cylinder(2, 3, sections=3), glass, (5, 2, 0.5), (0.3, 0.8, 0.1)),
+        turned_body("Pond", shape.icosphere(0, 3), water, (5, -3, -0.5), (0.4, 0, 0.2)),
+        turned_body("Bead", shape.icosphere(1, 1.2), mirror, (5.5, -3, -0.2), (0, 0.5, 0.2)),
+        turned_body("Pane", shape.box((0.3, 6, 6)), mirror, (12, 1, 0), (0.2, 0.3, 0.5)),
+    ]
+
+
+@pytest.mark.parametrize("at", [(0, 0, 0), (4.1, -2.8, -1.3), (5.4, -2.9, -0.3)])
+def test_light_through_bodies_is_as_traced_face_by_face(at):
+    """Objects, ranges, energies and ghosts, from the air, from water, and from glass in water."""
+    bodies = bodies_in_a_room()
+    rng = np.random.default_rng(5)
+    beams = Beams(np.radians(rng.uniform(-25, 15, 30)), np.radians(rng.uniform(-40, 40, 30)))
+    sensor = Sensor(beams, Spin(1, 360), optics=Optics())
+    found = cast(
+        [body.mesh for body in bodies], sensor, at, visibility_km=0.2,
+        materials=[body.material for body in bodies],
+        returns=Returns("all", pulse_ns=1e-6), precision_m=1e-6,
+        columns=("ray", "range", "intensity", "object", "cause"),
+    )  # fmt: skip
+    expected = []
+    for ray, ahead in enumerate(sensor.directions(np.arange(1))[0]):
+        start = np.array(at, float)
+        returns = sorted(traced(bodies, Path(start, ahead, (start, ahead))), key=lambda r: r[1])
+        expected += [(ray, *one) for one in returns]
+    ray, number, optical, energy, ghost = map(np.array, zip(*expected, strict=True))
+    assert found["ray"].tolist() == ray.tolist()
+    assert found["object"].tolist() == number.tolist()
+    assert (found["cause"] != 0).tolist() == ghost.tolist()
+    assert found["range"] == pytest.approx(optical, abs=3e-5)
+    assert found["intensity"] == pytest.approx(energy, rel=3e-5)
+    assert ghost.any() and len({*number.tolist()}) == 4

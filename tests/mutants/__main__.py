@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from queue import Queue
 
@@ -179,6 +180,7 @@ def _try(places: "Queue[Place]", lines: Lines, fault: Fault, budget_s: float) ->
     return Outcome(fault, noticed, tried, time.monotonic() - start)
 
 
+@cache
 def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[str]]:
     """Yield tests to run together: quick ones first, then the others up to a budget."""
     group: list[str] = []
