@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -86,9 +87,9 @@ class Lines:
     def tests_of(self, root: Path, fault: Fault) -> list[str]:
         """Return the tests that may notice a fault; first those that are quick and execute little.
 
-        These are the tests that execute its line; for a compiled loop, or a line that is only
-        executed by the processes of clusters, those that execute a function of a module that
-        imports the fault's module.
+        These are the tests that execute its line. For a compiled loop, or a line that only other
+        processes execute, these are the tests that execute a function of a module that imports the
+        fault's module, or that runs it as a script.
         """
         numbers = self._executing(root, fault)
         if not numbers:
@@ -97,6 +98,7 @@ class Lines:
                 for span in self.spans.get(path, {}).values():
                     numbers |= self._in_span(path, span)
         tests = [self.tests[number] for number in numbers]
+        tests = [test for test in tests if _is_there(root, test)]
         return sorted(tests, key=lambda test: self.cost(test) * self.counts[test])
 
     def cost(self, test: str) -> float:
@@ -107,7 +109,9 @@ class Lines:
         if self.checksums.get(fault.path) == _checksum((root / fault.path).read_text()):
             return self.lines[fault.path].get(fault.line, set())
         span = self.spans.get(fault.path, {}).get(fault.function)
-        return self._in_span(fault.path, span) if span else set()
+        if span is None:  # a function that is new since the lines were recorded
+            return set[int]().union(*self.lines.get(fault.path, {}).values())
+        return self._in_span(fault.path, span)
 
     def _in_span(self, path: str, span: tuple[int, int]) -> set[int]:
         by_line = self.lines.get(path, {})
@@ -131,6 +135,17 @@ class Lines:
         content = {**vars(self), "lines": lines}
         del content["counts"]
         path.write_text(json.dumps(content))
+
+
+@cache
+def _content(path: Path) -> str:
+    return path.read_text() if path.is_file() else ""
+
+
+def _is_there(root: Path, test: str) -> bool:
+    """Return whether a test has neither been removed nor renamed since it was recorded."""
+    path, _, name = test.partition("::")
+    return f"def {name.rpartition('::')[2]}(" in _content(root / path)
 
 
 def _importers(root: Path, path: str) -> set[str]:
@@ -168,6 +183,9 @@ def _imports(root: Path) -> dict[str, set[str]]:
 def _imported(root: Path, path: Path, files: dict[str, Path]) -> set[str]:
     candidates: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Constant) and str(node.value).endswith(".py"):
+            # A script beside the module, which runs in a process of its own.
+            candidates.add(path.relative_to(root).with_name(Path(str(node.value)).name).as_posix())
         if not isinstance(node, ast.ImportFrom):
             continue
         words = (node.module or "").split(".") if node.module else []
