@@ -503,6 +503,31 @@ def test_crosswalks_have_stripes(tmp_path):
     assert crossing["crosswalk 1/7"].materials.names == ("paint yellow",)
 
 
+@pytest.mark.parametrize("kind", ["crosswalk", "roadMark", "parkingSpace"])
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ("", None),
+        ('length="3" width="8"', "paint"),
+        ('length="3" width="8" height="0"', "paint"),
+        ('length="3" width="0" height="0"', None),
+        ('length="3" width="8" height="0.2"', "box"),
+    ],
+)
+def test_paint_without_an_outline_is_its_area_or_a_box(tmp_path, kind, size, expected):
+    mesh = load(tmp_path, document(road(more=thing(kind, size)))).get(f"{kind} 1/7")
+    if expected is None or kind == "parkingSpace":
+        assert mesh is None
+        return
+    last_stripe = 8.5 if kind == "crosswalk" and expected == "paint" else 9
+    bottom, top = (0.5, 0.7) if expected == "box" else (0.503, 0.503)
+    np.testing.assert_allclose(mesh.bounds, [[8.5, 1, bottom], [11.5, last_stripe, top]])
+    area, _ = painted(mesh)
+    assert area == pytest.approx({
+        ("crosswalk", "paint"): 8 * 0.5 * 3, ("roadMark", "paint"): 8 * 3,
+    }.get((kind, expected), 2 * (3 * 8 + 3 * 0.2 + 8 * 0.2)))  # fmt: skip
+
+
 def test_classes_and_materials(tmp_path):
     lanes = lane(-1, width(4) + mark()) + lane(-2, width(2), "sidewalk")
     (tmp_path / "a.xodr").write_text(document(road(section(right=lanes))))
@@ -571,6 +596,8 @@ def test_what_is_left_out_is_counted_in_words(tmp_path):
 
 
 TINY_DASHES = mark('<type name="x"><line length="1e-9" space="1e-9"/></type>', "broken")
+LANES = section(right="".join(lane(-number, width(1)) for number in range(1, 101)))
+BENDS = "".join(f'<laneOffset s="{s / 10}" a="0" b="0" c="0.01" d="0"/>' for s in range(700))
 ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
 
 
@@ -591,6 +618,11 @@ ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
         (document(road(shape='<arc curvature="1e99"/>')), "would unpack to"),
         (document(road(shape='<paramPoly3 pRange="normalized"/>')), "has no length"),
         (document(road(section(right=lane(-1, width(4) + TINY_DASHES)))), "would unpack to"),
+        # Its samples are more than its triangles, which would fit.
+        (
+            document(road(LANES, shape='<arc curvature="0.01"/>', offset=BENDS)),
+            "would unpack to 2[67].* MiB",
+        ),
         (document(road(section(right=lane(-1, width(4)) * 2))), "two lanes of the same id"),
         (document(road(section(right=lane(-1)))), "no triangles"),
         (ENTITY + "<OpenDRIVE/>", "declares an XML entity"),
