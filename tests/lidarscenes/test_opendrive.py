@@ -254,6 +254,21 @@ def test_tolerance_of_curves(tmp_path):
         Scene.load(_obj(tmp_path), sag_m=0.01)
 
 
+@pytest.mark.parametrize(("radius", "sag"), [(0.5, 0.01), (2, 0.01), (5, 0.01), (10, 0.1)])
+def test_cylinders_have_no_more_segments_than_their_tolerance_needs(tmp_path, radius, sag):
+    text = document(road(more=thing("pole", f'radius="{radius}" height="3"', at='s="50" t="20"')))
+    mesh = load(tmp_path, text, sag_m=sag)["pole 1/7"]
+    count = int(np.ceil(np.pi / np.arccos(1 - sag / radius)))
+    ring, top = mesh.vertices.reshape(2, count, 3)
+    angle = 2 * np.pi * np.arange(count) / count
+    expected = [50 + radius * np.cos(angle), 20 + radius * np.sin(angle), np.full(count, 0.5)]
+    np.testing.assert_allclose(ring, np.transpose(expected), atol=1e-9)
+    np.testing.assert_allclose(top - ring, [[0, 0, 3]] * count, atol=1e-9)
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    volume = np.einsum("ij,ij->", a - ring.mean(axis=0), np.cross(b - a, c - a)) / 6
+    assert volume == pytest.approx(3 * count / 2 * radius**2 * np.sin(2 * np.pi / count))
+
+
 def _obj(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
