@@ -593,6 +593,61 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     assert counts == [opened.count, 2]
 
 
+def hdl64e(model, lasers=range(64)):
+    """Yield times and packets of an HDL-64E in the middle of a round room, with its calibration.
+
+    Each packet ends with a byte of the state: the date and the like, then a table of 1,820 bytes.
+    Laser n has an elevation of (n - 40) / 2 degrees, and its ranges are n mm short of 5 m + n mm.
+    """
+    crc16 = pytest.importorskip("velodyne_decoder.hdl64e").crc16
+    rows = [struct.pack("<B9hBB", n, 50 * (n - 40), 0, n, n, n, 0, 0, 0, 0, 0, 255) for n in lasers]
+    end = (
+        bytes([16, 11, 15, 12, 47, 47, 25]) + struct.pack("<hHHH", 600, 0, 36000, 2685) + bytes(11)
+    )
+    table = b"UNIT#\x18\x18" + b"".join(row.ljust(28, b"\0") for row in rows)[:-7] + end
+    check = crc16(b"".join(row[1:21] for row in rows)) if model == "S3" else 1820
+    table += struct.pack("<H", check)
+    kinds = "W" if model == "S3" else "1234567"
+    state = [*zip(b"HMSDNYGTV", bytes([0, 5, 54, 1, 1, 0, 0, 20, 227]), strict=True)]
+    state += [(ord(kinds[k % len(kinds)]), value) for k, value in enumerate(table)]
+    for number, (kind, value) in enumerate(state):
+        data = b""
+        for firing in range(6):
+            azimuth = round((number * 6 + firing) * 17.28) % 36000
+            for flag in (0xEEFF, 0xDDFF):
+                data += struct.pack("<HH", flag, azimuth) + struct.pack("<HB", 2500, 50) * 32
+        micros = round(number * 288)
+        yield 1000 * micros, data + struct.pack("<IBB", micros, kind, value)
+
+
+@pytest.mark.extended(keep=("S3",))
+@pytest.mark.parametrize("model", ["S2", "S3"])
+def test_an_hdl64e_is_read_by_the_calibration_in_its_packets(model, tmp_path):
+    decoder = pytest.importorskip("velodyne_decoder")
+    path = tmp_path / "room.pcap"
+
+    def read(*lasers):
+        frames = [
+            (time_ns, MACS + IPV4 + ip_packet(data)) for time_ns, data in hdl64e(model, *lasers)
+        ]
+        path.write_bytes(pcap(frames))
+        return open_recording(path).read(1)
+
+    points, columns = read()[:2]
+    distances = np.linalg.norm(points, axis=1)
+    elevations = np.degrees(np.arcsin(points[:, 2] / distances))
+    rings = columns["ring"].astype(int)
+    assert np.array_equal(np.unique(rings), np.arange(64))
+    np.testing.assert_allclose(distances, 5 + 0.001 * rings, atol=1e-5)
+    np.testing.assert_allclose(elevations, (rings - 40) / 2, atol=1e-4)
+    config = decoder.Config(timestamp_first_packet=True)
+    _, rows = [*decoder.read_pcap(str(path), config)][1]  # which finds the model by itself
+    for row, name in enumerate(["x", "y", "z", "intensity", "time"]):
+        assert np.array_equal(columns[name], rows[:, row])
+    with pytest.raises(LidarError, match="the calibration in its packets is incomplete"):
+        read([0] * 64)
+
+
 ROOM_CAPTURES = variants(round_room())
 
 

@@ -82,6 +82,8 @@ STRETCHED = {  # {case: (system of the coordinates, records, what the message sa
     "Web Mercator": ("EPSG:3857", wkt("EPSG:3857"), r"EPSG:3857 \(WGS 84 / Pseudo-Mercator\)"),
     "WKT 2": ("EPSG:3857", wkt("EPSG:3857", "WKT2_2019"), "EPSG:3857"),
     "of Esri": ("EPSG:3857", wkt("ESRI:102100", "WKT1_ESRI"), "Mercator"),
+    "Esri's code": ("EPSG:3395", keys((1024, 1), (3072, 54004)), "World_Mercator"),
+    "code, and no type of system": ("EPSG:3857", keys((1024, 0), (3072, 3857)), "EPSG:3857"),
     "by its code": ("EPSG:3857", keys((1024, 1), (3072, 3857)), "EPSG:3857"),
     "code and unit": ("EPSG:3857", keys((1024, 1), (3072, 3857), (3076, 9001)), "EPSG:3857"),
     "World Mercator": ("EPSG:3395", wkt("EPSG:3395"), "EPSG:3395"),

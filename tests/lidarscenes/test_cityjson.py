@@ -248,6 +248,27 @@ def test_systems_without_true_metres_are_refused(tmp_path, reference, words):
 
 
 @pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
+@pytest.mark.parametrize(
+    ("code", "x", "y", "words"),
+    [
+        (32632, 500_000, 5_300_000, None),
+        (32632, 2_000_000, 5_300_000, r"whose metre is 0\.973 m long.*crs_reproject 32635 "),
+        (2056, 2_600_000, 1_200_000, None),
+    ],
+)
+def test_the_scale_counts_in_the_middle_of_a_city(tmp_path, code, x, y, words):
+    document = placed(x, y, URN + str(code), (1, 1, 1))
+    if words is not None:
+        with pytest.raises(LidarError, match=words):
+            load(tmp_path, document)
+        return
+    notes = []
+    (cube,) = load(tmp_path, document, notes)
+    np.testing.assert_allclose(cube.bounds[0, :2], [x, y])
+    assert any(f"is in EPSG:{code}: <world.epsg={code}>" in note for note in notes)
+
+
+@pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
 def test_feet_of_a_system_are_converted(tmp_path):
     notes = []
     (cube,) = load(tmp_path, placed(984_250, 200_000, URN + "2263", (1, 1, 1)), notes)

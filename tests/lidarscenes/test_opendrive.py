@@ -254,6 +254,21 @@ def test_tolerance_of_curves(tmp_path):
         Scene.load(_obj(tmp_path), sag_m=0.01)
 
 
+@pytest.mark.parametrize(("radius", "sag"), [(0.5, 0.01), (2, 0.01), (5, 0.01), (10, 0.1)])
+def test_cylinders_have_no_more_segments_than_their_tolerance_needs(tmp_path, radius, sag):
+    text = document(road(more=thing("pole", f'radius="{radius}" height="3"', at='s="50" t="20"')))
+    mesh = load(tmp_path, text, sag_m=sag)["pole 1/7"]
+    count = int(np.ceil(np.pi / np.arccos(1 - sag / radius)))
+    ring, top = mesh.vertices.reshape(2, count, 3)
+    angle = 2 * np.pi * np.arange(count) / count
+    expected = [50 + radius * np.cos(angle), 20 + radius * np.sin(angle), np.full(count, 0.5)]
+    np.testing.assert_allclose(ring, np.transpose(expected), atol=1e-9)
+    np.testing.assert_allclose(top - ring, [[0, 0, 3]] * count, atol=1e-9)
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    volume = np.einsum("ij,ij->", a - ring.mean(axis=0), np.cross(b - a, c - a)) / 6
+    assert volume == pytest.approx(3 * count / 2 * radius**2 * np.sin(2 * np.pi / count))
+
+
 def _obj(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
@@ -503,6 +518,31 @@ def test_crosswalks_have_stripes(tmp_path):
     assert crossing["crosswalk 1/7"].materials.names == ("paint yellow",)
 
 
+@pytest.mark.parametrize("kind", ["crosswalk", "roadMark", "parkingSpace"])
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ("", None),
+        ('length="3" width="8"', "paint"),
+        ('length="3" width="8" height="0"', "paint"),
+        ('length="3" width="0" height="0"', None),
+        ('length="3" width="8" height="0.2"', "box"),
+    ],
+)
+def test_paint_without_an_outline_is_its_area_or_a_box(tmp_path, kind, size, expected):
+    mesh = load(tmp_path, document(road(more=thing(kind, size)))).get(f"{kind} 1/7")
+    if expected is None or kind == "parkingSpace":
+        assert mesh is None
+        return
+    last_stripe = 8.5 if kind == "crosswalk" and expected == "paint" else 9
+    bottom, top = (0.5, 0.7) if expected == "box" else (0.503, 0.503)
+    np.testing.assert_allclose(mesh.bounds, [[8.5, 1, bottom], [11.5, last_stripe, top]])
+    area, _ = painted(mesh)
+    assert area == pytest.approx({
+        ("crosswalk", "paint"): 8 * 0.5 * 3, ("roadMark", "paint"): 8 * 3,
+    }.get((kind, expected), 2 * (3 * 8 + 3 * 0.2 + 8 * 0.2)))  # fmt: skip
+
+
 def test_classes_and_materials(tmp_path):
     lanes = lane(-1, width(4) + mark()) + lane(-2, width(2), "sidewalk")
     (tmp_path / "a.xodr").write_text(document(road(section(right=lanes))))
@@ -571,6 +611,8 @@ def test_what_is_left_out_is_counted_in_words(tmp_path):
 
 
 TINY_DASHES = mark('<type name="x"><line length="1e-9" space="1e-9"/></type>', "broken")
+LANES = section(right="".join(lane(-number, width(1)) for number in range(1, 101)))
+BENDS = "".join(f'<laneOffset s="{s / 10}" a="0" b="0" c="0.01" d="0"/>' for s in range(700))
 ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
 
 
@@ -591,6 +633,11 @@ ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
         (document(road(shape='<arc curvature="1e99"/>')), "would unpack to"),
         (document(road(shape='<paramPoly3 pRange="normalized"/>')), "has no length"),
         (document(road(section(right=lane(-1, width(4) + TINY_DASHES)))), "would unpack to"),
+        # Its samples are more than its triangles, which would fit.
+        (
+            document(road(LANES, shape='<arc curvature="0.01"/>', offset=BENDS)),
+            "would unpack to 2[67].* MiB",
+        ),
         (document(road(section(right=lane(-1, width(4)) * 2))), "two lanes of the same id"),
         (document(road(section(right=lane(-1)))), "no triangles"),
         (ENTITY + "<OpenDRIVE/>", "declares an XML entity"),

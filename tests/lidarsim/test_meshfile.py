@@ -135,6 +135,9 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
         write(path, content[:80] + struct.pack("<I", number) + content[84:])
         with pytest.raises(LidarError, match=f"announces {number} triangles and has 12"):
             load_meshes(path)
+    write(path, bytes(84))
+    with pytest.raises(LidarError, match="holds no triangles"):
+        load_meshes(path)
 
 
 @pytest.mark.parametrize(
@@ -224,6 +227,9 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.obj", "", r"is empty \(0 bytes\)"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4 is 'f 1 2 9', .*missing"),
         ("m.obj", "o a\nv 0 0 \\\n0\nv 1 0 x\n", "line 4 is 'v 1 0 x', and three numbers"),
+        ("m.obj", "v 0 0 0\nf 1 1 1\nf -1 1 -1\nv 1 0 x\n", "line 4 is 'v 1 0 x', and three"),
+        ("m.obj", "v 0 0 0\nf 1 1 1\nf 0 1 1\nv 1 0 0\n", "line 3 is 'f 0 1 1', .*missing"),
+        ("m.obj", "v 0 0 0\nf 1 1 -2\nv 1 0 0\n", "line 2 is 'f 1 1 -2', .*missing"),
         ("m.obj", "v 0 0 0\nf 1 1 a/1\n", "line 2 is 'f 1 1 a/1', and numbers of vertices"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\nv 5 5 5\n", "f -1 -2 -4.*missing"),

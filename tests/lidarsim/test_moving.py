@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tests.shapes import level, made, quad
 
 from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scene, Survey, Track, load_sensor
@@ -15,6 +16,7 @@ from lidarsim.base.vectors import into_axes
 from lidarsim.scene.actors import Actor, box
 from lidarsim.sensor.optics import Returns
 from lidarsim.simulator.rig import Rig
+from lidarsim.sweeps.sweep_motion import poses_at
 from raybeam import moving_loops
 
 WALL_M = 8.0
@@ -40,6 +42,35 @@ def wall():
     y = WALL_M
     corners = (-500, y, -50), (500, y, -50), (500, y, 90), (-500, y, 90)
     return Scene.from_meshes([quad("Wall", *corners)])
+
+
+def test_poses_between_knots_are_on_straight_lines():
+    angles = np.array([0, 0.4, 1.0])
+    axis = np.array([2, -1, 2]) / 3
+    quaternions = [[*np.sin(angle / 2) * axis, np.cos(angle / 2)] for angle in angles]
+    path = np.array([[0, 0, 0], [1, 2, 0.5], [2, 2.5, -1]])
+    knots = np.concatenate([path, quaternions], axis=1).astype(np.float32)
+    mount = Rotation.from_euler("zyx", [30, -20, 10], degrees=True)
+    start = np.array([10.0, -5.0, 2.0])
+    shares = np.array([-0.1, 0, 0.2, 0.5, 0.7, 1, 1.3])
+    poses = poses_at(knots, start, mount.as_matrix(), shares)
+    points = np.random.default_rng(1).normal(size=(len(shares), 3)) * 9
+    for number, share in enumerate(shares.clip(0, 1)):
+        first = 0 if share < 0.5 else 1
+        part = 2 * share - first
+        mean = knots[first] + part * (knots[first + 1].astype(float) - knots[first])
+        turn = Rotation.from_quat(mean[3:])  # normalized
+        position = start + mean[:3]
+        np.testing.assert_allclose(poses.positions[number], position)
+        np.testing.assert_allclose(poses.quaternions[:, number], turn.as_quat())
+        np.testing.assert_allclose(poses.steps[:, number], path[first + 1] - path[first])
+        in_world = (mount * turn).apply(points[number]) + position
+        np.testing.assert_allclose(poses.outward(points)[number], in_world)
+        in_sensor = (mount * turn).inv().apply(points[number] - position)
+        np.testing.assert_allclose(poses.inward(points)[number], in_sensor)
+    still = poses_at(knots[:1], start, mount.as_matrix(), shares)
+    np.testing.assert_allclose(still.outward(points), mount.apply(points) + start)
+    np.testing.assert_allclose(still.inward(points), mount.inv().apply(points - start))
 
 
 @pytest.mark.extended(every=3)

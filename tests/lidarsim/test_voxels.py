@@ -374,9 +374,12 @@ def test_what_voxels_cannot_do_is_refused(tmp_path):
         (np.zeros((1, 1, 1)), np.eye(3, 4)),
         (np.full((1, 1, 1), np.nan, np.float32), np.eye(3, 4)),
         (np.ones((1, 1, 1), np.float32), np.zeros((3, 4))),
+        *[(np.zeros(np.roll((10_001, 1, 1), axis), np.float32), np.eye(3, 4)) for axis in range(3)],
     ]:
         with pytest.raises(LidarError, match=r"voxels of 'T' are .*; they must be float32"):
             SceneMesh("T", mesh.vertices, mesh.faces, voxels=Voxels(density, matrix))
+    most = Voxels(np.zeros((1, 10_000, 1), np.float32), np.eye(3, 4))
+    assert SceneMesh("T", mesh.vertices, mesh.faces, voxels=most).voxels is most
 
 
 def test_a_scenario_names_them_as_files_and_copies(tmp_path):

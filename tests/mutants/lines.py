@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
@@ -87,14 +88,15 @@ class Lines:
     def tests_of(self, root: Path, fault: Fault) -> list[str]:
         """Return the tests that may notice a fault; first those that are quick and execute little.
 
-        These are the tests that execute its line; for a compiled loop, or a line that is only
-        executed by the processes of clusters, those that execute a function that names something
-        of the fault's module, directly or through other compiled loops.
+        These are the tests that execute its line. For a compiled loop, or a line that only other
+        processes execute, these are the tests that execute a function that names something of the
+        fault's module, directly or through other compiled loops, or that runs it as a script.
         """
         numbers = self._executing(root, fault)
         if not numbers:
             numbers = self._using(root, fault.path)
         tests = [self.tests[number] for number in numbers]
+        tests = [test for test in tests if _is_there(root, test)]
         return sorted(tests, key=lambda test: self.cost(test) * self.counts[test])
 
     def cost(self, test: str) -> float:
@@ -105,17 +107,23 @@ class Lines:
         if self.checksums.get(fault.path) == _checksum((root / fault.path).read_text()):
             return self.lines[fault.path].get(fault.line, set())
         span = self.spans.get(fault.path, {}).get(fault.function)
-        return self._in_span(fault.path, span) if span else set()
+        if span is None:  # a function that is new since the lines were recorded
+            return set[int]().union(*self.lines.get(fault.path, {}).values())
+        return self._in_span(fault.path, span)
 
     def _using(self, root: Path, module: str) -> set[int]:
         """Return the tests that execute functions which name something of a module."""
         numbers: set[int] = set()
         for path, module_names in _importers(root, module).items():
             lines = (root / path).read_text().splitlines()
-            for first, last in self.spans.get(path, {}).values():
-                words = set(re.findall(r"\w+", "\n".join(lines[first - 1 : last])))
-                if words & module_names:
-                    numbers |= self._in_span(path, (first, last))
+            spans = [*self.spans.get(path, {}).values()]
+            using = [
+                (first, last)
+                for first, last in spans
+                if module_names & {*re.findall(r"\w+", "\n".join(lines[first - 1 : last]))}
+            ]
+            for span in using or spans:  # a constant may have the name
+                numbers |= self._in_span(path, span)
         return numbers
 
     def _in_span(self, path: str, span: tuple[int, int]) -> set[int]:
@@ -140,6 +148,17 @@ class Lines:
         content = {**vars(self), "lines": lines}
         del content["counts"]
         path.write_text(json.dumps(content))
+
+
+@cache
+def _content(path: Path) -> str:
+    return path.read_text() if path.is_file() else ""
+
+
+def _is_there(root: Path, test: str) -> bool:
+    """Return whether a test has neither been removed nor renamed since it was recorded."""
+    path, _, name = test.partition("::")
+    return f"def {name.rpartition('::')[2]}(" in _content(root / path)
 
 
 def _importers(root: Path, path: str) -> dict[str, set[str]]:
@@ -192,6 +211,9 @@ def _imports(root: Path) -> dict[str, set[str]]:
 def _imported(root: Path, path: Path, files: dict[str, Path]) -> set[str]:
     candidates: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Constant) and str(node.value).endswith(".py"):
+            # A script beside the module, which runs in a process of its own.
+            candidates.add(path.relative_to(root).with_name(Path(str(node.value)).name).as_posix())
         if not isinstance(node, ast.ImportFrom):
             continue
         words = (node.module or "").split(".") if node.module else []

@@ -137,7 +137,7 @@ class VelodyneEncoder(PacketEncoder):
         fits = (units > 0) & (units <= _MAX_UNITS)  # not NaN, without a return
         distances = np.where(fits, units, 0).astype("<u2")
         reflectivities = shots.columns["reflectivity"] * fits
-        shape = len(blocks), -1, 1, _BLOCK_LASERS
+        shape = len(blocks), -1, _BLOCK_LASERS
         for name, values in (("distance", distances), ("reflectivity", reflectivities)):
             planes = last_and_strongest(values, fits) if self._planes == 2 else [values[0]]
             interleaved = np.concatenate([plane.reshape(shape) for plane in planes], axis=2)
