@@ -54,7 +54,8 @@ def points_of(scene: Scene, number: int) -> Cloud:
         "object": rng.integers(0, len(scene.names) + 2, count),
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
         "class": rng.integers(0, 30, count),
-        "time": scan * 1000,
+        # Anywhere in its scan, and in a turn, of which each sensor has `TURNS` from 0 s on.
+        "time": np.rint((scan % (TURNS * SCANS) + rng.uniform(0, 1, count)) * 1e8 / SCANS),
         **dict.fromkeys(("range", "azimuth", "elevation"), np.ones(count)),
         **dict.fromkeys(("return_number", "returns"), np.ones(count, np.uint8)),
     }
