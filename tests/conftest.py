@@ -196,7 +196,8 @@ def torch(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
     played.utils.data.IterableDataset = object
     played.utils.data.get_worker_info = lambda: None
     played.distributed = types.ModuleType("torch.distributed")
-    played.distributed.is_available = played.distributed.is_initialized = lambda: False
+    played.distributed.is_available = lambda: True
+    played.distributed.is_initialized = lambda: False
     for module in (played, played.utils, played.utils.data, played.distributed):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.delitem(sys.modules, "lidarpool.datasets.torch_sweeps", raising=False)

@@ -29,14 +29,18 @@ def the_scene() -> Scene:
     return replace(far, actors=cars)
 
 
-def the_sweeps(scene: Scene) -> Sweeps:
+def the_survey() -> Survey:
     """Three turns of each sensor, on a carrier that moves and turns."""
     half = np.sqrt(0.5)
     track = Track([0, 1], [[0, 0, 1], [10, 5, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
     lidar = Sensor.grid(360, 4)
     sensors = [Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front"), Mounted(lidar, name="rear/left")]
-    survey = Survey(sensors=sensors, trajectory=track, steps=TURNS * SCANS, columns=["ray"])
-    return Sweeps.from_survey(survey, scene)
+    return Survey(sensors=sensors, trajectory=track, steps=TURNS * SCANS, columns=["ray"])
+
+
+def the_sweeps(scene: Scene) -> Sweeps:
+    """Return the sweeps of `the_survey`."""
+    return Sweeps.from_survey(the_survey(), scene)
 
 
 def points_of(scene: Scene, number: int) -> Cloud:
@@ -54,7 +58,8 @@ def points_of(scene: Scene, number: int) -> Cloud:
         "object": rng.integers(0, len(scene.names) + 2, count),
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
         "class": rng.integers(0, 30, count),
-        "time": scan * 1000,
+        # Up to the last firing of the scan; each sensor has `TURNS` turns from 0 s on.
+        "time": np.rint((scan % (TURNS * SCANS) + rng.uniform(0, 0.9, count)) * 1e8 / SCANS),
         **dict.fromkeys(("range", "azimuth", "elevation"), np.ones(count)),
         **dict.fromkeys(("return_number", "returns"), np.ones(count, np.uint8)),
     }

@@ -191,7 +191,14 @@ def test_kitti_has_boxes_at_the_times_of_sweeps(cloud, tmp_path, sequence, count
     for number, (pose, time_s) in enumerate(zip(poses, times_s, strict=True)):
         for line in (folder / f"label_2/{number:06}.txt").read_text().splitlines():
             name, *words = line.split()
-            height, width, length, *bottom, _ = map(float, words[7:])
+            height, width, length, *bottom, around = map(float, words[7:])
+            # The actor turned about the camera's y, as seen from the camera; and no picture.
+            alpha = around - np.arctan2(bottom[0], bottom[2])
+            assert abs(float(words[2])) < np.pi + 1e-4
+            assert np.exp(1j * float(words[2])) == pytest.approx(np.exp(1j * alpha), abs=3e-4)
+            assert [float(word) for word in (*words[:2], *words[3:7])] == [0, 3, 0, 0, 0, 0]
+            heading = camera @ pose[:3, :3].T @ np.append(VELOCITIES[LABELS.index(name), :2], 0)
+            assert around == pytest.approx(np.arctan2(-heading[2], heading[0]), abs=1e-3)
             inside = camera.T @ (bottom - np.array([0, height / 2, 0]))
             labels.add(name, time_s, pose[:3, :3] @ inside + pose[:3, 3], (length, width, height))
     labels.check(2e-4, 1e-4, counts)

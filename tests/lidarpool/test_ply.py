@@ -7,12 +7,14 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
+from tests.drives import the_scene, the_sweeps
 
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.clouds import ply
@@ -21,6 +23,7 @@ from lidarpool.clouds.writing import save_cloud
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import Column
+from lidarsim.sweeps.sweeps import Sweeps
 
 
 def sample(count, *, offset=0.0, seed=1):
@@ -69,6 +72,89 @@ def test_georeferenced_points_are_kept_in_double_precision(tmp_path):
     given = sample(50, offset=[512_345.0, 5_403_210.0, 400.0])
     save_cloud(given, tmp_path / "c.ply")
     np.testing.assert_array_equal(read_cloud(tmp_path / "c.ply").positions, given.positions)
+
+
+@pytest.mark.parametrize(
+    ("farthest_m", "precision_m", "position_type"),
+    [
+        # Below 16,384 m, single precision is off by up to 2^-11 m, the twentieth of 9.766 mm.
+        (16_383.9, 0.00977, "f4"),
+        (16_383.9, 0.00976, "f8"),
+        (16_384.0, 0.00977, "f8"),
+        (16_384.0, 0.01954, "f4"),
+        (0.0, 1e-12, "f4"),
+    ],
+)
+@pytest.mark.parametrize("side", [-1, 1])
+def test_positions_are_double_where_single_precision_errs_by_a_twentieth(
+    tmp_path, farthest_m, precision_m, position_type, side
+):
+    points = np.array([[0, 0, 0], [0, side * farthest_m, -1], [0.5, 0, 0]])
+    save_cloud(Cloud(points * (farthest_m > 0), {}), tmp_path / "c.ply", precision_m=precision_m)
+    head = (tmp_path / "c.ply").read_bytes().partition(b"end_header")[0]
+    kind = {"f4": b"float", "f8": b"double"}[position_type]
+    assert [line.split()[1] for line in head.splitlines() if line.startswith(b"property")] == (
+        3 * [kind]
+    )
+
+
+@pytest.mark.parametrize(
+    ("coordinates", "columns", "comments"),
+    [
+        (
+            "world",
+            ["scan"],
+            ["crs: EPSG:25832", "class 3 road", "class 12 Stra\\xdfe"],
+        ),
+        (
+            "sensor",
+            ["scan", "material"],
+            [
+                "points in the sensor's axes at the firing of each: motion is not compensated",
+                "class 3 road",
+                "class 12 Stra\\xdfe",
+                "material 0 brick",
+                "material 1 Gl\\xe4s",
+            ],
+        ),
+    ],
+)
+def test_comments_state_frame_system_and_names(tmp_path, coordinates, columns, comments):
+    sweeps = replace(
+        the_sweeps(the_scene()),
+        coordinates=coordinates,
+        epsg=25832,
+        classes={3: "road", 12: "Stra\\xdfe"},
+        materials=("brick", "Gläs"),
+    )
+    cloud = Cloud(np.eye(3), {name: np.zeros(3, np.int32) for name in columns})
+    save_cloud(replace(cloud, sweeps=lambda: sweeps), tmp_path / "c.ply")
+    lines = (tmp_path / "c.ply").read_bytes().partition(b"end_header")[0].decode().splitlines()
+    found = [line.removeprefix("comment ") for line in lines if line.startswith("comment")]
+    assert found == ["Created by Open3D", *comments]
+    cloud = read_cloud(tmp_path / "c.ply")
+    assert {*cloud.columns} == {*columns} and len(cloud) == 3
+
+
+@pytest.mark.parametrize("block_bytes", [7, 100, 1 << 23])
+@pytest.mark.parametrize("expected", [3, 20, 5_000])
+def test_rows_move_if_the_header_gets_another_length(tmp_path, monkeypatch, expected, block_bytes):
+    """In blocks, whichever way they go."""
+    monkeypatch.setattr(ply, "FIRST_POINTS", 5)
+    monkeypatch.setattr(ply, "_BLOCK_BYTES", block_bytes)
+    cloud = sample(40)
+    columns = {**dict(zip("xyz", cloud.positions.T, strict=True)), **cloud.columns}
+    kind = np.dtype(np.float32)
+    with ply.GrowingPly(
+        tmp_path / "grown.ply", cloud.table, kind, Sweeps.unknown(), expected
+    ) as file:
+        for rows in (slice(0, 5), slice(5, 5), slice(5, 23), slice(23, 40)):
+            count = rows.stop - rows.start
+            file.append(count, [(name, values[rows]) for name, values in columns.items()])
+        assert file.count == 40 and file.size == (tmp_path / "grown.ply").stat().st_size
+        file.finish()
+    save_cloud(cloud, tmp_path / "whole.ply")
+    assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
 
 
 def test_open3d_reads_it_and_an_empty_one_has_the_same_properties(tmp_path):

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Writer
+from rosbags.rosbag2 import Reader, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+from tests.drives import points_of, the_scene, the_survey
 from tests.shapes import room
 
 from lidarpool import (
@@ -30,11 +32,11 @@ from lidarpool import (
 from lidarpool.cli.result_commands import export
 from lidarpool.clouds.format_table import FORMATS
 from lidarpool.clouds.ros import layouts
-from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION
+from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
 from lidarpool.clouds.writing import Format
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
-from lidarsim.columns.table import SCAN
+from lidarsim.columns.table import COLOURS, SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
@@ -43,14 +45,32 @@ COLUMNS = ("ray", "range", "time", "intensity", "reflectivity", "signal", "retur
            "returns")  # fmt: skip
 START_NS = 1_700_000_000_123_456_000  # on 14 November 2023
 SCENE = room()
-# Fields and step of a point in the sources of the drivers (master of each, November 2026):
-# PointField.datatype 2 uint8, 4 uint16, 7 float32, 8 float64.
-XYZI = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("intensity", 12, 7)]
+# Fields and step of a point in the sources of the drivers (master of each, November 2026), and the
+# step of a point without time: PointField.datatype 2 uint8, 4 uint16, 6 uint32, 7 float32,
+# 8 float64.
+XYZ = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7)]
+XYZI = [*XYZ, ("intensity", 12, 7)]
 DRIVERS = {
-    "livox": ([*XYZI, ("tag", 16, 2), ("line", 17, 2), ("timestamp", 18, 8)], 26),
-    "hesai": ([*XYZI, ("ring", 16, 4), ("timestamp", 18, 8)], 26),
-    "robosense": ([*XYZI, ("ring", 16, 4), ("timestamp", 18, 8)], 26),
-}
+    "velodyne": ([*XYZI, ("ring", 16, 4), ("time", 18, 7)], 22, 18),
+    "images": ([*XYZI, ("ring", 16, 4), ("time", 18, 7)], 22, 18),
+    "autoware": (
+        [*XYZ, ("intensity", 12, 2), ("return_type", 13, 2), ("channel", 14, 4),
+         ("azimuth", 16, 7), ("elevation", 20, 7), ("distance", 24, 7), ("time_stamp", 28, 6)],
+        32, 16,
+    ),
+    "ouster": (
+        [*XYZ, ("intensity", 16, 7), ("t", 20, 6), ("reflectivity", 24, 4), ("ring", 26, 4),
+         ("ambient", 28, 4), ("range", 32, 6)],
+        48, 48,
+    ),
+    "livox": ([*XYZI, ("tag", 16, 2), ("line", 17, 2), ("timestamp", 18, 8)], 26, 18),
+    "hesai": ([*XYZI, ("ring", 16, 4), ("timestamp", 18, 8)], 26, 18),
+    "robosense": ([*XYZI, ("ring", 16, 4), ("timestamp", 18, 8)], 26, 18),
+}  # fmt: skip
+TIMES = {"time": 1e9, "time_stamp": 1, "t": 1, "timestamp": 1e9}  # nanoseconds in a unit
+# Further fields: (name, datatype, column), each of 4 bytes.
+FURTHER = [("rgb", 7, ""), ("radial_velocity", 7, "radial_velocity"), ("label", 6, "class"),
+           ("incidence_deg", 7, "incidence_deg"), ("material", 5, "material")]  # fmt: skip
 
 
 @cache
@@ -71,19 +91,27 @@ def cast(model: str, mode: str = "strongest") -> Cloud:
     return Cloud(cloud.positions, cloud.columns, sweeps=lambda: sweeps)
 
 
+@cache
+def types_of_messages() -> Typestore:
+    """Return the types of messages, which `AnyReader` would parse again for each bag."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(CUSTOM_DEFINITION, CUSTOM_MSG))
+    return store
+
+
 def messages(path: Path, suffix: str) -> list[Any]:
     """Return the messages of the topics that end with `suffix`, by rosbags."""
-    with AnyReader([path]) as bag:
+    with Reader(path) as bag:
+        topics = [topic for topic in bag.connections if topic.topic.endswith(suffix)]
         return [
-            bag.deserialize(data, connection.msgtype)
-            for connection, _, data in bag.messages()
-            if connection.topic.endswith(suffix)
+            types_of_messages().deserialize_cdr(data, topic.msgtype)
+            for topic, _, data in (bag.messages(topics) if topics else ())  # else those of all
         ]
 
 
 def rows_of(message: Any) -> np.ndarray:
     """Return the points of a PointCloud2, (height, width)."""
-    kinds = {2: "u1", 4: "u2", 6: "u4", 7: "f4", 8: "f8"}
+    kinds = {2: "u1", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
     row = np.dtype({
         "names": [field.name for field in message.fields],
         "formats": [kinds[field.datatype] for field in message.fields],
@@ -97,29 +125,126 @@ def sweep_of(cloud: Cloud, sweep: int) -> Cloud:
     return list(cloud.sweeps().points(cloud))[sweep]
 
 
-@pytest.mark.parametrize(
-    ("layout", "model"),
-    [("livox", "livox/mid360"), ("hesai", "hesai/xt32"), ("robosense", "robosense/rs-lidar-16")],
-)
-def test_fields_are_those_of_the_driver(layout, model, tmp_path):
-    cloud = cast(model)
-    save_cloud(cloud, tmp_path / "c.mcap", layout=layout)
-    message = messages(tmp_path / "c.mcap", "/points")[1]
-    fields, step = DRIVERS[layout]
-    assert [(field.name, field.offset, field.datatype) for field in message.fields] == fields
-    assert (message.point_step, message.height, message.is_dense) == (step, 1, True)
-    (rows,) = rows_of(message)
-    points = sweep_of(cloud, 1)
-    np.testing.assert_array_equal(rows["intensity"], points.reflectivity)
-    channel = {"livox": "line"}.get(layout, "ring")
-    highest = load_sensor(model).channels - 1
-    rings = highest - points.channel if layout == "hesai" else points.channel
-    np.testing.assert_array_equal(rows[channel], rings)
-    unit = 1 if layout == "livox" else 1e9
-    exact = START_NS + points.time.astype(np.int64)
-    np.testing.assert_allclose(rows["timestamp"] * unit - START_NS, exact - START_NS, atol=300)
-    stamp = message.header.stamp
-    assert stamp.sec * 10**9 + stamp.nanosec == START_NS + round(cloud.sweeps().begins_ns[1])
+@cache
+def driven() -> tuple[Survey, Cloud]:
+    """Return a survey of two sensors on a vehicle that moves and turns, and random points of it."""
+    scene = the_scene()
+    start = datetime(2023, 11, 14, 22, 13, 20, 123_456, UTC)
+    survey = replace(the_survey(), start=start, classes={3: "road"})
+    sweeps = Sweeps.from_survey(survey, scene)
+    points = points_of(scene, 0)
+    rng = np.random.default_rng(2)
+    count = len(points)
+    columns = {
+        **points.columns,
+        "intensity": rng.uniform(0, 1.3, count).astype(np.float32),
+        "range": rng.uniform(1, 100, count).astype(np.float32),
+        "radial_velocity": rng.normal(0, 9, count).astype(np.float32),
+        "incidence_deg": rng.uniform(0, 90, count).astype(np.float32),
+        "material": rng.integers(-1, 9, count).astype(np.int32),
+        **{name: rng.integers(0, 256, count).astype(np.uint8) for name in COLOURS},
+    }
+    return survey, Cloud(points.positions, columns, sweeps=lambda: sweeps)
+
+
+def in_the_sensor(survey: Survey, points: Cloud, sensor: int, times_ns: np.ndarray) -> np.ndarray:
+    """Return points (n, 3) in the frame of a sensor at times (n,)."""
+    places, turns = survey.path.poses(0, times_ns.astype(float))
+    mount = survey.carried[sensor].mount
+    on_vehicle = np.einsum("nji,nj->ni", turns, points.positions - the_scene().origin - places)
+    return (on_vehicle - mount.position) @ (np.eye(3) if mount.rotation is None else mount.rotation)
+
+
+@pytest.mark.parametrize("compensated", [False, True])
+@pytest.mark.parametrize("layout", DRIVERS)
+def test_each_field_of_a_point_is_that_of_the_driver(layout, compensated, tmp_path):
+    survey, cloud = driven()
+    sweeps = cloud.sweeps()
+    save_cloud(cloud, tmp_path / "c.mcap", layout=layout, compensated=compensated)
+    fields, step, compensated_step = DRIVERS[layout]
+    if compensated:
+        names = {"autoware": {"azimuth", "elevation", "distance"}}.get(layout, set()) | {*TIMES}
+        fields = [field for field in fields if field[0] not in names]
+        step = compensated_step
+    end = 36 if layout == "ouster" else step
+    fields = fields + [(name, end + 4 * k, kind) for k, (name, kind, _) in enumerate(FURTHER)]
+    found = messages(tmp_path / "c.mcap", "/points")
+    assert len(found) == len(sweeps) == 6
+    for sensor, name in enumerate(("front", "rear_left")):
+        own = [message for message in found if message.header.frame_id == name]
+        assert len(own) == 3
+        for sweep, message in enumerate(own, 3 * sensor):
+            assert [(f.name, f.offset, f.datatype) for f in message.fields] == fields
+            assert all(field.count == 1 for field in message.fields)
+            assert message.point_step == max(step, end + 20)
+            assert (message.height, message.is_dense, message.is_bigendian) == (1, True, False)
+            assert message.row_step == message.width * message.point_step
+            begin_ns = 100_000_000 * (sweep % 3)
+            stamp = message.header.stamp
+            assert stamp.sec * 10**9 + stamp.nanosec == START_NS + begin_ns
+            (rows,) = rows_of(message)
+            points = sweep_of(cloud, sweep)
+            times = np.full(len(points), begin_ns) if compensated else points.time
+            inside = in_the_sensor(survey, points, sensor, times)
+            check_row(rows, points, inside, layout)
+            for name_of_time, unit_ns in TIMES.items() if not compensated else ():
+                if name_of_time not in rows.dtype.names:
+                    continue
+                unit = 1 if layout == "livox" else unit_ns
+                first = START_NS if name_of_time == "timestamp" else -begin_ns
+                since = rows[name_of_time].astype(float) * unit - first
+                np.testing.assert_allclose(since, points.time, atol=300)
+
+
+def check_row(rows: np.ndarray, points: Cloud, inside: np.ndarray, layout: str) -> None:
+    """Compare the fields besides time with the columns and positions of points."""
+    placed = np.stack([rows[axis] for axis in "xyz"], axis=1).astype(float)
+    np.testing.assert_allclose(placed, inside, atol=3e-5)
+    reversed_rings = layout in ("hesai", "ouster")
+    ring = {"livox": "line", "autoware": "channel"}.get(layout, "ring")
+    channels = 3 - points.channel.astype(int) if reversed_rings else points.channel
+    np.testing.assert_array_equal(rows[ring], channels)
+    energy = {"autoware": np.rint(255 * np.minimum(points.intensity, 1)), "ouster": points.signal}
+    energy |= {"velodyne": points.intensity, "images": points.intensity}
+    intensity = energy.get(layout, points.reflectivity)
+    np.testing.assert_array_equal(rows["intensity"], intensity)
+    names = rows.dtype.names
+    if layout == "ouster":
+        np.testing.assert_array_equal(rows["reflectivity"], points.reflectivity)
+        np.testing.assert_array_equal(rows["range"], np.rint(1000 * points.range.astype(float)))
+        assert not rows["ambient"].any()
+    if layout == "livox":
+        assert not rows["tag"].any()
+    if layout == "autoware":
+        assert (rows["return_type"] == 3).all()  # STRONGEST
+    if "azimuth" in names and len(rows):
+        x, y, z = inside.T
+        clockwise = np.arctan2(-y, x)
+        turn = (rows["azimuth"] - clockwise + np.pi) % (2 * np.pi) - np.pi
+        assert np.abs(turn).max() < 1e-5, np.degrees(turn)[:5]
+        assert rows["azimuth"].min() >= 0 and rows["azimuth"].max() <= np.float32(2 * np.pi)
+        np.testing.assert_allclose(
+            rows["elevation"], np.arcsin(z / np.hypot(np.hypot(x, y), z)), atol=1e-5
+        )
+        np.testing.assert_allclose(rows["distance"], np.linalg.norm(inside, axis=1), atol=3e-5)
+    for name, _, column in FURTHER[1:]:
+        np.testing.assert_array_equal(rows[name], points[column])
+    packed = np.ascontiguousarray(rows["rgb"]).view("<u4")
+    red, green, blue = (points[name].astype(np.uint32) for name in COLOURS)
+    np.testing.assert_array_equal(packed, red << 16 | green << 8 | blue)
+
+
+@pytest.mark.parametrize(("layout", "field"), [("autoware", "time_stamp"), ("ouster", "t")])
+def test_times_that_do_not_fit_in_32_bits_are_clipped(layout, field, tmp_path):
+    """A sensor without rotation has sweeps of any length; noise may come before a sweep."""
+    _, cloud = driven()
+    times = cloud.time.copy()
+    times[:3] = [-5, 4_294_967_295, 5_000_000_000]
+    late = Cloud(cloud.positions, {**cloud.columns, "time": times}, sweeps=cloud.sweeps)
+    save_cloud(late, tmp_path / "c.mcap", layout=layout)
+    (rows,) = rows_of(messages(tmp_path / "c.mcap", "/points")[0])
+    assert rows[field][:3].tolist() == [0, 2**32 - 1, 2**32 - 1]
+    np.testing.assert_array_equal(rows[field][3:], sweep_of(cloud, 0).time[3:])
 
 
 @pytest.mark.extended

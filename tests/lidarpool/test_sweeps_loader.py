@@ -338,6 +338,10 @@ def test_torch_gets_tensors(written, torch):
     data = lidarpool.sweeps(written("kitti"), shuffle=3)
     items = list(data.torch())
     assert [item["job"] for item in items] == [sweep.job for sweep in data]
+    # In builds without distributed training the module has little more than `is_available`.
+    torch.distributed.is_available = lambda: False
+    del torch.distributed.is_initialized
+    assert [item["job"] for item in data.torch()] == [sweep.job for sweep in data]
     item = items[0]
     sweep = data[0]
     np.testing.assert_array_equal(item["points"], sweep.points)
@@ -345,6 +349,12 @@ def test_torch_gets_tensors(written, torch):
     assert item["class"].dtype == np.int64 and item["points"].dtype == np.float32
     assert item["boxes"].shape == (len(sweep.boxes), 7) and item["pose"].shape == (4, 4)
     assert item["points"].flags.writeable
+    np.testing.assert_array_equal(item["pose"], sweep.pose)
+    np.testing.assert_array_equal(item["boxes"], sweep.boxes.rows)
+    np.testing.assert_array_equal(item["box_objects"], sweep.boxes.objects)
+    assert item["box_types"] == [*sweep.boxes.types] and item["box_objects"].dtype == np.int64
+    assert (item["sensor"], item["number"]) == (sweep.sensor, sweep.number)
+    assert item["time_ns"] == sweep.time_ns
     assert list(data.torch(transform=identity)) == [identity(sweep) for sweep in data]
 
 

@@ -310,7 +310,7 @@ def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
     if bounds.dtype == np.float32:
         return bounds.dtype
     farthest = np.float32(np.abs(bounds).max(initial=0.0))
-    enough = np.isfinite(farthest) and np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m
+    enough = np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m
     return np.dtype(np.float32 if enough else np.float64)
 
 
