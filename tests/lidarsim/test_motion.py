@@ -9,6 +9,7 @@ from lidarpool import LidarError, Pose, Track
 from lidarsim.motion.rotations import check_rotations, matrices, quaternions_of, rotations_of
 from lidarsim.motion.trajectory import batch_of, presence_ns, velocities
 
+
 def product(p, q):
     """Products of quaternions x, y, z, w (n, 4)."""
     vector = p[:, 3:] * q[:, :3] + q[:, 3:] * p[:, :3] + np.cross(p[:, :3], q[:, :3])
