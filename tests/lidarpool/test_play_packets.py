@@ -271,7 +271,7 @@ steps: 36
         (VLP16, ["--api", "203.0.113.1"], "cannot listen at 203.0.113.1:80"),
         (VLP16, ["--as", "radar"], "'radar' is no bridge. Use packets"),
         (
-            "sensor: velodyne/hdl64e-s3\nposes: [[0, 0, 1]]\nsteps: 9\n",
+            "scene: seed\nsensor: velodyne/hdl64e-s3\nposes: [[0, 0, 1]]\nsteps: 9\n",
             [],
             "has no packets: use a mod",
         ),

@@ -541,7 +541,7 @@ def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     ],
 )
 def test_fog_that_returns_no_light_is_in_the_advice(scenario, weather, noise, noted):
-    built = build(scenario(f"weather: {{{weather}}}\nnoise: {{{noise}}}"))
+    built = build(scenario(f"scene: seed\nweather: {{{weather}}}\nnoise: {{{noise}}}"))
     notes = [note for note in advice(built) if "fog" in note]
     assert len(notes) == (noted is not None)
     assert all(noted in note for note in notes)
@@ -575,7 +575,7 @@ def test_returns_that_no_pulse_has_are_in_the_advice(scenario, tmp_path, text, n
         "rate_hz: 10\nrange_m: [0.5, 100]\nbeams: {elevation_deg: {first: 0, last: 9, count: 4}}\n"
         "performance: {mode: dual}\n"
     )
-    notes = [note for note in advice(build(scenario(text))) if "returns mode" in note]
+    notes = [note for note in advice(build(scenario(f"scene: seed\n{text}"))) if "returns mode" in note]
     assert len(notes) == (noted is not None)
     assert all(re.search(noted, note) for note in notes)
 

@@ -239,9 +239,9 @@ class PictureContent:
             arrays[f"sensor{number}_times"] = sensor.times_ns
             arrays[f"sensor{number}"] = sensor.positions
         for number, actor in enumerate(self.scene.actors):
-            track = actor.trajectory
-            if not isinstance(track, Track):
+            if not isinstance(actor.trajectory, Track) or actor.trajectory.smooth:
                 raise TypeError(f"the trajectory of actor {actor.name!r} is not sampled")
+            track = actor.trajectory.with_turns
             arrays |= {f"actor{number}_{n}": getattr(track, field) for n, field in _TRACK.items()}
             arrays[f"actor{number}_absent"] = track.beyond == "absent"
             if actor.mesh.animation is not None:
