@@ -575,7 +575,9 @@ def test_returns_that_no_pulse_has_are_in_the_advice(scenario, tmp_path, text, n
         "rate_hz: 10\nrange_m: [0.5, 100]\nbeams: {elevation_deg: {first: 0, last: 9, count: 4}}\n"
         "performance: {mode: dual}\n"
     )
-    notes = [note for note in advice(build(scenario(f"scene: seed\n{text}"))) if "returns mode" in note]
+    notes = [
+        note for note in advice(build(scenario(f"scene: seed\n{text}"))) if "returns mode" in note
+    ]
     assert len(notes) == (noted is not None)
     assert all(re.search(noted, note) for note in notes)
 

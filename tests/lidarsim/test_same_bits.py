@@ -40,7 +40,6 @@ EXCEPTIONS = {
     "lidarsim/scene/simplified.py": "for pictures and planning",
     "lidarsim/sensor/helios_scanner.py": "sensors are written once, for another program",
     "lidarsim/sweeps/": "files of sweeps are written by one process for all",
-    "lidarscenes/files/ifc_child.py": "ifcopenshell computes places itself; the rest is a note",
     "lidarscenes/files/usd_child.py": "OpenUSD computes places itself; the rest are checks",
 }
 

@@ -144,7 +144,7 @@ def test_a_worker_that_cannot_import_the_plugin_is_named(tmp_path, monkeypatch, 
     monkeypatch.syspath_prepend(folder)
     client.run(sys_path_with, str(folder))
     try:
-        (tmp_path / "scenario.yaml").write_text("output: {write: [alone]}")
+        (tmp_path / "scenario.yaml").write_text("scene: seed\noutput: {write: [alone]}")
         options = "--only", "cloud", "--quiet", "--scheduler", client.scheduler.address
         outcome = lidarpool("run", "scenario.yaml", *options)
     finally:

@@ -23,6 +23,7 @@ from pydantic import Field
 from lidarsim.base.allowance import UNPACKED_TIMES, Allowance, memory_share
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.declared import Several, Text, about
+from lidarsim.base.elementary import arctan2
 from lidarsim.base.extras import install_command
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import plural
@@ -365,7 +366,7 @@ class _MapConversion:
             str(stated["system"] or "")[:80],
             unit_m,
             (east, north, height),
-            math.degrees(math.atan2(ordinate, abscissa)),
+            math.degrees(float(arctan2(ordinate, abscissa))),
             (x, y, z),
             ignores_scale,
         )

@@ -323,7 +323,7 @@ class _Interface(NamedTuple):
             value = body[start + 4 : start + 4 + size]
             if code == _RESOLUTION:
                 exponent = value[0] & 0x7F
-                units_per_s = 2**exponent if value[0] & 0x80 else 10**exponent
+                units_per_s = 1 << exponent if value[0] & 0x80 else int("1" + "0" * exponent)
             elif code == _OFFSET:
                 (offset_s,) = unpack_from(f"{order}q", value)
             elif code == 0:

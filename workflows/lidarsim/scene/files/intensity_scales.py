@@ -12,6 +12,7 @@ from ...base.arrays import AnyArray
 LEICA_LOWEST = -2048  # Leica's scale ends at 2047
 _LEICA_HIGHEST = 2047
 _MIN_LEICA_SPAN = 256  # decibels, which are negative as well, span less
+_PLAIN_STEPS = {1.0, *(2.0**n for n in range(1, 32)), *(float(f"1e{n}") for n in range(1, 9))}
 _OTHER_SCALE = 16  # ratio of limits that measurements of the same scale do not reach
 
 
@@ -24,8 +25,7 @@ class Limits(NamedTuple):
     def is_plain(self) -> bool:
         """Return True for the limits of a scale, such as 0 to 1, 100, 255 or 4096."""
         steps = {self.high, self.high + 1}
-        powers = {1.0} | {base**n for base, last in ((2.0, 32), (10.0, 9)) for n in range(1, last)}
-        return self.low == 0 and not steps.isdisjoint(powers)
+        return self.low == 0 and not steps.isdisjoint(_PLAIN_STEPS)
 
     def apply(self, intensities: AnyArray) -> AnyArray:
         """Return intensities (n,) as shares of the limits, at least 0."""
