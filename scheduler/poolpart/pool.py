@@ -22,7 +22,8 @@ from .pipe_states import names_of_pipes
 from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
-from .workers import WorkerInfo, all_workers, ask_workers, on_scheduler
+from .steward import names_with_rule
+from .workers import WorkerInfo, all_workers, ask_workers, note_on_slots, on_scheduler
 
 if TYPE_CHECKING:
     from .deploy.local_pool import LocalPool
@@ -60,6 +61,7 @@ class Pool:
         self._first_seen = {worker.name: worker for worker in self._workers}
         # Whether a worker of the cluster belongs to this pool; None if the workers are fixed.
         self._belongs: Callable[[WorkerInfo], bool] | None = None
+        self._noted: set[str] = set()  # partitions whose note was logged
         self._partition_names: list[str] = []  # made by this pool or its remainders
         self._local: LocalPool | None = None  # the cluster that `local` has started
 
@@ -167,6 +169,9 @@ class Pool:
         if (part := (parts := self.partitions()).get(name)) is None:
             names = ", ".join(parts) or "none yet: divide makes some"
             raise PoolError(f"There is no partition {name!r}; there are {names}.")
+        if part.note and name not in self._noted:
+            self._noted.add(name)
+            logger.warning("Partition %r: %s", name, part.note)
         return part
 
     @property
@@ -192,11 +197,20 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Return the partitions that workers declare now, and adaptive partitions, by name."""
+        """Return the partitions that workers declare now, and adaptive partitions, by name.
+
+        A partition that its workers were started with has a `note` if their slots and threads
+        differ.
+        """
         workers = all_workers(self.client)
         names = {name for worker in workers for name in worker.partitions}
-        names |= on_scheduler(self.client, adaptive_names)  # perhaps empty
-        return {name: Partition(name, self.client) for name in sorted(names)}
+        adaptive, with_rule = on_scheduler(self.client, _adaptive_and_divided)
+        return {
+            name: Partition(
+                name, self.client, "" if name in with_rule else note_on_slots(name, workers)
+            )
+            for name in sorted(names | adaptive)
+        }
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
         """Check that partitions have enough slots before tasks are submitted.
@@ -235,7 +249,7 @@ class Pool:
                 reason = f" ({purpose[name]})" if purpose and name in purpose else ""
                 raise PoolError(
                     f"Partition {name!r} has {total} of the "
-                    f"{minimum} slots needed{reason}: "
+                    f"{minimum} {'slot' if minimum == 1 else 'slots'} needed{reason}: "
                     f'start workers with --resources "{name}=1" or one with --nthreads {minimum} '
                     f'--resources "{name}={minimum}".'
                 )
@@ -464,6 +478,14 @@ class Pool:
             remainder._belongs = partial(_is_free, of=self._belongs)
         remainder._partition_names = self._partition_names
         return parts, remainder
+
+
+def _adaptive_and_divided(dask_scheduler: Any = None) -> tuple[Set[str], Set[str]]:
+    """Return the names of adaptive partitions, and of partitions with a rule.
+
+    Runs on the scheduler.
+    """
+    return adaptive_names(dask_scheduler), names_with_rule(dask_scheduler)
 
 
 def _declares_one_of(worker: WorkerInfo, names: Set[str] | None) -> bool:

@@ -53,6 +53,31 @@ def test_a_cluster_from_the_command_line_is_divided_already(start):
     assert parts["IO"].submit(worker_name).result() == "l"
 
 
+@pytest.mark.parametrize(
+    ("threads", "slots", "note"),
+    [
+        (
+            4,
+            1,
+            "worker w has 1 slot and 4 threads, so that threads stay idle. To use each thread, ",
+        ),
+        (1, 4, "worker w has 4 slots and 1 thread, so that tasks wait for a thread. To use each "),
+        (2, 2, ""),
+    ],
+)
+def test_threads_that_slots_do_not_use_are_noted_once(start, caplog, threads, slots, note):
+    client = start({"w": {"nthreads": threads, "resources": {"IO": slots}}, "free": {}})
+    pool = Pool.from_client(client)
+    with caplog.at_level(logging.WARNING, "poolpart"):
+        parts = [pool["IO"] for _ in range(2)]
+    assert {part.note[: len(note)] for part in parts} == {note}
+    assert caplog.text.count("worker w has") == bool(note)
+    if note:
+        assert parts[0].note.endswith(f'start it with --resources "IO={threads}".')
+    by_rule, _ = pool.partition("P", workers=["free"], slots=3)
+    assert pool["P"].note == by_rule.note == ""  # as its rule says
+
+
 def test_workers_by_name_and_by_address(start):
     pool = Pool.from_client(start(PLAIN))
     address = next(worker.address for worker in pool if worker.name == "b")
