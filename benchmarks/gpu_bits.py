@@ -7,17 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from raybeam import (
-    Instance,
-    Mesh,
-    Pattern,
-    PoseMotion,
-    RayCaster,
-    Scan,
-    available_backends,
-    check_scan,
-    pattern_rays,
-)
+from raybeam import Instance, Mesh, Pattern, PoseMotion, RayCaster, available_backends, pattern_rays
+from raybeam.scan import Scan, check_scan
 
 from .gpu_clock import Session, Sizes
 from .gpu_rays import MIDDLE, Rows, forest, name_of

@@ -16,8 +16,9 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from raybeam import Pattern, RayCaster, check_scan
+from raybeam import Pattern, RayCaster
 from raybeam.cuda_backend import flags, source
+from raybeam.scan import check_scan
 
 from .gpu_clock import Session
 from .gpu_rays import MIDDLE, Rows

@@ -29,7 +29,7 @@ from lidarsim.columns.part_columns import PartColumns
 from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
-from raybeam import Outbox
+from raybeam.device import Outbox
 
 from .gpu_clock import Session, Sizes, Split, to_pinned
 

@@ -8,17 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from raybeam import (
-    Instance,
-    Mesh,
-    Opacity,
-    Pattern,
-    PoseMotion,
-    RayCaster,
-    Scan,
-    check_scan,
-)
-from raybeam.scan import Groups
+from raybeam import Instance, Mesh, Opacity, Pattern, PoseMotion, RayCaster
+from raybeam.scan import Groups, Scan, check_scan
 
 from .gpu_clock import Session, Split, milliseconds, wall_milliseconds
 from .gpu_scenes import Float, beam_directions, city, revolution, track

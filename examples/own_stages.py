@@ -1,7 +1,8 @@
 """A pipeline of four stages and 100 trials beside it, on one pool, with functions of your own.
 
 The partitions are those of MATLAB's example: a worker for each GPU, four workers for the pipeline,
-and the rest for other work. Replace the bodies of the functions; the queues between them stay.
+and the rest for other work. While stage 1 generates scans, each scan becomes a short task on the GPU
+partition. Replace the bodies of the functions; the pipes between them stay.
 
     python examples/own_stages.py
 """
@@ -26,24 +27,22 @@ def generate(scans):
     scans.close()
 
 
-def intersect(scans, hits, frames):
-    """Stage 2, on the GPU partition: where the rays of each scan meet the walls of the room."""
+def intersect(item, hits, frames):
+    """Stage 2, a task on the GPU partition: where the rays of a scan meet the walls of the room."""
+    scan, azimuth_deg = item
+    azimuth = math.radians(azimuth_deg)
     elevations = np.radians(np.linspace(-45, 45, RAYS))
-    for scan, azimuth_deg in scans:
-        azimuth = math.radians(azimuth_deg)
-        directions = np.column_stack(
-            [
-                np.cos(elevations) * math.cos(azimuth),
-                np.cos(elevations) * math.sin(azimuth),
-                np.sin(elevations),
-            ]
-        )
-        with np.errstate(divide="ignore"):
-            ranges = (ROOM / 2 / np.abs(directions)).min(axis=1)
-        hits.put((scan, directions * ranges[:, None]))
-        frames.put((scan, ranges.mean()))
-    hits.close()
-    frames.close()
+    directions = np.column_stack(
+        [
+            np.cos(elevations) * math.cos(azimuth),
+            np.cos(elevations) * math.sin(azimuth),
+            np.sin(elevations),
+        ]
+    )
+    with np.errstate(divide="ignore"):
+        ranges = (ROOM / 2 / np.abs(directions)).min(axis=1)
+    hits.put((scan, directions * ranges[:, None]))
+    frames.put((scan, ranges.mean()))
 
 
 def sort_frames(frames, shown):
@@ -76,15 +75,15 @@ def main():
         gpu, lidar, other = pool["GPU"], pool["LIDAR"], pool["OTHER"]
         pipes = [Pipe(name, 4, pool.client) for name in ("scans", "hits", "frames", "shown")]
         scans, hits, frames, shown = [pipe.create() for pipe in pipes]
-        stages = [
-            lidar.submit(generate, scans),
-            gpu.submit(intersect, scans, hits, frames),
-            lidar.submit(sort_frames, frames, shown),
-        ]
+        stages = [lidar.submit(generate, scans), lidar.submit(sort_frames, frames, shown)]
+        casting = gpu.for_each(scans, intersect, hits=hits, frames=frames, wait=False)
         collectors = [lidar.submit(collect, hits) for _ in range(2)]
         lengths = other.map(plan, range(TRIALS), ordered=False)
         with shown.listen(lambda frame: print(f"scan {frame[0]}: {frame[1]:.2f} m on average")):
             best = min(lengths)
+            casting.result()  # all scans were cast: nothing else comes
+            hits.close()
+            frames.close()
         for stage in stages:
             stage.result()  # raises the error of a stage that has failed
         points = {}

@@ -51,7 +51,7 @@ def run(client, path, total=24):
                     keys.fail(f"picture {sent}: {error}")
                 keys.put([sent, futures[sent].key])
                 sent += 1
-            for count, resend in written.poll():
+            for count, resend in written.drain():
                 futures = {number: future for number, future in futures.items() if number >= count}
                 written_count = max(written_count, count)
                 sent = max(written_count, 0 if resend else sent)

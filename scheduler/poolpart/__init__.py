@@ -1,6 +1,7 @@
 """Pool partitions and pipes for Dask clusters."""
 
 from . import extras as extras  # adds its features
+from ._version import __version__
 from .devices import own_device, own_device_share
 from .errors import PipeClosed, PipeFailed, PoolError
 from .extras.background import after_all
@@ -30,6 +31,7 @@ __all__ = [
     "TaskRow",
     "TaskTable",
     "WorkerInfo",
+    "__version__",
     "after_all",
     "cancelled",
     "n_workers",

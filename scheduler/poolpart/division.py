@@ -19,10 +19,10 @@ from .features import FEATURES, begin_features, features_settled, names_with_fea
 from .fence import enclose, lower
 from .internals.client import ANSWER_S
 from .internals.scheduler import asks_for, lift_restrictions
-from .membership import release
+from .membership import release, release_statistics
 from .registration import forget_registrations
-from .rules import Rule, check_count, divide, rest, shortfalls
-from .stats import forget_statistics, statistics_of
+from .rules import Rule, check_count, divide, n_workers, rest, shortfalls, workers_in_words
+from .stats import statistics_of
 from .steward import Seat, Steward, names_of, steward_of
 from .workers import WorkerInfo, on_scheduler
 
@@ -224,6 +224,54 @@ async def grow(
     """Move workers into a partition and return their names."""
     check_count(_MOVES, count)
     steward.adopt(name)
+    return await _move(steward, _joining(steward, name, count, source), name, timeout_s)
+
+
+async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
+    """Move workers out of a partition and return their names."""
+    check_count(_MOVES, count)
+    steward.adopt(name)
+    leaving = _leaving(steward, name, count)
+    return await _move(steward, leaving, _destination(steward, name), timeout_s)
+
+
+async def resize(
+    steward: Steward, name: str, count: int, source: str | None, timeout_s: float
+) -> list[str]:
+    """Give a partition a number of workers, and return the names of the workers that moved."""
+    check_count(f"The number of workers of partition {name!r}", count, minimum=0)
+    steward.adopt(name)
+    rule = steward.rules[name]
+    if count < rule.minimum:
+        raise PoolError(
+            f"Partition {name!r} cannot have {count} workers, because its rule has the minimum "
+            f"{rule.minimum}."
+        )
+    size = len(steward.members(name))  # includes members that are starting again
+    if count > size:
+        moving, target = _joining(steward, name, count - size, source), name
+    else:
+        moving, target = _leaving(steward, name, size - count), _destination(steward, name)
+    # After a loss, the rule may ask for more workers than there are. Moving adds the difference.
+    steward.resize(name, size - _asked(rule, size))
+    try:
+        return await _move(steward, moving, target, timeout_s)
+    finally:
+        if name in steward.rules:
+            minimum = min(rule.minimum, _asked(steward.rules[name], rule.minimum))
+            steward.rules[name] = replace(steward.rules[name], minimum=minimum)
+
+
+def _asked(rule: Rule, default: int) -> int:
+    """Return the number of workers that a rule asks for, or a default if it has no such number."""
+    return rule.workers if isinstance(rule, n_workers) else default
+
+
+def _joining(steward: Steward, name: str, count: int, source: str | None) -> list[Seat]:
+    """Return the seats of workers that can move into a partition.
+
+    Raises PoolError if there are fewer than `count`.
+    """
     if source == name:
         raise PoolError(f"Partition {name!r} cannot take workers from itself.")
     if source is not None:
@@ -237,24 +285,31 @@ async def grow(
         donor_text = f"partition {donor!r}, beyond its minimum," if source else "the remainder"
         raise PoolError(
             f"Partition {name!r} cannot grow by {count}: {donor_text} has "
-            f"{len(spare)} spare workers. Start more, or shrink another partition first."
+            f"{workers_in_words(len(spare), 'spare')}. Start more, or shrink another partition "
+            "first."
         )
-    return await _move(steward, _by_load(steward, spare)[:count], name, timeout_s)
+    return _by_load(steward, spare)[:count]
 
 
-async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
-    """Move workers out of a partition and return their names."""
-    check_count(_MOVES, count)
-    steward.adopt(name)
+def _leaving(steward: Steward, name: str, count: int) -> list[Seat]:
+    """Return the seats of workers that can leave a partition.
+
+    Raises PoolError if fewer than its minimum would be left.
+    """
     members = _settled_members(steward, name)
     minimum = steward.rules[name].minimum
     if len(members) - count < minimum:
         raise PoolError(
-            f"Partition {name!r} cannot shrink by {count}: it has {len(members)} workers and "
-            f"needs at least {minimum}."
+            f"Partition {name!r} cannot shrink by {count}: it has "
+            f"{workers_in_words(len(members))} and needs at least {minimum}."
         )
+    return members[:count]
+
+
+def _destination(steward: Steward, name: str) -> str | None:
+    """Return the partition of workers that leave a partition, or None for no partition."""
     target = steward.remainder()
-    return await _move(steward, members[:count], None if target == name else target, timeout_s)
+    return None if target == name else target
 
 
 async def _move(
@@ -343,7 +398,7 @@ async def dissolve(
     if not steward.rules:
         for feature in FEATURES:
             feature.end_all(scheduler)
-        forget_statistics(scheduler)
+        release_statistics(scheduler)
     for seat in seats:
         steward.put(seat, None)
     lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker

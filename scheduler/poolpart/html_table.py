@@ -1,4 +1,4 @@
-"""Tables of HTML, as notebooks show them."""
+"""Tables as text, and as the HTML that notebooks show."""
 
 from __future__ import annotations
 
@@ -26,6 +26,16 @@ def html_table(title: str, head: Sequence[str], rows: Iterable[Sequence[object]]
     """Return a table with a title, the names of the columns and rows of cells."""
     sides = {name: "left" if name in WORDS else "right" for name in head}
     return _TABLE.generate(title=title, head=head, rows=rows, sides=sides).decode()
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return a table as lines of text, with columns of equal width."""
+    cells = [[str(cell) for cell in row] for row in (head, *rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    )
 
 
 def html_paragraph(text: str) -> str:

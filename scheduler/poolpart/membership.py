@@ -12,6 +12,9 @@ answer of a busy scheduler, and the answer would be old when it arrives.
 The registration ends with the connection of the client. It also ends when the partition is
 dissolved, by the client itself, or without any client outside tasks that uses the partition: then
 workers are told that their clients have to register again.
+
+Tasks are counted (`stats.py`) from the first registration on. Counts that nobody has asked for are
+deleted with the last registration.
 """
 
 from __future__ import annotations
@@ -32,6 +35,8 @@ from .internals.names import REFUSING, require
 from .internals.placing import has_worker_for, workers_declaring
 from .internals.worker import task_of_thread
 from .registration import is_registered, note_registration
+from .stats import NAME as STATISTICS
+from .stats import forget_statistics, statistics_of
 from .steward import NAME as STEWARD
 from .steward import Steward
 from .workers import on_scheduler
@@ -150,6 +155,9 @@ class Registrations(SchedulerPlugin):
         if not self.clients:
             self._rules.take_back()
             self.scheduler.remove_plugin(NAME)
+            statistics = self.scheduler.plugins.get(STATISTICS)
+            if statistics is not None and not statistics.is_kept:
+                forget_statistics(self.scheduler)
 
     # -- tasks -------------------------------------------------------------------------
 
@@ -206,6 +214,7 @@ async def _register(
         keeps = not (in_task and (ruled or name in names_with_features(dask_scheduler)))
         registrations = registrations or Registrations(dask_scheduler)
         registrations.add(name, client_id, keeps, has_or_had_rule)
+        statistics_of(dask_scheduler, keep=False)
         if not ruled:  # or the division of the pool has begun it
             begin_features(dask_scheduler, [name])
         await features_settled()
@@ -243,6 +252,14 @@ def release(scheduler: Any, names: Iterable[str], client: str = "", had_rule: bo
         if had_rule:
             registrations.with_rule.add(name)
         registrations.remove(name, client)
+
+
+def release_statistics(scheduler: Any) -> None:
+    """Stop counting tasks, or stop with the last client that submits to a partition."""
+    if NAME in scheduler.plugins:
+        statistics_of(scheduler).is_kept = False
+    else:
+        forget_statistics(scheduler)
 
 
 def has_rule(scheduler: Any, name: str) -> bool:

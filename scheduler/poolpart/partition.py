@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import concurrent.futures
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, nullcontext, suppress
 from contextvars import ContextVar
 from typing import Any, Literal, Self, overload
 
@@ -14,7 +15,7 @@ from dask.utils import funcname
 from distributed import Client, Future
 
 from .adapting import IDLE_S, Bounds, adapt, want
-from .division import ask, ask_to_dissolve, grow, shrink
+from .division import ask, ask_to_dissolve, grow, resize, shrink
 from .errors import PoolError
 from .extras.background import in_background
 from .extras.cancelling import ask_to_cancel
@@ -27,12 +28,13 @@ from .partition_stats import PartitionStats
 from .pipe import Pipe
 from .pipe_states import USES_PIPES
 from .rules import check_count
-from .stats import stats_of, tasks_of
+from .stats import size_of, stats_of, tasks_of
 from .task_context import own_client
-from .task_table import TaskRow, TaskTable
+from .task_table import TaskTable, moment
 from .worker_wait import WAIT_S
 from .workers import WorkerInfo, all_workers, on_scheduler
 
+_REPR_S = 2.0  # longest wait of `repr` for the scheduler, seconds
 # Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 
@@ -58,6 +60,10 @@ class Partition:
 
     Notes
     -----
+    Functions of a script are sent with each task, and global variables of the script are new each
+    time: keep a value that is expensive to build in a module, or as an attribute of
+    ``distributed.get_worker()``.
+
     A partition can be an argument of a task, which then submits with the client of its worker.
     Tasks that a task of a partition submits to a `Client` belong to the same partition and take a
     slot each; the submitting task lends its own slot while it waits for results. Release a
@@ -99,17 +105,32 @@ class Partition:
         return len(self.workers)
 
     def __repr__(self) -> str:
-        return f"<Partition {self.name!r}>"  # without the note, which is logged when it is made
+        size = self._size_in_words()  # without the note, which is logged when it is made
+        return f"<Partition {self.name!r}: {size}>" if size else f"<Partition {self.name!r}>"
+
+    def _size_in_words(self) -> str:
+        """Return the number of workers and slots in words, or "" where nobody can be asked."""
+        client = self._client  # none in a task that has not used the partition yet
+        if client is None or client.asynchronous or client.status != "running":
+            return ""
+        with suppress(RuntimeError):  # no event loop runs in this thread
+            if asyncio.get_running_loop() is client.loop.asyncio_loop:  # type: ignore[attr-defined]
+                return ""
+        try:
+            return str(on_scheduler(client, size_of, name=self.name, answer_s=_REPR_S))
+        except (PoolError, OSError):
+            return ""
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show."""
         return table_of_partition(lambda: self.client, repr(self), self.name)
 
     def stats(self) -> PartitionStats:
-        """Return the load and the finished tasks of the partition, of all clients.
+        """Return the load and the number of finished tasks of the partition, for all clients.
 
-        Tasks are counted from the division of the pool on; in a partition that the workers were
-        started with, from the first call.
+        In a divided pool, tasks are counted since its division. In a partition that the workers
+        were started with, they are counted since a client submitted its first task through
+        `Partition`, or since this method was first called. `PartitionStats.since` is that time.
 
         Raises
         ------
@@ -120,19 +141,18 @@ class Partition:
         return stats[0]
 
     def tasks(self) -> TaskTable:
-        """Return the tasks of the partition one by one, of all clients.
+        """Return the individual tasks of the partition, for all clients.
 
-        There are those that wait or run, and the last 1,000 that have ended since tasks are
-        The tasks wait or run, or are among the last 1,000 that have ended since tasks are counted
-        (`stats`).
+        The table has all unfinished tasks, and the last 1,000 tasks that have finished since
+        counting began (see `stats`).
 
         Raises
         ------
         PoolError
             If the scheduler lacks this package.
         """
-        rows: list[TaskRow] = on_scheduler(self.client, tasks_of, name=self.name)
-        return TaskTable.of_rows(rows)
+        rows, since = on_scheduler(self.client, tasks_of, name=self.name)
+        return TaskTable.from_rows(rows, moment(since))
 
     # -- tasks -------------------------------------------------------------------------
 
@@ -357,6 +377,9 @@ class Partition:
         when it is full. An item whose worker dies is run on another; several `for_each` may share a
         pipe.
 
+        Pipes that the function puts into stay open. Close them when this method has returned or,
+        without `wait`, when its future has a result.
+
         Parameters
         ----------
         items, function
@@ -554,7 +577,8 @@ class Partition:
         """Move workers into this partition while everything runs, and return their names.
 
         Tasks of the former partition that a worker runs end there first, and its waiting tasks
-        go to other members. If this partition's rule is a number of workers, that grows too.
+        go to other members. If this partition's rule is `n_workers`, its number grows too. After
+        the loss of a worker, use `resize` to return to the former size.
 
         Parameters
         ----------
@@ -579,6 +603,49 @@ class Partition:
         """
         arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
         moved: list[str] = ask(self.client, grow, name=self.name, **arguments)
+        return moved
+
+    def resize(
+        self, workers: int, *, source: str | None = None, timeout_s: float = 60.0
+    ) -> list[str]:
+        """Give this partition a number of workers, and return the names of the workers that moved.
+
+        Workers move in as with `grow`, or out as with `shrink`.
+
+        Parameters
+        ----------
+        workers
+            Number of workers that the partition should have. If its rule is `n_workers`, the rule
+            asks for this number from now on. Other rules stay as they are, and assign workers that
+            join later.
+        source
+            Name of the partition that workers leave, as in `grow`.
+        timeout_s
+            How long to wait until they are free.
+
+        Raises
+        ------
+        PoolError
+            If the number is below the minimum of the partition, there are too few spare workers, or
+            tasks do not end in time. In the last case their workers stay.
+
+        Notes
+        -----
+        A worker that its nanny restarts keeps its place for half a minute, and counts as a member.
+        If a worker is lost for good, the rule `n_workers` still asks for the former number: `stats`
+        has it as `target`, and the next worker that joins the cluster fills the place. Present
+        workers of other partitions do not fill it by themselves, unless they joined later and went
+        to the rest; ``resize(2)`` moves workers in until there are two. `grow` and `shrink` change
+        the target by the number of workers that they move: after a loss, they do not fill the place
+        either.
+
+        Examples
+        --------
+        >>> gpu.resize(2)                                              # doctest: +SKIP
+        ['5']
+        """
+        arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
+        moved: list[str] = ask(self.client, resize, name=self.name, **arguments)
         return moved
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 
-from .html_table import html_table, shown_seconds
+from .html_table import html_table, shown_seconds, text_table
+from .rules import workers_in_words
 
 COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in the order of tables
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
+
+
+def size_in_words(workers: int, target: int | None, slots: int) -> str:
+    """Return the size of a partition in words, such as "1 of 2 workers, 4 slots"."""
+    counted = workers_in_words(workers)
+    if target is not None and target != workers:
+        counted = f"{workers} of {workers_in_words(target)}"
+    return f"{counted}, {slots} {'slot' if slots == 1 else 'slots'}"
 
 
 @dataclass(frozen=True)
@@ -54,12 +64,12 @@ class StageStats:
         return [*(getattr(self, count) for count in COUNTS), shown_seconds(self.seconds)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PartitionStats(StageStats):
     """Current and finished tasks of a partition.
 
-    Counting of finished tasks begins when the cluster is divided, the first statistics are
-    requested, or the page is opened, whichever comes first.
+    Finished tasks are counted since the cluster was divided, a client submitted its first task to
+    a partition, statistics were first requested, or the page was opened, whichever came first.
 
     Parameters
     ----------
@@ -67,12 +77,17 @@ class PartitionStats(StageStats):
         Name of the partition.
     workers
         Workers that it has now.
+    target
+        Workers that its rule asks for, or None if the rule, such as `rest`, has no such number.
+        More than `workers` after the loss of a worker.
     slots, busy
         Slots of these workers, and how many are held by a task.
     exclusive
         Whether a fence keeps other tasks out.
     stages
         The same counts by stage.
+    since
+        When counting began, in UTC.
     """
 
     name: str = ""
@@ -81,6 +96,15 @@ class PartitionStats(StageStats):
     busy: int = 0
     exclusive: bool = False
     stages: Mapping[str, StageStats] = field(default_factory=dict)
+    since: datetime | None = None
+    target: int | None = None
+
+    def __repr__(self) -> str:
+        size = size_in_words(self.workers, self.target, self.slots)
+        since = f", counted since {self.since:%H:%M:%S} UTC" if self.since else ""
+        stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
+        title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{since}>"
+        return f"{title}\n{text_table(_HEAD_OF_STAGES, [*stages, ['all', *self._figures]])}"
 
     def _repr_html_(self) -> str:
         """Return the tables that notebooks show: the partition, and its stages."""

@@ -293,25 +293,6 @@ class Pipe:
 
     # -- producers ---------------------------------------------------------------------
 
-    @property
-    def advice(self) -> int:
-        """Number of records that the consumer wants bundled in an item.
-
-        The number is as old as the last `put`, `get` or other request of this object; before the
-        first request, the scheduler is asked. A producer may ignore the number.
-        """
-        return int(self._change()["advice"] if self._advice is None else self._advice)
-
-    def advise(self, amount: int) -> None:
-        """Set the number of records that producers should bundle in an item, 1 or more.
-
-        Only one consumer may call this.
-        """
-        if amount < 1:
-            raise ValueError(f"The advice for pipe {self.name!r} is {amount}; give 1 or more.")
-        if amount != self.advice:
-            self._change(advice=amount)
-
     def put(self, item: Any, timeout_s: float | None = None, *, unbounded: bool = False) -> None:
         """Add an item, and wait while the pipe is full.
 
@@ -359,7 +340,38 @@ class Pipe:
 
     # -- consumers ---------------------------------------------------------------------
 
-    def poll(self) -> list[Any]:
+    def poll(self, timeout_s: float = 0.0) -> tuple[Any, bool]:
+        """Take the next item if there is one in time, like MATLAB's ``[item, ok] = poll(queue)``.
+
+        `get` raises `TimeoutError` in place of False, and `PipeClosed` at the end of the pipe.
+
+        Parameters
+        ----------
+        timeout_s
+            Longest wait in seconds. By default, this method does not wait.
+
+        Returns
+        -------
+        item
+            The item, or None.
+        ok
+            Whether there was an item. It is also False, without a wait, if the pipe was closed and
+            is empty.
+
+        Raises
+        ------
+        PipeFailed
+            If the pipe was failed, with the reason.
+
+        Examples
+        --------
+        >>> hit, ok = hits.poll(10)                                      # doctest: +SKIP
+        """
+        with suppress(PipeClosed, TimeoutError):
+            return self.get(timeout_s), True
+        return None, False
+
+    def drain(self) -> list[Any]:
         """Take all queued items, possibly none, without waiting.
 
         Raises `PipeFailed`.
@@ -410,39 +422,6 @@ class Pipe:
             else:
                 return unpack(self.client, packed)
 
-    @property
-    def buffered(self) -> int:
-        """Number of items that this object has taken and not returned."""
-        return len(self._buffer)
-
-    def take_beside(
-        self, futures: Sequence[Future], limit: int, seconds: float
-    ) -> tuple[list[Any], bool]:
-        """Take up to `limit` items, as soon as there are any or a task of `futures` has ended.
-
-        For `Partition.for_each`, which waits beside its running tasks, for `seconds` at most. With
-        a limit of 0, the call waits for the end of the pipe or of a task. Raises `PipeFailed`.
-
-        Returns
-        -------
-        items
-            The items, possibly none.
-        closed
-            True if the scheduler has replied that the pipe is closed; False if this call took items
-            from the buffer, and did not ask.
-        """
-
-        def is_settled(reply: Reply) -> bool:
-            return bool(limit and self._buffer) or any(future.done() for future in futures)
-
-        closed = False
-        if not (limit and self._buffer):
-            keys = [future.key for future in futures]
-            deadline = time.monotonic() + seconds
-            reply = self._fill_buffer(deadline, is_settled, keys=keys, limit=limit)
-            closed = reply["closed"]
-        return self._unpack(self._remove(limit)), closed
-
     def _fill_buffer(
         self,
         deadline: float,
@@ -467,10 +446,6 @@ class Pipe:
         if reply["failure"]:
             raise PipeFailed(reply["failure"])
         return reply
-
-    def put_back(self, item: Any) -> None:
-        """Make an item that this object has returned the next item that it returns."""
-        self._buffer.appendleft(dumps(item))
 
     def _remove(self, limit: float = math.inf) -> list[Packed]:
         """Remove and return the first items of the buffer, at most `limit`, still pickled."""
@@ -563,6 +538,63 @@ def _producer() -> str:
 def forget_pipes(client: Client, names: Sequence[str]) -> None:
     """Delete pipes on the scheduler, with their items, if they exist."""
     on_scheduler(client, delete_pipes, names=list(names))
+
+
+def advice_of(pipe: Pipe) -> int:
+    """Return the number of records that the consumer of a pipe wants bundled in an item.
+
+    The number is as old as the last request of the object; before the first request, the scheduler
+    is asked. A producer may ignore the number.
+    """
+    return int(pipe._change()["advice"] if pipe._advice is None else pipe._advice)
+
+
+def advise(pipe: Pipe, amount: int) -> None:
+    """Set the number of records that producers should bundle in an item, 1 or more.
+
+    Only one consumer may call this.
+    """
+    if amount < 1:
+        raise ValueError(f"The advice for pipe {pipe.name!r} is {amount}; give 1 or more.")
+    if amount != advice_of(pipe):
+        pipe._change(advice=amount)
+
+
+def put_back(pipe: Pipe, item: Any) -> None:
+    """Make an item that a pipe object has returned the next item that it returns."""
+    pipe._buffer.appendleft(dumps(item))
+
+
+def take_beside(
+    pipe: Pipe, futures: Sequence[Future], limit: int, seconds: float
+) -> tuple[list[Any], bool, bool]:
+    """Take up to `limit` items, as soon as there are any or a task of `futures` has ended.
+
+    For `Partition.for_each`, which waits beside its running tasks, for `seconds` at most. With a
+    limit of 0, the call waits for the end of the pipe or of a task. Raises `PipeFailed`.
+
+    Returns
+    -------
+    items
+        The items, possibly none.
+    closed
+        True if the scheduler has replied that the pipe is closed; False if this call took items
+        from the buffer, and did not ask.
+    drained
+        True if the pipe is closed and all its items were taken.
+    """
+
+    def is_settled(reply: Reply) -> bool:
+        return bool(limit and pipe._buffer) or any(future.done() for future in futures)
+
+    closed = False
+    if not (limit and pipe._buffer):
+        keys = [future.key for future in futures]
+        deadline = time.monotonic() + seconds
+        reply = pipe._fill_buffer(deadline, is_settled, keys=keys, limit=limit)
+        closed = reply["closed"]
+    items = pipe._unpack(pipe._remove(limit))
+    return items, closed, closed and not pipe._buffer and len(items) < limit
 
 
 def take_news(

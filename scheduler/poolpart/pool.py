@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 from distributed import Client
@@ -21,7 +22,8 @@ from .pipe_states import names_of_pipes
 from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
-from .workers import WorkerInfo, all_workers, ask_workers, on_scheduler
+from .steward import names_with_rule
+from .workers import WorkerInfo, all_workers, ask_workers, note_on_slots, on_scheduler
 
 if TYPE_CHECKING:
     from .deploy.local_pool import LocalPool
@@ -30,12 +32,17 @@ logger = logging.getLogger(__name__)
 
 
 class Pool:
-    """Some workers of a Dask cluster that can be divided into partitions.
+    """Workers of a Dask cluster that can be divided into partitions.
 
-    Start with all of them (`Pool.from_client`); `partition` takes some out under a name and also
-    ``--resources "GPU=1"`` and the like, the cluster is divided already: ``pool["GPU"]`` finds a
-    partition. At the end of a ``with pool:`` block, the partitions that it made are dissolved.
-    `Pool.local` starts a separate cluster, which ends with its block.
+    `Pool.from_client` returns all workers of a cluster. `partition` takes some of them under a name
+    and returns the partition and a pool of the remaining workers; `divide` makes several partitions
+    by rules. A pool is a view of the running cluster: workers that join later belong to it, and
+    each use asks the scheduler.
+
+    If workers were started with ``--resources "GPU=1"`` and the like, the cluster is divided
+    already: ``pool["GPU"]`` returns a partition. At the end of a ``with pool:`` block, the
+    partitions that the pool has made are dissolved. `Pool.local` starts a separate cluster, which
+    ends with its block.
 
     Examples
     --------
@@ -49,13 +56,20 @@ class Pool:
 
     def __init__(self, client: Client, workers: Sequence[WorkerInfo]) -> None:
         self.client = client
-        self.workers = tuple(workers)
+        self._workers = tuple(workers)  # at the last look
+        # Workers as this pool saw them first: {name: description}
+        self._first_seen = {worker.name: worker for worker in self._workers}
+        # Whether a worker of the cluster belongs to this pool; None if the workers are fixed.
+        self._belongs: Callable[[WorkerInfo], bool] | None = None
+        self._noted: set[str] = set()  # partitions whose note was logged
         self._partition_names: list[str] = []  # made by this pool or its remainders
         self._local: LocalPool | None = None  # the cluster that `local` has started
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
-        """All workers that the client's cluster has now, with their GPUs.
+        """Return a pool of all workers of the client's cluster.
+
+        Workers that join later belong to the pool as well.
 
         Parameters
         ----------
@@ -71,23 +85,15 @@ class Pool:
             If the cluster has no workers and no adaptive partitions, a worker cannot import this
             package, or the client is closed or asynchronous.
         """
-        workers = all_workers(client)
-        if not workers and not on_scheduler(client, adaptive_names):
+        if not all_workers(client) and not on_scheduler(client, adaptive_names):
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers: start some with "
                 f'dask worker {client.scheduler.address} --resources "GPU=1"'
             )
-        if declaring is not None:
-            workers = [worker for worker in workers if declaring & set(worker.resources)]
-        answers = ask_workers(client, worker_gpus, [worker.address for worker in workers])
-        present = [worker for worker in workers if worker.address in answers]  # others have left
-        for worker in present:
-            if isinstance(error := answers[worker.address], BaseException):
-                raise PoolError(
-                    f"Worker {worker.name} at {worker.address} cannot describe its "
-                    f"machine ({type(error).__name__}: {error}); is poolpart installed there?"
-                )
-        return cls(client, [worker.with_gpus(answers[worker.address]) for worker in present])
+        pool = cls(client, ())
+        pool._belongs = partial(_declares_one_of, names=declaring)
+        pool._first_seen = {worker.name: worker for worker in pool.workers}
+        return pool
 
     @classmethod
     def local(
@@ -143,16 +149,17 @@ class Pool:
         return iter(self.workers)
 
     def __repr__(self) -> str:
-        hosts = {worker.host for worker in self.workers}
-        gpus = {gpu for worker in self.workers for gpu in worker.gpus}
         try:
-            workers = all_workers(self.client)
+            workers = self.workers
+            declared = Counter(name for w in all_workers(self.client) for name in w.partitions)
         except (PoolError, OSError):  # its client was closed
-            workers = list(self.workers)
-        declared = Counter(name for worker in workers for name in worker.partitions)
+            workers = self._workers
+            declared = Counter()
+        hosts = {worker.host for worker in workers}
+        gpus = {gpu for worker in workers for gpu in worker.gpus}
         parts = ", ".join(f"{name} {count}" for name, count in sorted(declared.items()))
         parts = f"; partitions: {parts}" if parts else ""
-        return f"<Pool: workers {len(self)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
+        return f"<Pool: workers {len(workers)}, hosts {len(hosts)}, GPUs {len(gpus)}{parts}>"
 
     def _repr_html_(self) -> str:
         """Return the table of all partitions of the cluster that notebooks show."""
@@ -162,7 +169,27 @@ class Pool:
         if (part := (parts := self.partitions()).get(name)) is None:
             names = ", ".join(parts) or "none yet: divide makes some"
             raise PoolError(f"There is no partition {name!r}; there are {names}.")
+        if part.note and name not in self._noted:
+            self._noted.add(name)
+            logger.warning("Partition %r: %s", name, part.note)
         return part
+
+    @property
+    def workers(self) -> tuple[WorkerInfo, ...]:
+        """The workers that belong to the pool now, with their GPUs.
+
+        A remainder has the workers that are in no partition. Only workers that have joined since
+        the last look are asked for their GPUs.
+        """
+        if self._belongs is not None:
+            present = [worker for worker in all_workers(self.client) if self._belongs(worker)]
+            gpus = {worker.address: worker.gpus for worker in self._workers}
+            gpus |= _ask_for_gpus(self.client, [w for w in present if w.address not in gpus])
+            # Workers that have not answered have left, or are silent.
+            self._workers = tuple(
+                w.with_gpus(gpus[w.address]) for w in present if w.address in gpus
+            )
+        return self._workers
 
     @property
     def names(self) -> list[str]:
@@ -170,11 +197,20 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Return the partitions that workers declare now, and adaptive partitions, by name."""
+        """Return the partitions that workers declare now, and adaptive partitions, by name.
+
+        A partition that its workers were started with has a `note` if their slots and threads
+        differ.
+        """
         workers = all_workers(self.client)
         names = {name for worker in workers for name in worker.partitions}
-        names |= on_scheduler(self.client, adaptive_names)  # perhaps empty
-        return {name: Partition(name, self.client) for name in sorted(names)}
+        adaptive, with_rule = on_scheduler(self.client, _adaptive_and_divided)
+        return {
+            name: Partition(
+                name, self.client, "" if name in with_rule else note_on_slots(name, workers)
+            )
+            for name in sorted(names | adaptive)
+        }
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
         """Check that partitions have enough slots before tasks are submitted.
@@ -194,7 +230,8 @@ class Pool:
             If a partition has fewer, or a worker declares two of the partitions or a number of
             slots that is not whole.
         """
-        for worker in self.workers:
+        workers = self.workers
+        for worker in workers:
             for name in slots.keys() & worker.resources.keys():
                 if (has := worker.resources[name]) % 1 or not 0 <= has < 2**31:
                     raise PoolError(
@@ -207,12 +244,12 @@ class Pool:
                     "one of them, because tasks of one would delay those of the other."
                 )
         for name, minimum in slots.items():
-            total = int(sum(worker.resources.get(name, 0) for worker in self.workers))
+            total = int(sum(worker.resources.get(name, 0) for worker in workers))
             if total < minimum:
                 reason = f" ({purpose[name]})" if purpose and name in purpose else ""
                 raise PoolError(
                     f"Partition {name!r} has {total} of the "
-                    f"{minimum} slots needed{reason}: "
+                    f"{minimum} {'slot' if minimum == 1 else 'slots'} needed{reason}: "
                     f'start workers with --resources "{name}=1" or one with --nthreads {minimum} '
                     f'--resources "{name}={minimum}".'
                 )
@@ -286,9 +323,9 @@ class Pool:
     ) -> tuple[Partition, Pool]:
         """Take workers out of this pool under a name.
 
-        Give exactly one selector. The chosen workers declare the Dask resource `name`, also after
-        a restart by their nanny. Waiting tasks for the resource are sent to them. Workers that
-        have left, or were taken by another partition since this pool was made, are not chosen.
+        Give exactly one selector, which chooses from the workers that the pool has now. The chosen
+        workers declare the Dask resource `name`, also after a restart by their nanny. Pending tasks
+        for the resource are sent to them. Workers that belong to another partition are not chosen.
         Workers that join later are chosen by the same selector, as with `divide`.
 
         Parameters
@@ -419,12 +456,15 @@ class Pool:
                     f"The rule of partition {name!r} is {rule!r}: give one such as n_workers(2), "
                     "per_gpu(1) or rest()."
                 )
+        for worker in self.workers:  # workers that have joined since the pool was made
+            first_seen = self._first_seen.get(worker.name, worker)
+            self._first_seen[worker.name] = first_seen.with_gpus(worker.gpus)
         notes, remaining_workers = ask(
             self.client,
             declare,
             rules=dict(rules),
             initial_rules=dict(initial_rules),
-            pool={worker.name: worker for worker in self.workers},
+            pool=self._first_seen,
             known_partitions=set(self.partitions()),
             own_partitions=set(self._partition_names),
         )
@@ -434,5 +474,40 @@ class Pool:
                 logger.warning("Partition %r: %s", part.name, part.note)
         self._partition_names += parts
         remainder = Pool(self.client, remaining_workers)
+        if self._belongs is not None:
+            remainder._belongs = partial(_is_free, of=self._belongs)
         remainder._partition_names = self._partition_names
         return parts, remainder
+
+
+def _adaptive_and_divided(dask_scheduler: Any = None) -> tuple[Set[str], Set[str]]:
+    """Return the names of adaptive partitions, and of partitions with a rule.
+
+    Runs on the scheduler.
+    """
+    return adaptive_names(dask_scheduler), names_with_rule(dask_scheduler)
+
+
+def _declares_one_of(worker: WorkerInfo, names: Set[str] | None) -> bool:
+    """Return whether a worker declares one of these resources, or True if `names` is None."""
+    return names is None or not names.isdisjoint(worker.resources)
+
+
+def _is_free(worker: WorkerInfo, of: Callable[[WorkerInfo], bool]) -> bool:
+    """Return whether a worker is in no partition, and belongs to a pool."""
+    return not worker.partitions and of(worker)
+
+
+def _ask_for_gpus(client: Client, workers: Sequence[WorkerInfo]) -> dict[str, tuple[str, ...]]:
+    """Return the GPUs of workers by address, without workers that do not answer.
+
+    Raises PoolError if a worker cannot describe its machine.
+    """
+    answers = ask_workers(client, worker_gpus, [worker.address for worker in workers])
+    for worker in workers:
+        if isinstance(error := answers.get(worker.address), BaseException):
+            raise PoolError(
+                f"Worker {worker.name} at {worker.address} cannot describe its machine "
+                f"({type(error).__name__}: {error}). Is poolpart installed there?"
+            )
+    return answers

@@ -54,6 +54,11 @@ class Rule:
         """Whether to add a worker to the members, where `everyone` lists all workers."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
+    @property
+    def target(self) -> int | None:
+        """Number of workers that the rule asks for, or None if that depends on the cluster."""
+        return None
+
     def slots_of(self, worker: WorkerInfo) -> int:
         """Return the slots of a worker as a member."""
         return self.slots or worker.nthreads
@@ -123,6 +128,11 @@ class n_workers(Rule):  # noqa: N801
         """Choose the first workers."""
         return list(free[: self.workers])
 
+    @property
+    def target(self) -> int:
+        """The given number."""
+        return self.workers
+
 
 @dataclass(frozen=True)
 class Named(Rule):
@@ -133,6 +143,11 @@ class Named(Rule):
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
         """Choose the named workers that are available."""
         return [worker for worker in free if {worker.name, worker.address} & set(self.names)]
+
+    @property
+    def target(self) -> int:
+        """Number of names."""
+        return len(self.names)
 
     def missing(self, members: Sequence[WorkerInfo]) -> list[str]:
         """Return the names that none of the members has."""
@@ -204,15 +219,15 @@ def divide(
         if len(workers) < rule.minimum:
             advice = _advice(rule, free, pool)
             raise PoolError(
-                f"Partition {name!r} would have {len(workers)} of the {rule.minimum} workers "
-                f"that it needs: {advice}"
+                f"Partition {name!r} would have {len(workers)} of the "
+                f"{workers_in_words(rule.minimum)} that it needs: {advice}"
             )
         if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU
         if isinstance(rule, n_workers) and len(workers) < rule.workers:
             notes[name] = (
-                f"has {len(workers)} of the {rule.workers} workers that it asks for; later "
-                "workers join it"
+                f"has {len(workers)} of the {workers_in_words(rule.workers)} that it asks for; "
+                "later workers join it"
             )
         if isinstance(rule, Named) and (missing := rule.missing(workers)):
             notes[name] = f"lacks {', '.join(map(repr, missing))}, for which its rule asks"
@@ -258,8 +273,9 @@ def shortfalls(
     now = _choices(rules, pool)
     expected = _choices(rules, pool_as_seen)
     return {
-        name: f"has {len(now[name].workers)} of the {len(choice.workers)} workers that its rule "
-        "would have taken when this pool was made: other partitions have taken workers since"
+        name: f"has {len(now[name].workers)} of the {workers_in_words(len(choice.workers))} that "
+        "its rule would have taken when this pool was made: other partitions have taken workers "
+        "since"
         for name, choice in expected.items()
         if len(now[name].workers) < len(choice.workers)
     }
@@ -271,8 +287,9 @@ def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) 
     advice = ""
     if elsewhere:
         resources = sorted({resource for worker in elsewhere for resource in worker.partitions})
+        verb = "declares" if len(elsewhere) == 1 else "declare"
         advice = (
-            f" {len(elsewhere)} declare the resource{'s' if len(resources) > 1 else ''} "
+            f" {len(elsewhere)} {verb} the resource{'s' if len(resources) > 1 else ''} "
             f"{', '.join(resources[:9])} already, and a worker belongs to one partition."
         )
     if not isinstance(rule, Named):
@@ -302,6 +319,11 @@ def partition_for(
     ]
     by_name = [name for name in willing if isinstance(rules[name], Named)]
     return next(iter([*by_name, *short, *willing]), None)
+
+
+def workers_in_words(count: int, kind: str = "") -> str:
+    """Return a number of workers for a message, such as "1 spare worker"."""
+    return " ".join(filter(None, (str(count), kind, "worker" if count == 1 else "workers")))
 
 
 def check_name(partition: object) -> None:

@@ -18,7 +18,8 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .features import FEATURES
 from .fence import fences_of
-from .partition_stats import PartitionStats, StageStats
+from .partition_stats import PartitionStats, StageStats, size_in_words
+from .steward import target_of
 from .task_table import KEPT, TaskRow, moment
 
 NAME = "poolpart-stats"
@@ -41,6 +42,9 @@ class Statistics(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
+        self.since = time.time()  # when counting began
+        # Whether the counts outlive the clients that submit to partitions.
+        self.is_kept = False
         # {(partition, stage): sums of its tasks that have ended, by fields of `StageStats`}
         self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
         # {partition: its tasks that have ended, newest first}
@@ -162,10 +166,10 @@ def _slots_taken(task: Any, partition: str) -> int:
     return int(task.resource_restrictions[partition]) if partition else 1
 
 
-def tasks_of(name: str, dask_scheduler: Any = None) -> list[TaskRow]:
-    """Return the tasks of a partition under way, and the ended tasks that are kept.
+def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], float]:
+    """Return the unfinished tasks of a partition, and the ended tasks that are kept.
 
-    Runs on the scheduler.
+    Also returns when counting began, in seconds since 1970. Runs on the scheduler.
     """
     scheduler = dask_scheduler
     statistics = statistics_of(scheduler)
@@ -190,15 +194,29 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> list[TaskRow]:
                 moment(statistics.queued_since(task.key)),
             )
         )
-    return [*rows, *statistics.recent.get(name, ())]
+    return [*rows, *statistics.recent.get(name, ())], statistics.since
 
 
-def statistics_of(scheduler: Any) -> Statistics:
-    """Find the scheduler's statistics, or start counting."""
+def size_of(name: str, dask_scheduler: Any = None) -> str:
+    """Return the number of workers and slots of a partition in words, without counting its tasks.
+
+    Runs on the scheduler.
+    """
+    workers = members(dask_scheduler, name)
+    slots = sum(slots_of(worker, name) for worker in workers)
+    return size_in_words(len(workers), target_of(dask_scheduler, name), slots)
+
+
+def statistics_of(scheduler: Any, keep: bool = True) -> Statistics:
+    """Find the scheduler's statistics, or start counting.
+
+    With `keep`, the counts outlive the clients that submit to partitions.
+    """
     statistics: Statistics | None = scheduler.plugins.get(NAME)
     if statistics is None:
         statistics = Statistics(scheduler)
         scheduler.add_plugin(statistics)
+    statistics.is_kept |= keep
     return statistics
 
 
@@ -246,6 +264,8 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
                 slots=sum(slots_of(worker, name) for worker in workers),
                 busy=sum(held for _, held in by_worker),
                 exclusive=name in fences_of(scheduler),
+                since=moment(statistics.since),
+                target=target_of(scheduler, name),
                 stages=stages,
                 **sums,
             )

@@ -421,6 +421,22 @@ def names_of(seats: Iterable[Seat]) -> str:
     return ", ".join(sorted(seat.info.name for seat in seats))
 
 
+def names_with_rule(scheduler: Any) -> frozenset[str]:
+    """Return the names of the partitions that a division has made."""
+    steward: Steward | None = scheduler.plugins.get(NAME)
+    return frozenset() if steward is None else frozenset(steward.rules)
+
+
+def target_of(scheduler: Any, name: str) -> int | None:
+    """Return the number of workers that the rule of a partition asks for.
+
+    None if it has no rule, or its rule has no such number.
+    """
+    steward: Steward | None = scheduler.plugins.get(NAME)
+    rule = steward.rules.get(name) if steward is not None else None
+    return rule.target if rule is not None else None
+
+
 @contextmanager
 def steward_of(scheduler: Any) -> Iterator[Steward]:
     """Yield the scheduler's steward, which leaves after the block if it has no partitions."""

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 from .errors import PoolError
-from .html_table import html_table, shown_seconds
+from .html_table import html_paragraph, html_table, shown_seconds, text_table
 
 KEPT = 1_000  # tasks of a partition that have ended
+_SHOWN = 20  # rows of a table that is printed
 STATES = ("waiting", "queued", "running", "done", "failed")
 _ENDED = STATES.index("done")  # this and later states have ended
 _HEAD = ("state", "key", "function", "worker", "slots", "queued", "started", "seconds", "error")
@@ -60,29 +62,40 @@ class TaskRow(NamedTuple):
 
 
 class TaskTable(tuple[TaskRow, ...]):
-    """Tasks of a partition: those under way by state, then those that have ended, newest first."""
+    """Tasks of a partition: unfinished tasks by state, then finished tasks, newest first.
 
-    __slots__ = ()
+    `since` is when counting began, in UTC: tasks that had finished before are missing.
+    """
+
+    since: datetime | None = None
 
     @classmethod
-    def of_rows(cls, rows: Iterable[TaskRow]) -> TaskTable:
+    def from_rows(cls, rows: Iterable[TaskRow], since: datetime | None = None) -> TaskTable:
         """Return the table of rows.
 
-        Rows of a state keep their order. So do rows that ended.
+        Rows of a state keep their order. So do rows of finished tasks.
         """
-        return cls(sorted(rows, key=lambda row: min(STATES.index(row.state), _ENDED)))
+        table = cls(sorted(rows, key=lambda row: min(STATES.index(row.state), _ENDED)))
+        table.since = since
+        return table
 
     def __repr__(self) -> str:
-        cells = [_HEAD, *(_cells(row) for row in self)]
-        widths = [max(len(row[column]) for row in cells) for column in range(len(_HEAD))]
-        return "\n".join(
-            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-            for row in cells
-        )
+        table = text_table(_HEAD, [_cells(row) for row in self[:_SHOWN]])
+        return "\n".join(filter(None, (table, self._omission)))
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show."""
-        return html_table("Tasks", _HEAD, [_cells(row) for row in self])
+        table = html_table("Tasks", _HEAD, [_cells(row) for row in self[:_SHOWN]])
+        return table + (html_paragraph(self._omission) if self._omission else "")
+
+    @property
+    def _omission(self) -> str:
+        """What follows a table of the first tasks, or "" if these are all."""
+        if len(self) <= _SHOWN:
+            return ""
+        counts = Counter(row.state for row in self)
+        by_state = ", ".join(f"{counts[state]:,} {state}" for state in STATES if counts[state])
+        return f"… the first {_SHOWN} of {len(self):,} tasks: {by_state}. to_pandas() has all."
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each task.

@@ -68,6 +68,19 @@ class WorkerInfo:
         )
 
 
+def note_on_slots(name: str, workers: Iterable[WorkerInfo]) -> str:
+    """Return a note on a worker whose slots of a partition differ from its threads, or ""."""
+    for worker in workers:
+        slots = worker.resources.get(name, 0)
+        if not slots or slots == worker.nthreads:
+            continue
+        has = f"worker {worker.name} has {slots:g} {'slot' if slots == 1 else 'slots'} and "
+        has += f"{worker.nthreads} {'thread' if worker.nthreads == 1 else 'threads'}, so that "
+        has += "threads stay idle" if slots < worker.nthreads else "tasks wait for a thread"
+        return f'{has}. To use each thread, start it with --resources "{name}={worker.nthreads}".'
+    return ""
+
+
 def on_scheduler(
     client: Client, function: Callable[..., Any], *, answer_s: float | None = None, **kwargs: Any
 ) -> Any:

@@ -31,7 +31,7 @@ def test_each_item_is_run_once_on_the_partition(client, a, make_pipe, pool):
     pipe.put_many(range(50))
     pipe.close()
     assert sum(count.result(LONG_S) for count in counts) == 50
-    results = done.poll()
+    results = done.drain()
     assert sorted(item for item, _ in results) == list(range(50))
     assert {worker for _, worker in results} == {"A-0", "A-1"}
 
@@ -40,7 +40,7 @@ def test_of_a_pipe_without_items(client, a, make_pipe):
     pipe = make_pipe(client)
     pipe.close()
     assert a.for_each(pipe, abs) == 0
-    assert repr(a) == "<Partition 'A'>"
+    assert repr(a) == "<Partition 'A': 2 workers, 4 slots>"
 
 
 def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
@@ -148,7 +148,7 @@ def test_an_item_may_be_a_future_that_a_queue_has_put(client, a, make_pipe):
         Queue(pipe.name, other).put(other.submit(pow, 2, 10))
         pipe.close()
         assert a.for_each(pipe, done.put) == 1
-    assert done.poll() == [1024]
+    assert done.drain() == [1024]
 
 
 @pytest.mark.parametrize("options", [{"window": 0}, {"slots": 0}])
@@ -182,7 +182,7 @@ def test_items_that_the_pipe_object_has_taken_before_come_first(client, a, make_
     pipe.close()
     assert pipe.get() == 0
     assert a.for_each(pipe, put_square, squares=squares, window=1) == 4
-    assert sorted(squares.poll()) == [1, 4, 9, 16]
+    assert sorted(squares.drain()) == [1, 4, 9, 16]
 
 
 def put_square(number, squares):
@@ -214,7 +214,7 @@ def test_without_waiting_it_returns_a_future_of_the_number_of_items(client, a, m
     assert not count.done()
     pipe.close()
     assert count.result(LONG_S) == 5
-    assert sorted(squares.poll()) == [0, 1, 4, 9, 16]
+    assert sorted(squares.drain()) == [0, 1, 4, 9, 16]
 
 
 def test_a_future_has_the_first_error(client, a, make_pipe):
@@ -270,7 +270,7 @@ def test_futures_as_they_end_are_items(client, a, b, make_pipe):
     roots = make_pipe(client, capacity=10)
     futures = [b.submit(pow, number, 2) for number in range(4)]
     assert a.for_each(as_completed(futures), put_square, squares=roots) == 4
-    assert sorted(roots.poll()) == [0, 1, 16, 81]
+    assert sorted(roots.drain()) == [0, 1, 16, 81]
 
 
 def test_an_error_of_an_iterable_or_of_its_items(client, a):

@@ -8,7 +8,15 @@ import time
 
 import pytest
 from distributed import Event, secede
-from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves, wait_for, worker_name
+from tests.poolpart.helpers import (
+    LONG_S,
+    declared,
+    declared_by_themselves,
+    join,
+    leave,
+    wait_for,
+    worker_name,
+)
 
 from lidarpool.run.pipeline.task_records import recorded
 from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, steward
@@ -67,6 +75,42 @@ def test_what_has_not_started_is_shared_out_evenly(divided, wait_until):
     moving.join()
     client.gather(tasks)
     assert given in ([1, 29, 30], [1, 28, 31], [1, 27, 32])
+
+
+def test_a_partition_is_resized_to_a_number_of_workers(divided):
+    _, parts = divided
+    a, rest_of_pool = parts["A"], parts["C"]
+    assert a.resize(3) == [] and len(a) == 3
+    assert len(a.resize(5)) == 2 and (len(a), len(rest_of_pool)) == (5, 0)
+    with pytest.raises(PoolError, match="'A' cannot grow by 1: the remainder has 0 spare workers"):
+        a.resize(6)
+    assert len(a.resize(2)) == 3 and (len(a), len(rest_of_pool)) == (2, 3)
+    (moved,) = a.resize(3, source="C")
+    assert moved in members(a) and a.stats().target == 3
+    with pytest.raises(PoolError, match=r"'A' cannot have 0 workers, because .* the minimum 1"):
+        a.resize(0)
+    with pytest.raises(PoolError, match="number of workers of partition 'A' is -1"):
+        a.resize(-1)
+    assert rest_of_pool.stats().target is None
+
+
+def test_after_a_loss_resize_returns_to_the_size_and_grow_does_not(start, wait_until):
+    client = start({name: {} for name in "abcde"})
+    a, _ = Pool.from_client(client).divide({"A": n_workers(2), "C": rest()}).values()
+    leave(client, members(a)[0])
+    wait_until(lambda: len(a) == 1)
+    assert (a.stats().target, repr(a)) == (2, "<Partition 'A': 1 of 2 workers, 1 slot>")
+    a.grow(1)
+    assert (len(a), a.stats().target) == (2, 3)
+    a.resize(2)
+    assert (len(a), a.stats().target) == (2, 2)
+    leave(client, members(a)[0])
+    wait_until(lambda: len(a) == 1)
+    assert len(a.resize(2)) == 1
+    assert (len(a), a.stats().target, repr(a)) == (2, 2, "<Partition 'A': 2 workers, 2 slots>")
+    join(client, "late")
+    client.wait_for_workers(4)
+    wait_until(lambda: declared(client)["late"] == {"C": 1})
 
 
 def test_slots_are_those_of_the_partition(start):

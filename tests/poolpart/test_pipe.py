@@ -17,7 +17,7 @@ from tests.poolpart.helpers import LONG_S
 
 from poolpart import Pipe, PipeClosed, PipeFailed, cancelled
 from poolpart import pipe as pipe_module
-from poolpart.pipe import take_news
+from poolpart.pipe import advice_of, advise, take_news
 from poolpart.pipe_states import PipeState, no_pipes, open_pipe, pipes_of
 
 
@@ -52,7 +52,7 @@ def pool():
 OPERATIONS = st.lists(
     st.one_of(
         st.tuples(st.just("put"), st.none() | st.integers() | st.text(max_size=5)),
-        st.tuples(st.sampled_from(["get", "poll", "get_all"]), st.none()),
+        st.tuples(st.sampled_from(["get", "drain", "get_all"]), st.none()),
     ),
     max_size=30,
 )
@@ -85,7 +85,7 @@ def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
                     taken.extend(queued)
                     queued.clear()
                 assert pipe.get(timeout_s=0) == taken.popleft()
-            elif operation == "poll" or taken or queued:
+            elif operation == "drain" or taken or queued:
                 assert getattr(pipe, operation)() == [*taken, *queued]
                 taken.clear()
                 queued.clear()
@@ -138,7 +138,26 @@ def test_consumers_drain_a_closed_pipe_and_end(client, make_pipe):
         end.get()
     with pytest.raises(PipeClosed, match="is closed and empty"):
         end.get_all()
-    assert end.poll() == []
+    assert end.drain() == []
+
+
+def test_poll_returns_an_item_and_whether_there_was_one(client, make_pipe, pool):
+    pipe = make_pipe(client)
+    assert pipe.poll() == (None, False)
+    pipe.put_many([None, 2])
+    end = other_end(pipe)
+    assert (end.poll(), end.poll(), end.poll(0.01)) == ((None, True), (2, True), (None, False))
+    waiting = pool.submit(end.poll, LONG_S)
+    wait_for_waiters(client, {pipe: 1})
+    pipe.put(3)
+    assert waiting.result(LONG_S) == (3, True)
+    waiting = pool.submit(end.poll, LONG_S)
+    wait_for_waiters(client, {pipe: 1})
+    pipe.close()
+    assert waiting.result(LONG_S) == (None, False)
+    pipe.fail("the disk is full")
+    with pytest.raises(PipeFailed, match="the disk is full"):
+        end.poll(LONG_S)
 
 
 def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool):
@@ -251,9 +270,9 @@ def test_a_task_that_ends_without_closing_its_pipe_is_no_failure(client, a, make
 
 def test_advice_can_return_to_what_it_was(client, make_pipe):
     pipe = make_pipe(client)
-    pipe.advise(5)
-    other_end(pipe).advise(1)
-    assert other_end(pipe).advice == 1
+    advise(pipe, 5)
+    advise(other_end(pipe), 1)
+    assert advice_of(other_end(pipe)) == 1
 
 
 def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
@@ -264,7 +283,7 @@ def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
     with pytest.raises(TimeoutError, match=r"stayed full for 0\.1 s"):
         pipe.put_many(source, timeout_s=0.1)
     assert next(source) == 2  # no more than fit into one request
-    assert pipe.poll() == ["first", 0]
+    assert pipe.drain() == ["first", 0]
     pipe.put_many(range(5), unbounded=True)
     pipe.close()
     with pytest.raises(PipeClosed):
@@ -283,11 +302,11 @@ USES = {
     "put_many": lambda pipe: pipe.put_many([1, 2]),
     "get": lambda pipe: pipe.get(),
     "get_all": lambda pipe: pipe.get_all(),
-    "poll": lambda pipe: pipe.poll(),
+    "drain": lambda pipe: pipe.drain(),
     "depth": lambda pipe: pipe.depth,
     "close": lambda pipe: pipe.close(),
     "fail": lambda pipe: pipe.fail("x"),
-    "advise": lambda pipe: pipe.advise(5),
+    "advise": lambda pipe: advise(pipe, 5),
     "iterate": list,
 }
 
@@ -352,7 +371,7 @@ def test_two_pipes_of_one_name(client, make_pipe):
 @pytest.mark.parametrize(
     ("change", "outcome"),
     [
-        (Pipe.poll, None),
+        (Pipe.drain, None),
         (Pipe.close, PipeClosed),
         (Pipe.delete, PipeFailed),
         (lambda pipe: pipe.fail("no more"), PipeFailed),
@@ -373,7 +392,7 @@ def test_a_put_that_waits_for_room_hears_at_once(client, make_pipe, monkeypatch,
     assert time.monotonic() - start < LONG_S / 2
     assert error is None if outcome is None else isinstance(error, outcome)
     if outcome is None:
-        assert pipe.poll() == ["second"]
+        assert pipe.drain() == ["second"]
 
 
 ENDS = [Pipe.close, Pipe.delete, lambda pipe: pipe.fail("why not")]
@@ -424,7 +443,7 @@ class Unreadable:
         return int, ("not a number",)
 
 
-@pytest.mark.parametrize("take", [Pipe.get_all, Pipe.poll])
+@pytest.mark.parametrize("take", [Pipe.get_all, Pipe.drain])
 def test_of_the_items_of_a_request_only_the_unreadable_one_is_lost(client, make_pipe, take):
     pipe = make_pipe(client, capacity=10)
     pipe.put_many([0, 1, Unreadable(), 2, 3])
@@ -564,14 +583,14 @@ def test_a_queue_waits_for_room_as_well(client, other, make_pipe, pool):
     waiting = pool.submit(queue.put, 2)
     wait_for_waiters(client, {pipe: 1})
     assert not waiting.done()
-    assert pipe.poll() == [1]
+    assert pipe.drain() == [1]
     waiting.result(LONG_S)
     waiting = pool.submit(pipe.put, 3)
     wait_for_waiters(client, {pipe: 1})
     assert not waiting.done()
     assert queue.get() == 2
     waiting.result(LONG_S)
-    assert pipe.poll() == [3]
+    assert pipe.drain() == [3]
 
 
 def test_several_queues_and_pipes_lose_and_double_nothing(client, other, make_pipe, pool):
@@ -631,7 +650,7 @@ def test_the_variable_is_the_state(client, other, make_pipe, pool):
         "advice": 1,
     }
     variable.set({**variable.get(), "advice": 5})
-    assert other_end(pipe).advice == 5
+    assert advice_of(other_end(pipe)) == 5
     pipe.close()
     assert len(variable.get()["closed_by"]) == 1
     waiting = pool.submit(pipe.get, LONG_S)

@@ -7,7 +7,7 @@ import signal
 
 import pytest
 from distributed import Client, LocalCluster
-from tests.poolpart.helpers import declared, worker_name
+from tests.poolpart.helpers import declared, join, worker_name
 
 from poolpart import Pool, PoolError, WorkerInfo, n_workers, probe, rest
 
@@ -51,6 +51,31 @@ def test_a_cluster_from_the_command_line_is_divided_already(start):
         "IO": (1, 4),
     }
     assert parts["IO"].submit(worker_name).result() == "l"
+
+
+@pytest.mark.parametrize(
+    ("threads", "slots", "note"),
+    [
+        (
+            4,
+            1,
+            "worker w has 1 slot and 4 threads, so that threads stay idle. To use each thread, ",
+        ),
+        (1, 4, "worker w has 4 slots and 1 thread, so that tasks wait for a thread. To use each "),
+        (2, 2, ""),
+    ],
+)
+def test_threads_that_slots_do_not_use_are_noted_once(start, caplog, threads, slots, note):
+    client = start({"w": {"nthreads": threads, "resources": {"IO": slots}}, "free": {}})
+    pool = Pool.from_client(client)
+    with caplog.at_level(logging.WARNING, "poolpart"):
+        parts = [pool["IO"] for _ in range(2)]
+    assert {part.note[: len(note)] for part in parts} == {note}
+    assert caplog.text.count("worker w has") == bool(note)
+    if note:
+        assert parts[0].note.endswith(f'start it with --resources "IO={threads}".')
+    by_rule, _ = pool.partition("P", workers=["free"], slots=3)
+    assert pool["P"].note == by_rule.note == ""  # as its rule says
 
 
 def test_workers_by_name_and_by_address(start):
@@ -134,9 +159,9 @@ def test_a_pool_that_is_divided_twice_does_not_give_one_worker_to_two(start):
     pool.partition("P", n_workers=2)
     _, rest = pool.partition("Q", n_workers=1)
     assert sorted(map(list, declared(client).values())) == [["P"], ["P"], ["Q"]]
-    assert len(rest) == 2  # P's, which this pool still counts as its own
+    assert rest.names == []
     with pytest.raises(PoolError, match="3 declare the resources P, Q already"):
-        pool.partition("R", workers=rest.names)
+        pool.partition("R", workers=["a", "b"])
 
 
 def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
@@ -151,6 +176,23 @@ def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
         pool.divide({"Q": 3})
     with pytest.raises(PoolError, match="would have 0 of the 1 workers"):
         pool.partition("Q", workers=["a"])
+
+
+def test_workers_that_join_after_the_pool_was_made_belong_to_it(start, monkeypatch):
+    client = start({"a": {}, "b": {}})
+    pool = Pool.from_client(client)
+    _, rest = pool.partition("P", workers=["a", "b"])
+    assert rest.names == []
+    monkeypatch.setattr(probe, "visible_gpus", lambda: ("x",))
+    for name in ("c", "d"):
+        join(client, name)
+    client.wait_for_workers(4)
+    assert sorted(pool.names) == ["a", "b", "c", "d"] and sorted(rest.names) == ["c", "d"]
+    assert repr(rest) == "<Pool: workers 2, hosts 1, GPUs 1; partitions: P 2>"
+    gpu, rest = rest.partition("GPU", max_workers_per_gpu=1)
+    assert ([worker.name for worker in gpu.workers], gpu.note) == (["c"], "")
+    assert pool.divide({"Q": n_workers(1)})["Q"].workers[0].name == "d"
+    assert rest.names == []
 
 
 def test_a_partition_is_found_by_its_name(start):

@@ -1,9 +1,11 @@
 """Statistics of partitions: each task counted once, whatever happens."""
 
+import re
 import threading
 import time
 import urllib.request
 import uuid
+from datetime import UTC, datetime
 
 import pytest
 from distributed import Client, get_worker, worker_client
@@ -147,3 +149,43 @@ def test_a_task_that_lends_its_slots_and_the_one_that_has_them_are_one(client, w
     assert (part.stats().busy, part.stats().running) == (2, 2)
     go.set()
     client.gather(tasks)
+
+
+def test_tasks_are_counted_from_the_first_submit(client, wait_until):
+    before = datetime.now(UTC)
+    part = Partition("A", client)
+    assert part.submit(after, 1).result(LONG_S) == "A-0"
+    submitted = datetime.now(UTC)
+    with Client(client.scheduler.address, set_as_default=False) as other:
+        stats = Partition("A", other).stats()
+        (task,) = Partition("A", other).tasks()
+        assert before < Partition("A", other).tasks().since == stats.since < submitted
+    assert (stats.done, task.function, task.state) == (1, "after", "done")
+
+
+def test_counts_that_nobody_requested_end_with_the_last_client(client, wait_until):
+    plugins = set(client.cluster.scheduler.plugins)
+    with Client(client.scheduler.address, set_as_default=False) as other:
+        Partition("A", other).submit(after, 1).result(LONG_S)
+        assert "poolpart-stats" in client.cluster.scheduler.plugins
+    wait_until(lambda: set(client.cluster.scheduler.plugins) == plugins)
+    with Client(client.scheduler.address, set_as_default=False) as other:
+        Partition("A", other).submit(after, 1).result(LONG_S)
+        Partition("A", other).stats()
+    wait_until(lambda: "poolpart-registrations" not in client.cluster.scheduler.plugins)
+    assert Partition("A", client).stats().done == 1
+
+
+def test_statistics_are_printed_as_a_table(client):
+    part = Partition("A", client)
+    client.gather([part.submit(after, i) for i in range(3)])
+    title, head, *rows = repr(part.stats()).splitlines()
+    assert re.fullmatch(
+        r"<PartitionStats 'A': 1 worker, 2 slots, 0 busy, counted since [\d:]{8} UTC>", title
+    )
+    assert head.split() == ["stage", "waiting", "queued", "running", "done", "failed", "seconds"]
+    assert [row.split()[:6] for row in rows] == [
+        ["after", "0", "0", "0", "3", "0"],
+        ["all", "0", "0", "0", "3", "0"],
+    ]
+    assert repr(part) == "<Partition 'A': 1 worker, 2 slots>"

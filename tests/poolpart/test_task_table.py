@@ -91,3 +91,16 @@ def test_the_table_is_printed_in_notebooks_and_as_a_frame(part):
     assert "Tasks" in page and "failed" in page and "<b>" not in page
     frame = table.to_pandas()
     assert list(frame["state"]) == ["failed"] and frame["seconds"][0] >= 0
+
+
+def test_a_long_table_is_printed_in_part(part):
+    futures = part.client.map(after, range(30), resources={"A": 1}, key="many")
+    table = part.tasks()
+    wait(futures, LONG_S)
+    part.client.gather([part.submit(after, i) for i in range(30)])
+    table = part.tasks()
+    *lines, last = repr(table).splitlines()
+    assert len(table) >= 30 and len(lines) == 1 + 20
+    assert last == f"… the first 20 of {len(table)} tasks: {len(table)} done. to_pandas() has all."
+    page = table._repr_html_()
+    assert page.count("<tr>") == 1 + 20 and last in page

@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raybeam import Outbox, Pattern, device
+from raybeam import Pattern, device
+from raybeam.device import Outbox
 from raybeam.instances import plain
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan

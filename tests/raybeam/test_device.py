@@ -8,16 +8,9 @@ import pytest
 from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
 from tests.raybeam.test_scan import case_of
 
-from raybeam import (
-    BackendUnavailable,
-    Instance,
-    Mesh,
-    OtherHits,
-    Pattern,
-    RayCaster,
-    check_scan,
-    pattern_rays,
-)
+from raybeam import BackendUnavailable, Instance, Mesh, Pattern, RayCaster, pattern_rays
+from raybeam.device import OtherHits
+from raybeam.scan import check_scan
 
 CASE = case_of("on the move, lever arms")
 PATTERN = Pattern(CASE["directions"], CASE["origins"])

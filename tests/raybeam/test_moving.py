@@ -15,12 +15,12 @@ from raybeam import (
     Pattern,
     PoseMotion,
     RayCaster,
-    check_scan,
-    hits_on,
     triangle,
 )
 from raybeam import moving as module
+from raybeam.moving import hits_on
 from raybeam.pattern_rays import checked_rays
+from raybeam.scan import check_scan
 
 pytestmark = pytest.mark.skipif(find_spec("numba") is None, reason="numba is not installed")
 

@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 
-from raybeam import (
-    Moving,
-    Pattern,
-    PoseMotion,
-    RayCaster,
-    SubRays,
-    check_scan,
-    hits_on,
-    pattern_rays,
-)
+from raybeam import Moving, Pattern, PoseMotion, RayCaster, SubRays, pattern_rays
+from raybeam.moving import hits_on
 from raybeam.pattern_rays import plain_rays
 from raybeam.poses import check_poses
+from raybeam.scan import check_scan
 
 RINGS = 7
 FIRINGS = 45

@@ -7,18 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from raybeam import (
-    Instance,
-    Mesh,
-    Moving,
-    Opacity,
-    Pattern,
-    RayCaster,
-    SubRays,
-    check_scan,
-    hits_on,
-    pattern_rays,
-)
+from raybeam import Instance, Mesh, Moving, Opacity, Pattern, RayCaster, SubRays, pattern_rays
+from raybeam.moving import hits_on
+from raybeam.scan import check_scan
 
 FIELDS = ("distance", "triangle", "u", "v", "instance")
 SIZES = (5e-324, 1e-310, 1e-45, 1e-38, 1e-30, 3.7e-20, 8e-19, 2e-18, 6.1e-17, 1e-15, 1e-12, 0.0)

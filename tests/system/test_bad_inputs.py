@@ -89,6 +89,30 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "unknown scheme": (["run", "good.yaml", "--scheduler", "foo://127.0.0.1:1"], "scheme 'foo'"),
     "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "has no host"),
     "no port": (["doctor", "--scheduler", "localhost"], "no port of 1 to 65535"),
+    "no certificates": (
+        ["run", "good.yaml", "--scheduler", "tls://127.0.0.1:1"],
+        "is encrypted, and --tls-ca and --tls-cert are missing",
+    ),
+    "certificates without encryption": (
+        ["doctor", "--scheduler", "tcp://127.0.0.1:1", "--tls-ca", "a.stl"],
+        "'tcp://127.0.0.1:1' does not begin with tls://",
+    ),
+    "no scheduler file": (
+        ["run", "good.yaml", "--wait", "0s", "--scheduler", "sched.json"],
+        "The scheduler file sched.json does not exist",
+    ),
+    "no such scheduler file": (
+        ["doctor", "--scheduler-file", "sched"],
+        "The scheduler file sched does not exist",
+    ),
+    "another file": (
+        ["doctor", "--scheduler-file", "good.yaml"],
+        "The scheduler file good.yaml cannot be read",
+    ),
+    "address and file": (
+        ["doctor", "--scheduler", "tcp://127.0.0.1:1", "--scheduler-file", "sched.json"],
+        "--scheduler and --scheduler-file cannot be combined",
+    ),
     "scene that is there": (["scene", "city", "good.ply"], "exists: give another"),
     "no scheduler": (  # nor is a folder left behind
         [

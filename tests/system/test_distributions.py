@@ -16,6 +16,10 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import lidarpool
+import lidarsim
+import poolpart
+import raybeam
 from lidarpool import __version__
 
 ROOT = Path(__file__).parents[2]
@@ -99,6 +103,12 @@ def test_a_part_wants_what_the_whole_wants(name):
         assert set(wanted) <= set(extras.get(extra, whole["dependencies"]))
     assert part["requires-python"] == whole["requires-python"]
     assert (folder_of(name) / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
+
+
+@pytest.mark.parametrize("part", [raybeam, poolpart, lidarpool])
+def test_all_parts_have_one_version(part):
+    assert part.__version__ == lidarsim.__version__
+    assert "__version__" in part.__all__
 
 
 def outside() -> dict[str, str]:

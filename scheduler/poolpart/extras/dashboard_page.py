@@ -23,11 +23,11 @@ from ..fence import fences_of
 from ..html_table import WORDS, shown_seconds
 from ..internals.names import PAGE, require
 from ..internals.scheduler import serve, serve_no_longer
+from ..membership import release_statistics
 from ..partition_stats import COUNTS, StageStats
 from ..pipe_states import pipes_of
 from ..stats import NAME as STATISTICS
 from ..stats import (
-    forget_statistics,
     running_on,
     slots_of,
     statistics_of,
@@ -175,7 +175,8 @@ class PageOwners(SchedulerPlugin):
         self.owners: set[str] = set()  # clients, by id
         # Names that the page is asked by; None where a proxy has a name that is not known here.
         self.names: set[str] | None = None if _HUB in os.environ else {*names}
-        self.began_to_count = STATISTICS not in scheduler.plugins
+        statistics = scheduler.plugins.get(STATISTICS)
+        self.began_to_count = statistics is None or not statistics.is_kept
         # A `dask scheduler --dashboard-prefix` is part of the path.
         handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": scheduler, "owners": self})]
         self.page = web.Application(handlers)
@@ -196,7 +197,7 @@ class PageOwners(SchedulerPlugin):
         if not self.owners:
             close_page(scheduler)
             if self.began_to_count and STEWARD not in scheduler.plugins:
-                forget_statistics(scheduler)
+                release_statistics(scheduler)
 
 
 def partitions_page(client: Client) -> str:

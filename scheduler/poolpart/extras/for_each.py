@@ -14,7 +14,7 @@ from distributed import Client, Future, wait
 
 from ..errors import PipeFailed, PoolError
 from ..membership import prospects
-from ..pipe import Pipe
+from ..pipe import Pipe, take_beside
 from ..worker_wait import WorkerWait, check_wait
 
 LOOK_S = 5.0  # between looks at the number of slots
@@ -46,8 +46,7 @@ class _PipeItems:
 
     def take(self, futures: Sequence[Future], limit: int, seconds: float) -> Sequence[Any]:
         """Return up to `limit` items, as soon as there are any or a task has ended."""
-        items, self.closed = self._pipe.take_beside(futures, limit, seconds)
-        self.drained = self.closed and not self._pipe.buffered and len(items) < limit
+        items, self.closed, self.drained = take_beside(self._pipe, futures, limit, seconds)
         return items
 
     def fail(self, reason: str) -> None:

@@ -96,6 +96,8 @@ class Listener:
 
     def _listen(self) -> None:
         """Call the function until the pipe ends or the listener is closed."""
+        from ..pipe import put_back  # `pipe` imports this module
+
         self._thread = threading.current_thread()
         try:
             while not self._closed.is_set():
@@ -111,7 +113,7 @@ class Listener:
                     raise
                 with self._calling:
                     if self._closed.is_set():
-                        self._pipe.put_back(item)
+                        put_back(self._pipe, item)
                         return
                     self._function(item)
         except BaseException as error:

@@ -17,7 +17,7 @@ from distributed import get_worker
 from lidarsim._version import __version__
 from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import Plugin, find_plugin
-from raybeam import backend_build
+from raybeam.registry import backend_build
 
 T = TypeVar("T")
 

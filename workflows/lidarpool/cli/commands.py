@@ -7,7 +7,7 @@ immediate: the imports of a run take a second.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, fields, replace
 from functools import wraps
 from pathlib import Path
@@ -42,6 +42,8 @@ from .stations_command import stations
 from .twin_command import twin
 
 if TYPE_CHECKING:
+    from poolpart import WorkerInfo
+
     from ..base.tls_files import TlsFiles
     from ..run.options import RunOptions
     from .terminal import Terminal
@@ -398,15 +400,15 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     from ..run.cluster.connection import connected
     from .doctor import advice_in_words, examine, in_words
 
-    pool = None
+    found: Iterable[WorkerInfo] = ()
     if scheduler is not None:
         with connected(scheduler, files) as client:
-            pool = Pool.from_client(client)
-    workers = sorted(pool or (), key=lambda worker: (sorted(worker.resources), worker.name))
+            found = Pool.from_client(client).workers
+    workers = sorted(found, key=lambda worker: (sorted(worker.resources), worker.name))
     figures = examine()
     figures["workers"] = [asdict(worker) for worker in workers]
     lines = in_words(figures)
-    if pool is not None:
+    if scheduler is not None:
         hosts = plural(len({worker.host for worker in workers}), "host")
         lines.append(f"cluster: {plural(len(workers), 'worker')} on {hosts}")
     for worker in workers:

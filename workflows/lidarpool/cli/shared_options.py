@@ -15,6 +15,12 @@ from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage, is_url
 from lidarsim.base.vocabulary import BACKENDS, UNITS_M
 
+from ..base.scheduler_address import (
+    check_address,
+    check_certificates,
+    is_scheduler_file,
+    read_scheduler_file,
+)
 from ..base.shard import Shard
 from ..base.tls_files import TlsFiles
 from . import completion
@@ -182,33 +188,21 @@ def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:
 
 
 def scheduler(command: Command) -> Command:
-    """Add --scheduler and its certificates, which the command gets as `scheduler` and `files`."""
+    """Add --scheduler, --scheduler-file and certificates.
+
+    The command gets the address as `scheduler`, and the certificates as `files`. All are checked
+    before the command is called.
+    """
 
     @wraps(command)
     def with_files(*arguments: Any, **settings: Any) -> None:
-        from lidarsim.base.input_files import input_size
-
-        if settings.get("cluster") is not None and settings["scheduler"] is not None:
-            raise click.UsageError(
-                "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
-            )
-        if settings.get("tls") and (
-            settings["cluster"] is not None or settings["scheduler"] is not None
-        ):
-            raise click.UsageError(
-                "--tls is for a cluster of this machine: that of --cluster is encrypted if its "
-                "file says so, that of --scheduler if its address begins with tls://."
-            )
         files = TlsFiles(*(settings.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
-        if any(files) and settings["scheduler"] is None:
-            raise click.UsageError(
-                "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
-                "address, tls://host:8786."
-            )
-        for file in filter(None, files):
-            with explained(f"{file} cannot be read"):
-                input_size(file)
-        command(*arguments, files=files, **settings)
+        file = settings.pop("scheduler_file")
+        _check_combination(settings, file, files)
+        address = _scheduler_address(settings["scheduler"], file, settings.get("wait_s"))
+        if address is not None:
+            check_certificates(address, files)
+        command(*arguments, files=files, **settings | {"scheduler": address})
 
     pem = click.Path(exists=True, dir_okay=False, path_type=Path)
     for name, description in (
@@ -217,9 +211,59 @@ def scheduler(command: Command) -> Command:
         ("ca", "Certificate of the authority of an encrypted cluster, a PEM file."),
     ):
         click.option(f"--tls-{name}", type=pem, help=description)(with_files)
-    return click.option(
-        "--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786."
+    click.option(
+        "--scheduler-file",
+        type=click.Path(dir_okay=False, path_type=Path),
+        help="File with the scheduler's address, as written by dask scheduler --scheduler-file.",
     )(with_files)
+    return click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Address of a running Dask scheduler, such as tcp://host:8786, or its scheduler file.",
+    )(with_files)
+
+
+def _check_combination(settings: Mapping[str, Any], file: Path | None, files: TlsFiles) -> None:
+    """Raise a UsageError for options of a scheduler that exclude each other.
+
+    Raises LidarError if a file of a certificate cannot be read.
+    """
+    from lidarsim.base.input_files import input_size
+
+    if settings["scheduler"] is not None and file is not None:
+        raise click.UsageError("--scheduler and --scheduler-file cannot be combined.")
+    has_scheduler = settings["scheduler"] is not None or file is not None
+    starts_cluster = settings.get("cluster") is not None
+    if starts_cluster and has_scheduler:
+        raise click.UsageError(
+            "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
+        )
+    if settings.get("tls") and (starts_cluster or has_scheduler):
+        raise click.UsageError(
+            "--tls is for a cluster of this machine: that of --cluster is encrypted if its "
+            "file says so, that of --scheduler if its address begins with tls://."
+        )
+    if any(files) and not has_scheduler:
+        raise click.UsageError(
+            "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
+            "address, tls://host:8786."
+        )
+    for pem in filter(None, files):
+        with explained(f"{pem} cannot be read"):
+            input_size(pem)
+
+
+def _scheduler_address(given: str | None, file: Path | None, wait_s: float | None) -> str | None:
+    """Return the address of --scheduler or --scheduler-file, after checking it."""
+    if given is not None and is_scheduler_file(given):
+        file = Path(given)
+    if file is not None:
+        return read_scheduler_file(
+            file, wait_s or 0.0, lambda text: click.echo(f"note: {text}", err=True)
+        )
+    if given is not None:
+        check_address(given)
+    return given
 
 
 def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:

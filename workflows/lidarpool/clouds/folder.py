@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, MissingFileError, explained
 from lidarsim.base.storage import WRITING, Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
@@ -71,7 +71,7 @@ def refuse_missing(place: Path | Storage, advice: str) -> None:
     """Raise LidarError with advice if a path, of a folder or file, does not exist."""
     local = place if isinstance(place, Path) else Path(place.url) if place.is_local else None
     if local is not None and not local.exists():
-        raise LidarError(f"{place} does not exist: {advice}")
+        raise MissingFileError(f"{place} does not exist: {advice}")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from lidarsim.base.declared import about
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, MissingFileError, explained
 from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
@@ -214,7 +214,7 @@ class Format:
         """Raise LidarError unless all requirements of `write` are met, before a file is written."""
         self.check_installed()
         if not path.parent.is_dir():
-            raise LidarError(f"The folder {path.parent} does not exist: make it first.")
+            raise MissingFileError(f"The folder {path.parent} does not exist: make it first.")
         if path.exists() and not overwrite:
             raise LidarError(f"{path} exists: give another place with --out, or --overwrite.")
         if path.name == self.row.file:

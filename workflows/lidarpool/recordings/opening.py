@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, MissingFileError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 
@@ -105,7 +105,7 @@ def _open_path(source: RecordingSource) -> Recording:
     """Open a file or folder."""
     path = source.path
     if not path.exists():
-        raise LidarError(f"{source.name} does not exist: give {KINDS}.")
+        raise MissingFileError(f"{source.name} does not exist: give {KINDS}.")
     if path.is_file() and not path.stat().st_size:
         raise LidarError(f"{source.name} is empty (0 bytes): give {KINDS}.")
     if (path / INDEX_FILE).exists():

@@ -14,7 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from lidarsim.base.errors import LidarError, Mistakes, explained
+from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import listed, plural
@@ -517,7 +517,9 @@ def _merge_survey(
     made_of = record["made_of"]
     path = Path(scenario or made_of["path"])
     if not path.exists():
-        raise LidarError(f"{path}, of which these shards are, does not exist: give --scenario.")
+        raise MissingFileError(
+            f"{path}, of which these shards are, does not exist: give --scenario."
+        )
     with screen.status("reading the scene"):
         built = build(Scenario.load(path, made_of["options"]))
         job = built.job()

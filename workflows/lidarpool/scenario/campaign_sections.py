@@ -44,7 +44,7 @@ from lidarsim.base.declared import (
     short,
 )
 from lidarsim.base.error_sentences import sentences
-from lidarsim.base.errors import LidarError, Mistakes, message_of
+from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, message_of
 from lidarsim.base.input_files import not_found, read_input_text
 from lidarsim.base.section_fields import sections_in
 from lidarsim.base.tables import ignored_columns
@@ -544,7 +544,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
         model = next(sections_in(entry), BaseModel)
         _check_columns(names, model)
     except FileNotFoundError as error:
-        raise LidarError(not_found(path)) from error
+        raise MissingFileError(not_found(path)) from error
     except (OSError, ValueError, csv.Error, LidarError) as error:
         raise LidarError(f"{path} is not a usable table: {message_of(error)}") from error
     adapter = TypeAdapter(entry)

@@ -11,7 +11,7 @@ import trimesh
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, MissingFileError, explained
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.meshfile import FORMAT_COMMENT
 from lidarsim.scene.scene import Scene
@@ -63,7 +63,7 @@ def check_target(path: Path) -> None:
             f"scenes are written as {', '.join(SUFFIXES)}."
         )
     if not path.parent.is_dir():
-        raise LidarError(f"The folder {path.parent} does not exist: make it first.")
+        raise MissingFileError(f"The folder {path.parent} does not exist: make it first.")
     if path.is_dir() or not os.access(path.parent, os.W_OK):
         raise LidarError(f"{path} cannot be written: choose another place.")
 

@@ -28,10 +28,21 @@ class LidarError(Exception):
     The message says in one or two lines what was given, what was expected and what to do. The
     command prints the message without a traceback and exits with code 2. A line is cut in its
     middle if it quotes a file at length. A long list of names has separate lines.
+
+    If a file does not exist, the error is also a FileNotFoundError. If an argument does not fit the
+    annotation of its parameter, it is also a ValueError.
     """
 
     def __init__(self, message: object = "") -> None:
         super().__init__("\n".join(map(_wrap_list, map(_cut, str(message).split("\n")))))
+
+
+class MissingFileError(LidarError, FileNotFoundError):
+    """A LidarError for a file or folder that does not exist."""
+
+
+class ArgumentError(LidarError, ValueError):
+    """A LidarError for an argument that does not fit the annotation of its parameter."""
 
 
 def _cut(line: str) -> str:
@@ -116,13 +127,19 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
 
 @contextmanager
 def explained(failure: str, advice: str = "") -> Iterator[None]:
-    """Turn an OSError of the body into a LidarError: the failure, the reason, and advice."""
+    """Turn an OSError of the body into a LidarError: the failure, the reason, and advice.
+
+    The error is a MissingFileError if a file does not exist.
+    """
     try:
         yield
+    except LidarError:
+        raise
     except OSError as error:
         why = message_of(error).rstrip(".")
         message = f"{failure} ({why}): {advice}." if advice else f"{failure}: {why}."
-        raise LidarError(message) from error
+        kind = MissingFileError if isinstance(error, FileNotFoundError) else LidarError
+        raise kind(message) from error
 
 
 @contextmanager
@@ -137,7 +154,8 @@ def converted(failure: str) -> Iterator[None]:
         reason = (
             message_of(error).rstrip(".") if isinstance(error, LidarError) else reason_of(error)
         )
-        raise LidarError(f"{failure}: {reason}.") from error
+        kind = MissingFileError if isinstance(error, FileNotFoundError) else LidarError
+        raise kind(f"{failure}: {reason}.") from error
 
 
 @contextmanager
@@ -146,7 +164,8 @@ def prefixed(subject: object) -> Iterator[None]:
     try:
         yield
     except LidarError as error:
-        raise LidarError(f"{subject}: {error}") from error
+        kind = MissingFileError if isinstance(error, MissingFileError) else LidarError
+        raise kind(f"{subject}: {error}") from error
 
 
 class Mistakes:

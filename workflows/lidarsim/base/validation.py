@@ -36,7 +36,7 @@ from pydantic_core import PydanticKnownError, SchemaValidator, ValidationError, 
 
 from .arrays import AnyArray
 from .error_sentences import argument_error
-from .errors import LidarError
+from .errors import ArgumentError, LidarError
 from .section_fields import LIMITS, limits_of
 from .signatures import ReadableSignature, readable
 from .value_texts import one_line, shown
@@ -141,7 +141,7 @@ def _check(target: Any, values: Mapping[str, Any]) -> None:
         try:
             validator.validate_python(without_numpy(values))
         except ValidationError as error:
-            raise LidarError(argument_error(error, hints)) from None
+            raise ArgumentError(argument_error(error, hints)) from None
 
 
 def without_numpy(value: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from .allowance import Allowance
-from .errors import LidarError, prefixed
+from .errors import LidarError, MissingFileError, prefixed
 from .input_files import not_found, read_input_text
 
 _NODE_BYTES = 500  # memory of a value in the loader
@@ -103,7 +103,7 @@ def read_yaml(
         with prefixed(path):
             content = load_yaml(read_input_text(path))
     except FileNotFoundError as error:
-        raise LidarError(not_found(path)) from error
+        raise MissingFileError(not_found(path)) from error
     except OSError as error:
         raise LidarError(f"{path} cannot be read: {error.strerror or error}.") from error
     except yaml.MarkedYAMLError as error:

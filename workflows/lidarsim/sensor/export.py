@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Ints
-from ..base.errors import LidarError
+from ..base.errors import LidarError, MissingFileError
 from ..base.validation import checked
 from ..sensor_files.fired_rays import FRAME_HZ, FiredRays, Light
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
@@ -91,7 +91,7 @@ def export_sensor(
     if not isinstance(sensor, Sensor):
         raise LidarError(f"{type(sensor).__name__} is no Sensor: load_sensor(MODEL) returns one.")
     if not path.parent.is_dir():
-        raise LidarError(f"The folder {path.parent} does not exist: make it first.")
+        raise MissingFileError(f"The folder {path.parent} does not exist: make it first.")
     write = row.function("write")
     if row.describes:
         rays = FiredRays(np.zeros((0, 3)))

@@ -10,7 +10,7 @@ from threading import Event
 import click
 import numpy as np
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, MissingFileError
 from lidarsim.base.notebook import cell_display
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud_file import CloudFile
@@ -110,7 +110,7 @@ def open_result(path: Path, downloads: Downloads | None = None) -> View:
     A scene or sweeps that cannot be read are noted only. LidarError for a missing or damaged cloud.
     """
     if not path.exists():
-        raise LidarError(f"{path} does not exist: give the folder of a result, or a cloud.")
+        raise MissingFileError(f"{path} does not exist: give the folder of a result, or a cloud.")
     title = f"{path.resolve().name} - lidarpool"
     if not path.is_dir():
         return View(CloudFile(path), title=title, downloads=downloads)

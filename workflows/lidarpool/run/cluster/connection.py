@@ -13,11 +13,9 @@ from contextlib import (
     closing,
     contextmanager,
     nullcontext,
-    suppress,
 )
 from multiprocessing import current_process
 from typing import Any
-from urllib.parse import urlsplit
 
 import dask
 from dask.system import CPU_COUNT
@@ -33,6 +31,7 @@ from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
 from ...base.fork_server import start_fork_server
+from ...base.scheduler_address import check_address
 from ...base.tls_files import TlsFiles
 from ..cluster_file import ClusterFile
 from ..pipeline.stage_names import GPU, LIDAR, OTHER
@@ -218,7 +217,7 @@ def connected(
     certificates are wrong.
     """
     if not scheduler.startswith("inproc"):
-        _check_address(scheduler)
+        check_address(scheduler)
     waiting = waiting or Waiting()
     try:
         security = Security()
@@ -241,18 +240,6 @@ def connected(
         ) from error
     with client:
         yield client
-
-
-def _check_address(address: str) -> None:
-    """Raise LidarError if an address has no host or no valid port."""
-    with suppress(ValueError):  # ValueError if the port is not a number, or out of range
-        parts = urlsplit(f"//{address.rpartition('//')[2]}")
-        if parts.hostname and parts.port:
-            return
-    raise LidarError(
-        f"The address {address!r} has no host, or no port of 1 to 65535: give that of the "
-        "scheduler, such as tcp://host:8786."
-    )
 
 
 async def _reach(address: str, security: Security, waiting: Waiting) -> None:

@@ -21,6 +21,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.survey.survey import Survey
 from poolpart import Pipe, PipeClosed, PipeFailed
 from poolpart.fetch import fetch_available, hold_for_driver
+from poolpart.pipe import advice_of
 from poolpart.task_context import telling_departure
 
 from ...columns.parts import pack
@@ -127,7 +128,7 @@ def _describe_scans(
                 survey: Survey = pickle.loads(description.survey)  # noqa: S301 - of the run's own driver
             while first < description.stop:
                 item = ScanRange(
-                    description.job, first, min(first + outlet.advice, description.stop)
+                    description.job, first, min(first + advice_of(outlet), description.stop)
                 )
                 with naming_scans(item.first, item.stop):
                     survey.scan(item.stop - 1)  # raises here if a scan cannot be described

@@ -27,7 +27,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from poolpart import Partition, Pipe, PipeFailed
 from poolpart.fetch import fetch_available, take_held
-from poolpart.pipe import forget_pipes, take_news
+from poolpart.pipe import advise, forget_pipes, take_news
 from poolpart.task_locations import TaskLocations, look_for_tasks
 
 from ...base.software import call_with_same_sources
@@ -166,7 +166,7 @@ class LongStages:
 
     def advise(self, scans: int) -> None:
         """Set the number of scans that stage 1 puts into an item."""
-        self._scans.advise(scans)
+        advise(self._scans, scans)
 
     def store_held(self, receipt: Receipt) -> bool:
         """Store a part that its worker holds in memory, and return False if the part is lost."""

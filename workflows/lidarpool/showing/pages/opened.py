@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any
 
 from lidarscenes.files.formats import ROBOTS
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, MissingFileError, explained
 from lidarsim.base.input_files import open_input
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.mesh_formats import format_of
@@ -65,7 +65,9 @@ def open_view(
     LidarError if the path has an unfinished run, or nothing that is read.
     """
     if not path.exists():
-        raise LidarError(f"{path} does not exist: give a result, a cloud, a mesh or a scenario.")
+        raise MissingFileError(
+            f"{path} does not exist: give a result, a cloud, a mesh or a scenario."
+        )
     title = f"{path.resolve().name} - lidarpool"
     if _is_previewed(path):
         return _preview(path, of_mesh, tell)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, MissingFileError
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
@@ -96,7 +96,9 @@ def open_source(
         If the source cannot be read, or has no sweeps.
     """
     if isinstance(source, Path) and not source.exists():
-        raise LidarError(f"{source} does not exist: give a result, a scenario or a recording.")
+        raise MissingFileError(
+            f"{source} does not exist: give a result, a scenario or a recording."
+        )
     with ExitStack() as stack:
         if isinstance(source, Path) and source.is_file():
             if source.suffix.lower() in CAPTURE_ENDINGS:

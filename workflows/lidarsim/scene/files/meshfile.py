@@ -16,7 +16,7 @@ import numpy as np
 
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
-from ...base.errors import CutShortError, LidarError, prefixed, unreadable
+from ...base.errors import CutShortError, LidarError, MissingFileError, prefixed, unreadable
 from ...base.extras import install_command
 from ...base.input_files import not_found, open_input, read_input
 from ...base.validation import checked
@@ -395,7 +395,7 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
         with prefixed(path):
             data = read_input(path, max_bytes)
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise LidarError(not_found(path, endings())) from error
+        raise MissingFileError(not_found(path, endings())) from error
     except (OSError, ValueError) as error:  # a NUL in the name
         reason = getattr(error, "strerror", None) or error
         raise LidarError(f"{path} cannot be read: {reason}.") from error

@@ -13,20 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from raybeam import (
-    Deforming,
-    Instance,
-    Moving,
-    OtherHits,
-    Pattern,
-    RayCaster,
-    Scan,
-    ScanReturns,
-    available_backends,
-    check_scan,
-    hits_on,
-    listed_hits_on,
-)
+from raybeam import Deforming, Instance, Moving, Pattern, RayCaster, ScanReturns, available_backends
+from raybeam.device import OtherHits
+from raybeam.moving import hits_on, listed_hits_on
+from raybeam.scan import Scan, check_scan
 
 from ...base.arrays import Bools, Floats, Indices, Ints, Ints32
 from ...base.errors import LidarError

@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from raybeam import DeviceHits, OtherHits, Outbox, Pattern, Scan, check_scan
-from raybeam.device import filled, host_array, to_device
+from raybeam import Pattern
+from raybeam.device import DeviceHits, OtherHits, Outbox, filled, host_array, to_device
+from raybeam.scan import Scan, check_scan
 
 from ...base.arrays import AnyArray, Floats, Floats32, Indices, Ints
 from ...columns.table import AXES, CHANNEL, OBJECT, TABLE, Column

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import Pattern, any_axes
+from raybeam import Pattern
+from raybeam.sub_rays import any_axes
 
 from ...base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ...base.elementary import exp, log

@@ -1,0 +1,44 @@
+"""Errors that mean the same as errors of Python are these errors, too."""
+
+import pickle
+
+import pytest
+
+from lidarsim import LidarError, Scene, load_sensor
+from lidarsim.base.errors import MissingFileError, explained, prefixed
+
+
+@pytest.mark.parametrize("load", [Scene.load, load_sensor])
+def test_a_file_that_does_not_exist(load, tmp_path):
+    path = tmp_path / ("nope.glb" if load is Scene.load else "nope.yaml")
+    with pytest.raises(FileNotFoundError, match="does not exist") as raised:
+        load(path)
+    assert isinstance(raised.value, LidarError)
+
+
+def test_an_argument_that_does_not_fit():
+    with pytest.raises(ValueError, match="unit") as raised:
+        Scene.load("a.stl", unit=3)
+    assert isinstance(raised.value, LidarError)
+
+
+def test_another_error_stays_alone(tmp_path):
+    path = tmp_path / "empty.stl"
+    path.touch()
+    with pytest.raises(LidarError) as raised:
+        Scene.load(path)
+    assert not isinstance(raised.value, OSError | ValueError)
+
+
+def test_the_kind_outlives_prefixes_processes_and_further_explanations(tmp_path):
+    with (
+        pytest.raises(MissingFileError) as raised,
+        explained("The run cannot start"),
+        prefixed("leg 3"),
+        explained("the table cannot be read"),
+    ):
+        (tmp_path / "nope.csv").read_text()
+    copy = pickle.loads(pickle.dumps(raised.value))
+    expected = "leg 3: the table cannot be read: No such file or directory."
+    assert str(copy) == str(raised.value) == expected
+    assert isinstance(copy, FileNotFoundError)

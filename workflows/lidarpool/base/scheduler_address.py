@@ -1,0 +1,131 @@
+"""Addresses of running Dask schedulers, as users give them.
+
+They are checked before anything else is read or computed.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from lidarsim.base.errors import LidarError, MissingFileError, converted, explained
+from lidarsim.base.input_files import read_input_text
+
+from .tls_files import TlsFiles
+
+_LOOK_EVERY_S = 0.5  # between looks for a scheduler file that does not exist yet
+_WRITING_S = 2.0  # longest time in which a scheduler writes its file
+_ENCRYPTED = ("tls://", "wss://")
+_SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")  # of Dask, between processes
+_NEEDED = {  # {option: key in Dask's configuration}
+    "--tls-ca": "distributed.comm.tls.ca-file",
+    "--tls-cert": "distributed.comm.tls.client.cert",
+}
+
+
+def is_scheduler_file(given: str) -> bool:
+    """Return whether `given` is the path of a scheduler file, and no address."""
+    return "://" not in given and (given.endswith(".json") or Path(given).is_file())
+
+
+def read_scheduler_file(
+    path: Path, wait_s: float = 0.0, tell: Callable[[str], None] = lambda text: None
+) -> str:
+    """Return the address in a file that ``dask scheduler --scheduler-file`` writes.
+
+    Parameters
+    ----------
+    path
+        The file.
+    wait_s
+        How long to wait for a file that does not exist yet, in seconds.
+    tell
+        Called with a note before a wait.
+
+    Raises
+    ------
+    LidarError
+        If the file does not exist in time, or is not a scheduler file.
+    """
+    deadline = time.monotonic() + wait_s
+    if wait_s and not path.exists():
+        tell(f"waiting for the scheduler file {path}")
+    was_found = False
+    while True:
+        found = path.exists()
+        try:
+            return _read(path)
+        except LidarError:
+            if found and not was_found:  # perhaps the scheduler is writing the file
+                deadline = min(deadline, time.monotonic() + _WRITING_S)
+                was_found = True
+            if time.monotonic() >= deadline:
+                raise
+        time.sleep(_LOOK_EVERY_S)
+
+
+def _read(path: Path) -> str:
+    """Return the address in a scheduler file, or raise LidarError."""
+    if not path.exists():
+        raise MissingFileError(
+            f"The scheduler file {path} does not exist. Start the scheduler with "
+            f"dask scheduler --scheduler-file {path}, or give more time with --wait."
+        )
+    failure = f"The scheduler file {path} cannot be read"
+    with explained(failure):
+        text = read_input_text(path)
+    with converted(failure):
+        address = json.loads(text)["address"]
+        check_address(address)
+    return str(address)
+
+
+def check_address(address: str) -> None:
+    """Raise LidarError if an address has an unknown scheme, no host or no valid port."""
+    scheme, separator, _ = address.partition("://")
+    if separator and scheme not in _SCHEMES:
+        raise LidarError(
+            f"The address {address!r} has the unknown scheme {scheme!r}. Give an address such as "
+            "tcp://host:8786 or, for an encrypted cluster, tls://host:8786."
+        )
+    with suppress(ValueError):  # ValueError if the port is not a number, or out of range
+        parts = urlsplit(f"//{address.rpartition('//')[2]}")
+        if parts.hostname and parts.port:
+            return
+    raise LidarError(
+        f"The address {address!r} has no host, or no port of 1 to 65535. Give the address of the "
+        "scheduler, such as tcp://host:8786, or its scheduler file."
+    )
+
+
+def check_certificates(address: str, files: TlsFiles) -> None:
+    """Raise LidarError if an encrypted cluster lacks certificates, or another has some.
+
+    Certificates may also be in Dask's configuration.
+    """
+    if not address.startswith(_ENCRYPTED):
+        if any(files):
+            raise LidarError(
+                f"--tls-ca, --tls-cert and --tls-key are for an encrypted cluster, and the address "
+                f"{address!r} does not begin with tls://. Start the scheduler with certificates, "
+                "or leave out these options."
+            )
+        return
+    from dask import config
+
+    missing = [
+        option
+        for (option, key), file in zip(_NEEDED.items(), files, strict=False)
+        if file is None and not config.get(key, None)
+    ]
+    if missing:
+        raise LidarError(
+            f"The cluster at {address!r} is encrypted, and {' and '.join(missing)} "
+            f"{'is' if len(missing) == 1 else 'are'} missing. Give the certificates that the "
+            "scheduler was started with by --tls-ca, --tls-cert and --tls-key, or in Dask's "
+            "configuration as distributed.comm.tls."
+        )
