@@ -9,9 +9,24 @@ from functools import cached_property
 import numpy as np
 import pytest
 import trimesh
-from tests.shapes import CPU, box, cast, level, solid
+from scipy.spatial.transform import Rotation
+from tests.shapes import CPU, box, cast, level, made, solid
 
-from lidarpool import Beams, LidarError, Material, Optics, Pose, Returns, Scene, Sensor, Spin
+from lidarpool import (
+    Actor,
+    Beams,
+    LidarError,
+    Material,
+    Optics,
+    Pose,
+    Returns,
+    Scene,
+    SceneInstance,
+    Sensor,
+    Spin,
+    Survey,
+    Track,
+)
 from lidarsim.media.materials import extinction, fresnel
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.steps.cast import MAX_PASSES, MAX_REFLECTIONS
@@ -222,12 +237,13 @@ def test_water_in_the_thickest_fog_has_no_energy_that_is_no_number():
 # -- bodies within bodies ------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Body:
     """A convex body, by the planes of its faces: independent of meshes and of casting."""
 
     mesh: SceneMesh
     material: Material
+    touches: bool = True  # whether it is made larger, so that light meets what it touches
 
     @cached_property
     def planes(self):
@@ -235,8 +251,7 @@ class Body:
         corners = self.mesh.vertices[self.mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1)[:, None]
-        # Bodies of media are larger by 15 µm, so that light meets what they touch.
-        grown = 1.5e-5 if self.material.refractive_index else 0.0
+        grown = 1.5e-5 if self.touches and self.material.refractive_index else 0.0
         return normals, (normals * corners[:, 0]).sum(axis=1) + grown
 
     def holds(self, point):
@@ -359,7 +374,7 @@ def traced(bodies, path, passes=MAX_PASSES):
         yield from traced(bodies, onward, passes - 1)
 
 
-def turned_body(name, mesh, material, at, angles=(0, 0, 0)):
+def turned_body(name, mesh, material, at, angles):
     mesh.apply_transform(trimesh.transformations.euler_matrix(*angles))
     return Body(solid(name, mesh, at), replace(material, objects=name))
 
@@ -373,31 +388,54 @@ def bodies_in_a_room():
     return [
         turned_body("Room", shape.box((40, 30, 20)), Material("*", 0.5), (5, 1, 2), (0.1, 0.2, 0)),
         turned_body("Prism", shape.cylinder(2, 3, sections=3), glass, (5, 2, 0.5), (0.3, 0.8, 0.1)),
+        turned_body("Pane", shape.box((0.3, 6, 6)), mirror, (12, 1, 0), (0.2, 0.3, 0.5)),
         turned_body("Pond", shape.icosphere(0, 3), water, (5, -3, -0.5), (0.4, 0, 0.2)),
         turned_body("Bead", shape.icosphere(1, 1.2), mirror, (5.5, -3, -0.2), (0, 0.5, 0.2)),
-        turned_body("Pane", shape.box((0.3, 6, 6)), mirror, (12, 1, 0), (0.2, 0.3, 0.5)),
     ]
 
 
-@pytest.mark.parametrize("at", [(0, 0, 0), (4.1, -2.8, -1.3), (5.4, -2.9, -0.3)])
-def test_light_through_bodies_is_as_traced_face_by_face(at):
+def scene_of(bodies, kind):
+    """A scene in which the last two bodies are meshes, placed copies of meshes, or actors."""
+    meshes = [body.mesh for body in bodies]
+    if kind == "mesh":
+        return Scene.from_meshes(meshes)
+    pose = Pose((5, -3, 0.5), 40, 20, 10)
+    shapes = [
+        replace(mesh, vertices=(mesh.vertices - pose.position) @ pose.rotation)
+        for mesh in meshes[3:]
+    ]
+    if kind == "instance":
+        return Scene.from_meshes(meshes[:3] + [SceneInstance(one, pose) for one in shapes])
+    quaternion = Rotation.from_matrix(pose.rotation).as_quat()
+    track = Track([0.0, 1.0], [pose.position] * 2, [quaternion] * 2)
+    return Scene.from_meshes(meshes[:3]).with_actors([Actor(one, track) for one in shapes])
+
+
+@pytest.mark.parametrize("kind", ["mesh", "instance", "actor"])
+def test_light_through_bodies_is_as_traced_face_by_face(kind):
     """Objects, ranges, energies and ghosts, from the air, from water, and from glass in water."""
     bodies = bodies_in_a_room()
+    for body in bodies[3:] if kind != "mesh" else ():
+        body.touches = False
     rng = np.random.default_rng(5)
-    beams = Beams(np.radians(rng.uniform(-25, 15, 30)), np.radians(rng.uniform(-40, 40, 30)))
-    sensor = Sensor(beams, Spin(1, 360), optics=Optics())
-    found = cast(
-        [body.mesh for body in bodies], sensor, at, visibility_km=0.2,
+    starts = np.repeat([(0, 0, 0), (4.1, -2.8, -1.3), (5.4, -2.9, -0.3)], 15, axis=0)
+    starts = rng.permutation(starts + rng.uniform(-0.2, 0.2, (45, 3)))
+    angles = np.radians(rng.uniform((-25, -40), (15, 40), (45, 2)))
+    sensor = Sensor(Beams(*angles.T, origin=starts), Spin(1, 360), optics=Optics())
+    survey = Survey(
+        sensor, poses=[(0, 0, 0)], steps=1, visibility_km=0.2, keep_every=1,
         materials=[body.material for body in bodies],
         returns=Returns("all", pulse_ns=1e-6), precision_m=1e-6,
         columns=("ray", "range", "intensity", "object", "cause"),
     )  # fmt: skip
+    scene = scene_of(bodies, kind)
+    found = made(survey, scene)
     expected = []
     for ray, ahead in enumerate(sensor.directions(np.arange(1))[0]):
-        start = np.array(at, float)
-        returns = sorted(traced(bodies, Path(start, ahead, (start, ahead))), key=lambda r: r[1])
-        expected += [(ray, *one) for one in returns]
+        path = Path(starts[ray], ahead, (starts[ray], ahead))
+        expected += [(ray, *one) for one in sorted(traced(bodies, path), key=lambda one: one[1])]
     ray, number, optical, energy, ghost = map(np.array, zip(*expected, strict=True))
+    assert [*scene.all_names] == [body.mesh.name for body in bodies]
     assert found["ray"].tolist() == ray.tolist()
     assert found["object"].tolist() == number.tolist()
     assert (found["cause"] != 0).tolist() == ghost.tolist()

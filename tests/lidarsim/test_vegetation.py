@@ -28,6 +28,7 @@ from lidarpool import (
 from lidarsim.media.leaves import NAMES, brightness, density, projection
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
+from lidarsim.simulator.steps.light_in_media import depths
 
 GROUND = Material("*", 0.3)
 cast = partial(shapes.cast, backend="tiles")
@@ -109,6 +110,33 @@ def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg
     share = (1 - np.exp(-tau * depth)) / (1 - math.exp(-tau))
     off = np.abs(share - (np.arange(len(depth)) + 0.5) / len(depth)).max()
     assert off < 1.63 / math.sqrt(len(depth)), "99 % of Kolmogorov and Smirnov's test"
+
+
+def test_depths_are_negative_logarithms_of_random_numbers():
+    """From a table whose steps are 1.5e-5 of its numbers, for numbers close to 0 and 1, too."""
+    bits = np.random.default_rng(2).integers(0, 2**64, 2000, np.uint64)
+    bits = np.concatenate([bits >> np.uint64(k) for k in (0, 1, 20)] + [[0], ~(bits >> 40)])
+    bits = bits.astype(np.uint64)
+    expected = -np.log(((bits >> np.uint64(11)).astype(float) + 0.5) * 2.0**-53)
+    assert np.abs(depths(bits) - expected).max() < 1.6e-5
+
+
+def test_leaves_of_crowns_that_overlap_are_met_in_proportion_to_their_density():
+    """The middle crown is of leaves that do not face the light, which count less."""
+    kinds = ("planophile", "erectophile", "spherical")
+    meshes = [box(f"Crown{k}", (-9, -9, 0), (9, 9, 3 + k / 1e3)) for k in range(3)]
+    materials = [
+        Material(f"Crown{k}", 0.5, leaf_area_density=0.5 + k, leaf_angle=kind)
+        for k, kind in enumerate(kinds)
+    ]
+    found = cast(meshes, rays(10_000, 0.0), (0, 0, 10), materials=materials)
+    shares = np.array([projection(kind, np.ones(1))[0] for kind in kinds]) * [0.5, 1.5, 2.5]
+    shares /= shares.sum()
+    count = len(found["object"])
+    off = np.bincount(found["object"], minlength=3) - count * shares
+    assert (np.abs(off) < 4 * np.sqrt(count * shares * (1 - shares))).all()
+    bright = np.array([brightness(kind, np.ones(1))[0] for kind in kinds])[found["object"]]
+    assert np.allclose(found["intensity"], 0.5 * bright * (10 / found["range"]) ** 2, 1e-5, 0)
 
 
 def test_leaves_are_as_bright_as_they_face_the_light():
