@@ -150,8 +150,7 @@ class Fences(SchedulerPlugin):
         elapsed_s = time.monotonic() - self._warned_at
         if elapsed_s < WARN_EVERY_S or not self.stop(task):
             return
-        candidates = workers_without_fences(self.scheduler, task)
-        if not candidates or not candidates <= self.closed:  # it waits also without fences
+        if not workers_without_fences(self.scheduler, task):  # it waits also without fences
             return
         self._warned_at = time.monotonic()
         fences = ", ".join(sorted(self.names))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
+import traceback
 import uuid
 from collections import Counter
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 from distributed import Client, Nanny, Scheduler
@@ -13,9 +16,42 @@ from tests.clusters import QUIET, cluster_of, import_jobqueue
 from tests.daemons import wait_until
 from tests.poolpart.job_queue import Queue
 
+import poolpart
 from poolpart import Partition, Pipe, Pool
 from poolpart.deploy import local_cluster
 from poolpart.deploy.local_processes import FixedCluster
+
+PACKAGE = Path(poolpart.__file__).parent
+
+
+class CaughtErrors(logging.Handler):
+    """Texts of logged errors that were raised in poolpart."""
+
+    def __init__(self):
+        super().__init__()
+        self.texts = []
+
+    def emit(self, record):
+        _, error, trace = record.exc_info or (None, None, None)
+        if any(PACKAGE in Path(frame.filename).parents for frame in traceback.extract_tb(trace)):
+            self.texts.append("".join(traceback.format_exception(error)))
+
+
+@pytest.fixture(autouse=True)
+def caught_errors():
+    """Fail a test if poolpart raises an error that is only logged; return the list of errors.
+
+    Dask and poolpart catch errors of plugins and rules on the scheduler, and go on without them. A
+    test that provokes such errors clears the list.
+    """
+    handler = CaughtErrors()
+    loggers = [logging.getLogger(name) for name in ("distributed.scheduler", "asyncio", "poolpart")]
+    for logger in loggers:
+        logger.addHandler(handler)
+    yield handler.texts
+    for logger in loggers:
+        logger.removeHandler(handler)
+    assert not handler.texts, "\n".join(handler.texts)
 
 
 def thread_cluster(workers):

@@ -121,7 +121,9 @@ def test_workers_that_join_leave_and_move_are_counted(client, parts):
 
 
 @pytest.mark.extended
-def test_dask_decides_within_the_fence_if_the_rule_fails(client, parts, monkeypatch, caplog):
+def test_dask_decides_within_the_fence_if_the_rule_fails(
+    client, parts, monkeypatch, caplog, caught_errors
+):
     monkeypatch.delattr("poolpart.choosing.free_slots_of")
     members = {worker.name for worker in parts["A"].workers}
     assert {parts["A"].submit(worker_name).result(LONG_S) for _ in range(10)} <= members
@@ -129,6 +131,7 @@ def test_dask_decides_within_the_fence_if_the_rule_fails(client, parts, monkeypa
         not {client.submit(worker_name, n, pure=False).result(LONG_S) for n in range(10)} & members
     )
     assert "Dask decides without it" in caplog.text
+    caught_errors.clear()
 
 
 def test_nothing_is_left_after_dissolving(client, parts):

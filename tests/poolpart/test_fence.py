@@ -204,10 +204,13 @@ def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(cl
     parts = enclose(client, **A, **B, C=["plain"])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
+        nowhere = client.submit(worker_name, workers="nobody", pure=False)  # not for the fences
+        wait_until(lambda: nowhere.key in scheduler_of(client).tasks)
         one = client.submit(worker_name, pure=False)
         many = client.map(worker_name, range(100), pure=False)
-        wait_until(lambda: complaints(caught) and len(scheduler_of(client).tasks) == 101)
+        wait_until(lambda: complaints(caught) and len(scheduler_of(client).tasks) == 102)
     [complaint] = complaints(caught)  # not one for each task
+    assert f"such as '{one.key}'" in complaint
     assert "exclusive partitions (A, B, C)" in complaint
     assert not one.done()
     parts["B"].dissolve()

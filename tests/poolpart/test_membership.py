@@ -9,7 +9,8 @@ import pytest
 from distributed import Client, get_client
 from tests.poolpart.helpers import LONG_S, addresses, join, kill, leave, twice, worker_name
 
-from poolpart import Partition, Pool, PoolError, n_workers, named, rest
+from poolpart import Partition, Pool, PoolError, membership, n_workers, named, rest
+from poolpart.features import names_with_features
 from poolpart.workers import worker_identities
 
 
@@ -179,6 +180,77 @@ def test_a_client_that_connects_again_registers_again(start, wait_until, monkeyp
     assert part.submit(nested).result(LONG_S) == ["a"] * 9
     with pytest.raises(PoolError, match="have 1 at most"):
         part.submit(worker_name, slots=2).result(LONG_S)
+
+
+def submit_in_task(name):
+    return Partition(name).submit(worker_name).result(LONG_S)
+
+
+def test_registrations_end_with_the_clients_outside_tasks(start, wait_until):
+    client = start({name: {"resources": {name: 1}} for name in "AB"})
+    scheduler = client.cluster.scheduler
+
+    def registered():
+        found = names()
+        assert ("_create_taskstate_from_graph" in vars(scheduler)) == bool(found)
+        assert (membership.NAME in scheduler.plugins) == bool(found)
+        return found
+
+    def names():
+        return set(names_with_features(scheduler))
+
+    assert registered() == set()
+    first, second = (Client(client.cluster, set_as_default=False) for _ in range(2))
+    with first, second:
+        for name in "AB":
+            assert Partition(name, first).submit(submit_in_task, name).result(LONG_S) == name
+        assert Partition("B", second).submit(worker_name).result(LONG_S) == "B"
+        assert registered() == {"A", "B"}
+        first.close()
+        wait_until(lambda: names() == {"B"})
+        assert registered() == {"B"}
+        second.close()
+        wait_until(lambda: names() == set())
+        wait_until(lambda: registered() == set())
+    # Without a client outside tasks, the registration of a task lasts.
+    assert client.submit(submit_in_task, "A", resources={"A": 1}).result(LONG_S) == "A"
+    assert registered() == {"A"}
+    with Client(client.cluster, set_as_default=False) as third:
+        assert Partition("A", third).submit(worker_name).result(LONG_S) == "A"
+    wait_until(lambda: third.id not in scheduler.clients)
+    assert registered() == {"A"}
+
+
+def test_who_cannot_submit_is_not_registered(start, monkeypatch):
+    client = start({"a": {"resources": {"A": 1}}})
+    with pytest.raises(PoolError, match="asks for 2 slots"):
+        Partition("A", client).submit(worker_name, slots=2)
+    # The last request of a client that was killed may arrive after it has left.
+    monkeypatch.setattr(client, "id", "gone")
+    assert membership.register(client, "A", 1, by_rule=False) is False
+    assert membership.NAME not in client.cluster.scheduler.plugins
+
+
+def test_only_a_partition_that_had_a_rule_was_dissolved(start, wait_until):
+    client = start({"a": {}})
+    scheduler = client.cluster.scheduler
+    Pool.from_client(client).divide({"A": rest()})
+    with Client(client.cluster, set_as_default=False) as other:
+        for user in (client, other):
+            assert Partition("A", user).submit(worker_name).result(LONG_S) == "a"
+        Pool(client, []).dissolve()
+        with Client(client.cluster, set_as_default=False) as third:
+            with pytest.raises(PoolError, match="Partition 'A' was dissolved"):
+                Partition("A", third).submit(worker_name)
+            waiting = Partition("LATER", third).submit(worker_name)
+            wait_until(lambda: scheduler.unrunnable)
+            assert waiting.status == "pending"
+    # Nobody remembers it.
+    wait_until(lambda: membership.NAME not in scheduler.plugins)
+    waiting = Partition("A", client).submit(worker_name)
+    wait_until(lambda: scheduler.unrunnable)
+    join(client, "b", resources={"A": 1})
+    assert waiting.result(LONG_S) == "b"
 
 
 def nested():

@@ -9,7 +9,8 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from distributed import Client, Queue, Variable
+from distributed import Client, Queue, Variable, get_worker
+from distributed.protocol.pickle import dumps
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.daemons import wait_until
@@ -18,7 +19,17 @@ from tests.poolpart.helpers import LONG_S
 from poolpart import Pipe, PipeClosed, PipeFailed, cancelled
 from poolpart import pipe as pipe_module
 from poolpart.pipe import advice_of, advise, take_news
-from poolpart.pipe_states import PipeState, no_pipes, open_pipe, pipes_of
+from poolpart.pipe_states import (
+    CHANGE,
+    PUT,
+    TAKE,
+    USES_PIPES,
+    PipeState,
+    fail_pipes_of_killed,
+    no_pipes,
+    open_pipe,
+    pipes_of,
+)
 
 
 def other_end(pipe):
@@ -29,7 +40,9 @@ def other_end(pipe):
 def known(client):
     """What the scheduler knows of pipes, and can be asked."""
     scheduler = client.cluster.scheduler
-    handlers = {name for name, answer in scheduler.handlers.items() if answer is not no_pipes}
+    handlers = {
+        name: answer for name, answer in scheduler.handlers.items() if answer is not no_pipes
+    }
     return set(pipes_of(scheduler)), set(scheduler.plugins), handlers
 
 
@@ -40,6 +53,21 @@ def consume(pipe):
 def produce(pipe, items):
     for item in items:
         pipe.put(item)
+
+
+go = threading.Event()  # the workers are threads of this process
+
+
+def wait_to_go():
+    return go.wait(LONG_S)
+
+
+@pytest.fixture
+def gate():
+    """The event that `wait_to_go` waits for; it is set at the end."""
+    go.clear()
+    yield go
+    go.set()
 
 
 @pytest.fixture
@@ -56,6 +84,27 @@ OPERATIONS = st.lists(
     ),
     max_size=30,
 )
+
+
+@pytest.fixture
+def patient(monkeypatch):
+    """Have all waits last long, so that only a notification ends them in time."""
+    monkeypatch.setattr(pipe_module, "WAIT_S", LONG_S)
+    monkeypatch.setattr("poolpart.internals.queues.LOOK_S", LONG_S)
+
+
+@pytest.fixture
+def requests(monkeypatch):
+    """Record the requests of pipes: (name, longest wait in seconds or None)."""
+    found = []
+    ask = pipe_module.ask
+
+    def record(client, timeout_s, question, **arguments):
+        found.append((question, arguments.get("seconds")))
+        return ask(client, timeout_s, question, **arguments)
+
+    monkeypatch.setattr(pipe_module, "ask", record)
+    return found
 
 
 def wait_for_waiters(client, counts):
@@ -199,6 +248,27 @@ def test_a_consumer_that_fails_ends_its_producers(client, b, make_pipe, pool):
     assert pipes[1].get(LONG_S) == "the program submits another consumer"
 
 
+def close_and_fail(pipe):
+    pipe.put("last")
+    pipe.close()
+    raise OSError("the disk is full")
+
+
+def test_a_closed_pipe_does_not_fail_with_its_task(client, b, make_pipe):
+    pipe = make_pipe(client)
+    with pytest.raises(OSError, match="the disk is full"):
+        b.submit(close_and_fail, pipe).result(LONG_S)
+    assert list(pipe) == ["last"]
+
+
+def test_a_task_whose_input_fails_ends_its_pipe_with_the_error_of_the_input(client, b, make_pipe):
+    pipe = make_pipe(client)
+    dependent = b.submit(produce, pipe, b.submit(int, "no number"), key=f"producer-{pipe.name}")
+    reason = rf"^Task '{dependent.key}', which uses the pipe, has failed: ValueError\(.*'no number'"
+    with pytest.raises(PipeFailed, match=reason):
+        pipe.get(LONG_S)
+
+
 def test_a_task_of_for_each_that_fails_ends_the_consumers_of_its_pipe(client, a, make_pipe):
     results = make_pipe(client)
     with pytest.raises(ValueError, match="bad item"):
@@ -263,6 +333,7 @@ def test_a_task_that_ends_without_closing_its_pipe_is_no_failure(client, a, make
     for item in range(2):
         assert a.submit(pipe.put, item).result(LONG_S) is None
         assert a.submit(produce, pipe, [item]).result(LONG_S) is None
+    assert a.submit(str, pipe).result(LONG_S) == str(pipe)  # does not use it
     wait_until(lambda: not client.cluster.scheduler.tasks)
     assert sorted(pipe.get_all(LONG_S)) == [0, 0, 1, 1]
     pipe.put(3)
@@ -273,6 +344,94 @@ def test_advice_can_return_to_what_it_was(client, make_pipe):
     advise(pipe, 5)
     advise(other_end(pipe), 1)
     assert advice_of(other_end(pipe)) == 1
+
+
+def test_advice_is_requested_once_and_sent_only_if_it_changes(client, make_pipe, requests):
+    pipe = make_pipe(client)
+    assert [pipe.advice, pipe.advice] == [1, 1]
+    pipe.advise(1)
+    assert requests == [(CHANGE, None)]
+    pipe.advise(2)
+    pipe.advise(2)
+    assert pipe.advice == 2
+    assert len(requests) == 2
+    with pytest.raises(ValueError, match=r"is 0; give 1 or more"):
+        pipe.advise(0)
+
+
+def test_each_request_waits_for_a_part_of_the_time_that_is_left(
+    client, make_pipe, requests, monkeypatch
+):
+    monkeypatch.setattr(pipe_module, "WAIT_S", 0.05)
+    pipe = make_pipe(client, capacity=2)
+    for take in (Pipe.get, Pipe.get_all):
+        requests.clear()
+        with pytest.raises(TimeoutError):
+            take(pipe, timeout_s=0.12)
+        questions, seconds = zip(*requests, strict=True)
+        assert {*questions} == {TAKE}
+        assert seconds[0] == max(seconds) == 0.05
+        assert 0.05 < sum(seconds) < 0.125
+    requests.clear()
+    assert pipe.poll() == []
+    pipe.put_many([0, 1])
+    with pytest.raises(TimeoutError, match="stayed full for 0 s"):
+        pipe.put(2, timeout_s=0)
+    assert pipe.get() == 0
+    assert pipe.get_all() == [1]  # has it already, and looks for more
+    assert requests == [(TAKE, 0.0), (PUT, 0.05), (PUT, 0.0), (TAKE, 0.05), (TAKE, 0.0)]
+
+
+def test_items_are_taken_beside_tasks(client, make_pipe, requests, monkeypatch, gate):
+    monkeypatch.setattr(pipe_module, "WAIT_S", 0.05)
+    pipe = make_pipe(client, capacity=9)
+    pipe.put_many(range(7))
+    assert pipe.take_beside([], 2, LONG_S) == ([0, 1], False)
+    assert pipe.depth == 5
+    assert pipe.get() == 2
+    requests.clear()
+    assert pipe.take_beside([], 3, LONG_S) == ([3, 4, 5], False)
+    pipe.close()
+    assert pipe.take_beside([], 3, LONG_S) == ([6], False)
+    assert [question for question, _ in requests] == [CHANGE]  # items of the buffer need none
+    assert pipe.take_beside([], 3, LONG_S) == ([], True)
+
+    pipe = make_pipe(client)
+    task = client.submit(wait_to_go, pure=False)
+    assert pipe.take_beside([task], 1, 0.1) == ([], False)
+    threading.Timer(0.2, pipe.put, ["late"]).start()
+    assert pipe.take_beside([task], 1, LONG_S) == (["late"], False)
+    pipe.put("not taken")
+    requests.clear()
+    threading.Timer(0.2, gate.set).start()
+    assert pipe.take_beside([task], 0, LONG_S) == ([], False)
+    assert task.done() and len(requests) > 1
+    assert pipe.poll() == ["not taken"]
+
+
+@pytest.mark.parametrize("take", ["get_all", "take_news"])
+def test_a_wait_for_more_items_ends_when_the_pipe_is_full_or_ends(
+    client, make_pipe, pool, patient, take
+):
+    def take_all(pipe):
+        if take == "get_all":
+            return other_end(pipe).get_all(linger_s=LONG_S)
+        return take_news(client, LONG_S, [pipe.name], linger_s=LONG_S)[pipe.name]
+
+    start = time.monotonic()
+    pipe = make_pipe(client)
+    for last in (lambda: pipe.put(2), pipe.close):
+        pipe.put(0)
+        waiting = pool.submit(take_all, pipe)
+        wait_for_waiters(client, {pipe: 1})
+        pipe.put(1)
+        assert not waiting.done()
+        last()
+        assert waiting.result(LONG_S) == ([0, 1] if last == pipe.close else [0, 1, 2])
+    pipe = make_pipe(client)
+    pipe.put(0)
+    assert pipe.get_all(timeout_s=0.1, linger_s=LONG_S) == [0]
+    assert time.monotonic() - start < LONG_S / 2
 
 
 def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
@@ -291,6 +450,10 @@ def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
     with pytest.raises(PipeClosed):
         pipe.put_many(range(5))
     assert list(pipe) == [0, 1, 2, 3, 4]
+    failed = make_pipe(client)
+    failed.fail("")
+    with pytest.raises(PipeFailed, match="no reason was given"):
+        failed.put(1)
     failed = make_pipe(client)
     failed.fail("no more")
     with pytest.raises(PipeFailed, match="no more"):
@@ -368,6 +531,17 @@ def test_two_pipes_of_one_name(client, make_pipe):
     assert other_end(pipe).create().depth == 0
 
 
+@pytest.mark.parametrize("kind", [Queue, Variable])
+def test_a_pipe_does_not_take_over_a_queue_or_variable(client, kind):
+    name = f"taken-{kind.__name__}"
+    found = kind(name, client)
+    found.put(1) if kind is Queue else found.set(1)
+    with pytest.raises(ValueError, match=f"has a queue or variable '{name}'"):
+        Pipe(name, client=client).create()
+    assert found.get() == 1
+    found.close() if kind is Queue else found.delete()
+
+
 @pytest.mark.parametrize(
     ("change", "outcome"),
     [
@@ -377,9 +551,8 @@ def test_two_pipes_of_one_name(client, make_pipe):
         (lambda pipe: pipe.fail("no more"), PipeFailed),
     ],
 )
-def test_a_put_that_waits_for_room_hears_at_once(client, make_pipe, monkeypatch, change, outcome):
+def test_a_put_that_waits_for_room_hears_at_once(client, make_pipe, patient, change, outcome):
     """By the scheduler's answer: it would look by itself only after the longest wait."""
-    monkeypatch.setattr(pipe_module, "WAIT_S", LONG_S)
     pipe = make_pipe(client, capacity=1)
     pipe.put("first")
     with ThreadPoolExecutor(1) as thread:
@@ -399,7 +572,7 @@ ENDS = [Pipe.close, Pipe.delete, lambda pipe: pipe.fail("why not")]
 
 
 @pytest.mark.parametrize("change", [*ENDS, lambda pipe: pipe.put("item")])
-def test_an_item_or_the_end_of_a_pipe_ends_the_wait(client, make_pipe, change):
+def test_an_item_or_the_end_of_a_pipe_ends_the_wait(client, make_pipe, patient, change):
     pipe = make_pipe(client)
     start = time.monotonic()
     threading.Timer(0.1, change, [pipe]).start()
@@ -407,15 +580,28 @@ def test_an_item_or_the_end_of_a_pipe_ends_the_wait(client, make_pipe, change):
     assert 0.1 <= time.monotonic() - start < LONG_S / 2
 
 
-def test_a_task_that_ends_or_is_not_known_ends_the_wait(client, make_pipe):
-    future = client.submit(time.sleep, 0.1, pure=False)
+def test_a_task_that_ends_or_is_not_known_ends_the_wait(client, make_pipe, patient, pool, gate):
+    pipe = make_pipe(client)
+    future = client.submit(wait_to_go, pure=False)
+    wait_until(lambda: future.key in client.cluster.scheduler.tasks)
     start = time.monotonic()
-    take_news(client, LONG_S, [make_pipe(client).name], [future.key])
+    waiting = pool.submit(take_news, client, LONG_S, [pipe.name], [future.key])
+    wait_for_waiters(client, {pipe: 1})
+    assert take_news(client, 0.1, [pipe.name], [future.key]) == {}  # leaves the other wait alone
+    assert time.monotonic() - start >= 0.1
+    assert not waiting.done()
+    gate.set()
+    assert waiting.result(LONG_S) == {}
     take_news(client, LONG_S, [], ["nobody-knows"])
     assert time.monotonic() - start < LONG_S / 2
-    start = time.monotonic()
-    assert take_news(client, 0.1, [make_pipe(client).name]) == {}
-    assert time.monotonic() - start >= 0.1
+
+
+def test_items_are_put_beyond_the_capacity_in_the_request_that_takes_others(client, make_pipe):
+    inlet, outlet = make_pipe(client, capacity=1), make_pipe(client)
+    outlet.put("news")
+    puts = {inlet.name: [1, 2], "nobody-knows": [3]}
+    assert take_news(client, 0.0, [outlet.name], puts=puts) == {outlet.name: ["news"]}
+    assert inlet.poll() == [1, 2]
 
 
 def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, monkeypatch):
@@ -726,7 +912,7 @@ def test_other_queues_and_variables_are_as_ever(client, other, make_pipe):
 
 
 def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(
-    client, make_pipe, pool, monkeypatch, wait_until
+    client, make_pipe, pool, monkeypatch, patient, wait_until
 ):
     """The time of an item would grow with the number of pipes."""
     looks = []
@@ -736,8 +922,6 @@ def test_a_change_of_a_pipe_wakes_those_that_wait_for_it_only(
         "has_ended",
         property(lambda state: looks.append(state.name) or has_ended(state)),
     )
-    monkeypatch.setattr(pipe_module, "WAIT_S", LONG_S)
-    monkeypatch.setattr("poolpart.internals.queues.LOOK_S", LONG_S)
     idle = [make_pipe(client) for _ in range(8)]
     busy = make_pipe(client)
     waiting = [pool.submit(other_end(pipe).get, LONG_S) for pipe in idle]
@@ -760,3 +944,52 @@ def test_a_pipe_of_a_client_that_has_left_is_not_made(client):
     late = {"name": "late", "owner": "gone", "capacity": 1, "producers": 1}
     assert client.run_on_scheduler(open_pipe, **late) is False
     assert known(client) == before
+
+
+def test_requests_of_a_client_that_has_left_change_nothing(client, make_pipe):
+    """They may arrive after the news of its end; nobody would get the answer."""
+    pipe = make_pipe(client)
+    pipe.put("kept")
+
+    async def request(dask_scheduler=None):
+        handlers = dask_scheduler.handlers
+        common = {"names": [pipe.name], "asker": "gone", "seconds": 0.0}
+        return (
+            handlers[PUT](**common, items=[dumps("lost")], unbounded=False),
+            await handlers[TAKE](**common),
+        )
+
+    put, taken = client.run_on_scheduler(request)
+    assert put[pipe.name]["answer"] == 0
+    assert taken[pipe.name]["answer"] == []
+    assert pipe.poll() == ["kept"]
+
+
+def get_and_return_key(pipe):
+    return pipe.get(LONG_S), get_worker().get_current_task()
+
+
+@pytest.mark.parametrize("case", ["open", "closed", "consumer", "without pipe"])
+def test_a_killed_task_ends_the_open_pipes_that_it_does_not_consume(client, b, make_pipe, case):
+    pipe = make_pipe(client)
+    pipe.put(1)
+    key = "producer"
+    annotations = {USES_PIPES: [pipe.name]}
+    if case == "consumer":
+        item, key = b.submit(get_and_return_key, pipe).result(LONG_S)
+        pipe.put(item)
+    elif case == "closed":
+        pipe.close()
+    elif case == "without pipe":
+        annotations = None
+
+    def fail(dask_scheduler=None):
+        fail_pipes_of_killed(dask_scheduler, key, annotations)
+
+    client.run_on_scheduler(fail)
+    if case == "open":
+        reason = "^Task 'producer', which uses the pipe, was cancelled, and its worker was restart"
+        with pytest.raises(PipeFailed, match=reason):
+            pipe.poll()
+    else:
+        assert pipe.poll() == [1]
