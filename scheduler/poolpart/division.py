@@ -248,8 +248,9 @@ async def resize(
             f"{rule.minimum}."
         )
     size = len(steward.members(name))  # includes members that are starting again
+    target: str | None = name
     if count > size:
-        moving, target = _joining(steward, name, count - size, source), name
+        moving = _joining(steward, name, count - size, source)
     else:
         moving, target = _leaving(steward, name, size - count), _destination(steward, name)
     # After a loss, the rule may ask for more workers than there are. Moving adds the difference.

@@ -30,7 +30,7 @@ def test_the_readme_orders_all_modules_and_says_who_asks_for_each_extra():
         rows = [line.split("|") for line in table.splitlines() if line.startswith("|")][2:]
         modules = re.findall(r"`(\w+)`", " ".join(row[column] for row in rows))
         assert sorted(modules) == sorted(
-            path.stem for path in folder.glob("*.py") if path.stem != "__init__"
+            path.stem for path in folder.glob("*.py") if not path.stem.startswith("_")
         )
 
 

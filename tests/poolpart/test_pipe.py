@@ -18,7 +18,7 @@ from tests.poolpart.helpers import LONG_S
 
 from poolpart import Pipe, PipeClosed, PipeFailed, cancelled
 from poolpart import pipe as pipe_module
-from poolpart.pipe import advice_of, advise, take_news
+from poolpart.pipe import advice_of, advise, take_beside, take_news
 from poolpart.pipe_states import (
     CHANGE,
     PUT,
@@ -348,15 +348,15 @@ def test_advice_can_return_to_what_it_was(client, make_pipe):
 
 def test_advice_is_requested_once_and_sent_only_if_it_changes(client, make_pipe, requests):
     pipe = make_pipe(client)
-    assert [pipe.advice, pipe.advice] == [1, 1]
-    pipe.advise(1)
+    assert [advice_of(pipe), advice_of(pipe)] == [1, 1]
+    advise(pipe, 1)
     assert requests == [(CHANGE, None)]
-    pipe.advise(2)
-    pipe.advise(2)
-    assert pipe.advice == 2
+    advise(pipe, 2)
+    advise(pipe, 2)
+    assert advice_of(pipe) == 2
     assert len(requests) == 2
     with pytest.raises(ValueError, match=r"is 0; give 1 or more"):
-        pipe.advise(0)
+        advise(pipe, 0)
 
 
 def test_each_request_waits_for_a_part_of_the_time_that_is_left(
@@ -373,7 +373,7 @@ def test_each_request_waits_for_a_part_of_the_time_that_is_left(
         assert seconds[0] == max(seconds) == 0.05
         assert 0.05 < sum(seconds) < 0.125
     requests.clear()
-    assert pipe.poll() == []
+    assert pipe.drain() == []
     pipe.put_many([0, 1])
     with pytest.raises(TimeoutError, match="stayed full for 0 s"):
         pipe.put(2, timeout_s=0)
@@ -386,27 +386,27 @@ def test_items_are_taken_beside_tasks(client, make_pipe, requests, monkeypatch, 
     monkeypatch.setattr(pipe_module, "WAIT_S", 0.05)
     pipe = make_pipe(client, capacity=9)
     pipe.put_many(range(7))
-    assert pipe.take_beside([], 2, LONG_S) == ([0, 1], False)
+    assert take_beside(pipe, [], 2, LONG_S) == ([0, 1], False, False)
     assert pipe.depth == 5
     assert pipe.get() == 2
     requests.clear()
-    assert pipe.take_beside([], 3, LONG_S) == ([3, 4, 5], False)
+    assert take_beside(pipe, [], 3, LONG_S) == ([3, 4, 5], False, False)
     pipe.close()
-    assert pipe.take_beside([], 3, LONG_S) == ([6], False)
+    assert take_beside(pipe, [], 3, LONG_S) == ([6], False, False)
     assert [question for question, _ in requests] == [CHANGE]  # items of the buffer need none
-    assert pipe.take_beside([], 3, LONG_S) == ([], True)
+    assert take_beside(pipe, [], 3, LONG_S) == ([], True, True)
 
     pipe = make_pipe(client)
     task = client.submit(wait_to_go, pure=False)
-    assert pipe.take_beside([task], 1, 0.1) == ([], False)
+    assert take_beside(pipe, [task], 1, 0.1) == ([], False, False)
     threading.Timer(0.2, pipe.put, ["late"]).start()
-    assert pipe.take_beside([task], 1, LONG_S) == (["late"], False)
+    assert take_beside(pipe, [task], 1, LONG_S) == (["late"], False, False)
     pipe.put("not taken")
     requests.clear()
     threading.Timer(0.2, gate.set).start()
-    assert pipe.take_beside([task], 0, LONG_S) == ([], False)
+    assert take_beside(pipe, [task], 0, LONG_S) == ([], False, False)
     assert task.done() and len(requests) > 1
-    assert pipe.poll() == ["not taken"]
+    assert pipe.poll() == ("not taken", True)
 
 
 @pytest.mark.parametrize("take", ["get_all", "take_news"])
@@ -601,7 +601,7 @@ def test_items_are_put_beyond_the_capacity_in_the_request_that_takes_others(clie
     outlet.put("news")
     puts = {inlet.name: [1, 2], "nobody-knows": [3]}
     assert take_news(client, 0.0, [outlet.name], puts=puts) == {outlet.name: ["news"]}
-    assert inlet.poll() == [1, 2]
+    assert inlet.drain() == [1, 2]
 
 
 def test_all_that_is_in_the_pipes_is_taken_in_one_request(client, make_pipe, monkeypatch):
@@ -962,7 +962,7 @@ def test_requests_of_a_client_that_has_left_change_nothing(client, make_pipe):
     put, taken = client.run_on_scheduler(request)
     assert put[pipe.name]["answer"] == 0
     assert taken[pipe.name]["answer"] == []
-    assert pipe.poll() == ["kept"]
+    assert pipe.poll() == ("kept", True)
 
 
 def get_and_return_key(pipe):
@@ -992,4 +992,4 @@ def test_a_killed_task_ends_the_open_pipes_that_it_does_not_consume(client, b, m
         with pytest.raises(PipeFailed, match=reason):
             pipe.poll()
     else:
-        assert pipe.poll() == [1]
+        assert pipe.poll() == (1, True)
