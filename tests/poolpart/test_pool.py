@@ -116,7 +116,7 @@ def test_rules_for_a_partition_that_workers_were_started_with(start):
 
 def test_rules_for_workers_that_were_started_with_two_resources(start):
     pool = Pool.from_client(start({"a": {"resources": {"CPU": 1, "MEM": 5}}}))
-    with pytest.raises(PoolError, match="1 declare the resources CPU, MEM already"):
+    with pytest.raises(PoolError, match="1 declares the resources CPU, MEM already"):
         pool.divide({"CPU": n_workers(1)})
     message = r'resources CPU, MEM, and a worker belongs to one .*--resources "CPU=1" alone'
     with pytest.raises(PoolError, match=message):
@@ -174,7 +174,7 @@ def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
     assert list(pool.partitions()) == ["P"]
     with pytest.raises(PoolError, match=r"rule of partition 'Q' is 3: .* n_workers\(2\)"):
         pool.divide({"Q": 3})
-    with pytest.raises(PoolError, match="would have 0 of the 1 workers"):
+    with pytest.raises(PoolError, match="would have 0 of the 1 worker"):
         pool.partition("Q", workers=["a"])
 
 
@@ -263,7 +263,7 @@ def test_slots_that_are_missing_are_named_with_their_purpose(start):
     pool.require({"IO": 2})
     with pytest.raises(PoolError, match=r"'IO' has 2 of the 4 slots needed \(four stages\): "):
         pool.require({"IO": 4}, {"IO": "four stages"})
-    with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slots needed: start workers"):
+    with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slot needed: start workers"):
         pool.require({"GPU": 1}, {"IO": "four stages"})
 
 

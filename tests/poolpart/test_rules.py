@@ -45,7 +45,7 @@ def test_workers_that_a_rule_names_are_kept_for_it():
 
 def test_fewer_than_the_minimum():
     pool = [worker("a"), worker("b")]
-    message = "'Q' would have 0 of the 1 workers that it needs: 0 of 2 are left"
+    message = "'Q' would have 0 of the 1 worker that it needs: 0 of 2 are left"
     with pytest.raises(PoolError, match=message):
         divide({"P": n_workers(2), "Q": per_host(1)}, pool)
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
