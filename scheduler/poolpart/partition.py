@@ -114,7 +114,7 @@ class Partition:
         if client is None or client.asynchronous or client.status != "running":
             return ""
         with suppress(RuntimeError):  # no event loop runs in this thread
-            if asyncio.get_running_loop() is client.loop.asyncio_loop:  # type: ignore[attr-defined]
+            if asyncio.get_running_loop() is client.loop.asyncio_loop:
                 return ""
         try:
             return str(on_scheduler(client, size_of, name=self.name, answer_s=_REPR_S))
