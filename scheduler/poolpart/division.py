@@ -248,11 +248,13 @@ async def resize(
             f"{rule.minimum}."
         )
     size = len(steward.members(name))  # includes members that are starting again
+    moving: list[Seat] = []
     target: str | None = name
     if count > size:
         moving = _joining(steward, name, count - size, source)
-    else:
-        moving, target = _leaving(steward, name, size - count), _destination(steward, name)
+    elif count < size:
+        moving = _leaving(steward, name, size - count)
+        target = _destination(steward, name)
     # After a loss, the rule may ask for more workers than there are. Moving adds the difference.
     steward.resize(name, size - _asked(rule, size))
     try:

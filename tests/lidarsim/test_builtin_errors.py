@@ -4,21 +4,20 @@ import pickle
 
 import pytest
 
-from lidarsim import LidarError, Scene, load_sensor
+from lidarsim import LidarError, Pose, Scene, load_sensor
 from lidarsim.base.errors import MissingFileError, explained, prefixed
 
 
-@pytest.mark.parametrize("load", [Scene.load, load_sensor])
-def test_a_file_that_does_not_exist(load, tmp_path):
-    path = tmp_path / ("nope.glb" if load is Scene.load else "nope.yaml")
-    with pytest.raises(FileNotFoundError, match="does not exist") as raised:
-        load(path)
+@pytest.mark.parametrize(("load", "name"), [(Scene.load, "a.glb"), (load_sensor, "a.yaml")])
+def test_a_file_that_does_not_exist(load, name, tmp_path):
+    with pytest.raises(FileNotFoundError, match=name) as raised:
+        load(tmp_path / name)
     assert isinstance(raised.value, LidarError)
 
 
 def test_an_argument_that_does_not_fit():
-    with pytest.raises(ValueError, match="unit") as raised:
-        Scene.load("a.stl", unit=3)
+    with pytest.raises(ValueError, match="position is 'a'") as raised:
+        Pose("a")
     assert isinstance(raised.value, LidarError)
 
 

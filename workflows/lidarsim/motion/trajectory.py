@@ -120,12 +120,13 @@ def pose_of(name: str, value: Any) -> Pose:
     if isinstance(value, Pose):
         return value
     try:
-        return Pose(tuple(map(float, value)))  # type: ignore[arg-type]  # it counts them
+        position = tuple(map(float, value))
     except (TypeError, ValueError) as error:
         raise LidarError(
             f"{name} is {shown(value)}; it must be a Pose, or x, y and z in metres, such as "
             "(0, 0, 1)."
         ) from error
+    return Pose(position)  # type: ignore[arg-type]  # it counts them
 
 
 CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
