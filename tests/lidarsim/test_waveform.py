@@ -30,6 +30,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.waveform import Digitizer, returns_in
+from lidarsim.simulator.steps.waveform_samples import digitised
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM
@@ -248,6 +249,20 @@ def test_recorded_noise_is_a_fifth_of_the_threshold():
     assert len(quiet) > 2000
     assert quiet.std() == pytest.approx(noise.threshold / 5, rel=0.1)
     assert quiet.mean() == pytest.approx(0, abs=noise.threshold / 50)
+
+
+@pytest.mark.parametrize("power", [-160, -126, -60, -11, 0, 1, 40, 110])
+def test_samples_are_rounded_to_the_smallest_step_that_holds_them(power):
+    random = np.random.default_rng(7)
+    samples = np.ldexp(random.uniform(-0.02, 1, (20, 16)) * random.uniform(1, 4, (20, 1)), power)
+    samples[:3] *= -1  # noise below zero decides
+    steps, exponents = digitised(samples)
+    step = np.ldexp(1.0, exponents.astype(int))[:, None]
+    assert np.all(np.abs((steps - 2048.0) * step - samples) <= step / 2)
+    halves = samples / (step / 2)
+    outside = (halves.max(axis=1) >= 65_535 - 2048) | (halves.min(axis=1) <= -2048)
+    assert np.all(outside | (exponents == -126))
+    assert digitised(np.zeros((1, 4)))[0].tolist() == [[2048] * 4]
 
 
 @pytest.mark.extended

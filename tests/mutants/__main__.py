@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -13,12 +14,11 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from queue import Queue
 
 from tests.mutants.faults import ROOTS, Fault, choose
-from tests.mutants.forks import PYTEST, Forks
+from tests.mutants.forks import PASSED, PYTEST, Forks
 from tests.mutants.lines import Lines
 
 ROOT = Path(__file__).parents[2]
@@ -82,7 +82,7 @@ def main() -> None:
         lines = Lines.read(record)
     if options.again:
         faults = [
-            Fault(**{**row["fault"], "columns": tuple(row["fault"]["columns"])})
+            Fault.read(row["fault"])
             for row in json.loads(options.again.read_text())
             if not row["noticed"]
         ]
@@ -159,28 +159,44 @@ def _places(count: int) -> Iterator["Queue[Place]"]:
 def _try(places: "Queue[Place]", lines: Lines, fault: Fault, budget_s: float) -> Outcome:
     """Plant a fault, run the tests that execute it in groups, and say what became of it."""
     start = time.monotonic()
-    groups = list(_groups(lines, lines.tests_of(ROOT, fault), budget_s))
+    tests = lines.tests_of(ROOT, fault)
     place = places.get()
-    noticed = ""
-    tried = 0
     try:
-        for group in [] if fault.compiled else groups:
-            limit_s = 3 * sum(map(lines.cost, group)) + _EXTRA_S
-            tried += len(group)
-            noticed = place.forks.failure(fault, group, limit_s) or ""
-            if noticed:
-                break
-        if not noticed and groups:  # compiled, or only seen by processes that tests start
-            tried = sum(map(len, groups))
-            noticed = _failure(
-                place.copy, fault, lines, [test for group in groups for test in group]
-            )
+        noticed, tried = _noticed(place, lines, fault, list(_groups(lines, tests, budget_s)))
+        while noticed.startswith("by ") and not _passes(place, lines, noticed[3:]):
+            print(f"left out, since it fails without a fault: {noticed[3:]}", flush=True)
+            tests = [test for test in tests if not noticed[3:].startswith(test)]
+            noticed, tried = _noticed(place, lines, fault, list(_groups(lines, tests, budget_s)))
     finally:
         places.put(place)
     return Outcome(fault, noticed, tried, time.monotonic() - start)
 
 
-@cache
+def _noticed(place: Place, lines: Lines, fault: Fault, groups: list[list[str]]) -> tuple[str, int]:
+    """Return by which test a fault was noticed (see `Outcome`), and the number of tests tried."""
+    tried = 0
+    for group in [] if fault.compiled else groups:
+        tried += len(group)
+        noticed = place.forks.failure(fault, group, _limit_s(lines, group))
+        if noticed:
+            return noticed, tried
+    tests = [test for group in groups for test in group]
+    if not tests:
+        return "", 0
+    # It is compiled, or only seen by processes that tests start.
+    return _failure(place.copy, fault, lines, tests), len(tests)
+
+
+def _passes(place: Place, lines: Lines, test: str) -> bool:
+    """Return whether a test passes without a fault."""
+    return not place.forks.failure(None, [test], _limit_s(lines, [test]))
+
+
+def _limit_s(lines: Lines, tests: list[str]) -> float:
+    """Return after how many seconds tests count as hanging."""
+    return 3 * sum(map(lines.cost, tests)) + _EXTRA_S
+
+
 def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[str]]:
     """Yield tests to run together: quick ones first, then the others up to a budget."""
     group: list[str] = []
@@ -215,7 +231,7 @@ def _failure(copy: Path, fault: Fault, lines: Lines, tests: list[str]) -> str:
             env=environment,
             capture_output=True,
             text=True,
-            timeout=3 * sum(map(lines.cost, tests)) + _EXTRA_S,
+            timeout=_limit_s(lines, tests),
             check=False,
         )
     except subprocess.TimeoutExpired:
@@ -223,10 +239,14 @@ def _failure(copy: Path, fault: Fault, lines: Lines, tests: list[str]) -> str:
     finally:
         shutil.copy2(ROOT / fault.path, path)
         _restore_loops(copy)
-    if done.returncode in (0, 5):
+    if done.returncode in PASSED:
         return ""
-    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return f"by {failed[0].split(' - ')[0]}" if failed else f"exit status {done.returncode}"
+    failed = re.search(
+        r"^(FAILED|ERROR) (?=\S+\.py)(?P<test>.+?)( - .*)?$", done.stdout, re.MULTILINE
+    )
+    if failed:
+        return f"by {failed['test']}"
+    raise RuntimeError(f"pytest ended with status {done.returncode}: {done.stdout[-2000:]}")
 
 
 def _restore_loops(copy: Path) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 ROOTS = ("kernels", "scheduler", "workflows")
 COMPILED = {"compiled", "inlined", "stage", "part"}  # decorators of loops that numba compiles
@@ -86,6 +87,11 @@ class Fault:
 
     def __str__(self) -> str:
         return f"{self.path}:{self.line} in {self.function}: {self.before} -> {self.after}"
+
+    @classmethod
+    def read(cls, row: dict[str, Any]) -> "Fault":
+        """Return a fault from the JSON object of its attributes."""
+        return cls(**{**row, "columns": tuple(row["columns"])})
 
     def plant(self, source: str) -> str:
         """Return the source with the fault.

@@ -22,6 +22,7 @@ from typing import Any
 from tests.mutants.faults import ROOTS, Fault
 
 ROOT = Path(__file__).parents[2]
+PASSED = (0, 5)  # exit statuses of pytest: all passed, or all were deselected or skipped
 PYTEST = ["-q", "-x", "-p", "no:cacheprovider", "-m", "not slow"]
 
 
@@ -37,13 +38,19 @@ class Forks:
             text=True,
         )
 
-    def failure(self, fault: Fault, tests: list[str], limit_s: float) -> str | None:
-        """Return which test failed first, "hangs", or "" if all passed; None if not planted."""
+    def failure(self, fault: Fault | None, tests: list[str], limit_s: float) -> str | None:
+        """Return which test failed first, "hangs", or "" if all passed; None if not planted.
+
+        Without a fault, the tests run on the sources as they are. Raises RuntimeError if pytest
+        could not run the tests.
+        """
         assert self._process.stdin is not None and self._process.stdout is not None
-        request = {"fault": vars(fault), "tests": tests, "limit_s": limit_s}
+        request = {"fault": fault and vars(fault), "tests": tests, "limit_s": limit_s}
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
-        answer: str | None = json.loads(self._process.stdout.readline())
+        answer: str | int | None = json.loads(self._process.stdout.readline())
+        if isinstance(answer, int):
+            raise RuntimeError(f"pytest ended with status {answer} for {' '.join(tests)}.")
         return answer
 
     def close(self) -> None:
@@ -77,9 +84,8 @@ def _serve() -> None:
     functions = _functions_by_file()
     for line in sys.stdin:
         request = json.loads(line)
-        request["fault"]["columns"] = tuple(request["fault"]["columns"])
-        fault = Fault(**request["fault"])
-        answer = _try(fault, request, functions.get(str(ROOT / fault.path), []))
+        fault = Fault.read(request["fault"]) if request["fault"] else None
+        answer = _try(fault, request, functions.get(str(ROOT / fault.path), []) if fault else [])
         print(json.dumps(answer), file=answers, flush=True)
 
 
@@ -112,8 +118,10 @@ def _functions_by_file() -> dict[str, list[types.FunctionType]]:
     return found
 
 
-def _try(fault: Fault, request: dict[str, Any], functions: list[types.FunctionType]) -> str | None:
-    """Fork, plant a fault, run tests, and return what `Forks.failure` returns."""
+def _try(
+    fault: Fault | None, request: dict[str, Any], functions: list[types.FunctionType]
+) -> str | int | None:
+    """Fork, plant a fault, run tests, and return the answer of `_failed`, or "hangs"."""
     reader, writer = os.pipe()
     child = os.fork()
     if child:
@@ -121,7 +129,7 @@ def _try(fault: Fault, request: dict[str, Any], functions: list[types.FunctionTy
         with os.fdopen(reader) as answers:
             answer = answers.read()
         os.waitpid(child, 0)
-        result: str | None = json.loads(answer) if answer else "hangs"
+        result: str | int | None = json.loads(answer) if answer else "hangs"
         return result
     os.close(reader)
     os.setsid()
@@ -136,15 +144,21 @@ def _try(fault: Fault, request: dict[str, Any], functions: list[types.FunctionTy
         os._exit(0)
 
 
-def _failed(fault: Fault, tests: list[str], functions: list[types.FunctionType]) -> str | None:
-    """Plant a fault in this process, and return which test failed first."""
+def _failed(
+    fault: Fault | None, tests: list[str], functions: list[types.FunctionType]
+) -> str | int | None:
+    """Plant a fault in this process, and return which test failed first.
+
+    Returns "" if all passed, None if the fault could not be planted, and the exit status of pytest
+    if it could not run the tests.
+    """
     import pytest
 
-    if not _plant(fault, functions):
+    if fault and not _plant(fault, functions):
         return None
     first = _First()
     status = pytest.main([*PYTEST, *tests], plugins=[first])
-    return first.name or ("" if status in (0, 5) else f"exit status {status}")
+    return first.name or ("" if status in PASSED else int(status))
 
 
 def _plant(fault: Fault, functions: list[types.FunctionType]) -> bool:

@@ -10,7 +10,7 @@ from ..base.arrays import AnyArray, Floats, Records
 
 WAVEFORM = "waveform"  # name of the column in parts; of cloud files, only LAS holds waveforms
 ZERO = 2048  # digitised value of 0; noise is also negative
-SILENT = -126  # exponent of a waveform without light
+FAINTEST = -126  # exponent of the faintest waveforms: 2**FAINTEST is a normal float32
 
 
 def record(samples: int) -> np.dtype[np.void]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ...base.arrays import Floats, Ints
 from ...base.elementary import exp
 from ...base.random_numbers import Purpose, normal, raw
-from ...columns.waveforms import SILENT, ZERO, record
+from ...columns.waveforms import FAINTEST, ZERO, record
 from ...sensor.noise import THRESHOLD_SIGMAS
 from ...sensor.optics import CUT
 from ..returns import Keys, PulseReturns, numbers, required
@@ -156,6 +156,6 @@ def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
     """
     scale = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
     _, exponents = np.frexp(scale)
-    exponents = np.clip(np.where(scale > 0, exponents, SILENT), SILENT, 127)
+    exponents = np.clip(exponents, FAINTEST, 127)
     steps = np.rint(np.ldexp(samples, -exponents[:, None])) + ZERO
     return np.clip(steps, 0, 65_535).astype(np.uint16), exponents.astype(np.int8)

@@ -1,0 +1,158 @@
+"""Points of recorded sweeps are compensated and calibrated: a turning sensor, in closed form."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
+from lidarpool.places.alignment import Alignment
+from lidarpool.places.motion import Motion
+from lidarpool.places.odometry import RecordedPoses
+from lidarpool.places.recorded_sweeps import RecordedSweep
+
+STAMPS_S = np.array([0.0, 0.1, 0.26, 0.33, 0.5])
+SPIN_RAD_S = np.array([0.1, -0.2, 0.8])
+VELOCITY_M_S = np.array([9.0, -2.0, 0.5])
+RINGS = 3
+
+
+def pose_at(time_s):
+    """Return the pose (4, 4) of a sensor that moves straight and turns steadily.
+
+    After the last stamp it moves as in the step before, seen from the sensor.
+    """
+    pose = np.eye(4)
+    pose[:3, :3] = turned(time_s)
+    known_s = min(time_s, STAMPS_S[-1])
+    seen = turned(STAMPS_S[-2]).T @ VELOCITY_M_S
+    pose[:3, 3] = known_s * VELOCITY_M_S + turned(known_s) @ seen * (time_s - known_s)
+    return pose
+
+
+def turned(time_s):
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(time_s * SPIN_RAD_S).as_matrix()
+
+
+def in_frame(world, time_s):
+    """Return points (n, 3) of the world in the sensor frame at times (n,) or at one."""
+    poses = np.stack([pose_at(time) for time in np.broadcast_to(time_s, len(world))])
+    return np.einsum("nji,nj->ni", poses[:, :3, :3], world - poses[:, :3, 3])
+
+
+def poses():
+    return np.stack([pose_at(time) for time in STAMPS_S])
+
+
+def sweep(points, time_s=None, start_rad=0.0):
+    ring = np.arange(len(points)) % RINGS
+    return RecordedSweep(points, ring, None, None, time_s, np.full(RINGS, start_rad))
+
+
+@pytest.fixture
+def world():
+    return np.random.default_rng(4).uniform(-40, 40, (50, 3))
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_points_are_compensated_to_the_stamp_of_their_sweep(world, number):
+    times_s = np.linspace(-0.09, 0.12, len(world))
+    stamp_s = STAMPS_S[number]
+    alignment = Alignment(poses(), STAMPS_S, 0.1, 0.2, Motion.TIMED, np.zeros((RINGS, 3)))
+    fired = in_frame(world, stamp_s + times_s)
+    points, origins = alignment.compensated(sweep(fired, times_s), number)
+    sensors = np.stack([pose_at(time_s)[:3, 3] for time_s in stamp_s + times_s])
+    np.testing.assert_allclose(points, in_frame(world, stamp_s), atol=1e-9)
+    np.testing.assert_allclose(origins, in_frame(sensors, stamp_s), atol=1e-9)
+
+
+@pytest.mark.parametrize(("motion", "sign"), [(Motion.COUNTERCLOCKWISE, 1), (Motion.CLOCKWISE, -1)])
+def test_points_without_times_are_compensated_by_their_azimuth(motion, sign):
+    turns = np.linspace(0.02, 0.98, 30)
+    start_rad = 0.4
+    azimuth = start_rad + sign * 2 * np.pi * turns
+    fired = np.stack([20 * np.cos(azimuth), 20 * np.sin(azimuth), turns], axis=1)
+    world = np.stack(
+        [(pose_at(0.1 + 0.15 * t) @ [*p, 1])[:3] for t, p in zip(turns, fired, strict=True)]
+    )
+    alignment = Alignment(poses(), STAMPS_S, 0.15, 0.2, motion, np.zeros((RINGS, 3)))
+    points, _ = alignment.compensated(sweep(fired, start_rad=start_rad), 1)
+    np.testing.assert_allclose(points, in_frame(world, 0.1), atol=1e-9)
+
+
+def test_compensated_points_stay_and_get_the_offsets_of_their_rings(world):
+    offsets = np.array([[0.1, 0.0, 0.0], [0.0, 0.01, 0.0], [0.0, 0.0, -0.02]])
+    alignment = Alignment(poses(), STAMPS_S, 0.1, 0.2, Motion.COMPENSATED, offsets)
+    points, origins = alignment.compensated(sweep(world), 2)
+    x, y, z = world.T
+    ranges, elevation, azimuth = (
+        np.linalg.norm(world, axis=1),
+        np.arctan2(z, np.hypot(x, y)),
+        np.arctan2(y, x),
+    )
+    shifted = np.stack([ranges, elevation, azimuth], axis=1) + offsets[np.arange(50) % RINGS]
+    level = shifted[:, 0] * np.cos(shifted[:, 1])
+    expected = np.stack(
+        [
+            level * np.cos(shifted[:, 2]),
+            level * np.sin(shifted[:, 2]),
+            shifted[:, 0] * np.sin(shifted[:, 1]),
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(points, expected, atol=1e-9)
+    assert not origins.any()
+
+
+def test_poses_by_registration_are_moved_to_the_stamps_of_sweeps():
+    registered = np.stack([pose_at(0.1 * n + 0.02 + 0.4 * 0.1) for n in range(5)])
+    found = RecordedPoses(registered, 0.1 * np.arange(5), "", np.zeros(3), share=0.4, first_s=0.02)
+    alignment = Alignment.unaligned(found, 0.2, Motion.TIMED, RINGS)
+    expected = np.stack([pose_at(0.1 * n) for n in range(5)])
+    np.testing.assert_allclose(alignment.poses[:4], expected[:4], atol=1e-9)
+    kept = Alignment.unaligned(found, 0.2, Motion.COMPENSATED, RINGS)
+    np.testing.assert_array_equal(kept.poses, registered)
+
+
+def test_slopes_and_edges_of_a_room_are_those_of_its_planes():
+    """A box around the sensor: the planes of its six faces are known."""
+    azimuth = (np.arange(360) + 0.5) * np.pi / 180
+    elevation = np.linspace(-0.6, 0.6, 25)[:, None]
+    directions = np.stack(
+        np.broadcast_arrays(
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ),
+        axis=-1,
+    )
+    faces = np.concatenate([np.eye(3), -np.eye(3)])
+    offsets = np.array([6.0, 4.0, 2.0, 7.0, 5.0, 1.5])
+    cosines = directions @ faces.T
+    ranges = np.where(cosines > 0, offsets / np.maximum(cosines, 1e-9), np.inf)
+    face, distance = ranges.argmin(axis=-1), ranges.min(axis=-1)
+    stack = SimpleNamespace(directions=directions)
+    found = find_surfaces(stack, distance, np.full(distance.shape, 1e-3))
+
+    shifted = [np.roll(face, shift, axis=1) for shift in (-2, -1, 1, 2)]
+    rows = np.arange(len(face))
+    shifted += [face[np.clip(rows + shift, 0, rows[-1])] for shift in (-1, 1)]
+    inside = np.all([other == face for other in shifted], axis=0)
+    inside[[0, -1]] = False  # rings at the ends have one neighbour
+    assert np.all(found.smooth[inside]) and inside.mean() > 0.7
+    next_to_corner = (shifted[1] != face) | (shifted[2] != face)
+    assert not found.smooth[next_to_corner & (np.abs(elevation) < 0.05)].any()
+
+    normal = np.take_along_axis(faces[None, None], face[..., None, None], axis=2)[:, :, 0]
+    cosine = (normal * directions).sum(axis=-1)
+    scaled = normal / cosine[..., None]
+    np.testing.assert_allclose(found.scaled_normal[inside], scaled[inside], atol=1e-6)
+    slope = distance * np.sqrt(1 / cosine**2 - 1)
+    np.testing.assert_allclose(found.slope[inside], slope[inside], atol=1e-5)
+    east = np.stack([-directions[..., 1], directions[..., 0]], axis=-1)  # change with azimuth
+    by_azimuth = -distance * (normal[..., :2] * east).sum(axis=-1) / cosine
+    np.testing.assert_allclose(found.azimuth_slope[inside], by_azimuth[inside], atol=1e-5)
