@@ -74,10 +74,9 @@ def main() -> None:
     options = _parser().parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
     record = FOLDER / "lines.json"
-    if options.record or not record.is_file():
-        lines = Lines.record(
-            ROOT, FOLDER, ["-m", "not slow", "-n", str(options.jobs), "--dist", "loadfile"]
-        )
+    if options.record is not None or not record.is_file():
+        pytest_options = ["-m", "not slow", "-n", str(options.jobs), "--dist", "loadfile"]
+        lines = Lines.record(ROOT, FOLDER, options.record or [], pytest_options)
     else:
         lines = Lines.read(record)
     if options.again:
@@ -121,8 +120,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--record",
-        action="store_true",
-        help="Record anew which tests execute which lines (20 minutes).",
+        nargs="*",
+        metavar="FILE",
+        help="Record which lines these test files execute, or all of the tests (20 minutes).",
     )
     add(
         "--again",

@@ -7,12 +7,15 @@ import re
 import subprocess
 import sys
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
 from tests.mutants.faults import ROOTS, Fault, function_spans
+
+Spans = dict[str, tuple[int, int]]  # first and last line of functions, by qualified name
 
 _TEST_S = 0.05  # added to the time of a test: sets that are alike in time should be small
 
@@ -40,7 +43,7 @@ class Lines:
     tests: list[str]
     seconds: dict[str, float]
     lines: dict[str, dict[int, set[int]]]
-    spans: dict[str, dict[str, tuple[int, int]]]
+    spans: dict[str, Spans]
     checksums: dict[str, str]
     counts: Counter[str] = field(default_factory=Counter)
 
@@ -51,29 +54,24 @@ class Lines:
                 self.counts.update(self.tests[number] for number in tests)
 
     @classmethod
-    def record(cls, root: Path, folder: Path, pytest_options: list[str]) -> "Lines":
-        """Run the tests with `recorder`, write ``lines.json``, and return its content."""
+    def record(
+        cls, root: Path, folder: Path, files: Sequence[str], pytest_options: list[str]
+    ) -> "Lines":
+        """Run tests with `recorder`, write ``lines.json``, and return its content.
+
+        With test files, what was recorded of other files is kept.
+        """
         for path in folder.glob("gw*.json"):
             path.unlink()
         command = [sys.executable, "-m", "pytest", "-q", "-p", "tests.mutants.recorder"]
         environment = os.environ | {"LIDARPOOL_MUTANTS": str(folder)}
-        subprocess.run([*command, *pytest_options], cwd=root, env=environment, check=False)
-        return cls._merge(root, folder)
-
-    @classmethod
-    def _merge(cls, root: Path, folder: Path) -> "Lines":
-        """Merge what the processes have recorded, and write ``lines.json``."""
-        merged = cls([], {}, defaultdict(lambda: defaultdict(set)), {}, {})
-        numbers: dict[str, int] = {}
-        for path in folder.glob("gw*.json"):
-            merged._add(json.loads(path.read_text()), numbers)
-        merged.tests = [*numbers]
-        for path in merged.lines:
-            source = (root / path).read_text()
-            merged.spans[path] = function_spans(source)
-            merged.checksums[path] = _checksum(source)
-        merged._write(folder / "lines.json")
-        return cls.read(folder / "lines.json")
+        subprocess.run([*command, *pytest_options, *files], cwd=root, env=environment, check=False)
+        path = folder / "lines.json"
+        recorded = cls.read(path) if files else cls([], {}, {}, {}, {})
+        for part in folder.glob("gw*.json"):
+            recorded._add(root, json.loads(part.read_text()))
+        recorded._write(path)
+        return cls.read(path)
 
     @classmethod
     def read(cls, path: Path) -> "Lines":
@@ -131,12 +129,22 @@ class Lines:
         found = (by_line.get(line, set()) for line in range(span[0], span[1] + 1))
         return set[int]().union(*found)
 
-    def _add(self, record: dict, numbers: dict[str, int]) -> None:
-        """Add what one process has recorded."""
+    def _add(self, root: Path, record: dict) -> None:
+        """Add what one process has recorded, as lines of the files as they were at first."""
+        numbers = {name: number for number, name in enumerate(self.tests)}
         own = [numbers.setdefault(name, len(numbers)) for name in record["tests"]]
+        self.tests = [*numbers]
         for path, by_line in record["lines"].items():
-            for line, tests in by_line.items():
-                self.lines[path][int(line)].update(own[test] for test in tests)
+            source = (root / path).read_text()
+            spans = function_spans(source)
+            first_spans = self.spans.setdefault(path, spans)
+            is_changed = self.checksums.setdefault(path, _checksum(source)) != _checksum(source)
+            lines = self.lines.setdefault(path, {})
+            for text, tests in by_line.items():
+                line = int(text)
+                if is_changed:
+                    line = _moved(line, spans, first_spans)
+                lines.setdefault(line, set()).update(own[test] for test in tests)
         for test, seconds in record["seconds"].items():
             self.seconds[test] = max(seconds, self.seconds.get(test, 0.0))
 
@@ -148,6 +156,12 @@ class Lines:
         content = {**vars(self), "lines": lines}
         del content["counts"]
         path.write_text(json.dumps(content))
+
+
+def _moved(line: int, spans: Spans, first_spans: Spans) -> int:
+    """Return the first line that the function of a line had, or 0 if there was no such function."""
+    names = [name for name, (first, last) in spans.items() if first <= line <= last]
+    return next((first_spans[name][0] for name in names if name in first_spans), 0)
 
 
 @cache
