@@ -338,6 +338,7 @@ def test_a_sweep_has_its_share_of_a_step_with_dropped_sweeps():
             np.testing.assert_allclose(moved, points + origins)
 
 
+@pytest.mark.extended
 def test_few_points_and_unknown_intensities_change_no_others(drive):
     opened = open_recording(drive, name="drive")
 
@@ -388,6 +389,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
         twin(recording, trajectory=trajectory)
 
 
+@pytest.mark.extended
 def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
     opened = open_recording(drive, name="drive")
 
@@ -478,6 +480,7 @@ def test_rings_are_found_by_elevations_in_any_order(street, survey):
     assert "their elevations are not those of a few cones" in notes[0]
 
 
+@pytest.mark.extended
 def test_a_window_returns_nothing_in_the_place(street, survey, tmp_path):
     body = static_box("van", (6.0, 0.6, 3.0), (2.0, 5.2))
     corners = [[0.5, 4.88, 0.6], [3.5, 4.88, 0.6], [3.5, 4.88, 2.4], [0.5, 4.88, 2.4]]
