@@ -307,10 +307,10 @@ def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
     load_meshes(model.write(path), tell=notes.append)
     assert notes[1].endswith("cannot be used: its scale, 500, does not fit its units")
     model.file.remove(conversion)
-    model.site.RefLatitude = (48, 8, 15)
-    model.site.RefLongitude = (-11, -34, -30)
+    model.site.RefLatitude = (48, 8, 15, 600_000)
+    model.site.RefLongitude = (-11, -34, -30, -600_000)
     load_meshes(model.write(path), tell=notes.append)
-    assert notes[2].endswith("the position of its site, 48.1375° N, 11.575° W, which is not used")
+    assert notes[2].endswith("the position of its site, 48.1377° N, 11.5752° W, which is not used")
 
 
 def with_map_sets(model, owner, system, conversion, names=("ePSet_MapConversion",)):

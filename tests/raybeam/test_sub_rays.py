@@ -67,10 +67,25 @@ def test_a_scan_has_the_bits_of_rays_made_one_by_one(backend, shapes, place, kin
 
 @pytest.mark.slow(every=3)
 @pytest.mark.parametrize("place", ["stands", "turns", "moves", "far away"])
-@pytest.mark.parametrize("kind", ["none", "origins", "", "axis starts offsets", "starts origins"])
-def test_loops_make_the_rays_of_numpy(place, kind):
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [("none", 1), ("origins", 1), ("", 7), ("axis starts offsets", 7), ("starts origins", 7)],
+)
+def test_loops_make_the_rays_of_numpy(place, kind, count):
+    check_rays_of_loops(place, kind, count)
+
+
+@pytest.mark.parametrize(
+    ("place", "kind"),
+    [("stands", "starts"), ("turns", "axis starts"), ("moves", "axis starts offsets")],
+)
+def test_loops_make_the_lone_sub_rays_of_numpy(place, kind):
+    check_rays_of_loops(place, kind, 1)
+
+
+def check_rays_of_loops(place, kind, count):
     rng = np.random.default_rng(9)
-    given = pattern(rng, 7, kind)
+    given = pattern(rng, count, kind)
     if kind in ("none", "origins"):
         given = Pattern(given.directions[:3], None if kind == "none" else given.origins[:3])
     where = {"rotations": None, "rays_per_pose": None, **poses(rng, place, 2_000)}
