@@ -82,6 +82,21 @@ def test_angles_are_those_of_the_source(name, channels):
         assert off[channel] == pytest.approx(aside, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "field", "rate"),
+    [
+        ("velodyne/vlp16", "360°, -15° to 15°", "10 Hz, 289,440 rays/s"),
+        ("ouster/os1-64", "360°, -21.8° to 20.7°", "10 Hz, 655,360 rays/s"),
+        ("robosense/rs-helios", "360°, -55° to 15°", "10 Hz, 576,000 rays/s"),
+        # Its data sheet has 70.4° x 77.2°. This is a sample of its rays.
+        ("livox/avia", "70.43°, -37.5° to 38.5°", "10 Hz, 240,000 rays/s"),
+    ],
+)
+def test_notebooks_show_the_field_of_view_and_the_rate(name, field, rate):
+    shown = load_sensor(name)._repr_html_()
+    assert f">{field}<" in shown and f">{rate}<" in shown
+
+
 @pytest.mark.parametrize("rate_hz", [5.0, 10.0, 20.0])
 def test_a_vlp16_fires_when_it_does_and_turns_meanwhile(rate_hz):
     sensor = load_sensor("velodyne/vlp16", rate_hz=rate_hz)

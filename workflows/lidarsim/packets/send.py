@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from ipaddress import AddressValueError, IPv4Address, IPv6Address
 from pathlib import Path
 from typing import IO, Any, Self
@@ -286,10 +286,6 @@ class Address:
     def is_loopback(self) -> bool:
         """Whether the address is of this machine alone."""
         return IPv4Address(self.host).is_loopback
-
-    def with_port(self, port: int) -> Address:
-        """Return the address with a port, if it has none."""
-        return self if self.port is not None else replace(self, port=port)
 
     def __str__(self) -> str:
         return self.host if self.port is None else f"{self.host}:{self.port}"
