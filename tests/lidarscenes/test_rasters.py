@@ -271,6 +271,17 @@ def test_a_coarser_grid_has_means_without_holes_of_the_finer(tmp_path):
         read(path, window=(0, 0, 10, 10))
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("side", [-1, 1])
+def test_windows_beside_the_raster_are_refused(tmp_path, axis, side):
+    path = write(tmp_path / "m.tif")
+    window = np.array([X0, Y0 - 12, X0 + 16, Y0], float)
+    assert len(read(path, window=tuple(window))[0].vertices) == SLOPE.size
+    window[axis::2] += side * [16, 12][axis]
+    with pytest.raises(LidarError, match="has nothing in the window"):
+        read(path, window=tuple(window))
+
+
 def inside(place, window):
     return all(window[i] <= place[i] <= window[i + 2] for i in (0, 1))
 
