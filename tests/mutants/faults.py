@@ -26,7 +26,8 @@ SKIPPED_MODULES = (
     "workflows/lidarpool/**/*drawing*.py",
     "workflows/lidarpool/cli/*",
     "scheduler/poolpart/**/*page*.py",
-    "scheduler/poolpart/notebook.py",
+    "scheduler/poolpart/extras/notebook.py",
+    "scheduler/poolpart/html_table.py",
     # Run on GPUs only.
     "kernels/raybeam/cuda_backend.py",
     "kernels/raybeam/device.py",
