@@ -431,12 +431,6 @@ def _placed_object(
     The name of the object is safe for terminals and files. None if the object is too far away.
     """
     name = printable(item.name) or printable(stem)
-    if isinstance(item, SceneInstance):  # an instance cannot be moved too far
-        position = item.matrix[:3, 3]
-        for transform in transforms:
-            position = turned(position[None], transform.linear)[0] + transform.offset
-        if not (reach_m := float(np.abs(position).max())) <= MAX_COORDINATE_M:
-            return None, reach_m
     for transform in transforms:
         if name != item.name or not _keeps_places(transform):
             item = item.moved(name, transform.linear, transform.offset)
