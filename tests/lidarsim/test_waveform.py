@@ -240,6 +240,27 @@ def test_a_recorded_waveform_is_the_sum_of_the_echoes():
     assert waves.samples[0] == pytest.approx(model, abs=step + 2e-3 * model.max())
 
 
+def test_windows_that_overlap_have_the_same_samples():
+    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 25)]
+    returns = Returns("all", subrays=217, pulse_ns=5, waveform="gaussian")
+    made = Survey(
+        beam_along_x(divergence_mrad=1),
+        poses=[(0, 0, 0)],
+        steps=1,
+        returns=returns,
+        columns=COLUMNS,
+        waveform_samples=50,
+        noise=Noise(detection_range_m=30),
+    )
+    waves = cloud_of(made, Scene.from_meshes(meshes)).waveforms
+    times_ns = np.round(waves.times_ns, 6)
+    shared_ns, first, second = np.intersect1d(times_ns[0], times_ns[1], return_indices=True)
+    assert 10 < len(shared_ns) < 40
+    step = waves.samples.max(axis=1).sum() / 63_487  # both are rounded
+    assert waves.samples[0, first] == pytest.approx(waves.samples[1, second], abs=step)
+    assert waves.samples[0, first].std() > 20 * step
+
+
 def test_recorded_noise_is_a_fifth_of_the_threshold():
     noise = Noise(detection_range_m=30)
     made = survey(noise=noise, waveform_samples=100)

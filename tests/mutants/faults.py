@@ -195,10 +195,15 @@ def _expressions(
 
 
 def _walk(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield a node and its descendants, without messages and without the inside of functions."""
-    if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.AnnAssign) or (
-        isinstance(node, ast.Call) and _name(node.func) in _MESSAGE_CALLS
-    ):
+    """Yield a node and its descendants, without messages and without the inside of functions.
+
+    ``strict=True`` of zip, a check of the program itself, is left out.
+    """
+    if isinstance(node, ast.Raise | ast.Assert | ast.JoinedStr | ast.AnnAssign):
+        return
+    if isinstance(node, ast.Call) and _name(node.func) in _MESSAGE_CALLS:
+        return
+    if isinstance(node, ast.keyword) and node.arg == "strict":
         return
     yield node
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
