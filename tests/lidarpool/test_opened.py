@@ -446,4 +446,4 @@ def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind, ti
         with pytest.raises(KeyError):
             jobs.answer(question, {}, bool)
     result = CliRunner().invoke(view_command, [str(tmp_path / "set"), "--export", "page.html"])
-    assert "is a data set of many jobs" in str(result.exception)
+    assert "is a data set with several jobs" in str(result.exception)

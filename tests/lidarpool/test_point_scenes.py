@@ -536,7 +536,9 @@ def test_the_command_says_what_is_not_kept(tmp_path):
     (tmp_path / "a.ply").write_bytes(header_of(".ply", rows) + rows.tobytes())
     arguments = ["points", str(tmp_path / "a.ply"), str(tmp_path / "b.obj")]
     outcome = CliRunner().invoke(command, arguments, catch_exceptions=False)
-    assert "note: " in outcome.stderr and "b.obj holds no colours and classes" in outcome.stderr
+    assert (
+        "note: " in outcome.stderr and "b.obj cannot store the colors and classes" in outcome.stderr
+    )
 
 
 def test_too_many_points_are_refused(tmp_path, monkeypatch):

@@ -269,7 +269,9 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     other = build(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
     assert other.survey.carried[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
-    assert "holds scenario.yaml: give another folder, or --overwrite" in str(result.exception)
+    assert "already contains scenario.yaml. Use another folder, or pass --overwrite." in str(
+        result.exception
+    )
 
 
 def test_rings_are_found_in_the_order_of_points(drive):

@@ -577,7 +577,7 @@ def test_a_full_turn_has_no_direction_twice_and_other_lidars_are_told(tmp_path):
     assert "exists" in str(result.exception)
     for text, words in ((world(model("m", link())), "it has no lidar"), ("<sdf>", "has no end")):
         arguments = [str(write(path, text)), "-o", str(tmp_path / "x")]
-        with pytest.raises(LidarError, match=f"makes no scenario: .*{words}"):
+        with pytest.raises(LidarError, match=f"cannot be converted to a scenario: .*{words}"):
             CliRunner().invoke(import_, arguments, catch_exceptions=False)
         assert not (tmp_path / "x").exists()
 

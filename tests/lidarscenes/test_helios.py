@@ -679,7 +679,7 @@ def test_a_scenario_that_the_check_refuses_is_not_written(survey, tmp_path):
     with pytest.raises(LidarError) as refused:
         import_survey(path, tmp_path / "out", check=refuse, surfels=surfels)
     assert str(refused.value).endswith(
-        f"makes no scenario: {tmp_path / 'out/scenario.yaml'}: no such sensor."
+        f"cannot be converted to a scenario: {tmp_path / 'out/scenario.yaml'}: no such sensor."
     )
     assert list(checked[0]["sensors"]) == ["leg0"]
     assert [entry.name for entry in tmp_path.iterdir()] == ["helios"]

@@ -252,7 +252,7 @@ def test_models_without_usable_rangefinders_make_no_scenario(tmp_path):
         (mjcf("<worldbodi/>"), "Schema violation"),
     ):
         write(path, text)
-        with pytest.raises(LidarError, match=f"makes no scenario: .*{message}"):
+        with pytest.raises(LidarError, match=f"cannot be converted to a scenario: .*{message}"):
             CliRunner().invoke(
                 import_, [str(path), "-o", str(tmp_path / "x")], catch_exceptions=False
             )

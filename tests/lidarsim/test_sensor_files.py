@@ -816,6 +816,8 @@ def test_import_reads_tables_of_other_programs(tmp_path):
     [line] = import_whole(import_sensor, path, tmp_path / "untimed", (), Scenario.load)
     assert line == "times: it states none, so 2 rays take 0.1 s"
     path.write_text("azimuth_deg,speed\n0,0\n")
-    with pytest.raises(LidarError, match=r"mine\.csv makes no scenario: it has no rays .*speed"):
+    with pytest.raises(
+        LidarError, match=r"mine\.csv cannot be converted to a scenario: it has no rays .*speed"
+    ):
         import_whole(import_sensor, path, tmp_path / "no", (), Scenario.load)
     assert not (tmp_path / "no").exists()

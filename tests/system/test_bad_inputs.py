@@ -63,9 +63,9 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "no model": (["run", "a.stl", "--sensor", ""], "There is no sensor model ''."),
     "misspelt column": (["run", "a.stl", "--columns", "rang,time"], "Did you mean 'range'?"),
     "misspelt format": (["run", "a.stl", "--format", "lass"], "Did you mean 'las'?"),
-    "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is no place: give x,y,z"),
+    "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is not a position. Expected X,Y,Z"),
     "no time": (["run", "good.yaml", "--wait", "soon"], "'soon' is not a time"),
-    "both": (["run", "good.yaml", "--resume", "--fresh"], "give one of them"),
+    "both": (["run", "good.yaml", "--resume", "--fresh"], "cannot be combined"),
     "certificates alone": (["doctor", "--tls-key", "a.stl"], "are for the cluster of --scheduler"),
     "certificate that is not there": (["doctor", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
     "two clusters": (

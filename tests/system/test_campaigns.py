@@ -468,7 +468,7 @@ def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
         assert refused.code == 2 and says in refused.err
     for option in (["--verify"], ["--job", 1], ["--retry-failed"]):
         refused = lidarpool("run", files / "base.yaml", "--out", files / "ds", *option)
-        assert refused.code == 2 and "are for campaigns" in refused.err
+        assert refused.code == 2 and "can only be used with campaigns" in refused.err
 
 
 SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
@@ -748,7 +748,7 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     [
         (["--job", 99], "there is no job 99"),
         (["--resume", "--overwrite"], "overwrite remove what resume"),
-        (["--only", "cloud"], "for one survey"),
+        (["--only", "cloud"], "cannot be used with campaigns"),
         (["--resume", "--fresh"], "--fresh"),
         (["--retry-failed", "--fresh"], "--fresh"),
         (["--retry-failed", "--job", 1], "--retry-failed"),

@@ -349,4 +349,4 @@ def test_a_timeline_says_when_each_step_ended_and_no_process_is_left(tmp_path):
 
 def test_a_timeline_that_cannot_be_written_is_refused_at_once(tmp_path, lidarpool):
     outcome = lidarpool("run", "x.yaml", "--timeline", tmp_path / "missing" / "timeline.html")
-    assert outcome.code == 2 and "give another name or folder" in outcome.err
+    assert outcome.code == 2 and "Use another file or folder" in outcome.err

@@ -132,7 +132,10 @@ def _messages(path):
 
 def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):
     told = lidarpool("export", tmp_path, "-f", "laz")
-    assert told.code == 2 and "holds no cloud.ply: give the folder of a finished run" in told.err
+    assert (
+        told.code == 2
+        and "does not contain cloud.ply. Pass the output folder of a finished run" in told.err
+    )
     for command in (("export", "-f", "laz"), ("plot",), ("merge", "--out", tmp_path / "all")):
         told = lidarpool(*command, tmp_path / "nowhere")
         assert told.code == 2 and "nowhere does not exist: give the folder" in told.err

@@ -108,7 +108,7 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     wrong = lidarpool(*arguments, "--resume", "--backend", "tiles")
     assert wrong.code == 2 and "were cast with 'numpy': continue with that" in wrong.err
     both = lidarpool(*arguments, "--resume", "--fresh")
-    assert both.code == 2 and "give one of them" in both.err
+    assert both.code == 2 and "cannot be combined" in both.err
     assert committed(out / "run") == before
 
     shutil.copytree(out, tmp_path / "fresh")

@@ -32,7 +32,7 @@ def test_init_overwrites_nothing(tmp_path, lidarpool):
     (tmp_path / "scenario.yaml").write_text("mine")
     outcome = lidarpool("init", tmp_path)
     assert outcome.code == 2
-    assert f"{tmp_path / 'scenario.yaml'} exists, and is not overwritten" in outcome.err
+    assert f"{tmp_path / 'scenario.yaml'} already exists and is not overwritten" in outcome.err
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
@@ -42,7 +42,7 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     options = ["--mesh", "my room.stl", "--mesh", "#1: é.glb", "--unit", "mm"]
     outcome = lidarpool("init", "a/b", *options)
     assert (outcome.code, outcome.err) == (0, "")
-    assert outcome.out.startswith("a/b/scenario.yaml is a survey of my room.stl, #1: é.glb:")
+    assert outcome.out.startswith("Created a/b/scenario.yaml for my room.stl, #1: é.glb.")
     made = Scenario.load("a/b/scenario.yaml")
     files = [(entry.file, entry.unit) for entry in made.scene.files]
     assert files == [("../../my room.stl", "mm"), ("../../#1: é.glb", "mm")]
@@ -96,7 +96,7 @@ def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
         (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
         (["--mesh", "notes.txt"], "notes.txt is not read: if it is a point cloud, make a mesh"),
         (["--sensor", "vlp61"], "Did you mean 'vlp16'?"),
-        (["--unit", "mm"], "name it with --mesh"),
+        (["--unit", "mm"], "require --mesh"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),
     ],
 )
@@ -138,13 +138,13 @@ def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool):
     assert outcome.code == 0
     rows = {line.split()[0]: " ".join(line.split()[1:]) for line in outcome.out.splitlines()}
     assert rows["velodyne/vlp16"] == "16 360° x -15.0° to 15.0° 0.4 to 130 m 5 to 20 289,352"
-    assert rows["livox/mid70"].startswith("1 70.4° circle ahead")
+    assert rows["livox/mid70"].startswith("1 70.4° circle, forward")
     assert max(map(len, outcome.out.splitlines())) <= 116
     outcome = lidarpool("sensors", "velodyne/vlp16")
     assert outcome.out.startswith("Velodyne VLP-16\nangles ")
     out = "lidarpool sensors velodyne/vlp16 --out"
-    draw = f"to draw its pattern: {out} pattern.png"
-    assert outcome.out.endswith(f"\n{draw}\nfor other programs: {out} rays.npz\n")
+    draw = f"To draw its pattern: {out} pattern.png"
+    assert outcome.out.endswith(f"\n{draw}\nTo export its rays: {out} rays.npz\n")
     assert list(tmp_path.iterdir()) == []
     pictures = {"livox/mid40": "rose.png", "airborne/riegl-vq780i": "lines.png", "vlp16": "v.png"}
     for name, target in pictures.items():
@@ -163,7 +163,10 @@ def test_sensors_writes_a_file_and_says_what_the_file_lacks(tmp_path, lidarpool)
     assert outcome.out.endswith(f"\n304 rays: v.csv\nnot in the file: {lacks}\n")
     assert "# max_range_m: 50.0" in (tmp_path / "v.csv").read_text()
     again = lidarpool("sensors", "vlp16", "--out", "v.csv")
-    assert again.code == 2 and "v.csv exists: give another name, or --overwrite." in again.err
+    assert (
+        again.code == 2
+        and "v.csv already exists. Use another name, or pass --overwrite." in again.err
+    )
     outcome = lidarpool("sensors", "--calibration", "v.csv", "--out", "v.npz")
     assert outcome.code == 0 and (tmp_path / "v.npz").exists()
     assert lidarpool("sensors", "vlp16", "--seconds", "1").code == 2

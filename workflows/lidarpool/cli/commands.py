@@ -58,25 +58,28 @@ _common_options = shared.combine(
         "--live",
         type=click.Choice([PAGE, *VIEWERS]),
         shell_complete=completion.live,
-        help="Show the run until Ctrl-C: on its page in the browser, in Foxglove or in Rerun; "
-        "--live alone shows the page.",
+        help="Show the progress and the point cloud during the run, in the browser (default), in "
+        "Foxglove or in Rerun, until Ctrl-C.",
     ),
     click.option(
         "--no-stay",
         "stay",
         flag_value=False,
         default=True,
-        help="With --live: end the page, or viewer, with the run.",
+        help="With --live, exit when the run ends.",
     ),
     click.option(
-        "--only", type=click.Choice(["cloud"]), help="Write the cloud and report.json, no page."
+        "--only", type=click.Choice(["cloud"]), help="Write only the point cloud and report.json."
     ),
-    shared.flag("--overwrite", help="Replace the result of another survey, or a data set."),
+    shared.flag("--overwrite", help="Overwrite the result of a different survey, or a data set."),
     shared.path(
-        "--timeline", help="Print when each step of the command ends, and draw it as a page here."
+        "--timeline",
+        help="Record the duration of each startup and shutdown step, print them, and write them "
+        "to FILE "
+        "as an HTML page.",
     ),
-    shared.flag("--quiet", "-q", help="No progress, only the result."),
-    shared.flag("--verbose", "-v", help="Show what Dask and other libraries log, on stderr."),
+    shared.flag("--quiet", "-q", help="Do not show progress."),
+    shared.flag("--verbose", "-v", help="Show log messages of Dask and other libraries."),
     shared.strict,
     shared.as_json,
 )
@@ -88,7 +91,9 @@ def _seconds(text: str) -> float:
     try:
         return float(text[:-1]) * unit if unit else float(text)
     except ValueError as error:
-        message = f"{text!r} is not a time: give a number with s, m or h."
+        message = (
+            f"{text!r} is not a duration. Expected a number with the unit s, m or h, such as 90s."
+        )
         raise click.BadParameter(message) from error
 
 
@@ -112,7 +117,7 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         **settings: Any,
     ) -> None:
         if only and pictures:
-            raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
+            raise click.UsageError("--only and --pictures cannot be combined.")
         settings["extent"] = "pictures" if pictures else only
         begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
         from ..base import timeline as steps
@@ -227,9 +232,9 @@ def cli() -> None:
 @_common_options
 @_with_run_options
 def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
-    """Scan six objects, plan a path and draw the pictures, on this machine.
+    """Run the demo: scan six objects, plan a path, and draw pictures.
 
-    It runs examples/seed.yaml.
+    The demo runs examples/seed.yaml on this machine.
 
     \b
     Examples:
@@ -249,33 +254,36 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
 @shared.scheduler
 @shared.cluster
 @shared.backend
-@shared.flag("--pictures", help="Draw the pictures, too, as lidarpool plot does later.")
+@shared.flag("--pictures", help="Draw pictures of the result; lidarpool plot can do this later.")
 @shared.flag("--resume", help="Resume an unfinished run, if there is one.")
-@shared.flag("--fresh", help="Delete an unfinished run.")
-@shared.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
-@shared.flag("--verify", help="Compare every byte of a data set, or of the jobs to resume from.")
+@shared.flag("--fresh", help="Discard an unfinished run and start again.")
+@shared.flag("--retry-failed", help="Run the failed jobs of a campaign again.")
+@shared.flag(
+    "--verify",
+    help="Verify the checksums of a data set, or of the finished jobs of a run that is resumed.",
+)
 @shared.job
 @shared.shard
 @click.option(
     "--parts",
     metavar="PLACE",
-    help="Folder or URL (s3://…) where LIDAR workers keep the points during the run.",
+    help="Folder or URL (s3://…) where LIDAR workers store points during the run.",
 )
 @click.option(
     "--wait",
     "wait_s",
     type=_seconds,
     metavar="TIME",
-    help="How long to wait at the start for the scheduler and for empty partitions, such as 90s "
-    f"or 10m; by default {WAIT_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
+    help="How long to wait for the scheduler and for workers at startup, such as 90s or 10m "
+    f"(default: {WAIT_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
 )
 @click.option(
     "--patience",
     "patience_s",
     type=_seconds,
     metavar="TIME",
-    help="How long to wait for partitions that become empty later; by default "
-    f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
+    help="How long to wait for new workers if a partition loses all of its workers during the run "
+    f"(default: {PATIENCE_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
 )
 @_common_options
 @_with_run_options
@@ -289,13 +297,14 @@ def run(
     backend: str | None,
     **settings: Any,
 ) -> None:
-    """Run the survey of a scenario or mesh file, or a campaign of many.
+    """Simulate a survey, or a campaign of surveys.
 
-    A campaign file, or several scenarios, make one data set.
+    SCENARIO is a scenario file, a mesh file or a campaign file. A campaign file, or several
+    scenarios, produce one data set.
 
-    A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
-    above if it is an object; every hit is kept. --sensor, --pose and the like say it otherwise;
-    lidarpool init DIR --mesh FILE writes the same as a scenario to edit.
+    For a mesh file, poses are chosen automatically unless --pose is given: rooms and landscapes are
+    scanned from the center of the floor, objects from all sides. To create a scenario file from the
+    same options, use lidarpool init DIR --mesh FILE.
 
     \b
     Examples:
@@ -317,11 +326,11 @@ def run(
     from .run_command import run_campaign, run_job, run_scenario
 
     if options.fresh and (options.resume or options.verify):
-        raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
+        raise click.UsageError("--fresh cannot be combined with --resume or --verify.")
     if number is not None and settings["shard"] is not None:
-        raise click.UsageError("--job does one job, and --shard a share: give one of them.")
+        raise click.UsageError("--job and --shard cannot be combined.")
     if options.retry_failed and (options.fresh or number is not None):
-        raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
+        raise click.UsageError("--retry-failed cannot be combined with --fresh or --job.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))
@@ -331,20 +340,21 @@ def run(
     is_several = len(paths) > 1
     if of_mesh and is_several:
         raise click.UsageError(
-            "--sensor, --pose and the like are for one mesh: run each by itself."
+            "--sensor, --pose and the other mesh options require a single mesh file. Run the "
+            "files one by one."
         )
     if is_several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, terminal, options, backend, extent)
         elif extent is not None:
-            raise click.UsageError(
-                "--only and --pictures are for one survey: a data set is written as a whole."
-            )
+            raise click.UsageError("--only and --pictures cannot be used with campaigns.")
         else:
             run_campaign(campaign.of_shard(settings["shard"] or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
-        raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
+        raise click.UsageError(
+            "--job, --retry-failed and --verify can only be used with campaigns."
+        )
     else:
         scenario = Scenario.load(paths[0], of_mesh)
         settings["made_of"] = {"path": str(paths[0].absolute()), "options": of_mesh}
@@ -353,12 +363,12 @@ def run(
 
 @cli.command()
 @click.argument("shards", metavar="SHARD...", nargs=-1, required=True, type=shared.StoragePath())
-@click.option("--partial", is_flag=True, help="Merge what there is, and say what is missing.")
-@shared.path(
-    "--scenario", help="Of a survey: its scenario or mesh file, if that is not where it was."
+@click.option(
+    "--partial", is_flag=True, help="Merge the shards that exist, and report what is missing."
 )
+@shared.path("--scenario", help="Scenario or mesh file of the survey, if it has been moved.")
 @shared.out
-@shared.flag("--quiet", "-q", help="No progress, only the result.")
+@shared.flag("--quiet", "-q", help="Do not show progress.")
 @shared.strict
 @shared.as_json
 def merge(
@@ -366,7 +376,7 @@ def merge(
 ) -> None:
     """Merge shards into a data set or result.
 
-    After a kill, the same command goes on.
+    If a merge was interrupted, run the same command again to continue.
 
     \b
     Examples:
@@ -453,9 +463,9 @@ def _explanation(error: Exception) -> str | None:
             return error.format_message()
         case OSError(filename=str() | Path() as name):
             # No file can have this name, or its folder may not be read.
-            return f"{name}: {error.strerror}: give another name or folder."
+            return f"{name}: {error.strerror}. Use another file or folder."
         case MemoryError():
-            return "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
+            return "Not enough memory. Use a smaller scene, fewer scans or a larger keep_every."
         case LidarError():
             return str(error)
         case RuntimeError():

@@ -77,9 +77,9 @@ def import_by(
             raise
         except Exception as error:  # a plug-in may raise anything
             reason = printable(str(error)) or type(error).__name__
-            raise LidarError(f"{plugin} fails ({reason}).") from error
+            raise LidarError(f"{plugin} failed: {reason}.") from error
         if not (partial / SCENARIO_FILE).is_file():
-            raise LidarError(f"{plugin} wrote no {SCENARIO_FILE}.")
+            raise LidarError(f"{plugin} did not write {SCENARIO_FILE}.")
         return left_out
 
     return import_whole(write, survey, folder, assets, check)
@@ -107,7 +107,7 @@ def import_whole(
         If the folder exists, the survey cannot be written, or the scenario is refused.
     """
     if folder.exists():
-        raise LidarError(f"{folder} exists: name another folder, --out DIR.")
+        raise LidarError(f"{folder} already exists. Pass another folder with --out.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
@@ -117,7 +117,7 @@ def import_whole(
         partial.rename(folder)
     except LidarError as error:
         message = str(error).replace(str(partial), str(folder))
-        raise LidarError(f"{survey} makes no scenario: {message}") from error
+        raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return left_out

@@ -30,44 +30,51 @@ _NOW_NS = 2_000_000_000  # time between reading the source and the first sweep o
     metavar="BRIDGE",
     shell_complete=completion.bridges,
     required=True,
-    help="packets: as the sensor sends; ros2: topics of ROS 2; foxglove, rerun: for viewers.",
+    help="Output: packets (the network protocol of the sensor), ros2 (ROS 2 topics), foxglove or "
+    "rerun.",
 )
 @click.option(
     "--to",
     metavar="[NAME=]ADDRESS",
     multiple=True,
-    help="packets: where to send, HOST or HOST:PORT, for a sensor of several NAME=HOST:PORT; "
-    "viewers: where to listen.  [default: 127.0.0.1]",
+    help="For packets, the destination HOST or HOST:PORT; with several sensors, NAME=HOST:PORT. "
+    "For "
+    "viewers, the address to listen on (default: 127.0.0.1).",
 )
-@options.flag("--loop", help="Play again and again until Ctrl-C; times go on.")
+@options.flag("--loop", help="Repeat until Ctrl-C with increasing timestamps.")
 @click.option(
     "--rate",
     type=click.FloatRange(0.001, 1000),
     default=1.0,
     show_default=True,
-    help="Speed: 0.5 takes twice as long.",
+    help="Playback rate; 0.5 is half speed.",
 )
-@options.flag("--now", help="Stamps of today's clock, not of the survey's start.")
+@options.flag(
+    "--now", help="Use the current time for timestamps instead of the start time of the survey."
+)
 @click.option(
     "--api",
     metavar="[NAME=]ADDRESS",
     multiple=True,
-    help="packets: where the sensor's own interface listens, HOST or HOST:PORT.  "
-    "[default: 127.0.0.1, port 80 or a free one]",
+    help="For packets, the address on which the HTTP or command interface of the sensor listens, "
+    "HOST "
+    "or HOST:PORT (default: 127.0.0.1, port 80 or a free one).",
 )
 @click.option(
     "--layout",
     type=click.Choice(list(LAYOUTS)),
-    help="ros2: layout of points.  [default: velodyne]",
+    help="For ros2, the point layout (default: velodyne).",
 )
 @click.option(
     "--organized",
     is_flag=True,
     default=None,
-    help="ros2: a point for each ray, NaN without a return.",
+    help="For ros2, publish one point per ray, NaN for rays without a return.",
 )
 @options.mesh_reading
-@options.new_file("--lateness", help="packets: how late they were, as JSON.")
+@options.new_file(
+    "--lateness", help="For packets, write statistics of the sending delays to FILE as JSON."
+)
 def play(
     source: Path | Storage,
     bridge_name: str,
@@ -78,10 +85,10 @@ def play(
     of_mesh: dict[str, Any],
     **settings: Any,
 ) -> None:
-    """Play a result or scenario as its sensors would send the sweeps, at their own times.
+    """Play back a result or simulate a scenario in real time.
 
-    SOURCE: the folder of a result; a scenario, campaign or mesh file, whose sweeps are cast as they
-    are due; or packets in a .pcap or .pcapng file.
+    SOURCE is the folder of a result; a scenario, campaign or mesh file, which is simulated in real
+    time; or a .pcap or .pcapng file with packets.
 
     \b
     Examples:
@@ -107,11 +114,13 @@ def play(
     kind = bridge_class(bridge_name)
     bridge_settings = {name: value for name, value in settings.items() if value not in (None, ())}
     if unknown := [name for name in bridge_settings if name not in kind.settings]:
-        raise click.UsageError(f"--{unknown[0]} is not for --as {bridge_name}: leave it out.")
+        raise click.UsageError(f"--{unknown[0]} cannot be used with --as {bridge_name}.")
     schedule = Schedule(rate)
     if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() in ENDINGS:
         if now:
-            raise click.UsageError("--now: the stamps of recorded packets are in them.")
+            raise click.UsageError(
+                "--now cannot be used with recorded packets, which contain their timestamps."
+            )
         options.refuse_mesh_options(of_mesh, source)
         _play_recording(source, to, schedule, bridge_settings, loop=loop)
         return

@@ -28,7 +28,7 @@ def _size(text: str) -> tuple[int, int]:
     if match := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text):
         return int(match[1]), int(match[2])
     raise click.BadParameter(
-        f"{text!r} is not a picture size: give width x height in pixels, such as 1600x1000."
+        f"{text!r} is not a picture size. Expected width x height in pixels, such as 1600x1000."
     )
 
 
@@ -55,7 +55,7 @@ class _FormatName(click.Choice[str]):
     "--only",
     type=click.Choice(PICTURES),
     multiple=True,
-    help="Picture to draw; may be given several times.  [default: all]",
+    help="Picture to draw; can be repeated (default: all).",
 )
 @click.option(
     "--size",
@@ -63,7 +63,7 @@ class _FormatName(click.Choice[str]):
     metavar="WxH",
     default="1600x1000",
     show_default=True,
-    help="Width and height in pixels.",
+    help="Picture size in pixels.",
 )
 @options.copies
 @click.option(
@@ -72,10 +72,10 @@ class _FormatName(click.Choice[str]):
     shell_complete=completion.colours,
     default="z",
     show_default=True,
-    help="Column to colour the points of the cloud by; rgb for red, green and blue.",
+    help="Column that determines the point colors, or rgb.",
 )
 def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) -> None:
-    """Draw the pictures of a result, also into its report.html.
+    """Draw the pictures of a result and add them to report.html.
 
     \b
     Examples:
@@ -93,8 +93,9 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     with local_result(result, (PICTURE_FILE, CLOUD, PAGE)) as folder_of_result:
         if not (folder_of_result / PICTURE_FILE).exists():
             raise LidarError(
-                f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
-                "folder of a finished run (its --out)."
+                f"{result} does not contain {PICTURE_FILE}, from which the pictures are drawn. "
+                "Pass the "
+                "output folder of a finished run."
             )
         keep_freed_memory()
         content = PictureContent.load(folder_of_result / PICTURE_FILE)
@@ -115,24 +116,25 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     shell_complete=completion.format_name,
     multiple=True,
     required=True,
-    help="Format to write, also one of a plug-in; may be given several times.",
+    help="Output format, built in or from a plug-in; can be repeated.",
 )
 @click.option(
     "--layout",
     type=click.Choice(list(LAYOUTS)),
     default="velodyne",
     show_default=True,
-    help="Layout of points in mcap and rosbag2.",
+    help="Point layout in mcap and rosbag2.",
 )
 @click.option(
     "--compensated",
     is_flag=True,
-    help="Points of mcap, rosbag2 and pcd at the start of the sweep, without their times.",
+    help="Compensate the motion within each sweep in mcap, rosbag2 and pcd; removes the point "
+    "times.",
 )
 @click.option(
     "--organized",
     is_flag=True,
-    help="A point for each ray in mcap and rosbag2, NaN without a return.",
+    help="Write one point per ray to mcap and rosbag2, NaN for rays without a return.",
 )
 @click.option(
     "--intensity-full-scale",
@@ -149,7 +151,7 @@ def export(
     overwrite: bool,
     **settings: Any,
 ) -> None:
-    """Write the cloud of a finished result in further formats.
+    """Convert a result to other formats.
 
     \b
     Examples:
@@ -167,13 +169,14 @@ def export(
     required = ("cloud.ply", SWEEPS_FILE, "report.json")
     target = result if out is None else out
     if isinstance(result, Path) and result.is_file():
-        raise LidarError(f"{result} is a file: give its folder, {result.parent}.")
+        raise LidarError(f"{result} is a file. Pass its folder, {result.parent}.")
     with local_result(result, (*required, PICTURE_FILE, *INSTRUMENT_FILES)) as source:
         for name in required:
             if not (source / name).exists():
                 raise LidarError(
-                    f"{result} holds no {name}: give the folder of a finished run (its --out); "
-                    "lidarpool run --resume continues an unfinished one."
+                    f"{result} does not contain {name}. Pass the output folder of a finished "
+                    "run. To finish "
+                    "an interrupted run, use lidarpool run --resume."
                 )
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
@@ -206,7 +209,8 @@ def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
     """Raise LidarError if a storage holds a file that must not be overwritten."""
     if isinstance(target, Storage) and not overwrite and file in target.entries():
         raise LidarError(
-            f"{target.path(file)} is there already: give another place with --out, or --overwrite."
+            f"{target.path(file)} already exists. Pass another folder with --out, or pass "
+            "--overwrite."
         )
 
 
@@ -254,12 +258,15 @@ def _tell(note: str) -> None:
     type=click.IntRange(0, 65_535),
     default=8080,
     show_default=True,
-    help="Port on 127.0.0.1, or the next free one; 0 for any.",
+    help="Port on 127.0.0.1; if it is in use, the next free one. 0 selects any free port.",
 )
-@options.flag("--no-browser", help="Only print the address.")
-@options.new_file("--film", help="Write a .gif or .webp instead: along a drive, or all around.")
-@options.new_file("--export", help="Write the page as one .html instead, of at most 25 MB.")
-@options.flag("--keep-noise", help="Show withheld points and noise of a .las or .laz, too.")
+@options.flag("--no-browser", help="Print the address without opening a browser.")
+@options.new_file(
+    "--film",
+    help="Render an animation to a .gif or .webp file: along a drive, or around the scene.",
+)
+@options.new_file("--export", help="Export the view as a single .html file of at most 25 MB.")
+@options.flag("--keep-noise", help="Include withheld points and noise of .las and .laz files.")
 @options.mesh_reading
 def view(
     results: Sequence[Path | Storage],
@@ -270,12 +277,12 @@ def view(
     keep_noise: bool,
     of_mesh: dict[str, Any],
 ) -> None:
-    """Show a file or folder in the browser, or write a file to share.
+    """Show results, recordings or scenes in the browser.
 
-    RESULT: a result; a data set of a campaign; a cloud or recording (.ply, .las, .laz, .pcd, .e57,
-    .parquet, text such as .csv, .pts, .ptx, .npy, .bin, .mcap, .pcap, .osf, or a folder of rosbag2,
-    KITTI, nuScenes, WebDataset, PCD or range images); or a scenario or mesh, before its run.
-    Several are shown in one view, with a colour each.
+    RESULT is a result, a data set, a point cloud or recording (.ply, .las, .laz, .pcd, .e57,
+    .parquet, text such as .csv, .pts, .ptx, .npy, .bin, .mcap, .pcap, .osf, or a folder with
+    rosbag2, KITTI, nuScenes, WebDataset, PCD or range images), or a scenario or mesh. Several
+    inputs are shown in one view with different colors.
 
     \b
     Examples:
@@ -295,11 +302,12 @@ def view(
     from ..showing.pages.opened import growing_view, is_data_set, open_views
 
     if (film or export) and len(results) > 1:
-        raise LidarError("--film and --export take one result: give them one after the other.")
+        raise LidarError("--film and --export require a single input.")
     if data_sets := [result for result in results if is_data_set(result)]:
         if len(results) > 1 or film or export:
             raise LidarError(
-                f"{data_sets[0]} is a data set of many jobs: view it alone, without --film and "
+                f"{data_sets[0]} is a data set with several jobs. View it on its own, without "
+                "--film and "
                 "--export."
             )
         options.refuse_mesh_options(of_mesh, data_sets[0])
@@ -334,52 +342,62 @@ def view(
     type=click.Path(file_okay=False, path_type=Path),
     default=Path("lidarpool-compare"),
     show_default=True,
-    help="Folder for compare.html, compare.json and pictures; earlier ones are replaced.",
+    help="Output folder for compare.html, compare.json and pictures; existing files are replaced.",
 )
-@click.option("--sweep", "sweeps", type=int, multiple=True, help="Compare only this pair, from 0.")
+@click.option(
+    "--sweep",
+    "sweeps",
+    type=int,
+    multiple=True,
+    help="Compare only the pair of sweeps with this index, starting at 0; can be repeated.",
+)
 @click.option(
     "--match",
     type=click.Choice(["order", "time"]),
     default="order",
     show_default=True,
-    help="Which sweeps belong together.",
+    help="How to pair the sweeps of A and B.",
 )
-@click.option("--sensor-a", metavar="NAME", help="Sensor of A, or topic of a bag, of several.")
-@click.option("--sensor-b", metavar="NAME", help="The same of B.")
+@click.option("--sensor-a", metavar="NAME", help="Sensor or topic of A, if A contains several.")
+@click.option("--sensor-b", metavar="NAME", help="Sensor or topic of B.")
 @click.option("--intensity-a", metavar="COLUMN", help="Column of A to compare as intensity.")
-@click.option("--intensity-b", metavar="COLUMN", help="The same of B.")
+@click.option("--intensity-b", metavar="COLUMN", help="Column of B to compare as intensity.")
 @click.option(
     "--unit-a",
     type=click.Choice([*UNITS_M]),
-    help="Unit of A; by default that of a .las or .laz, else m.",
+    help="Length unit of A (default: from a .las or .laz file, otherwise m).",
 )
-@click.option("--unit-b", type=click.Choice([*UNITS_M]), help="The same of B.")
-@options.flag("--keep-noise", help="Compare withheld points and noise of a .las or .laz, too.")
-@click.option("--azimuth-deg", type=float, help="Width of a cell; by default the step of pulses.")
+@click.option("--unit-b", type=click.Choice([*UNITS_M]), help="Length unit of B.")
+@options.flag("--keep-noise", help="Include withheld points and noise of .las and .laz files.")
+@click.option(
+    "--azimuth-deg",
+    type=float,
+    help="Cell width of the range images in degrees (default: the azimuth step of the sensor).",
+)
 @click.option(
     "--distance",
     "distances_m",
     type=float,
-    metavar="METRES",
+    metavar="M",
     multiple=True,
     default=(0.05, 0.1, 0.2, 0.5),
     show_default=True,
-    help="Distance for the F-score; may be given several times.",
+    help="Distance threshold in meters for the F-score; can be repeated.",
 )
 @click.option(
     "--most-points",
     type=int,
     default=10_000_000,
     show_default=True,
-    help="Points of a cloud without sweeps that are held in memory.",
+    help="Maximum number of points to load from a cloud without sweeps.",
 )
 @options.as_json
 def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None:
-    """Compare two clouds or recordings of the same place.
+    """Compare two point clouds or recordings of the same scene.
 
-    B is the reference. A and B: results, data sets, .ply, .pcd or folders of them, .las, .laz,
-    .e57, text such as .csv, .pts, .ptx, .npy, .bin, bags of ROS 2, .pcap and .osf. Sweeps of one
-    sensor are compared by range images, clouds without rings by distances.
+    B is the reference. A and B can be results, data sets, .ply, .pcd or folders of these, .las,
+    .laz, .e57, text such as .csv, .pts, .ptx, .npy, .bin, ROS 2 bags, .pcap and .osf. Sweeps of the
+    same sensor are compared as range images, clouds without rings by point distances.
 
     \b
     Examples:
@@ -400,26 +418,34 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
 
 @click.command()
 @click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
-@options.new_file("--out", required=True, help="Sensor file, .yaml; its page is a .html beside it.")
+@options.new_file(
+    "--out",
+    required=True,
+    help="Output sensor file (.yaml); a report is written next to it as .html.",
+)
 @click.option(
     "--model",
     metavar="MODEL|FILE",
     shell_complete=completion.sensors,
-    help="The sensor, for what the recording hides.",
+    help="Sensor model that provides the properties the recording does not reveal.",
 )
-@options.path("--scene", help="The place, a mesh.")
+@options.path("--scene", help="Mesh of the scene.")
 @options.poses
-@click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
-@click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
-@click.option("--white", type=float, help="Intensity of white, if it is the same at all ranges.")
+@click.option(
+    "--sensor", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
+)
+@click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
+@click.option(
+    "--white", type=float, help="Intensity of a white surface, if it does not depend on the range."
+)
 @options.as_json
 def fit(
     recording: Path, out: Path, pose: Sequence[Sequence[float]], as_json: bool, **settings: Any
 ) -> None:
-    """Fit a sensor to a recording of a unit that stands: noise, lost returns, false alarms.
+    """Estimate noise, dropout and false alarms of a sensor from a recording.
 
-    RECORDING is one that `lidarpool compare` reads, with sweeps and rings. With --scene the unit
-    may move, if its poses are known.
+    RECORDING can have any format that `lidarpool compare` reads, and must contain sweeps and rings.
+    The sensor must be stationary, unless --scene and its poses are given.
 
     \b
     Examples:

@@ -31,23 +31,22 @@ if TYPE_CHECKING:
     from ..base.tls_files import TlsFiles
 
 MAX_COPIED_TRIANGLES = 20_000_000  # limit for files that cannot share triangles
-_SENSOR_FORMATS = "Format of the file: " + ", ".join(row.name for row in FORMATS) + "."
+_SENSOR_FORMATS = "File format: " + ", ".join(row.name for row in FORMATS) + "."
 
 
 @click.command()
 @click.argument(
     "folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path(), required=False
 )
-@options.path(
-    "--mesh", "meshes", multiple=True, help="Mesh file to survey; may be given several times."
-)
+@options.path("--mesh", "meshes", multiple=True, help="Mesh file to survey; can be repeated.")
 @options.mesh_options
 @options.flag("--all", "every", help="Write every field with its default and a description.")
 def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every: bool) -> None:
-    """Write a commented scenario file with your options and poses.
+    """Create a scenario file.
 
-    All other settings have their defaults. The JSON Schema of the scenario is written beside the
-    file, so that editors complete and check the scenario. An existing scenario is not overwritten.
+    The scenario contains the given options and defaults for everything else. Its JSON Schema is
+    written to the same folder, so that editors can complete and check it. An existing scenario is
+    not overwritten.
 
     \b
     Examples:
@@ -69,7 +68,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     )
 
     if not meshes and {"unit", "up_axis"} & of_mesh.keys():
-        raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
+        raise click.UsageError("--unit and --up-axis require --mesh.")
     target = folder / SCENARIO_FILE
     data = mesh_data(meshes, folder, of_mesh)
     note = ""
@@ -93,18 +92,19 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
         )
     except FileExistsError as error:
         raise LidarError(
-            f"{error.filename} exists, and is not overwritten: name another folder, "
-            "lidarpool init DIR, or remove it."
+            f"{error.filename} already exists and is not overwritten. Remove it, or pass another "
+            "folder: "
+            "lidarpool init DIR."
         ) from error
     name = click.format_filename(target)
     if meshes:
         listed = ", ".join(click.format_filename(path) for path in meshes)
-        click.echo(f"{name} is a survey of {listed}: change what you like.")
+        click.echo(f"Created {name} for {listed}.")
         for note in notes:
             click.echo(f"note: {note}")
     else:
-        click.echo(f"{name} is a survey of the six objects of the demo: change what you like.")
-        click.echo("for a mesh of your own: lidarpool init DIR --mesh FILE [--unit mm]")
+        click.echo(f"Created {name} for the six objects of the demo.")
+        click.echo("To use your own mesh: lidarpool init DIR --mesh FILE [--unit mm]")
     click.echo(f"next: lidarpool check {shlex.quote(str(target))}")
 
 
@@ -115,19 +115,18 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     metavar="DIR",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     multiple=True,
-    help="Folder where references in the survey start; may be given several times.  "
-    "[default: the survey's, and those above it]",
+    help="Folder for resolving references in the survey; can be repeated (default: the folder of "
+    "the "
+    "survey and its parents).",
 )
-@options.path(
-    "--out", "-o", metavar="DIR", help="Folder for the scenario.  [default: named after the survey]"
-)
+@options.path("--out", "-o", metavar="DIR", help="Output folder (default: the name of the survey).")
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
-    """Write a survey of another program as a scenario.
+    """Convert a survey from another program to a scenario.
 
-    Surveys and scanners of HELIOS++ are read, worlds of Gazebo (.sdf, .world) with their lidars,
-    models of MuJoCo (.xml) with their rangefinders, rays of a sensor (.csv, .npz, .parquet),
-    OmniLidar prims (.usd, .usda), and surveys for which a plug-in is installed. Unsupported
-    features are listed, one line each. Mesh files stay where they are.
+    Supported inputs are HELIOS++ surveys and scanners, Gazebo worlds (.sdf, .world) with their
+    lidars, MuJoCo models (.xml) with their rangefinders, ray tables of a sensor (.csv, .npz,
+    .parquet), OmniLidar prims (.usd, .usda), and formats of installed plug-ins. Unsupported
+    features are listed. Mesh files are referenced, not copied.
 
     \b
     Examples:
@@ -200,13 +199,12 @@ def check(
     strict: bool,
     as_json: bool,
 ) -> None:
-    """Show the forecast and the needs of a run.
+    """Validate a scenario and estimate its run time and memory.
 
-    The scenario is checked; nothing is started. Of a campaign, the values that vary, and five of
-    its jobs.
+    No workers are started. For a campaign, the varying values and five of the jobs are checked.
 
-    Some rays are cast here to estimate the number of points. Warnings name poses, trajectories and
-    noise that real surveys do not have. The exit code is 0 if it can run, and 2, with the reasons,
+    A sample of the rays is cast in this process to estimate the number of points. Warnings point
+    out implausible poses, trajectories and noise. The exit code is 0 if the scenario can run, and 2
     if it cannot.
 
     \b
@@ -268,14 +266,13 @@ def _free_target(target: Path | Storage) -> str:
 
 
 @click.command()
-@click.option("--campaign", is_flag=True, help="Of campaign files.")
+@click.option("--campaign", is_flag=True, help="Print the schema of campaign files.")
 def schema(campaign: bool) -> None:
     """Print the JSON Schema of scenario files.
 
-    Editors complete and check scenarios with it.
-
-    Visual Studio Code does with the extension redhat.vscode-yaml, Vim, Emacs and others with
-    yaml-language-server, once the first line of a scenario names the schema's file:
+    Editors can use the schema to complete and check scenarios: Visual Studio Code with the
+    extension redhat.vscode-yaml, and Vim, Emacs and others with yaml-language-server. The first
+    line of the scenario must refer to the schema:
     # yaml-language-server: $schema=scenario.schema.json
 
     \b
@@ -290,7 +287,7 @@ def schema(campaign: bool) -> None:
 
 @click.group(name="scene")
 def scene() -> None:
-    """Make scenes as mesh files: generated, or of a point cloud."""
+    """Generate a scene, or convert a point cloud to one."""
 
 
 _out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj")
@@ -301,19 +298,19 @@ def _generated_scene_options(triangles: int) -> Callable[[Command], Command]:
     return combine(
         _out,
         overwrite,
-        click.option("--triangles", default=triangles, help="Approximate number."),
-        click.option("--seed", default=0, help="The same seed gives the same scene."),
+        click.option("--triangles", default=triangles, help="Approximate number of triangles."),
+        click.option("--seed", default=0, help="Seed of the random generator."),
     )
 
 
 @scene.command(context_settings={"show_default": True})
 @_generated_scene_options(triangles=100_000)
-@click.option("--trees", default=0, help="Number of detailed trees, instead of the simple ones.")
-@click.option("--cars", default=0, help="Number of detailed cars, instead of the simple ones.")
+@click.option("--trees", default=0, help="Number of detailed trees, which replace the simple ones.")
+@click.option("--cars", default=0, help="Number of detailed cars, which replace the simple ones.")
 def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars: int) -> None:
-    """Make a city: streets, houses, towers, trees, cars.
+    """Generate a city with streets, houses, towers, trees and cars.
 
-    A city with more triangles is larger.
+    The size of the city grows with the number of triangles.
 
     \b
     Examples:
@@ -328,12 +325,14 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
 
 @scene.command(context_settings={"show_default": True})
 @_generated_scene_options(triangles=2_000_000)
-@click.option("--side", default=1000.0, help="Length of a side in metres.")
-@click.option("--trees", default=0, help="Number of trees, in woods on ground that is not steep.")
+@click.option("--side", default=1000.0, help="Side length in meters.")
+@click.option(
+    "--trees", default=0, help="Number of trees; they grow in woods where the ground is not steep."
+)
 def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, trees: int) -> None:
-    """Make a square of hills and mountains.
+    """Generate a square terrain with hills and mountains.
 
-    A square with more triangles is finer.
+    The resolution of the terrain grows with the number of triangles.
 
     \b
     Examples:
@@ -350,40 +349,40 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
 @click.option(
     "--voxel-m",
     type=float,
-    help="Edge of cubes with one point each; by default the spacing of the points.",
+    help="Voxel size in meters; one point is kept per voxel (default: the point spacing).",
 )
 @click.option(
     "--size",
     default=1.0,
     show_default=True,
-    help="Factor of the surfels' sides: larger ones close gaps, and reach farther beyond edges.",
+    help="Scale factor of the surfels; larger surfels close gaps but extend further beyond edges.",
 )
 @click.option(
     "--unit",
     type=click.Choice([*UNITS_M]),
-    help="Unit of x, y and z; by default that of a .las or .laz, else m.",
+    help="Length unit of the cloud (default: from a .las or .laz file, otherwise m).",
 )
 @click.option(
     "--epsg",
     type=click.IntRange(1024, 32767),
     metavar="CODE",
-    help="EPSG code of a system in metres, to which a cloud is brought from the system that it "
-    "states: from degrees, or from Web Mercator.",
+    help="EPSG code of a coordinate system in meters to which the cloud is converted, for example "
+    "from degrees or Web Mercator.",
 )
-@options.flag("--keep-noise", help="Make surfaces of withheld points and noise, too.")
+@options.flag("--keep-noise", help="Include withheld points and noise.")
 @click.option(
     "--colour",
     type=click.Choice(["rgb", "intensity"]),
-    help="What colours the surfels; by default rgb, else intensity, as the cloud has them.",
+    help="Source of the surfel colors (default: rgb if the cloud has it, otherwise intensity).",
 )
 @overwrite
 @click.argument("cloud", type=click.Path(path_type=Path), metavar="CLOUD")
 @_out
 def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
-    """Make a scene of a point cloud, Z-up: a scan that can be scanned again.
+    """Convert a point cloud to a scene that can be scanned again.
 
-    CLOUD: .ply, .pcd, .las, .laz, .e57, text (.xyz, .txt, .asc, .csv), .pts or .ptx of Leica, .npy,
-    or .bin of KITTI or nuScenes.
+    CLOUD must be z-up. Supported formats are .ply, .pcd, .las, .laz, .e57, text (.xyz, .txt, .asc,
+    .csv), Leica .pts and .ptx, .npy, and .bin from KITTI or nuScenes.
 
     \b
     Examples:
@@ -401,7 +400,10 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
     def make() -> Scene:
         place = scene_of_points(cloud, tell=tell, **settings)
         if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
-            tell(f"{out} holds no colours and classes: write a .glb to keep those of {cloud}")
+            tell(
+                f"{out} cannot store the colors and classes of {cloud}. Write a .glb file to "
+                "keep them."
+            )
         return place
 
     _write(out, make, overwrite)
@@ -417,14 +419,15 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
 
     check_target(file)
     if file.exists() and not overwrite:
-        raise LidarError(f"{file} exists: give another name, or --overwrite.")
+        raise LidarError(f"{file} already exists. Use another name, or pass --overwrite.")
     scene = make()
     if file.suffix.lower() == ".glb":  # other formats hold no colours
         scene = painted(scene) if paint else scene
     elif scene.instances and scene.triangles > MAX_COPIED_TRIANGLES:
         raise LidarError(
-            f"{file} would hold {scene.triangles:,} triangles, because only .glb files have a tree "
-            "once for many places: write one."
+            f"{file} would contain {scene.triangles:,} triangles, because only .glb files can "
+            "store "
+            "instances. Write a .glb file."
         )
     write_scene(file, scene)
     lower, upper = scene.bounds
@@ -442,8 +445,9 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
 @options.path(
     "--out",
     metavar="FILE",
-    help="Write the sensor for other programs, in the format of the ending or of --as; .png draws "
-    "its pattern.",
+    help="Write the sensor to FILE for other programs. The format follows from the file "
+    "extension or "
+    "from --as; .png draws the scan pattern.",
     shell_complete=completion.sensor_file,
 )
 @click.option(
@@ -457,19 +461,34 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     "--seconds",
     type=click.FloatRange(0, 1e6, min_open=True),
     metavar="S",
-    help="Duration of the pattern in the file.  [default: one revolution or frame]",
+    help="Duration of the pattern (default: one revolution or frame).",
 )
 @click.option(
     "--revolutions",
     type=click.IntRange(1, 10_000_000),
     metavar="N",
-    help="Revolutions or frames in the file instead.",
+    help="Number of revolutions or frames, as an alternative to --seconds.",
 )
-@options.path("--calibration", help="The unit's calibration, as in a scenario.")
-@click.option("--columns", type=click.IntRange(1, 100_000), metavar="N", help="As in a scenario.")
-@click.option("--rate", "rate_hz", type=float, metavar="HZ", help="rate_hz of a scenario.")
-@click.option("--min-range", "min_range_m", type=float, metavar="M", help="As in a scenario.")
-@click.option("--max-range", "max_range_m", type=float, metavar="M", help="As in a scenario.")
+@options.path("--calibration", help="Calibration file of the unit, as in a scenario.")
+@click.option(
+    "--columns",
+    type=click.IntRange(1, 100_000),
+    metavar="N",
+    help="Columns per revolution, as in a scenario.",
+)
+@click.option(
+    "--rate",
+    "rate_hz",
+    type=float,
+    metavar="HZ",
+    help="Revolutions per second, as rate_hz in a scenario.",
+)
+@click.option(
+    "--min-range", "min_range_m", type=float, metavar="M", help="Minimum range in meters."
+)
+@click.option(
+    "--max-range", "max_range_m", type=float, metavar="M", help="Maximum range in meters."
+)
 @options.overwrite
 def sensors(
     model: str | None,
@@ -480,10 +499,10 @@ def sensors(
     overwrite: bool,
     **settings: Any,
 ) -> None:
-    """List sensor models, show the figures of a model, or write it as a file.
+    """List sensor models, describe one, or export it to a file.
 
-    Files are rays in the order of firing: docs/how-to/other-simulators.md has their conventions.
-    What a format does not hold is printed.
+    Exported files contain rays in firing order; docs/how-to/other-simulators.md describes the
+    conventions. Properties that the format cannot store are printed.
 
     \b
     Examples:
@@ -498,10 +517,10 @@ def sensors(
     settings = {name: value for name, value in settings.items() if value is not None}
     writing = [file_format, seconds, revolutions, *settings]
     if out is None and any(value is not None for value in writing):
-        raise click.UsageError("These options are for a file: name it, --out FILE.")
+        raise click.UsageError("These options require --out FILE.")
     if model is None and "calibration" not in settings:
         if out is not None:
-            raise click.UsageError("Name the model that is to be written, or --calibration FILE.")
+            raise click.UsageError("Specify the model to write, or pass --calibration FILE.")
         _list_models()
         return
     if model is not None:
@@ -509,15 +528,15 @@ def sensors(
     if out is None:
         assert model is not None  # a calibration needs a file
         command = f"lidarpool sensors {shlex.quote(model)} --out"
-        click.echo(f"to draw its pattern: {command} pattern.png")
-        click.echo(f"for other programs: {command} rays.npz")
+        click.echo(f"To draw its pattern: {command} pattern.png")
+        click.echo(f"To export its rays: {command} rays.npz")
         return
     sensor = load_sensor(model, **settings)
     if out.suffix.lower() != ".png" or file_format is not None:
         _write_sensor(sensor, out, overwrite, file_format, seconds, revolutions)
         return
     if seconds is not None or revolutions is not None:
-        raise click.UsageError("A picture shows fixed durations: leave the duration out.")
+        raise click.UsageError("--seconds and --revolutions cannot be used with a .png file.")
     from lidarview.render.pattern_picture import (
         draw_pattern,  # imports Matplotlib, which figures do not need
     )
@@ -538,7 +557,7 @@ def _write_sensor(
     from lidarsim.sensor.export import export_sensor
 
     if out.exists() and not overwrite:
-        raise LidarError(f"{out} exists: give another name, or --overwrite.")
+        raise LidarError(f"{out} already exists. Use another name, or pass --overwrite.")
     file = export_sensor(sensor, out, format=file_format, seconds=seconds, revolutions=revolutions)
     size = plural(len(file.rays), "ray") if len(file.rays) else plural(sensor.channels, "channel")
     click.echo(f"{size}: {click.format_filename(out)}")
@@ -550,7 +569,7 @@ def _list_models() -> None:
     """Print the models with their main figures."""
     from lidarsim.base.model_names import model_names, plugin_model_names
 
-    heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
+    heads = ("model", "channels", "field of view", "range", "rate (Hz)", "points/s")
     rows = [heads, *map(_row, (*model_names(), *plugin_model_names()))]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
@@ -565,7 +584,9 @@ def _show_model(name: str) -> None:
     click.echo(described.name)
     lines = [*described.sources.items()]
     if described.typical:
-        lines.insert(0, ("rays", "a typical pattern; calibration: FILE has those of a unit"))
+        lines.insert(
+            0, ("rays", "typical pattern; use calibration: FILE for the rays of a specific unit")
+        )
     if described.performance is not None:
         sheet = described.datasheet()
         lines.append(("noise", shown_noise(sheet.noise)))
@@ -602,12 +623,12 @@ def _field_of_view(name: str, model: SensorModel) -> str:
 
     elevations_deg = model.beams.elevation_deg
     if model.mirror:
-        return f"{model.mirror.width_deg:g}° across, below"
+        return f"{model.mirror.width_deg:g}° across track, downward"
     if not model.prisms:
         return f"360° x {min(elevations_deg):.1f}° to {max(elevations_deg):.1f}°"
     x, y, z = load_sensor(name).directions(np.arange(20_000)).reshape(-1, 3).T
     if len(elevations_deg) < 2:
-        return f"{2 * np.degrees(np.arccos(x.min())):.1f}° circle ahead"
+        return f"{2 * np.degrees(np.arccos(x.min())):.1f}° circle, forward"
     lowest, highest = np.degrees(np.arcsin(np.clip([z.min(), z.max()], -1, 1)))
     width = 2 * np.degrees(np.abs(np.arctan2(y, x)).max())
     return f"{width:.0f}° x {lowest:.1f}° to {highest:.1f}°"

@@ -47,33 +47,35 @@ out = click.option(
     type=StoragePath(),
     default=Path("lidarpool-out"),
     show_default=True,
-    help="Folder for the results, made if it does not exist, or a URL such as s3://bucket/run.",
+    help="Output folder, created if necessary, or a URL such as s3://bucket/run.",
 )
 backend = click.option(
     "--backend",
     type=click.Choice(BACKENDS),
-    help="Ray caster of stage 2; by default the scenario's, else the fastest available.",
+    help="Ray-casting backend (default: from the scenario, otherwise the fastest available).",
 )
 job = click.option(
-    "--job", "number", type=click.IntRange(0), metavar="N", help="Of a campaign: this job alone."
+    "--job", "number", type=click.IntRange(0), metavar="N", help="Run only job N of the campaign."
 )
 shard = click.option(
     "--shard",
     metavar="N/OF",
     type=Shard.parse,
-    help="Do one of several equal shares, such as 3/10, for lidarpool merge; auto: the task of a "
-    "Slurm array; auto/10: the index of a Kubernetes job.",
+    help="Run only shard N of OF, for example 3/10; combine the shards with lidarpool merge. Use "
+    "auto "
+    "for the task ID of a Slurm array, or auto/10 for the index of a Kubernetes job.",
 )
 cluster = path(
-    "--cluster", help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md."
+    "--cluster",
+    help="Start the Slurm, PBS or SSH cluster that FILE describes; see docs/how-to/queues.md.",
 )
-overwrite = flag("--overwrite", help="Replace existing files.")
-as_json = flag("--json", "as_json", help="Print the figures as one JSON document.")
+overwrite = flag("--overwrite", help="Overwrite existing files.")
+as_json = flag("--json", "as_json", help="Print the results as JSON.")
 WARNED = 1  # exit code of --strict
-strict = flag("--strict", help="Exit with code 1 if there was a warning, such as of no points.")
+strict = flag("--strict", help="Exit with code 1 if there was a warning.")
 result = click.argument("result", metavar="FOLDER", type=StoragePath())
 copies = click.option(
-    "--out", type=StoragePath(file_okay=False), help="Folder for the files.  [default: FOLDER]"
+    "--out", type=StoragePath(file_okay=False), help="Output folder (default: FOLDER)."
 )
 
 
@@ -93,7 +95,9 @@ def _position(text: str) -> list[float]:
         x, y, z = map(float, text.split(","))
     except ValueError as error:
         message = (
-            f"{text!r} is no place: give x,y,z, such as 0,0,1.9; angles are for scenario files."
+            f"{text!r} is not a position. Expected X,Y,Z, for example 0,0,1.9. To set angles, "
+            "use a "
+            "scenario file."
         )
         raise click.BadParameter(message) from error
     return [int(number) if number.is_integer() else number for number in (x, y, z)]
@@ -106,35 +110,45 @@ def _names(text: str) -> list[str]:
 
 def _mesh_option(name: str, description: str, **settings: Any) -> Callable[[Command], Command]:
     """Return an option of a mesh file."""
-    return click.option(f"--{name}", help=f"Of a mesh: {description}.", **settings)
+    return click.option(f"--{name}", help=f"{description}. Mesh input only.", **settings)
 
 
 _mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_names, multiple=True)
 poses = click.option("--pose", metavar="X,Y,Z", type=_position, multiple=True,
-                     help="Place of the sensor in the scene, metres; or one for each sweep. By "
-                     "default that of the recording, or 0,0,0.")  # fmt: skip
+                     help="Position of the sensor in the scene, in meters; repeat it to give one "
+                     "position for each "
+                     "sweep (default: from the recording, otherwise 0,0,0).")  # fmt: skip
 _MESH_READING = ("unit", "up_axis")  # how a mesh is read, wherever a command takes a mesh
 _mesh_reading_options = combine(
-    _mesh_option("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),
-    _mesh_option("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
+    _mesh_option(
+        "unit",
+        "Length unit of the mesh (default: from the file, otherwise m)",
+        type=click.Choice([*UNITS_M]),
+    ),
+    _mesh_option(
+        "up-axis",
+        "Up axis of the mesh (default: from the file, otherwise z)",
+        type=click.Choice([*"xyz"]),
+    ),
 )
 _mesh_options = combine(
     click.option(
         "--sensor",
-        help="Of a mesh, or a scenario with one sensor: sensor, one of lidarpool sensors or a "
-        "file.",
+        help="Sensor model, as listed by lidarpool sensors, or a sensor file. Mesh input, or "
+        "scenarios "
+        "with one sensor.",
         metavar="MODEL|FILE.yaml",
         shell_complete=completion.sensors,
     ),
     _mesh_reading_options,
-    _mesh_list_option("pose", "place of the sensor, metres", metavar="X,Y,Z", type=_position),
+    _mesh_list_option("pose", "Position of the sensor in meters", metavar="X,Y,Z", type=_position),
     _mesh_list_option(
         "columns",
-        "further columns of its points, such as range,intensity",
+        "Additional columns of the point cloud, such as range,intensity",
         shell_complete=completion.columns,
     ),
     _mesh_list_option(
-        "format", "further formats of the cloud, such as las", shell_complete=completion.formats
+        "format", "Additional output formats, such as las", shell_complete=completion.formats
     ),
 )
 
@@ -174,8 +188,7 @@ def refuse_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
     """Raise a LidarError for options of a mesh with a path that is none."""
     for name in of_mesh:
         raise LidarError(
-            f"--{name.replace('_', '-')} says how a mesh file is read, and {path} is none: leave "
-            "it out."
+            f"--{name.replace('_', '-')} only applies to mesh files, and {path} is not a mesh file."
         )
 
 
@@ -206,20 +219,21 @@ def scheduler(command: Command) -> Command:
 
     pem = click.Path(exists=True, dir_okay=False, path_type=Path)
     for name, description in (
-        ("key", "Private key of that certificate, if its file does not hold it."),
-        ("cert", "Own certificate for an encrypted cluster, a PEM file."),
-        ("ca", "Certificate of the authority of an encrypted cluster, a PEM file."),
+        ("key", "Private key of the client certificate, if it is in a separate file (PEM)."),
+        ("cert", "Client certificate for a TLS cluster (PEM)."),
+        ("ca", "Certificate authority of a TLS cluster (PEM)."),
     ):
         click.option(f"--tls-{name}", type=pem, help=description)(with_files)
     click.option(
         "--scheduler-file",
         type=click.Path(dir_okay=False, path_type=Path),
-        help="File with the scheduler's address, as written by dask scheduler --scheduler-file.",
+        help="File with the address of the scheduler, as written by dask scheduler "
+        "--scheduler-file.",
     )(with_files)
     return click.option(
         "--scheduler",
         metavar="ADDRESS",
-        help="Address of a running Dask scheduler, such as tcp://host:8786, or its scheduler file.",
+        help="Address of a running Dask scheduler, such as tcp://host:8786, or a scheduler file.",
     )(with_files)
 
 

@@ -21,25 +21,31 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("recording", metavar="RECORDING", type=click.Path(path_type=Path))
-@options.path("--out", "-o", metavar="DIR", required=True, help="Folder for the twin.")
+@options.path("--out", "-o", metavar="DIR", required=True, help="Output folder.")
 @click.option(
     "--model",
     metavar="MODEL|FILE",
     shell_complete=completion.sensors,
-    help="The sensor; needed if it has no rings.",
+    help="Sensor model; required for sensors without rings.",
 )
 @options.path(
     "--trajectory",
-    help="Poses of the sensor, with times or as KITTI rows, one per sweep.  "
-    "[default: from the recording, otherwise by registration]",
+    help="File with the poses of the sensor, with timestamps or as KITTI rows, one per sweep "
+    "(default: from the recording, otherwise by registration).",
 )
 @click.option(
-    "--voxel-m", type=float, default=0.1, show_default=True, help="Distance of the surfels, metres."
+    "--voxel-m",
+    type=float,
+    default=0.1,
+    show_default=True,
+    help="Spacing of the surfels in meters.",
 )
-@click.option("--sensor", metavar="NAME", help="Sensor of the recording, or topic of a bag.")
-@click.option("--intensity", metavar="COLUMN", help="Column of the intensity.")
+@click.option(
+    "--sensor", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
+)
+@click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
 @options.scheduler
-@options.flag("--resume", help="Go on with an unfinished twin, if there is one.")
+@options.flag("--resume", help="Resume an unfinished reconstruction, if there is one.")
 @overwrite
 @options.as_json
 def twin(
@@ -53,11 +59,11 @@ def twin(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Rebuild the place of a drive from its recording, without what moved.
+    """Reconstruct the scene of a recorded drive, without moving objects.
 
-    Writes the scene (place.glb), the drive (trajectory.csv), the sensor (sensor.yaml), a scenario
-    with these, and report.html. The report compares held-out sweeps with a scan of the place.
-    RECORDING is one that `lidarpool compare` reads, with sweeps.
+    Writes the scene (place.glb), the trajectory (trajectory.csv), the sensor (sensor.yaml), a
+    scenario that combines them, and report.html, which compares held-out sweeps with simulated
+    ones. RECORDING can have any format that `lidarpool compare` reads, and must contain sweeps.
 
     \b
     Examples:
@@ -74,9 +80,11 @@ def twin(
     from ..run.cluster.connection import connected
 
     if resume and overwrite:
-        raise click.UsageError("--resume continues what --overwrite deletes: give one of them.")
+        raise click.UsageError("--resume and --overwrite cannot be combined.")
     if (out / SCENARIO_FILE).exists() and not overwrite:
-        raise LidarError(f"{out} holds {SCENARIO_FILE}: give another folder, or --overwrite.")
+        raise LidarError(
+            f"{out} already contains {SCENARIO_FILE}. Use another folder, or pass --overwrite."
+        )
     steps = out / STEPS_FOLDER
     if overwrite:
         FinishedSteps(steps).remove()

@@ -108,7 +108,7 @@ def import_survey(
         partial.rename(folder)
     except LidarError as error:
         message = str(error).replace(str(partial), str(folder))
-        raise LidarError(f"{survey} makes no scenario: {message}") from error
+        raise LidarError(f"{survey} cannot be converted to a scenario: {message}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
     return Imported(folder / SCENARIO_FILE, survey_import.left_out)
