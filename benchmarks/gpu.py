@@ -79,7 +79,7 @@ ROWS = (
      "10⁶, 10⁷ triangles, Gray/s", 2,
      _casts("coherent")),
     ("one revolution in sensor order, same cities, Gray/s", 2, _casts("one revolution")),
-    ("the same rays in random order, same cities, Gray/s", 2, _casts("shuffled")),
+    ("16 revolutions in random order, same cities, Gray/s", 2, _casts("shuffled")),
     ("random directions from random origins, same cities, Gray/s", 2, _casts("scattered")),
     ("brute force, city of 10⁴, 10⁵, 10⁶ triangles, Mray/s", 2,
      [f"kernels/{city}, brute force/mrays_s" for city in _CITIES]),
