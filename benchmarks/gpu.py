@@ -75,44 +75,51 @@ def _casts(kind: str) -> list[str]:
 
 # Rows of the table: what it is, its unit and digits, and where in the results the figures are.
 ROWS = (
-    ("rays in order, 16 revolutions of 128 × 2,048, city of 10⁴, 10⁵, 10⁶, 10⁷, Gray/s", 2,
+    ("rays in sensor order, 16 revolutions of 128 × 2,048 rays, city of 10⁴, 10⁵, "
+     "10⁶, 10⁷ triangles, Gray/s", 2,
      _casts("coherent")),
-    ("the same, one revolution", 2, _casts("one revolution")),
-    ("the same, shuffled", 2, _casts("shuffled")),
-    ("the same, random directions from random origins", 2, _casts("scattered")),
-    ("brute force, Mray/s", 2, [f"kernels/{city}, brute force/mrays_s" for city in _CITIES]),
-    ("hits to the host, 16 bytes each, Gray/s", 2,
+    ("one revolution in sensor order, same cities, Gray/s", 2, _casts("one revolution")),
+    ("16 revolutions in random order, same cities, Gray/s", 2, _casts("shuffled")),
+    ("random directions from random origins, same cities, Gray/s", 2, _casts("scattered")),
+    ("brute force, city of 10⁴, 10⁵, 10⁶ triangles, Mray/s", 2,
+     [f"kernels/{city}, brute force/mrays_s" for city in _CITIES]),
+    ("hits copied to the host, 16 bytes each, city of 10⁴, 10⁵, 10⁶ triangles, Gray/s", 2,
      [f"kernels/{city}, coherent/grays_s/to_host" for city in _CITIES]),
-    ("build of a caster of 10⁴, 10⁵, 10⁶, 10⁷ triangles, s", 1,
+    ("time to build a caster of 10⁴, 10⁵, 10⁶, 10⁷ triangles, s", 1,
      (*(f"kernels/{city}, build/seconds" for city in _CITIES), "large/city 1e7, build/seconds")),
-    ("a still sensor; a pose for each firing; with motion, city of 10⁶, Gray/s", 2,
+    ("stationary sensor; one pose per firing; motion within each firing; city of 10⁶ "
+     "triangles, Gray/s", 2,
      [f"moving/{name}/grays_s/cast" for name in _MOVING]),
-    ("forest of 1,000 trees of 50,000 leaves; masked, Gray/s", 2,
+    ("forest of 1,000 trees of 50,000 leaves; with opacity masks, Gray/s", 2,
      [f"instances/{name}/grays_s/cast" for name in ("forest", "forest, masked")]),
-    ("values that differ from NumPy's in samples; rays that escape", 0,
+    ("sampled values that differ from NumPy; rays that escape", 0,
      ("different", "leaks/edges and corners/escaped")),
-    ("NVIDIA Warp's mesh query at best, city of 10⁵, 10⁶, in order, Gray/s", 2,
+    ("NVIDIA Warp mesh query, fastest configuration, sensor order, city of 10⁵, 10⁶ "
+     "triangles, Gray/s", 2,
      [f"peers/{city}/coherent" for city in _CITIES[1:]]),
-    ("raybeam's rate ÷ Warp's at best, in order, shuffled, city of 10⁵; 10⁶", 2,
+    ("raybeam rate ÷ fastest Warp rate: city of 10⁵ triangles in sensor order, in "
+     "random order; city of 10⁶ triangles in sensor order, in random order", 2,
      [f"to Warp/{city}/{order}" for city in _CITIES[1:] for order in ("coherent", "shuffled")]),
-    ("MuJoCo-LiDAR's Warp backend; raybeam, poses to distances on the host, city of 10⁵, Gray/s", 2,
+    ("MuJoCo-LiDAR with Warp; raybeam; from poses to distances on the host, city of "
+     "10⁵ triangles, Gray/s", 2,
      ("mujoco/MuJoCo-LiDAR/grays_s", "mujoco/raybeam/grays_s")),
-    ("points with columns in host memory: plain survey, every fifth, ten actors, million/s", 0,
+    ("points with columns in host memory: all points, every fifth point, ten actors, "
+     "million points/s", 0,
      [f"columns/{name}/mpoints_s" for name in ("plain", "every fifth point", "ten actors")]),
-    ("bytes of a point over the bus; share of the bus", 2,
+    ("bytes per point over the bus; share of the bus bandwidth", 2,
      ("columns/plain/bytes_a_point", "columns/plain/bus_share")),
-    ("points in parts in memory, on a disk, million/s", 0,
+    ("points in parts in memory, on disk, million points/s", 0,
      ("durable/memory/mpoints_s", "durable/disk/mpoints_s")),
-    ("a survey on a cluster of this machine, all points, every fifth, million points/s", 0,
+    ("survey on a local cluster: all points, every fifth point, million points/s", 0,
      [f"run/{name}/mpoints_s" for name in ("all points", "every fifth point")]),
-    ("two processes on a device, compared with one", 2, ("sharing/two to one/ratio",)),
+    ("rate of two processes on one device ÷ rate of one process", 2, ("sharing/two to one/ratio",)),
     ("2³¹ rays, Gray/s", 2, ("large/many rays/grays_s",)),
-    ("a scanner in a loop, to the host: images of ranges, sweeps, Gray/s", 2,
+    ("scanner in a loop, results copied to the host: range images, sweeps, Gray/s", 2,
      ("scanner/ranges of 16 poses/grays_s", "scanner/sweeps/grays_s")),
-    ("tests that need a device: passed, failed", 0, ("tests/passed", "tests/failed")),
-    ("compute-sanitizer on small scenes: errors of memory, hazards", 0,
+    ("tests that require a device: passed, failed", 0, ("tests/passed", "tests/failed")),
+    ("compute-sanitizer on small scenes: memory errors, hazards", 0,
      ("sanitizer/memcheck/errors", "sanitizer/racecheck/errors")),
-    ("the cast by ncu: registers, occupancy %, threads at work in a warp", 0,
+    ("casting kernel (ncu): registers, occupancy in %, active threads per warp", 0,
      [f"counters/cast_table/{figure}" for figure in (
          "Registers Per Thread, register per thread", "Achieved Occupancy, %",
          "Avg. Active Threads Per Warp")]),
@@ -147,7 +154,7 @@ def figure_at(results: dict[str, Any], path: str) -> float | None:
 
 def table(results: dict[str, Any]) -> list[str]:
     """Return the lines of the table of docs/performance.md."""
-    lines = ["| | |", "|---|---|"]
+    lines = ["| measurement | result |", "|---|---|"]
     for name, digits, paths in ROWS:
         values = [figure_at(results, path) for path in paths]
         words = ["not measured" if v is None else f"{v:,.{digits}f}" for v in values]
