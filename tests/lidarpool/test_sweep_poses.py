@@ -9,9 +9,13 @@ import pytest
 
 from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.places.alignment import Alignment
+from lidarpool.places.labels import divided, labels_of
 from lidarpool.places.motion import Motion
 from lidarpool.places.odometry import RecordedPoses
 from lidarpool.places.recorded_sweeps import RecordedSweep
+from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
+from lidarsim.scene.face_materials import FaceMaterials
+from lidarsim.scene.scene_mesh import SceneMesh
 
 STAMPS_S = np.array([0.0, 0.1, 0.26, 0.33, 0.5])
 SPIN_RAD_S = np.array([0.1, -0.2, 0.8])
@@ -156,3 +160,24 @@ def test_slopes_and_edges_of_a_room_are_those_of_its_planes():
     east = np.stack([-directions[..., 1], directions[..., 0]], axis=-1)  # change with azimuth
     by_azimuth = -distance * (normal[..., :2] * east).sum(axis=-1) / cosine
     np.testing.assert_allclose(found.azimuth_slope[inside], by_azimuth[inside], atol=1e-5)
+
+
+def test_surfels_are_divided_by_the_objects_and_classes_of_their_labels():
+    columns = {
+        "label": np.array([7, 0, 9, 7, 70_000]),
+        "instance": np.array([2, 0, -1, 2, 0]),
+    }
+    labels = labels_of(columns)
+    corners = np.arange(5 * 4 * 3, dtype=float).reshape(-1, 3)
+    rows = np.unique(labels)
+    names = tuple(f"{CLASS_MATERIAL}{label}" for label in rows.tolist())
+    index = np.repeat(np.searchsorted(rows, labels), 2).astype(np.int32)
+    mesh = SceneMesh("Place", corners, surfel_faces(5), materials=FaceMaterials(names, index))
+    parts = divided(mesh)
+    assert [part.name for part in parts] == ["object 0", "object 2", "Place"]
+    surfels = corners.reshape(5, 4, 3)
+    for part, expected in zip(parts, ([1, 4], [0, 3], [2]), strict=True):
+        np.testing.assert_array_equal(part.vertices.reshape(-1, 4, 3), surfels[expected])
+    assert parts[0].materials is None  # a class above 65,535 is none
+    assert parts[1].materials.names == (f"{CLASS_MATERIAL}7",)
+    assert parts[2].materials.names == (f"{CLASS_MATERIAL}9",)
