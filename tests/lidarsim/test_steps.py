@@ -32,7 +32,7 @@ from lidarsim.survey.survey import OPTIONAL_NAMES
 
 EFFECTS = Path(__file__).parents[2] / "docs/effects.md"
 # What is no step: figures for steps, a column, and files.
-OTHERS = {"Data sheets", "Radial velocity", "People who walk", "Navigation"}
+OTHERS = {"Data sheets", "Radial velocity", "Walking people", "Navigation"}
 OF_OTHERS = {*(VELOCITY, WHITE, DRIVEN, WALK, SKEW, OUTAGE)}
 
 NOISE = Noise(

@@ -1,4 +1,4 @@
-"""Errors that last: of channels, while a sensor warms up, and of its encoder."""
+"""Systematic errors: of channels, during warm-up, and of the encoder."""
 
 from __future__ import annotations
 

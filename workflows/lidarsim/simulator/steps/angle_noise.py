@@ -45,7 +45,7 @@ class RippleStep(PulseStep):
     """Turns beams by an error of azimuth that repeats with the head's revolutions."""
 
     role = Role.AIMS | Role.ABOUT_AXIS
-    effects = ("Errors that last",)
+    effects = ("Systematic errors",)
 
     @staticmethod
     def applies(setup: Setup) -> bool:

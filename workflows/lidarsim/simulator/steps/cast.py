@@ -161,7 +161,7 @@ class CastStep(PulseStep):
     effects = (
         "Ghosts",
         "Wet ground",
-        "Gaussian and oval beams",
+        "Gaussian and elliptical beams",
         "Refraction",
         "Vegetation",
         "Rays without a return",

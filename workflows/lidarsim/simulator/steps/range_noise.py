@@ -19,7 +19,7 @@ class RangeNoiseStep(PulseStep):
     """Adds errors to the ranges of reported returns."""
 
     role = Role.ON_REPORTED
-    effects = "Weak returns and range walk", "Errors that last"
+    effects = "Weak returns and range walk", "Systematic errors"
     reads = "ray", "distance", "energy", "amplitude", "number"
     writes = ("reported",)
     purposes = RANGE, CHANNEL
