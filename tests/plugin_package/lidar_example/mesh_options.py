@@ -1,4 +1,4 @@
-"""Options of .boxes."""
+"""Options for .boxes files."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -9,6 +9,6 @@ from lidarsim.plugins import about, checked_fields
 @dataclass(frozen=True)
 @checked_fields
 class BoxesOptions:
-    """Options that .boxes alone has."""
+    """Options that apply to .boxes files only."""
 
-    grow_m: Annotated[float, about("length added to each side, metres", ge=0, le=10)] = 0.0
+    grow_m: Annotated[float, about("length added to each side, in meters", ge=0, le=10)] = 0.0

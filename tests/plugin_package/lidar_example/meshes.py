@@ -1,4 +1,7 @@
-"""Reads .boxes: lines of a name, the middle of the underside and the size, in metres."""
+"""Reader for .boxes files.
+
+Each line has a name, the center of the underside, and the size of a box, in meters.
+"""
 
 from pathlib import Path
 
@@ -14,7 +17,7 @@ FACES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
 
 
 def read(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Return a box for each line."""
+    """Return one box per line."""
     meshes = []
     for number, line in enumerate(data.decode().splitlines(), 1):
         name, *figures = line.split()
