@@ -31,7 +31,7 @@ from ..clouds.boxes import Boxes
 from ..clouds.folder import local_folder
 from ..clouds.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
 from ..clouds.kitti import NAMES_FILE, labels_file
-from ..clouds.nuscenes import merge
+from ..clouds.nuscenes import LABELS, merge, relabeled
 from ..clouds.pieces import Entry, Pieces, pieces_of
 from ..clouds.writing import Format
 from .job_table import TABLE_FILE, JobRow, Tally
@@ -239,10 +239,27 @@ class DataSet:
                 index.write(f'{json.dumps(head)[:-1]}, "jobs": [')
                 manifests = self._indexed(jobs, index)
                 if self.format == "nuscenes":
-                    merge(self.storage, manifests)
+                    for job, classes in merge(self.storage, manifests).items():
+                        self._relabel(job, classes)
                 else:
                     deque(manifests, maxlen=0)
                 index.seal()
+
+    def _relabel(self, job: str, classes: Sequence[int]) -> None:
+        """Write the labels of a job anew, in nuScenes, so that they number other classes.
+
+        The manifest is removed first: if this is interrupted, the job is made again.
+        """
+        manifest = self._manifest(job)
+        self.storage.remove([manifest_file(job)])
+        storage = Listing.from_storage(self.storage)
+        for name in manifest["files"]:
+            if name.startswith(LABELS):
+                labels = self.storage.read(name)
+                storage.write(name, relabeled(labels, manifest["lidarseg"], classes))
+        manifest |= {"lidarseg": classes, "files": manifest["files"] | storage.files}
+        manifest["crc"] = _crc(manifest)
+        self.storage.write(manifest_file(job), json.dumps(manifest).encode())
 
     def _indexed(self, jobs: Iterable[JobRow], index: SealedWriter) -> Iterator[dict[str, Any]]:
         """Yield the manifests of finished jobs, and write their names and sensors to the index."""
