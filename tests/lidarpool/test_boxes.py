@@ -204,6 +204,26 @@ def test_kitti_has_boxes_at_the_times_of_sweeps(cloud, tmp_path, sequence, count
     labels.check(2e-4, 1e-4, counts)
 
 
+@pytest.mark.parametrize("sequence", ["00", "01"])
+def test_kitti_has_tracks_with_the_instances_of_points(cloud, tmp_path, sequence):
+    save_cloud(cloud, tmp_path / "kitti", format="kitti")
+    folder = tmp_path / "kitti/sequences" / sequence
+    labels = {path.stem: path.read_text().splitlines() for path in folder.glob("label_2/*.txt")}
+    kinds = dict[str, str]()
+    for line in (tmp_path / f"kitti/label_02/{sequence}.txt").read_text().splitlines():
+        frame, track, kind, truncation, *others = line.split()
+        assert truncation == "0"
+        # The remaining values are those of the object's label in the sweep.
+        labels[f"{int(frame):06}"].remove(" ".join([kind, "0.00", *others]))
+        instances = np.fromfile(folder / f"labels/{int(frame):06}.label", "<u4") >> 16
+        assert int(track) in instances
+        assert kinds.setdefault(track, kind) == kind
+    assert not any(labels.values())
+    assert [*kinds.values()] == [*LABELS]
+    first = len(cloud.sweeps().objects) + 1
+    assert [*kinds] == [str(first + number) for number in range(len(LABELS))]
+
+
 def test_webdataset_has_boxes_at_the_times_of_sweeps(cloud, tmp_path):
     save_cloud(cloud, tmp_path / "web", format="webdataset")
     files = {}

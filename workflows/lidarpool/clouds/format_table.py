@@ -191,7 +191,7 @@ _OSI = ("object", "channel", "intensity", "reflectance", "radial_velocity", "sen
 _BAG_COLUMNS = ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material")
 
 _KITTI_FILES = (
-    r"semantic-kitti\.yaml|poses/[^/]+\.txt|"
+    r"semantic-kitti\.yaml|(poses|label_02)/[^/]+\.txt|"
     r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
 )
 _NUSCENES_FILES = (
