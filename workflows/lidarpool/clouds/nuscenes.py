@@ -25,7 +25,7 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
-from lidarsim.sweeps.sweeps import COMPENSATED, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from ..base.fingerprint import fingerprint
 from . import pieces, sweep_reader
@@ -342,7 +342,7 @@ class _Tables:
             "scene",
             self._scene,
             name=self._scene,
-            description=COMPENSATED,
+            description=sweeps.frame_text(compensated=True),
             nbr_samples=count,
             log_token=self._token("log", _LOG),
             first_sample_token=self._token("sample", 0),

@@ -108,6 +108,8 @@ class DataSet:
     compensated
         Points in mcap are in the sensor frame at the start of the sweep, and have no times; else at
         their firing. `lidarpool.sweeps` gives both at the start of the sweep.
+    compensated_actors, pose_rate_hz
+        As of `lidarpool.save_cloud`.
     made_with
         Identity and software that determine the bytes of all jobs, for JSON; part of each manifest.
     """
@@ -116,11 +118,19 @@ class DataSet:
     format: Literal[tuple(DATA_SETS)]  # type: ignore[valid-type]
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
     compensated: bool = False
+    compensated_actors: bool = False
+    pose_rate_hz: float | None = None
     made_with: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def _job_format(self) -> Format:
-        return Format(DATA_SETS[self.format], self.layout, self.compensated)
+        return Format(
+            DATA_SETS[self.format],
+            self.layout,
+            self.compensated,
+            compensated_actors=self.compensated_actors,
+            pose_rate_hz=self.pose_rate_hz,
+        )
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -165,7 +175,8 @@ class DataSet:
         boxes: list[Boxes] = []
         with explained(f"Job {name} cannot be written to {storage}"):
             if file_format.row.in_pieces:
-                pieces = pieces_of(file_format.format, cloud, sweeps, entry)
+                prepared = file_format.prepared(sweeps)
+                pieces = pieces_of(file_format.format, cloud, prepared, entry)
                 details = _write_pieces(pieces, storage)
                 manifest = pieces.summary(details)
                 boxes = details if file_format.row.boxes else []
