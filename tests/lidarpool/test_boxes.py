@@ -394,7 +394,7 @@ def test_a_bag_has_poses_at_a_rate(cloud, tmp_path):
     np.testing.assert_allclose(quaternions[:, 2:], turned, atol=1e-6)
     for name, start, velocity in zip(LABELS, STARTS, VELOCITIES, strict=True):
         actor_s, positions, _ = frames[f"{name}_1"]
-        np.testing.assert_allclose(positions, start + np.outer(actor_s, velocity), atol=2e-5)
+        np.testing.assert_allclose(positions, start + np.outer(actor_s, velocity), atol=1e-6)
         if name == "Guest":
             assert actor_s.min() >= GUEST_S[0] and actor_s.max() <= GUEST_S[1]
         else:

@@ -207,12 +207,12 @@ def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats
     position, rotation
         (3,) and (3, 3): pose of the sensor at the start of the sweep.
     shares
-        (k,): elapsed parts of the sweep, 0 to 1.
+        (k,): elapsed parts of the sweep, 0 to 1; just after the sweep, poses are extrapolated.
     """
     intervals = len(knots) - 1
     if intervals < 1:
         return FiringPoses(position, rotation)
-    knot_position = np.clip(shares, 0, 1) * intervals
+    knot_position = shares * intervals
     knot = np.minimum(knot_position.astype(np.intp), intervals - 1)
     fraction = knot_position - knot
     starts = np.ascontiguousarray(knots[:-1].T, np.float64)

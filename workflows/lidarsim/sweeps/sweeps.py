@@ -202,7 +202,7 @@ class Sweeps:
 
     def _shares(self, sweep: int, points: Cloud) -> Floats:
         """Return the elapsed part of a sweep at the firing of each point: (k,), 0 to 1."""
-        return self.since_ns(sweep, points) / max(self.span_ns(sweep), 1.0)
+        return np.clip(self.since_ns(sweep, points) / max(self.span_ns(sweep), 1.0), 0, 1)
 
     def _sensor_within(self, sweep: int, shares: Floats) -> FiringPoses:
         """Return the poses of the sensor at elapsed parts (k,) of a sweep."""
@@ -217,7 +217,7 @@ class Sweeps:
         return poses_at(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
 
     def carrier_within(self, sweep: int, shares: Floats) -> SweepPoses:
-        """Return the poses of the carrier at elapsed parts (k,) of a sweep, 0 to 1."""
+        """Return the poses of the carrier at elapsed parts (k,) of a sweep, or just after it."""
         positions, rotations = self._sensor_within(sweep, shares).frames(len(shares))
         number = self.sensor[sweep]
         (mount,) = matrices(self.mounts.quaternions[[number]])
@@ -225,7 +225,7 @@ class Sweeps:
         return _poses_of(positions - rotations @ self.mounts.positions[number], rotations)
 
     def actor_within(self, actor: int, sweep: int, shares: Floats) -> SweepPoses:
-        """Return the poses of an actor at elapsed parts (k,) of a sweep, 0 to 1."""
+        """Return the poses of an actor at elapsed parts (k,) of a sweep, or just after it."""
         return _poses_of(*self._actor_within(actor, sweep, shares).frames(len(shares)))
 
     def with_actors_at_start(self, sweep: int, points: Cloud) -> Cloud:
