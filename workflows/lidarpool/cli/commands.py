@@ -69,6 +69,13 @@ _common_options = shared.combine(
         help="With --live: end the page, or viewer, with the run.",
     ),
     click.option(
+        "--pace",
+        type=click.FloatRange(0, min_open=True),
+        metavar="SPEED",
+        help="With --live: show frames in order at their times; 1 is the scanner's rate "
+        "(default: as soon as they are cast). Survey only.",
+    ),
+    click.option(
         "--only", type=click.Choice(["cloud"]), help="Write the cloud and report.json, no page."
     ),
     shared.flag("--overwrite", help="Replace the result of another survey, or a data set."),
@@ -113,6 +120,8 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     ) -> None:
         if only and pictures:
             raise click.UsageError("--only leaves out what --pictures draws: give one of them.")
+        if settings.get("pace") and not settings.get("live"):
+            raise click.UsageError("--pace sets the pace of the live page. Add --live.")
         settings["extent"] = "pictures" if pictures else only
         begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
         from ..base import timeline as steps
