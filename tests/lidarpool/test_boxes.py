@@ -8,9 +8,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarpool import Fault, Mounted, Pose, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.clouds.boxes import Boxes
+import lidarpool
+from lidarpool import (
+    Fault,
+    LidarError,
+    Mounted,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    save_cloud,
+)  # fmt: skip
+from lidarpool.clouds.boxes import Boxes, SweepBoxes
 from lidarpool.clouds.writing import Format
+from lidarpool.datasets.dataset import DataSet
+from lidarpool.datasets.job_table import JobRow, write_table
+from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.actors import Actor, box
@@ -25,6 +39,7 @@ STARTS = np.array([[-8, 6, 0], [5, -4, 0.1], [3, -9, 0], [20, 8, 0]], float)
 VELOCITIES = np.array([[3, 0, 0], [0.84, 1.12, 0], [-12, 5, 0.25], [-15, 0, 0]], float)
 # Sizes of the boxes, m: the walker's arms and legs reach 0.6 m ahead, 0.4 m back and 0.3 m aside.
 SIZES = np.array([[11, 2.5, 3], [1.0, 0.6, 1.75], [20, 2.3, 3.4], [4, 2, 1.5]])
+DRIVE_START = np.array([0, 0, 1])  # of the carrier, m
 GUEST_S = (0.25, 0.83)  # Guest 1 appears during its third sweep, and leaves during its ninth
 
 
@@ -204,6 +219,26 @@ def test_kitti_has_boxes_at_the_times_of_sweeps(cloud, tmp_path, sequence, count
     labels.check(2e-4, 1e-4, counts)
 
 
+@pytest.mark.parametrize("sequence", ["00", "01"])
+def test_kitti_has_tracks_with_the_instances_of_points(cloud, tmp_path, sequence):
+    save_cloud(cloud, tmp_path / "kitti", format="kitti")
+    folder = tmp_path / "kitti/sequences" / sequence
+    labels = {path.stem: path.read_text().splitlines() for path in folder.glob("label_2/*.txt")}
+    kinds = dict[str, str]()
+    for line in (tmp_path / f"kitti/label_02/{sequence}.txt").read_text().splitlines():
+        frame, track, kind, truncation, *others = line.split()
+        assert truncation == "0"
+        # The remaining values are those of the object's label in the sweep.
+        labels[f"{int(frame):06}"].remove(" ".join([kind, "0.00", *others]))
+        instances = np.fromfile(folder / f"labels/{int(frame):06}.label", "<u4") >> 16
+        assert int(track) in instances
+        assert kinds.setdefault(track, kind) == kind
+    assert not any(labels.values())
+    assert [*kinds.values()] == [*LABELS]
+    first = len(cloud.sweeps().objects) + 1
+    assert [*kinds] == [str(first + number) for number in range(len(LABELS))]
+
+
 def test_webdataset_has_boxes_at_the_times_of_sweeps(cloud, tmp_path):
     save_cloud(cloud, tmp_path / "web", format="webdataset")
     files = {}
@@ -268,6 +303,220 @@ def test_bags_have_boxes_at_their_stamps(cloud, tmp_path):
                     marker.text.split("_")[0], since_ns / 1e9, vector_of(marker.pose.position), size
                 )
     labels.check(1e-9)
+
+
+def frames_of(path):
+    """Return the frames in a bag's /tf: {frame: (times, s; positions; quaternions)}, and mounts."""
+    rosbags = pytest.importorskip("rosbags.highlevel", reason="rosbags is an extra")
+    from rosbags.typesys import Stores, get_typestore
+
+    frames = {}
+    with rosbags.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        connections = [one for one in bag.connections if one.topic in ("/tf", "/tf_static")]
+        start_ns = bag.start_time
+        for connection, _, data in bag.messages(connections):
+            for stamped in bag.deserialize(data, connection.msgtype).transforms:
+                stamp = stamped.header.stamp
+                time_s = (stamp.sec * 10**9 + stamp.nanosec - start_ns) / 1e9
+                turned = stamped.transform.rotation
+                quaternion = (turned.x, turned.y, turned.z, turned.w)
+                row = (time_s, vector_of(stamped.transform.translation), quaternion)
+                frames.setdefault(stamped.child_frame_id, []).append(row)
+    for name, rows in frames.items():
+        times_s, positions, quaternions = map(np.array, zip(*sorted(rows, key=first), strict=True))
+        frames[name] = times_s, positions, quaternions
+    return frames
+
+
+def first(row):
+    return row[0]
+
+
+def poses_in(frame, times_s):
+    """Interpolate the poses of a frame, which must have poses before and after all times."""
+    frame_s, positions, quaternions = frame
+    assert frame_s[0] <= times_s.min() and times_s.max() <= frame_s[-1]
+    before = np.clip(np.searchsorted(frame_s, times_s, "right") - 1, 0, len(frame_s) - 2)
+    share = ((times_s - frame_s[before]) / (frame_s[before + 1] - frame_s[before]))[:, None]
+    positions = positions[before] * (1 - share) + positions[before + 1] * share
+    # Between frames 0.1 s apart, the drive turns by 9 degrees.
+    first_q, second_q = quaternions[before], quaternions[before + 1]
+    angle = np.arccos(np.clip((first_q * second_q).sum(axis=1), -1, 1))[:, None] + 1e-12
+    mixed = np.sin(angle * (1 - share)) * first_q + np.sin(angle * share) * second_q
+    return positions, matrices(mixed / np.sin(angle))
+
+
+def points_in_map(path, frames, sensor):
+    """Return the points of a sensor in a bag in `map`, each moved by the frames at its time."""
+    rosbags = pytest.importorskip("rosbags.highlevel", reason="rosbags is an extra")
+    from rosbags.typesys import Stores, get_typestore
+
+    _, (mount,), (quaternion,) = frames[sensor]
+    in_map = []
+    with rosbags.AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        connections = [one for one in bag.connections if one.topic == f"/{sensor}/points"]
+        for connection, when_ns, data in bag.messages(connections):
+            message = bag.deserialize(data, connection.msgtype)
+            kind = [("xyz", "<f4", 3), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]
+            rows = message.data.view(kind)
+            times_s = (when_ns - bag.start_time) / 1e9 + rows["time"].astype(float)
+            positions, rotations = poses_in(frames["base_link"], times_s)
+            on_carrier = rows["xyz"] @ matrices(np.array([quaternion]))[0].T + mount
+            in_map.append(np.einsum("nij,nj->ni", rotations, on_carrier) + positions)
+    return in_map
+
+
+@pytest.mark.parametrize("format", ["mcap", "rosbag2"])
+def test_all_sweeps_of_a_bag_can_be_deskewed_by_its_frames(cloud, tmp_path, format):  # noqa: A002
+    path = tmp_path / ("a.mcap" if format == "mcap" else "a")
+    save_cloud(cloud, path, format=format)
+    frames = frames_of(path)
+    sweeps = cloud.sweeps()
+    by_sensor = {"roof": [], "rear": []}
+    for number, points in enumerate(sweeps.points(cloud)):
+        by_sensor[sweeps.sensors[sweeps.sensor[number]]].append(points.positions)
+    for sensor, expected in by_sensor.items():
+        in_map = points_in_map(path, frames, sensor)
+        np.testing.assert_allclose(np.concatenate(in_map), np.concatenate(expected), atol=2e-5)
+    # Besides the starts of the sweeps there are frames at the ends of the last of each sensor.
+    times_s = frames["base_link"][0]
+    ends_s = 1.000001 - np.array([0.1, 0.2]) / 360  # a microsecond after the last firing
+    assert set(np.round(times_s, 9)) == {*np.round(np.arange(10) / 10, 9), *np.round(ends_s, 9)}
+
+
+def test_a_bag_has_poses_at_a_rate(cloud, tmp_path):
+    save_cloud(cloud, tmp_path / "a.mcap", pose_rate_hz=40)
+    frames = frames_of(tmp_path / "a.mcap")
+    times_s, positions, quaternions = frames["base_link"]
+    assert {*np.round(np.arange(40) / 40, 9)} <= {*np.round(times_s, 9)}
+    np.testing.assert_allclose(positions, DRIVE_START + np.outer(times_s, [4, 1, 0]), atol=1e-5)
+    turned = np.stack([np.sin(np.pi / 4 * times_s), np.cos(np.pi / 4 * times_s)], axis=1)
+    np.testing.assert_allclose(quaternions[:, 2:], turned, atol=1e-6)
+    for name, start, velocity in zip(LABELS, STARTS, VELOCITIES, strict=True):
+        actor_s, positions, _ = frames[f"{name}_1"]
+        np.testing.assert_allclose(positions, start + np.outer(actor_s, velocity), atol=1e-6)
+        if name == "Guest":
+            assert actor_s.min() >= GUEST_S[0] and actor_s.max() <= GUEST_S[1]
+        else:
+            assert len(actor_s) == len(times_s)
+
+
+def test_frames_of_a_bag_stay_at_a_station_until_its_last_sweep_ends(tmp_path):
+    lidar = Sensor.grid(SCANS * 10, 4)
+    scene = Scene.from_meshes([box("Floor", (60, 60, 0.01))])
+    survey = Survey(lidar, [(0, 0, 1), (7, 0, 1)], steps=2 * SCANS, columns=["time", "intensity"])
+    scan = np.arange(survey.scan_count)
+    times_ns = np.array([survey.begins_ns(number) for number in scan])
+    columns = {"scan": scan, "channel": 0 * scan, "object": 0 * scan, "time": np.rint(times_ns)}
+    columns["intensity"] = np.ones(len(scan), "f4")
+    sweeps = Sweeps.from_survey(survey, scene)
+    cloud = Cloud(np.zeros((len(scan), 3)), columns, sweeps=lambda: sweeps)
+    save_cloud(cloud, tmp_path / "a.mcap")
+    positions, _ = poses_in(frames_of(tmp_path / "a.mcap")["base_link"], times_ns / 1e9)
+    expected = np.where(scan < 2 * SCANS, 0, 7)
+    np.testing.assert_allclose(positions[:, 0], expected, atol=1e-9)
+
+
+def moving_corners(coordinates="world"):
+    """Return a cloud of the corners of two boxes in each scan, and their sweeps."""
+    trailer = box("Trailer 1", (8, 2, 3))
+    trailer = replace(trailer, vertices=trailer.vertices - [4, 0, 0])
+    angles = np.linspace(0, 1.5, 601)  # about the hitch, at 0.5 rad/s
+    quaternions = np.stack([0 * angles, 0 * angles, np.sin(angles / 2), np.cos(angles / 2)], axis=1)
+    turning = Track(2 * angles, np.tile([9.0, 0, 0], (601, 1)), quaternions)
+    driving = Track([0, 3], [[-30, 5, 0], [60, 5, 0]])  # 30 m/s
+    parked = Track([0, 3], [[0, -5, 0], [0, -5, 0]])
+    cars = box("Car 1", (4, 2, 1.5)), box("Car 2", (4, 2, 1.5))
+    actors = Actor(cars[0], driving), Actor(trailer, turning), Actor(cars[1], parked)
+    scene = Scene.from_meshes([box("Floor", (60, 60, 0.01))]).with_actors(actors)
+    carrier = Track([0, 1], [[0, 0, 1], [4, 1, 1]])
+    columns = ["time", "intensity", "reflectivity", "normal_x", "normal_y", "normal_z"]
+    survey = Survey(Sensor.grid(SCANS * 10, 4), trajectory=carrier, columns=[*columns, "class"],
+                    coordinates=coordinates)  # fmt: skip
+    positions, normals, scan, number, stamps = [], [], [], [], []
+    for step in range(survey.scan_count):
+        time_ns = survey.begins_ns(step)
+        for actor, moving in enumerate(actors):
+            vertices = moving.placed(time_ns).vertices
+            _, rotations = moving.trajectory.poses(0, np.array([time_ns]))
+            forward = [1, 0, 0] if rotations is None else rotations[0][:, 0]
+            if coordinates == "sensor":
+                pose = survey.pose(step)
+                vertices = (vertices - pose.position) @ pose.rotation
+                forward = forward @ pose.rotation
+            positions.append(vertices)
+            normals.append(np.tile(forward, (len(vertices), 1)))
+            scan.append(np.full(len(vertices), step))
+            number.append(np.full(len(vertices), len(scene.names) + actor))
+            stamps.append(np.full(len(vertices), round(time_ns)))
+    scan, number, stamps = map(np.concatenate, (scan, number, stamps))
+    x, y, z = np.concatenate(normals).T
+    columns = {
+        "scan": scan, "object": number, "time": stamps, "channel": 0 * scan, "class": 0 * scan,
+        "intensity": np.ones(len(scan), "f4"), "reflectivity": np.full(len(scan), 9, np.uint8),
+        "normal_x": x, "normal_y": y, "normal_z": z,
+    }  # fmt: skip
+    sweeps = Sweeps.from_survey(survey, scene)
+    return Cloud(np.concatenate(positions), columns, sweeps=lambda: sweeps), sweeps
+
+
+def outside(boxes, objects, points):
+    """Return the distances (n,) of points to the boxes of their actors, m."""
+    rotations = matrices(boxes.quaternions)
+    index = np.searchsorted(boxes.objects, objects)
+    inside = np.einsum("nji,nj->ni", rotations[index], points - boxes.centres[index])
+    return np.linalg.norm(np.maximum(np.abs(inside) - boxes.sizes[index] / 2, 0), axis=1)
+
+
+@pytest.mark.extended(keep=("kitti",))
+@pytest.mark.parametrize("name", ["kitti", "nuscenes", "webdataset", "mcap"])
+def test_points_of_actors_lie_in_their_boxes_at_the_start_of_the_sweep(tmp_path, name):
+    cloud, sweeps = moving_corners()
+    objects = [points["object"] for points in sweeps.points(cloud)]
+    for compensated, expected in ((False, 3.0), (True, 0.0)):
+        data = DataSet(
+            Storage.at(tmp_path / str(compensated)), name, compensated_actors=compensated
+        )
+        rows = [JobRow(0, "00")]
+        data.write_job(rows[0], cloud, sweeps)
+        write_table(data.storage, [], lambda rows=rows: rows)
+        data.finish(rows)
+        found = lidarpool.sweeps(tmp_path / str(compensated))
+        distances = [
+            outside(sweep.boxes, numbers, sweep.points)
+            for sweep, numbers in zip(found, objects, strict=True)
+        ]
+        assert np.max(distances) == pytest.approx(expected, abs=0.1 if expected else 2e-4)
+
+
+@pytest.mark.parametrize("coordinates", ["world", "sensor"])
+def test_actors_are_compensated_in_both_coordinates(coordinates):
+    cloud, sweeps = moving_corners(coordinates)
+    boxes_by_sweep = []
+    for number, points in enumerate(sweeps.points(cloud)):
+        boxes = Boxes.from_points(sweeps, number, points).inward(sweeps.pose, number)
+        boxes_by_sweep.append(SweepBoxes.select(sweeps, boxes))
+    moved = replace(sweeps, actors_at_start=True)
+    for number, points in enumerate(moved.points(cloud)):
+        boxes = boxes_by_sweep[number]
+        at_start = moved.compensated(number, points)
+        assert outside(boxes, points["object"], at_start).max() < 2e-4
+        columns = moved.columns_compensated(number, points)
+        normals = np.stack([columns[f"normal_{axis}"] for axis in "xyz"], axis=1)
+        forward = matrices(boxes.quaternions)[:, :, 0]
+        expected = forward[np.searchsorted(boxes.objects, points["object"])]
+        np.testing.assert_allclose(normals, expected, atol=2e-6)
+
+
+def test_formats_without_sweeps_refuse_to_move_the_points_of_actors():
+    for name in ("laz", "parquet", "pcap"):
+        with pytest.raises(
+            LidarError, match=f"{name} does not have the option `compensated_actors"
+        ):
+            Format(name, compensated_actors=True)
+    with pytest.raises(LidarError, match="kitti does not have the option `pose_rate_hz`"):
+        Format("kitti", pose_rate_hz=10)
+    assert "time" in Format("kitti", compensated_actors=True).needs
 
 
 def test_an_actor_whose_box_is_beside_its_origin_has_the_velocity_of_the_box(tmp_path):

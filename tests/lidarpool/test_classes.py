@@ -13,7 +13,7 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
-from tests.drives import SCANS, points_of, the_scene, the_sweeps
+from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
 import lidarpool
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
@@ -193,14 +193,33 @@ def check_lidarseg(folder):
     return names
 
 
-def test_nuscenes_has_labels_and_categories(saved, sweeps):
-    names = check_lidarseg(saved("nuscenes"))
-    assert {names[number] for number in (0, 3, 7, 20)} == {"none", "road", "Straße", NAMES[20]}
-    assert names[4] == "class 4" and {names[21], names[22]} == {"Car", "Van"}
-    names = check_lidarseg(saved("nuscenes", replace(sweeps, classes={2: "Car"})))
-    assert names == {0: "none", 1: "class 1", 2: "Car", 3: "Van"}
+def test_nuscenes_has_labels_and_categories(saved, scene, sweeps):
+    folder = saved("nuscenes")
+    # The devkit allows no gaps between labels; boxes of "Car 1" have the category of class "car".
+    names = check_lidarseg(folder)
+    assert names == dict(enumerate(["none", "road", "Straße", NAMES[20], "car", "Van"]))
+    labels = np.fromfile(folder / "lidarseg/v1.0-lidarpool/samples-rear_left-000001.pcd.bin", "u1")
+    points = points_of(scene, 0)
+    expected = points["class"][points.scan // SCANS == TURNS + 1]
+    told = [0 if label == 0 else [*NAMES][label - 1] for label in labels]
+    assert told == np.where(np.isin(expected, [*NAMES]), expected, 0).tolist()
+    names = check_lidarseg(saved("nuscenes", replace(sweeps, classes={2: "none"})))
+    assert names == {0: "none", 1: "none (2)", 2: "Car", 3: "Van"}
     tables = tables_of(saved("nuscenes", replace(sweeps, classes={})))
     assert "lidarseg" not in tables and "index" not in tables["category"][0]
+    many = dict(zip(range(1, 257), map(str, range(256)), strict=True))
+    with pytest.raises(LidarError, match=r"256 classes have names, but .* at most 255\. Remove"):
+        saved("nuscenes", replace(sweeps, classes=many))
+
+
+def test_boxes_of_nuscenes_are_spelled_as_classes(saved, sweeps):
+    classes = {10: "car", 40: "delivery van"}
+    sweeps = replace(sweeps, classes=classes, actors=("CAR (b.7)", "Delivery Van 2"))
+    tables = tables_of(saved("nuscenes", sweeps))
+    names = {row["token"]: row["name"] for row in tables["category"]}
+    assert [*names.values()] == ["none", "car", "delivery van"]
+    kinds = [names[row["category_token"]] for row in tables["instance"]]
+    assert kinds == ["car", "delivery van"]
 
 
 @pytest.mark.extended(every=3)
@@ -219,7 +238,17 @@ def test_data_sets_give_them_back(scene, sweeps, tmp_path, name):
     expected = points["class"][points.scan // SCANS == 2]
     if name == "nuscenes":
         expected = np.where(np.isin(expected, [*NAMES]), expected, 0)
-        assert check_lidarseg(tmp_path)[8] == "tree"
+        names = check_lidarseg(tmp_path)  # of all jobs, whose labels are renumbered
+        assert [*names.values()][:3] == ["none", "road; lane", "Straße"] and names[3] == "tree"
+        other_points = points_of(scene, 1)
+        kept = other_points["class"][other_points.scan // SCANS == 2]
+        again = found[2 + 2 * TURNS]
+        assert again.job == "01"
+        assert np.array_equal(again.classes, np.where(np.isin(kept, [3, 8]), kept, 0))
+        assert [damage for _, (_, damage) in data.look(rows, contents=True)] == ["", ""]
+        files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        data.finish(rows)
+        assert files == {path: path.read_bytes() for path in files}
     assert found[2].classes.dtype == np.uint16
     assert np.array_equal(found[2].classes, expected)
     if name == "kitti":

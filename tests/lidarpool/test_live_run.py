@@ -8,6 +8,7 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from tests.shapes import box
 from lidarpool import Campaign, Column, Job, Planning, Scene, Sensor, Survey
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.report.campaign_output import DataSetOutput
+from lidarpool.run import pace
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.pipeline.stage_messages import Receipt
@@ -71,6 +73,29 @@ def displayed(live: LivePage) -> int:
     """Count the points on the page."""
     news(live)  # or nobody looks
     return len(ask(live.page.url, "points", colour="z", most=1_000_000)["arrays"]["rows"])
+
+
+def test_frames_and_their_parts_are_shown_in_order_at_the_pace(monkeypatch):
+    """At a tenth of the scanner's rate, never faster after a delay, nor before the part is due."""
+    clock = SimpleNamespace(now=7.0)
+    clock.monotonic = lambda: clock.now
+    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
+    monkeypatch.setattr(pace, "time", clock)
+    shown = []
+    page = SimpleNamespace(
+        on_frame=lambda frame: shown.append((round(clock.now, 9), frame.scan)),
+        on_parts=lambda parts: shown.append((round(clock.now, 9), *[part.name for part in parts])),
+    )
+    output = SimpleNamespace(on_parts=lambda parts: None)
+    run = Run(make_job(8), RunOptions(pace=0.1), output, Screen(), page)
+    parts = [SimpleNamespace(name=name, first=first) for name, first in (("b", 2), ("a", 0))]
+    run._on_parts(parts)
+    assert shown == []
+    for scan, time_s in enumerate((0.0, 0.1, 0.2, 0.3, 0.0)):  # the last of a second sensor
+        if scan == 3:
+            clock.now += 5
+        run._frame(SimpleNamespace(scan=scan, time_ns=time_s * 1e9))
+    assert shown == [(7, "a"), (7, 0), (8, 1), (9, "b"), (9, 2), (14, 3), (14, 4)]
 
 
 def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():

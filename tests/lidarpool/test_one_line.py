@@ -63,7 +63,7 @@ THINGS = [
     Packets(SENSOR),
     Plan(np.zeros((90, 2)), 1.2345, 1.2, 0.3, 3, 100),
     PLANNING,
-    ScanFrame(0, "", 1, 1, 1, np.zeros((90, 3), np.float32), SURVEY, lambda scan: None),
+    ScanFrame(0, "", 1, 1, 1, np.zeros((90, 3), np.float32), 1, SURVEY, lambda scan: None),
     Scanner(Scene.seed(), SENSOR),
     SceneInstance(MESH, np.eye(4)),
     MESH,

@@ -110,7 +110,8 @@ def test_labels_and_frames_are_of_actors_that_are_there(sweeps_of_three, tmp_pat
             elif connection.topic == "/tf":
                 frames.append([one.child_frame_id for one in message.transforms])
     assert shown == [2, 0, 2]  # DELETE, ADD, DELETE
-    assert frames == [["base_link"], ["base_link", "Car"], ["base_link"]]
+    # The last frame is at the end of the last sweep.
+    assert frames == [["base_link"], ["base_link", "Car"], ["base_link"], ["base_link"]]
 
 
 # A car that drives east at 10 m/s, and at 2 s is taken out for a step; a person who walks north;

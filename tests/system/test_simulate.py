@@ -6,6 +6,7 @@ import time
 import urllib.error
 import urllib.request
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -161,6 +162,30 @@ def test_another_client_watches_the_queues_and_variables_of_the_default_survey(c
         assert not state["closed"]
         assert not state["failure"]
     assert not Pool.from_client(plain).pipes()
+
+
+def test_frames_have_their_hits_on_each_triangle(cluster_client):
+    """The sums are those of the run, which counts hits when they are cast."""
+    scene = room()
+    survey = Survey(SENSOR, [(0, 0, 1)], steps=4, columns=["triangle"])
+    counts = []
+
+    def count(frame):
+        counts.append(frame.hit_counts())
+        assert counts[-1].sum() == frame.hit_count
+        triangle, hits = np.unique(frame.points()["triangle"], return_counts=True)
+        assert np.array_equal(counts[-1][triangle], hits)
+
+    result = simulate(scene, survey, client=cluster_client, on_frame=count, pace=1e6)
+    assert len(counts) == 4
+    assert np.array_equal(sum(counts), result.hit_counts) and result.hit_count == 56
+    for change, message in (
+        ({"keep_every": 3}, "keeps only one of every 3 hits. Set `keep_every` to 1"),
+        ({"columns": []}, "without the column `triangle`. Add it to the `columns`"),
+    ):
+        other = replace(survey, **change)
+        with pytest.raises(LidarError, match=message):
+            simulate(scene, other, client=cluster_client, on_frame=lambda f: f.hit_counts())
 
 
 @pytest.mark.slow(every=3)

@@ -37,7 +37,7 @@ from .result import Result
 # Options without a meaning in a call: a survey has no data set, a campaign plans no paths, and its
 # run is stored beside the data set; a stream stores nothing and has no stages 1 and 4.
 _NOT_OF_SURVEYS = ("fresh", "retry_failed", "verify", "overwrite")
-_NOT_OF_CAMPAIGNS = ("folder", "other_workers")
+_NOT_OF_CAMPAIGNS = ("folder", "other_workers", "pace")
 _NOT_OF_STREAMS = (
     *_NOT_OF_SURVEYS,
     *_NOT_OF_CAMPAIGNS,
@@ -69,8 +69,8 @@ def simulate(
         A path to plan on the OTHER partition while the survey runs; None for none.
     on_frame
         Called with each frame, in scan order, while the survey runs; its points are in storage by
-        then (`ScanFrame.points`). It is called in this thread: a slow callback makes the
-        pipeline wait, and nothing is lost.
+        then (`ScanFrame.points`, `ScanFrame.hit_counts`). It is called in this thread: a slow
+        callback makes the pipeline wait, and nothing is lost.
     on_progress
         Called about ten times a second with the progress. Without it there are bars in a notebook
         and at a terminal.
@@ -87,6 +87,10 @@ def simulate(
         Show the run in the browser meanwhile, as `lidarpool run --live` does; in a notebook, in the
         cell. `Result.view` shows the result afterwards. "foxglove" and "rerun" show its sweeps in
         Foxglove and Rerun.
+    pace
+        Speed at which `on_frame` and the live page get the frames, in scan order: 1 is the rate of
+        the scanner, 0.1 a tenth of it. By default, they get each frame once its points are in
+        storage.
     queue_capacity
         How many items stage 1 may be ahead of stage 2.
     collectors

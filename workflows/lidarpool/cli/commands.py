@@ -69,14 +69,20 @@ _common_options = shared.combine(
         help="With --live, exit when the run ends.",
     ),
     click.option(
+        "--pace",
+        type=click.FloatRange(0, min_open=True),
+        metavar="SPEED",
+        help="With --live, show frames in order at this multiple of the scanner's rate (default: "
+        "as soon as they are cast). Not for campaigns.",
+    ),
+    click.option(
         "--only", type=click.Choice(["cloud"]), help="Write only the point cloud and report.json."
     ),
     shared.flag("--overwrite", help="Overwrite the result of a different survey, or a data set."),
     shared.path(
         "--timeline",
         help="Record the duration of each startup and shutdown step, print them, and write them "
-        "to FILE "
-        "as an HTML page.",
+        "to FILE as an HTML page.",
     ),
     shared.flag("--quiet", "-q", help="Do not show progress."),
     shared.flag("--verbose", "-v", help="Show log messages of Dask and other libraries."),
@@ -118,6 +124,8 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
     ) -> None:
         if only and pictures:
             raise click.UsageError("--only and --pictures cannot be combined.")
+        if settings.get("pace") and not settings.get("live"):
+            raise click.UsageError("--pace requires --live.")
         settings["extent"] = "pictures" if pictures else only
         begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
         from ..base import timeline as steps

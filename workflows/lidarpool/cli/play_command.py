@@ -66,6 +66,12 @@ _NOW_NS = 2_000_000_000  # time between reading the source and the first sweep o
     help="For ros2, the point layout (default: velodyne).",
 )
 @click.option(
+    "--pose-rate-hz",
+    type=click.FloatRange(0, 10_000, min_open=True),
+    metavar="RATE",
+    help="ros2: poses per second on /tf.  [default: one for each sweep]",
+)
+@click.option(
     "--organized",
     is_flag=True,
     default=None,

@@ -132,6 +132,17 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     "times.",
 )
 @click.option(
+    "--compensated-actors",
+    is_flag=True,
+    help="Points of actors where the actor was at the start of the sweep, in formats with sweeps.",
+)
+@click.option(
+    "--pose-rate-hz",
+    type=click.FloatRange(0, 10_000, min_open=True),
+    metavar="RATE",
+    help="Poses per second on /tf of mcap and rosbag2 (default: one for each sweep).",
+)
+@click.option(
     "--organized",
     is_flag=True,
     help="Write one point per ray to mcap and rosbag2, NaN for rays without a return.",
@@ -218,6 +229,8 @@ def _chosen_formats(
     names: Iterable[str],
     layout: str,
     compensated: bool,
+    compensated_actors: bool,
+    pose_rate_hz: float | None,
     organized: bool,
     intensity_full_scale: float | None,
 ) -> list[Format]:
@@ -229,15 +242,19 @@ def _chosen_formats(
 
     rows = {name: row_of(name) for name in names}
     compensating = {name for name, row in rows.items() if row.raw_or_compensated} or rows
+    moving = {name for name, row in rows.items() if row.positions_of_sweeps} or rows
+    with_frames = {name for name, row in rows.items() if row.layouts} or rows
     organizing = {name for name, row in rows.items() if row.organized_layouts} or rows
     scaling = {name for name, row in rows.items() if row.integer_intensities} or rows
     return [
         Format(
             name,
             layout,
-            compensated and name in compensating,
-            organized and name in organizing,
-            intensity_full_scale if name in scaling else None,
+            compensated=compensated and name in compensating,
+            compensated_actors=compensated_actors and name in moving,
+            pose_rate_hz=pose_rate_hz if name in with_frames else None,
+            organized=organized and name in organizing,
+            intensity_full_scale=intensity_full_scale if name in scaling else None,
         )
         for name in rows
     ]

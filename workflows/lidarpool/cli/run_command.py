@@ -116,6 +116,8 @@ def run_campaign(
 
     LidarError if the run or a job fails.
     """
+    if options.pace is not None:
+        raise click.UsageError("--pace applies to a survey only. Remove it to run the campaign.")
     options = options.with_pool(campaign.pool, {"backend": backend})
     assert options.out is not None, "commands write"
     for warning in _first_job_warnings(campaign, terminal):

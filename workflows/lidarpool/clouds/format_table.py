@@ -61,13 +61,16 @@ class FormatRow:
         Columns that it holds in addition if classes have names.
     layouts
         {layout: columns that it needs and holds in addition}, where there are layouts. The
-        function that writes it then takes `layout`, `compensated` and `organized` as well.
+        function that writes it then takes `layout`, `compensated`, `organized` and `pose_rate_hz`
+        as well.
     organized_layouts
         Layouts that have an option for organized clouds: a point for each ray.
     raw_or_compensated
         Whether it has an option for points at the start of the sweep.
     one_system
         Whether readers expect all points in one coordinate system.
+    as_measured
+        Whether it stores measurements, such as ranges, instead of positions.
     compensates
         Whether its points are always compensated for motion.
     first_sensor
@@ -114,6 +117,7 @@ class FormatRow:
     organized_layouts: tuple[str, ...] = ()
     raw_or_compensated: bool = False
     one_system: bool = False
+    as_measured: bool = False
     compensates: bool = False
     first_sensor: str = ""
     laser_scans: bool = False
@@ -135,6 +139,11 @@ class FormatRow:
         if self.holds is None or name in self.holds:
             return True
         return classes_have_names and name in self.named
+
+    @property
+    def positions_of_sweeps(self) -> bool:
+        """Whether it stores the positions of points sweep by sweep."""
+        return "scan" in self.needs and not self.as_measured
 
     @property
     def missing_packages(self) -> list[str]:
@@ -191,7 +200,7 @@ _OSI = ("object", "channel", "intensity", "reflectance", "radial_velocity", "sen
 _BAG_COLUMNS = ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material")
 
 _KITTI_FILES = (
-    r"semantic-kitti\.yaml|poses/[^/]+\.txt|"
+    r"semantic-kitti\.yaml|(poses|label_02)/[^/]+\.txt|"
     r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
 )
 _NUSCENES_FILES = (
@@ -376,6 +385,7 @@ FORMATS = {
         needs=("scan", *_ALL_RAYS),
         holds=("scan", "sensor", "channel", *_ALL_RAYS, "time", "reflectivity", "signal"),
         inside=r"[^/]+\.(pcap|json)",
+        as_measured=True,
         suffixes=(".pcap", ".pcapng", ".osf"),
         reads=("sweeps",),
     ),

@@ -18,7 +18,7 @@ from lidarsim.base.input_files import read_input
 from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.ray_image import Image, fired_of
-from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from . import pieces, sweep_reader
 from .boxes import Boxes
@@ -57,7 +57,7 @@ class Pieces(pieces.Pieces):
         columns |= dict(zip("xyz", positions.T, strict=True))
         arrays: dict[str, Any] = image.ray_arrays()
         arrays["pose"] = sweeps.pose.matrix(number)
-        arrays["frame"] = np.array(AS_FIRED if sweeps.coordinates == "sensor" else COMPENSATED)
+        arrays["frame"] = np.array(sweeps.frame_text(compensated=sweeps.coordinates == "world"))
         for name, values in columns.items():
             for plane, image_of_return in enumerate(image.filled(values)):
                 if (key := _key(name, plane)) in arrays:

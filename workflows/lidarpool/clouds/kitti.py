@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -50,10 +50,13 @@ class Pieces(pieces.Pieces):
     sweep, and reflectivity by 255, 0 to 1), `labels/000000.label` (uint32: instance << 16 | class;
     the instance is the object's number + 1), where there are actors `label_2/000000.txt` (boxes of
     the actors that have points), `poses.txt` (3 x 4, from the first), `times.txt` in seconds and
-    `calib.txt`. Poses and boxes are in the frame of a camera as KITTI's, at the position of the
-    sensor; `Tr` leads to this frame. The camera is level where the sensor is tilted, in the mean
-    over its sweeps, because KITTI turns boxes about its vertical axis alone. KITTI's own tools look
-    for the poses in `poses/00.txt`.
+    `calib.txt`. `label_02/00.txt` has the boxes of all sweeps in the layout of KITTI tracking; a
+    track has the number of the instance.
+
+    Poses and boxes are in the frame of a camera as KITTI's, at the position of the sensor; `Tr`
+    leads to this frame. The camera is level where the sensor is tilted, in the mean over its
+    sweeps, because KITTI turns boxes about its vertical axis alone. KITTI's own tools look for the
+    poses in `poses/00.txt`.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
@@ -85,11 +88,13 @@ class Pieces(pieces.Pieces):
             return files, None
         boxes = Boxes.from_points(sweeps, number, points)
         camera = self.cameras[sweeps.sensor[number]]
-        files[f"{folder}/label_2/{name}.txt"] = _labels(sweeps, number, boxes, camera).encode()
+        labels_of_actors = _labels(sweeps, number, boxes, camera)
+        lines = (f"{kind} 0.00 {values}\n" for _, kind, values in labels_of_actors)
+        files[f"{folder}/label_2/{name}.txt"] = "".join(lines).encode()
         return files, boxes
 
     def shared_files(self, boxes: Sequence[Boxes | None]) -> dict[str, bytes]:
-        """Return poses, times and calibrations."""
+        """Return poses, times, calibrations and tracks."""
         sweeps = self.sweeps
         files: dict[str, bytes] = {}
         for sensor, (folder, camera) in enumerate(zip(self.sequences, self.cameras, strict=True)):
@@ -108,9 +113,25 @@ class Pieces(pieces.Pieces):
             files[f"{folder}/{CALIBRATION_FILE}"] = "".join(
                 [*lines, f"Tr: {_row(camera)}\n"]
             ).encode()
+            if sweeps.actors:
+                tracks = self._tracks(np.flatnonzero(sweep_mask).tolist(), boxes)
+                files[f"label_02/{self.names[sensor]}.txt"] = tracks
         if sweeps.classes and self.entry is None:  # else all jobs share a file
             files[NAMES_FILE] = labels_file(sweeps.classes)
         return files
+
+    def _tracks(self, numbers: Sequence[int], boxes: Sequence[Boxes | None]) -> bytes:
+        """Return the boxes of the sweeps of a sensor in the layout of KITTI tracking."""
+        sweeps = self.sweeps
+        lines = []
+        for frame, number in enumerate(numbers):
+            boxes_of_sweep = boxes[number]
+            assert boxes_of_sweep is not None  # there are actors
+            camera = self.cameras[sweeps.sensor[number]]
+            for actor, kind, values in _labels(sweeps, number, boxes_of_sweep, camera):
+                instance = len(sweeps.objects) + actor + 1
+                lines.append(f"{frame} {instance} {kind} 0 {values}\n")
+        return "".join(lines).encode()
 
 
 def intensity_of(points: Cloud) -> Floats32:
@@ -179,10 +200,13 @@ def _camera(sweeps: Sweeps, sensor: int) -> Floats:
     return np.asarray(_CAMERA @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)))
 
 
-def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
-    """Return the lines of label_2, without a picture, so without truncation and occlusion.
+def _labels(
+    sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats
+) -> Iterator[tuple[int, str, str]]:
+    """Yield number and type of each actor with points, and values of its label after truncation.
 
-    The position is the middle of the underside; boxes are turned about the camera's y alone.
+    There is no picture: occlusion is 3, which is unknown, and the box in the picture is zero. The
+    position is the middle of the underside; boxes are turned about the camera's y alone.
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
     forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # directions of the actors
@@ -191,24 +215,12 @@ def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
     rotation_y = np.arctan2(-forward[:, 2], forward[:, 0])
     alpha = rotation_y - np.arctan2(positions[:, 0], positions[:, 2])
     alpha = np.angle(np.exp(1j * alpha))  # between -pi and pi
-    lines = []
-    for actor in np.flatnonzero(boxes.present & (boxes.points > 0)):
-        length, width, height = boxes.sizes[actor]
-        values = (
-            alpha[actor],
-            0,
-            0,
-            0,
-            0,
-            height,
-            width,
-            length,
-            *positions[actor],
-            rotation_y[actor],
-        )
-        numbers = " ".join(f"{value:.4f}" for value in values)
-        lines.append(f"{sweeps.actor_types[actor]} 0.00 3 {numbers}\n")
-    return "".join(lines)
+    picture = np.zeros((len(alpha), 4))
+    sizes = boxes.sizes[:, ::-1]  # height, width and length
+    rows = np.column_stack([alpha, picture, sizes, positions, rotation_y])
+    for actor in np.flatnonzero(boxes.present & (boxes.points > 0)).tolist():
+        values = " ".join(f"{value:.4f}" for value in rows[actor])
+        yield actor, sweeps.actor_types[actor], f"3 {values}"
 
 
 # -- reading ---------------------------------------------------------------------------------

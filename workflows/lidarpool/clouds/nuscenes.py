@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cached_property
 from hashlib import md5
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.arrays import Bools, Bytes, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
@@ -24,7 +25,7 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
-from lidarsim.sweeps.sweeps import COMPENSATED, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from ..base.fingerprint import fingerprint
 from . import pieces, sweep_reader
@@ -44,7 +45,9 @@ _TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample",
     "sample_annotation", "sample_data", "scene", "sensor", "visibility",
 )  # fmt: skip
-_LABELS = f"lidarseg/{VERSION}/"
+LABELS = f"lidarseg/{VERSION}/"
+_MAX_CLASSES = 255  # labels are bytes, and 0 is for points without a class
+_NO_CLASS = "none"
 _SWEEP_TABLE = "sample_data.json"
 _Row = Mapping[str, Any]  # of a table
 _SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of a data set share
@@ -58,8 +61,9 @@ class Pieces(pieces.Pieces):
     of the devkit expect, and the name of each further sensor. The first sensor's sweeps are the
     samples; of another sensor, the first sweep that begins in a sample is its key frame, and
     further sweeps are in `sweeps/NAME`. The ego vehicle's pose is the sensor's, at each sweep.
-    Actors are annotated in each sample, at their poses at its time. Classes with names, below 256,
-    are labels of nuScenes-lidarseg.
+    Actors are annotated in each sample, at their poses at its time. Classes with names are labels
+    of nuScenes-lidarseg: indices of rows of `category.json`, which nuscenes-devkit requires to have
+    no gaps. They are numbered by class from 1 on; 0 is for points without a named class.
 
     In a data set each job is a scene with its name, on a separate day, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
@@ -74,8 +78,9 @@ class Pieces(pieces.Pieces):
         self.names = _files(sweeps, self.channels, self.first, entry)
         self.folders = [name.rpartition("/")[0] for name in self.names]
         named = sweeps.classes and any(column.name == "class" for column in cloud.table)
-        self.labels = [_LABELS + name.replace("/", "-") for name in self.names] if named else []
-        self.folders += [_LABELS] if named else []
+        self.labels = [LABELS + name.replace("/", "-") for name in self.names] if named else []
+        self.folders += [LABELS] if named else []
+        self.label_of_class = _labels_of_classes(sweeps.classes)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
         """Return the file of a sweep, and its boxes."""
@@ -87,9 +92,7 @@ class Pieces(pieces.Pieces):
         rows[:, 4] = points["channel"]
         files = {self.names[number]: as_data(rows)}
         if self.labels:
-            named = np.isin(points["class"], [n for n in self.sweeps.classes if n < 256])
-            labels = np.where(named, points["class"], 0).astype("u1")
-            files[self.labels[number]] = as_data(labels)
+            files[self.labels[number]] = as_data(self.label_of_class[points["class"]])
         return files, Boxes.from_points(self.sweeps, number, points)
 
     def shared_files(self, boxes: Sequence[Boxes]) -> dict[str, bytes]:
@@ -103,8 +106,9 @@ class Pieces(pieces.Pieces):
         return files | {_MAP: _no_map()}
 
     def summary(self, boxes: Sequence[Boxes]) -> dict[str, Any]:
-        """Return the tables of a job, for `merge`."""
-        return {"tables": self._tables(boxes)}
+        """Return the tables of a job, and the classes that its labels number, for `merge`."""
+        labeled = {"lidarseg": sorted(self.sweeps.classes)} if self.labels else {}
+        return {"tables": self._tables(boxes), **labeled}
 
     def _tables(self, boxes: Sequence[Boxes]) -> dict[str, list[dict[str, Any]]]:
         tables = _Tables(self.sweeps, self.entry)
@@ -134,7 +138,7 @@ class Reader(sweep_reader.Reader):
     def files(self, sweep: int) -> list[str]:
         """Return the names of the files of points and, with names, classes."""
         file = self._names[sweep]
-        return [file, _LABELS + file.replace("/", "-")] if self.sweeps.classes else [file]
+        return [file, LABELS + file.replace("/", "-")] if self.sweeps.classes else [file]
 
     def read(self, sweep: int) -> sweep_reader.PointColumns:
         """Return the points of a sweep."""
@@ -144,7 +148,8 @@ class Reader(sweep_reader.Reader):
         intensity /= 255
         columns = {"intensity": intensity, "channel": channel.astype("u2")}
         if labels:
-            columns["class"] = self.rows(labels[0], np.dtype("u1"), len(rows)).astype("u2")
+            labels_of_points = self.rows(labels[0], np.dtype("u1"), len(rows))
+            columns["class"] = np.array([0, *sorted(self.classes)], "u2")[labels_of_points]
         return rows[:, :3], columns
 
 
@@ -169,19 +174,70 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
     ]
 
 
+def _labels_of_classes(classes: Collection[int]) -> Bytes:
+    """Return the labels of all class numbers, uint8 (65536,): 0 for classes without a name.
+
+    Raises
+    ------
+    LidarError
+        If there are more classes with names than labels.
+    """
+    if len(classes) > _MAX_CLASSES:
+        raise LidarError(
+            f"{len(classes)} classes have names, but labels of nuScenes-lidarseg hold at most "
+            f"{_MAX_CLASSES}. Remove names from `classes`, or write another format, such as kitti."
+        )
+    labels = np.zeros(1 << 16, np.uint8)
+    labels[sorted(classes)] = np.arange(1, len(classes) + 1)
+    return labels
+
+
 def _categories(kinds: Iterable[Any], classes: Mapping[int, str]) -> list[dict[str, Any]]:
-    """Return rows of all classes and types of actors, numbered without gaps for lidarseg."""
+    """Return the rows of all named classes and categories of actors, each name once.
+
+    Rows of classes are in the order of their labels. If jobs give one name to several numbers,
+    the number is appended to the name.
+    """
     rows_by_name = {row["name"]: row for row in kinds}
-    last = max((number for number in classes if number < 256), default=0)
-    names = [classes.get(n, f"class {n}" if n else "none") for n in range(last + 1)]
+    names = {_NO_CLASS: None}
+    for number in sorted(classes):
+        name = classes[number]
+        names[f"{name} ({number})" if name in names else name] = None
+    names |= dict.fromkeys(rows_by_name)
     return [
         {"token": name, "name": name, "description": "", **rows_by_name.get(name, {}), "index": n}
-        for n, name in enumerate([*names, *(name for name in rows_by_name if name not in names)])
+        for n, name in enumerate(names)
     ]
 
 
-def merge(storage: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
-    """Write the tables of a data set from the summaries of its jobs."""
+def _actor_categories(sweeps: Sweeps) -> list[str]:
+    """Return the category of each actor: its type, in the spelling of the class of that name.
+
+    Points and boxes share the categories, so "Car 1" is a `car` if a class has this name.
+    """
+    spellings = {_spelled_alike(name): name for name in sweeps.classes.values()}
+    return [spellings.get(_spelled_alike(kind), kind) for kind in sweeps.actor_types]
+
+
+def _spelled_alike(name: str) -> str:
+    """Return what names have in common that differ in case or in spaces alone."""
+    return name.casefold().replace("_", " ")
+
+
+def relabeled(labels: bytes, before: Sequence[int], after: Sequence[int]) -> bytes:
+    """Return labels that number the classes `after` instead of the classes `before`."""
+    table = _labels_of_classes(after)[[0, *before]]
+    return table[np.frombuffer(labels, np.uint8)].tobytes()
+
+
+def merge(storage: Storage, jobs: Iterable[Mapping[str, Any]]) -> dict[str, list[int]]:
+    """Write the tables of a data set from the manifests of its jobs.
+
+    Returns
+    -------
+    The classes that labels number, for each job whose labels number others: jobs have different
+    classes.
+    """
     shared: set[str] = set()  # tokens of rows that several jobs have
     with ExitStack() as stack:
         files = {
@@ -189,7 +245,7 @@ def merge(storage: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
         }
         separators: dict[str, bytes] = {}  # {table: bytes before its next row}
         kinds = dict[str, dict[str, Any]]()
-        classes = dict[int, str]()
+        classes = _JobClasses()
 
         def write(tables: Mapping[str, Iterable[dict[str, Any]]]) -> None:
             for name, rows in tables.items():
@@ -205,14 +261,42 @@ def merge(storage: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
 
         for job in jobs:
             kinds |= {row["token"]: row for row in job["tables"].pop("category")}
-            classes |= {int(number): name for number, name in job.get("classes", {}).items()}
+            classes.add(job)
             write(job["tables"])
         rows = kinds.values()
-        write({"category": _categories(rows, classes) if "lidarseg" in files else rows})
+        write({"category": _categories(rows, classes.names) if "lidarseg" in files else rows})
         for name, file in files.items():
             file.write(b"\n]\n" if name in separators else b"[]\n")
     with storage.writing(_MAP) as file:
         file.write(_no_map())
+    return classes.relabeled_jobs()
+
+
+class _JobClasses:
+    """The classes of the jobs of a data set."""
+
+    def __init__(self) -> None:
+        self._names: dict[int, dict[str, None]] = {}  # {class: its names in the jobs, in order}
+        self._labeled: dict[tuple[int, ...], list[str]] = {}  # {labeled classes: jobs}
+
+    def add(self, job: Mapping[str, Any]) -> None:
+        """Add the classes of a job from its manifest."""
+        for number, name in job.get("classes", {}).items():
+            self._names.setdefault(int(number), {})[name] = None
+        if "lidarseg" in job:
+            self._labeled.setdefault(tuple(job["lidarseg"]), []).append(job["row"]["name"])
+
+    @property
+    def names(self) -> dict[int, str]:
+        """Names of the classes of all jobs."""
+        return {number: "; ".join(names) for number, names in self._names.items()}
+
+    def relabeled_jobs(self) -> dict[str, list[int]]:
+        """Return the classes of all jobs, for each job whose labels number others."""
+        numbers = sorted(self._names)
+        _labels_of_classes(numbers)  # raises LidarError if these are too many
+        others = (jobs for labeled, jobs in self._labeled.items() if [*labeled] != numbers)
+        return dict.fromkeys(chain.from_iterable(others), numbers)
 
 
 def _no_map() -> bytes:
@@ -258,7 +342,7 @@ class _Tables:
             "scene",
             self._scene,
             name=self._scene,
-            description=COMPENSATED,
+            description=sweeps.frame_text(compensated=True),
             nbr_samples=count,
             log_token=self._token("log", _LOG),
             first_sample_token=self._token("sample", 0),
@@ -315,7 +399,7 @@ class _Tables:
 
     def add_actors(self, boxes: list[list[Boxes]]) -> None:
         """Add the actors, and their boxes in the key frames of each sample."""
-        kinds = self.sweeps.actor_types
+        kinds = _actor_categories(self.sweeps)
         self.rows |= {"category": [], "instance": [], "sample_annotation": []}
         for kind in dict.fromkeys(kinds):
             self._add("category", kind, name=kind, description="")

@@ -14,7 +14,6 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import COLOURS, NORMAL
 from lidarsim.scene.colours import as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
-from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED
 
 from . import pieces
 from .file_points import FilePoints, of_scans
@@ -39,7 +38,7 @@ class Pieces(pieces.Pieces):
         fields = self._fields(number, points, as_fired=as_fired)
         x, y, z, w = self.sweeps.pose.quaternions[number].tolist()
         position = self.sweeps.pose.positions[number].tolist()
-        comment = AS_FIRED if as_fired else COMPENSATED
+        comment = self.sweeps.frame_text(compensated=not as_fired)
         return {f"{number:06}.pcd": pcd_bytes(fields, position, (w, x, y, z), comment)}, None
 
     def _fields(self, number: int, points: Cloud, *, as_fired: bool) -> list[tuple[str, AnyArray]]:

@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 import weakref
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,11 +28,19 @@ PointColumns = tuple[Floats32, dict[str, AnyArray]]
 class Reader:
     """Reads the points of a job's sweeps in any order, in a single thread."""
 
-    def __init__(self, storage: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
+    def __init__(
+        self,
+        storage: Storage,
+        sweeps: Sweeps,
+        entry: Entry,
+        layout: str,
+        classes: Mapping[int, str],
+    ) -> None:
         self.storage = storage
         self.sweeps = sweeps
         self.entry = entry
         self.layout = layout
+        self.classes = classes  # names of the classes of all jobs
         self._copies: Path | None = None
         self.last = ""  # name of the file of rows that was read last, for errors
 

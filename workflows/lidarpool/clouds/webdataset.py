@@ -20,7 +20,7 @@ from lidarsim.base.input_files import input_size
 from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps, plain_names
+from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from . import pieces, sweep_reader
 from .boxes import Boxes, SweepBoxes
@@ -113,7 +113,7 @@ class Pieces(pieces.Pieces):
             "sensor": sweeps.sensors[sweeps.sensor[number]],
             "sweep": int(sweeps.numbers[number]),
             "time_ns": round(sweeps.begins_ns[number]),
-            "frame": AS_FIRED if sweeps.coordinates == "sensor" else COMPENSATED,
+            "frame": sweeps.frame_text(compensated=sweeps.coordinates == "world"),
             "box_names": present.names,
             "box_types": present.types,
             "box_objects": present.objects.tolist(),

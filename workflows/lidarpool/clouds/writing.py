@@ -54,6 +54,21 @@ class Format:
             "without times of points; by default as drivers publish them, each at its firing"
         ),
     ] = False
+    compensated_actors: Annotated[
+        bool,
+        about(
+            "points of actors where the actor was at the start of the sweep, so that they lie in "
+            "its box; by default where the actor was at their firing (formats of single sweeps)"
+        ),
+    ] = False
+    pose_rate_hz: Annotated[
+        float | None,
+        about(
+            "poses per second on /tf of mcap and rosbag2 (default: one at the start of each sweep)",
+            gt=0,
+            le=10_000,
+        ),
+    ] = None
     organized: Annotated[
         bool,
         about(
@@ -78,6 +93,18 @@ class Format:
             raise LidarError(
                 f"compensated is an option of {', '.join(choices)}, not of {self.format}: leave it "
                 "out."
+            )
+        if self.compensated_actors and not row.positions_of_sweeps:
+            choices = [name for name, row in FORMATS.items() if row.positions_of_sweeps]
+            raise LidarError(
+                f"{self.format} does not have the option `compensated_actors`. It can be set for "
+                f"formats that store the points of single sweeps: {', '.join(choices)}."
+            )
+        if self.pose_rate_hz is not None and not row.layouts:
+            choices = [name for name, row in FORMATS.items() if row.layouts]
+            raise LidarError(
+                f"{self.format} does not have the option `pose_rate_hz`. It can be set for "
+                f"{' and '.join(choices)} only."
             )
         if self.intensity_full_scale is not None and not row.integer_intensities:
             choices = [name for name, row in FORMATS.items() if row.integer_intensities]
@@ -132,7 +159,12 @@ class Format:
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that a cloud must have."""
-        return self.row.needs + self._laid_out
+        needs = self.row.needs + self._laid_out
+        return (*needs, "time") if self.compensated_actors and "time" not in needs else needs
+
+    def prepared(self, sweeps: Sweeps) -> Sweeps:
+        """Return sweeps that yield points as the options of the format state."""
+        return replace(sweeps, actors_at_start=True) if self.compensated_actors else sweeps
 
     def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return the names of the cloud's columns that the format cannot hold."""
@@ -264,6 +296,7 @@ class Format:
                 "layout": self.layout,
                 "compensated": self.compensated,
                 "organized": self.organized,
+                "pose_rate_hz": self.pose_rate_hz,
             }
         if self.row.with_scene:
             options["content"] = content()
@@ -280,7 +313,7 @@ class Format:
                     self._range_writer(cloud, sweeps, storage).write(workers)
                 else:
                     write = self.row.provides(self.row.write)
-                    write(staged, cloud, sweeps, **options)
+                    write(staged, cloud, self.prepared(sweeps), **options)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
                     Storage.at(path.parent).discard(path.name)
@@ -289,7 +322,7 @@ class Format:
         return full_scale
 
     def _range_writer(self, cloud: CloudLike, sweeps: Sweeps, storage: Storage) -> RangeWriter:
-        return RangeWriter(self.format, cloud, sweeps, storage, self.compensated)
+        return RangeWriter(self.format, cloud, self.prepared(sweeps), storage, self.compensated)
 
     def write_to_storage(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
@@ -330,6 +363,8 @@ def save_cloud(
     format: str | None = None,  # noqa: A002 - its name in scenarios and in the command
     layout: str = "velodyne",
     compensated: bool = False,
+    compensated_actors: bool = False,
+    pose_rate_hz: float | None = None,
     organized: bool = False,
     intensity_full_scale: float | None = None,
     precision_m: float | None = None,
@@ -356,6 +391,12 @@ def save_cloud(
     compensated
         In mcap, rosbag2 and pcd, points in the sensor's axes at the start of the sweep, without
         times of points; by default each is in the sensor's axes at its firing, as of drivers.
+    compensated_actors
+        In formats of single sweeps, move the points of each actor to where the actor was at the
+        start of the sweep, so that they lie in its box. The cloud needs the column `time`.
+    pose_rate_hz
+        In mcap and rosbag2, poses per second on `/tf`. By default, there is one at the start of
+        each sweep and one at the end of the last.
     organized
         In mcap and rosbag2, a point for each ray, NaN without a return, in lines as the driver
         of the layout has them: velodyne, ouster, images and robosense.
@@ -383,7 +424,15 @@ def save_cloud(
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarError(f"precision_m is {precision_m}; it must be a length in metres.")
-    file_format = Format(name, layout, compensated, organized, intensity_full_scale)
+    file_format = Format(
+        name,
+        layout,
+        compensated,
+        compensated_actors=compensated_actors,
+        pose_rate_hz=pose_rate_hz,
+        organized=organized,
+        intensity_full_scale=intensity_full_scale,
+    )
     sweeps = Sweeps.unknown() if cloud.sweeps is None else cloud.sweeps()
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     with explained(f"{path} cannot be written"):

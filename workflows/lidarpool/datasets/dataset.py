@@ -31,7 +31,7 @@ from ..clouds.boxes import Boxes
 from ..clouds.folder import local_folder
 from ..clouds.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
 from ..clouds.kitti import NAMES_FILE, labels_file
-from ..clouds.nuscenes import merge
+from ..clouds.nuscenes import LABELS, merge, relabeled
 from ..clouds.pieces import Entry, Pieces, pieces_of
 from ..clouds.writing import Format
 from .job_table import TABLE_FILE, JobRow, Tally
@@ -108,6 +108,8 @@ class DataSet:
     compensated
         Points in mcap are in the sensor frame at the start of the sweep, and have no times; else at
         their firing. `lidarpool.sweeps` gives both at the start of the sweep.
+    compensated_actors, pose_rate_hz
+        As of `lidarpool.save_cloud`.
     made_with
         Identity and software that determine the bytes of all jobs, for JSON; part of each manifest.
     """
@@ -116,11 +118,19 @@ class DataSet:
     format: Literal[tuple(DATA_SETS)]  # type: ignore[valid-type]
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
     compensated: bool = False
+    compensated_actors: bool = False
+    pose_rate_hz: float | None = None
     made_with: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def _job_format(self) -> Format:
-        return Format(DATA_SETS[self.format], self.layout, self.compensated)
+        return Format(
+            DATA_SETS[self.format],
+            self.layout,
+            self.compensated,
+            compensated_actors=self.compensated_actors,
+            pose_rate_hz=self.pose_rate_hz,
+        )
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -165,7 +175,8 @@ class DataSet:
         boxes: list[Boxes] = []
         with explained(f"Job {name} cannot be written to {storage}"):
             if file_format.row.in_pieces:
-                pieces = pieces_of(file_format.format, cloud, sweeps, entry)
+                prepared = file_format.prepared(sweeps)
+                pieces = pieces_of(file_format.format, cloud, prepared, entry)
                 details = _write_pieces(pieces, storage)
                 manifest = pieces.summary(details)
                 boxes = details if file_format.row.boxes else []
@@ -239,10 +250,27 @@ class DataSet:
                 index.write(f'{json.dumps(head)[:-1]}, "jobs": [')
                 manifests = self._indexed(jobs, index)
                 if self.format == "nuscenes":
-                    merge(self.storage, manifests)
+                    for job, classes in merge(self.storage, manifests).items():
+                        self._relabel(job, classes)
                 else:
                     deque(manifests, maxlen=0)
                 index.seal()
+
+    def _relabel(self, job: str, classes: Sequence[int]) -> None:
+        """Write the labels of a job anew, in nuScenes, so that they number other classes.
+
+        The manifest is removed first: if this is interrupted, the job is made again.
+        """
+        manifest = self._manifest(job)
+        self.storage.remove([manifest_file(job)])
+        storage = Listing.from_storage(self.storage)
+        for name in manifest["files"]:
+            if name.startswith(LABELS):
+                labels = self.storage.read(name)
+                storage.write(name, relabeled(labels, manifest["lidarseg"], classes))
+        manifest |= {"lidarseg": classes, "files": manifest["files"] | storage.files}
+        manifest["crc"] = _crc(manifest)
+        self.storage.write(manifest_file(job), json.dumps(manifest).encode())
 
     def _indexed(self, jobs: Iterable[JobRow], index: SealedWriter) -> Iterator[dict[str, Any]]:
         """Yield the manifests of finished jobs, and write their names and sensors to the index."""

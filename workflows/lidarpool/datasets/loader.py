@@ -184,7 +184,7 @@ class SavedSweeps:
             local.jobs = OrderedDict()
         jobs: OrderedDict[int, _OpenJob] = local.jobs
         if job.number not in jobs:
-            jobs[job.number] = _OpenJob(self._storage, self._written, job)
+            jobs[job.number] = _OpenJob(self._storage, self._written, job, self.classes)
             if len(jobs) > _OPEN_JOBS:
                 jobs.popitem(last=False)[1].reader.close()
         jobs.move_to_end(job.number)
@@ -194,7 +194,9 @@ class SavedSweeps:
 class _OpenJob:
     """Poses, boxes and reader of a job whose sweeps are read."""
 
-    def __init__(self, storage: Storage, written: Format, job: JobRow) -> None:
+    def __init__(
+        self, storage: Storage, written: Format, job: JobRow, classes: Mapping[int, str]
+    ) -> None:
         self.storage = storage
         self.job = job
         row = written.row
@@ -216,7 +218,8 @@ class _OpenJob:
                 )
                 self.boxes = boxes.inward(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
-        self.reader: Reader = row.provides("Reader")(storage, self.sweeps, entry, written.layout)
+        reader = row.provides("Reader")
+        self.reader: Reader = reader(storage, self.sweeps, entry, written.layout, classes)
 
     def read(self, sweep: int) -> Sweep:
         """Read a sweep."""

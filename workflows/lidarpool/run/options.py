@@ -54,6 +54,7 @@ class RunOptions(TaskOptions):
     wait_s: Annotated[float, Field(ge=0)] = WAIT_S
     patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
     live: Live = False
+    pace: Annotated[float | None, Field(gt=0)] = None  # speed of frames; 1 is that of the scanner
     stay: bool = True  # False if the live page, or viewer, ends with the run
 
     def with_pool(
@@ -100,6 +101,7 @@ class RunKeywords(TypedDict, total=False):
     wait_s: float
     patience_s: float
     live: Live
+    pace: float | None
 
 
 def options_of_call(

@@ -39,6 +39,7 @@ from .cluster.cluster import Cluster, start_local
 from .cluster.connection import StartedAhead
 from .job_source import JobMaker, Jobs
 from .options import RunOptions
+from .pace import Pacer
 from .pipeline.stage_messages import Receipt, ScanFrame
 from .progress import Screen
 from .run_loop import Listeners, RunLoop
@@ -119,6 +120,8 @@ class Run(Generic[R]):
         self.screen = screen
         self.page = page
         self._on_frame = on_frame
+        self._pacer = None if options.pace is None else Pacer(options.pace)
+        self._unshown: list[Receipt] = []  # parts whose frames wait for their time
         self.started = time.monotonic()
         self.stack = ExitStack()
         self.cluster_stack = ExitStack()  # leaves the cluster
@@ -235,13 +238,26 @@ class Run(Generic[R]):
             self.loop.run(first, show)
 
     def _frame(self, frame: ScanFrame) -> None:
+        if self._pacer is not None:
+            self._pacer.wait(frame.time_ns)
+            self._show_parts(frame.scan + 1)
         self.page.on_frame(frame)
         if self._on_frame is not None:
             self._on_frame(frame)
 
     def _on_parts(self, receipts: Sequence[Receipt]) -> None:
-        self.page.on_parts(receipts)
+        if self._pacer is None:
+            self.page.on_parts(receipts)
+        else:
+            self._unshown += receipts
         self.output.on_parts(receipts)
+
+    def _show_parts(self, stop: int) -> None:
+        """Show the parts up to a scan, whose frames are due."""
+        due = sorted((part for part in self._unshown if part.first < stop), key=lambda p: p.first)
+        if due:
+            self._unshown = [part for part in self._unshown if part.first >= stop]
+            self.page.on_parts(due)
 
     # -- for outputs -------------------------------------------------------------------------
 

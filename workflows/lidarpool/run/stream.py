@@ -38,6 +38,7 @@ from ..datasets.job_table import JobRow
 from ..datasets.sweep_data import Sweep
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
+from ..scenario.campaign_sections import Keep
 from ..scenario.empty_cloud import empty_cloud_reason
 from .cluster.checks import check_workers, find_workers
 from .cluster.cluster import client_of
@@ -116,13 +117,13 @@ class SweepStream:
 class StreamedJob(PipelineJob):
     """A job whose sweeps are cast, with the columns that wait to be read.
 
-    Columns as of `data_format`, the format of the data set that a run of the campaign writes.
+    Points as of `keep`, the format of the data set that a run of the campaign writes.
     """
 
-    def __init__(self, job: Job, data_format: str) -> None:
+    def __init__(self, job: Job, keep: Keep) -> None:
         super().__init__(job.number, job.scene, job.survey, range(job.survey.scan_count))
         self.job = job
-        self.data_format = data_format
+        self.keep = keep
         self.columns: dict[int, PartColumns] = {}  # {first scan: columns of a batch}
         self.sweeps_begun = 0  # sweeps that the dispatcher has or had
         self.points_read = 0
@@ -147,10 +148,12 @@ class StreamedJob(PipelineJob):
         table = (SCAN, *stored)
         cloud = Cloud.joined([part.cloud(table, survey.precision_m, origin) for part in parts])
         self.points_read += len(cloud)
+        if self.keep.compensated_actors:
+            cloud = sweeps.with_actors_at_start(number, cloud)
         positions = sweeps.in_sensor(number, cloud.positions).astype(np.float32)
         in_sensor = sweeps.columns_in_sensor(number, cloud)
         columns = {column.name: np.array(in_sensor[column.name]) for column in table}
-        if self.data_format == "kitti":  # the intensity of files of this format
+        if self.keep.format == "kitti":  # the intensity of files of this format
             columns["intensity"] = intensity_of(cloud)
         boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
@@ -265,7 +268,7 @@ class _Casting:
             return True
         job = entry
         options = self._stream.options
-        streamed = StreamedJob(job, self._stream.campaign.keep.format)
+        streamed = StreamedJob(job, self._stream.campaign.keep)
         try:
             check_workers(job, options, self._backend, self._workers)
             packed, scene_name = self._casting.add(job.number, job.scene, job.survey)

@@ -398,13 +398,35 @@ class Keep:
         ),
     ] = False
 
+    compensated_actors: Annotated[
+        bool,
+        about(
+            "points of actors where the actor was at the start of the sweep, so that they lie in "
+            "its box; by default where it was at their firing (not in parquet and folder)"
+        ),
+    ] = False
+    pose_rate_hz: Annotated[
+        float | None,
+        about(
+            "poses per second on /tf in mcap (default: one at the start of each sweep)",
+            gt=0,
+            le=10_000,
+        ),
+    ] = None
+
     def __post_init__(self) -> None:
         _ = self.of_jobs  # LidarError if its fields do not fit together
 
     @property
     def of_jobs(self) -> Format:
         """Format of the files of a job."""
-        return Format(DATA_SETS[self.format], self.layout, self.compensated)
+        return Format(
+            DATA_SETS[self.format],
+            self.layout,
+            self.compensated,
+            compensated_actors=self.compensated_actors,
+            pose_rate_hz=self.pose_rate_hz,
+        )
 
 
 KeepEntry = Annotated[

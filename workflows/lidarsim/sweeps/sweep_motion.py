@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.arrays import Floats, Floats32, Ints
-from ..motion.rotations import quaternions_of
+from ..motion.rotations import matrices, quaternions_of
 from ..motion.trajectory import Pose, Trajectory, full_poses
 from ..survey.survey import Survey
 from .lidar_traits import LidarTraits
@@ -21,7 +21,7 @@ STILL = np.zeros((0, 0, 7), np.float32)  # knots of sensors that are static whil
 
 @dataclass(frozen=True, eq=False)
 class FiringPoses:
-    """Poses of a sensor at the firings of points (k,) of a sweep."""
+    """Poses of a sensor or actor at the firings of points (k,) of a sweep, or at other times."""
 
     position: Floats  # (3,): at the start of the sweep, metres, world coordinates
     rotation: Floats  # (3, 3): from the sensor frame at the start to the world frame
@@ -44,6 +44,24 @@ class FiringPoses:
         """Convert points (k, 3) from the sensor frame at their firings to the world."""
         in_world: Floats = self.turned_outward(points) + self.positions
         return in_world
+
+    def frames(self, count: int) -> tuple[Floats, Floats]:
+        """Return positions (count, 3) and rotations (count, 3, 3), also of a static body."""
+        positions = np.broadcast_to(self.positions, (count, 3))
+        rotations = np.broadcast_to(self.rotation, (count, 3, 3))
+        if self.quaternions is not None:
+            rotations = rotations @ matrices(self.quaternions.T)
+        return positions, rotations
+
+    def to_start(self, points: Floats) -> Floats:
+        """Move points (k, 3), in the world, with the body from their firings to the start."""
+        at_start: Floats = self.inward(points) @ self.rotation.T + self.position
+        return at_start
+
+    def turned_to_start(self, vectors: Floats) -> Floats:
+        """Rotate vectors (k, 3), in the world, with the body from their firings to the start."""
+        at_start: Floats = self.turned_inward(vectors) @ self.rotation.T
+        return at_start
 
     def turned_inward(self, vectors: Floats) -> Floats:
         """Rotate vectors (k, 3) from the world frame to the sensor frame at their firings."""
@@ -75,6 +93,25 @@ def _turned(vectors: Floats, quaternions: Floats, sign: float) -> Floats:
     return np.stack(rows, axis=1)
 
 
+def knots_in(longest_ns: float, knot_ns: float) -> int:
+    """Return the number of knots of sweeps: one every `knot_ns` of the longest, within limits."""
+    return 1 + int(np.clip(np.ceil(longest_ns / knot_ns), 1, _MAX_KNOTS))
+
+
+def relative_knots(displacements: Floats, rotations: Floats) -> Floats32:
+    """Return knots (n, m, 7): positions since the start of each sweep, and rotations.
+
+    `displacements` (n, m, 3) are stored as they are; of the rotations (n, m, 3, 3) from the body's
+    frame to the world, the quaternions x, y, z, w since the first, in the body's frame.
+    """
+    shape = displacements.shape[:2]
+    since = rotations[:, :1].swapaxes(2, 3) @ rotations
+    quaternions = quaternions_of(since.reshape(-1, 3, 3)).reshape(*shape, 4)
+    flips = (quaternions[:, 1:] * quaternions[:, :-1]).sum(axis=2) < 0
+    quaternions[:, 1:] *= 1 - 2 * (np.cumsum(flips, axis=1)[..., None] % 2)
+    return np.concatenate([displacements, quaternions], axis=2).astype(np.float32)
+
+
 def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -> Floats32:
     """Return the poses of each sweep's sensor at times that divide the sweep evenly.
 
@@ -99,8 +136,7 @@ def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -
         stop - start + lidar.firing_ns
         for (_, start, stop), lidar in zip(survey.sweeps_each, lidars, strict=True)
     ]
-    longest_ns = max(float(span.max(initial=0.0)) for span in spans)
-    count = 1 + int(np.clip(np.ceil(longest_ns / KNOT_NS), 1, _MAX_KNOTS))
+    count = knots_in(max(float(span.max(initial=0.0)) for span in spans), KNOT_NS)
     knots = np.empty((len(rotations), count, 7), np.float32)
     first = 0
     for number, span in enumerate(spans):
@@ -144,7 +180,7 @@ def _cast_at(survey: Survey, number: int) -> tuple[Ints, Floats]:
 
 def _relative_poses(
     path: Trajectory, station: int, times_ns: Floats, mount: Pose, sent_rotations: Floats
-) -> Floats:
+) -> Floats32:
     """Return the knots (k, m, 7) of sweeps at times (k, m), for `knots_of`.
 
     `sent_rotations` (k, 3, 3) are from the sensor frame at the starts of the sent sweeps to the
@@ -158,11 +194,7 @@ def _relative_poses(
     starts = rotations[:, :1]
     # In the sensor frame at the start of the cast sweep, then of the sent sweep.
     displacement = (positions - positions[:, :1]) @ starts[:, 0]
-    since = starts.swapaxes(2, 3) @ rotations
-    quaternions = quaternions_of(since.reshape(-1, 3, 3)).reshape(*shape, 4)
-    flips = (quaternions[:, 1:] * quaternions[:, :-1]).sum(axis=2) < 0
-    quaternions[:, 1:] *= 1 - 2 * (np.cumsum(flips, axis=1)[..., None] % 2)
-    return np.concatenate([displacement @ sent_rotations.transpose(0, 2, 1), quaternions], axis=2)
+    return relative_knots(displacement @ sent_rotations.transpose(0, 2, 1), rotations)
 
 
 def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats) -> FiringPoses:
@@ -175,12 +207,12 @@ def poses_at(knots: Floats32, position: Floats, rotation: Floats, shares: Floats
     position, rotation
         (3,) and (3, 3): pose of the sensor at the start of the sweep.
     shares
-        (k,): elapsed parts of the sweep, 0 to 1.
+        (k,): elapsed parts of the sweep, 0 to 1; just after the sweep, poses are extrapolated.
     """
     intervals = len(knots) - 1
     if intervals < 1:
         return FiringPoses(position, rotation)
-    knot_position = np.clip(shares, 0, 1) * intervals
+    knot_position = shares * intervals
     knot = np.minimum(knot_position.astype(np.intp), intervals - 1)
     fraction = knot_position - knot
     starts = np.ascontiguousarray(knots[:-1].T, np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.archives import open_archive, packed
-from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints
+from ..base.arrays import AnyArray, AnyFloats, Bools, Bytes, Floats, Floats32, Ints, Ints32
 from ..base.errors import LidarError
-from ..base.vectors import applied, cross
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import NORMAL, ORIGIN, TABLE
 from ..motion.rotations import matrices, quaternions_of
-from ..motion.trajectory import CLOCK_S, full_poses, presence_ns, velocities
+from ..motion.trajectory import full_poses
 from ..scene.scene import Scene
 from ..scene.transform import affine
 from ..sensor import Sensor
@@ -28,6 +27,7 @@ from ..sensor.optics import TWO_RETURNS
 from ..sensor.plain_data import from_plain_data, to_plain_data
 from ..survey.faults import Fault
 from ..survey.survey import Survey, nanoseconds
+from .actor_sweeps import NO_ROWS, ActorSweeps
 from .instruments import Instruments
 from .lidar_traits import LidarTraits
 from .sweep_motion import STILL, FiringPoses, knots_of, poses_at
@@ -41,12 +41,14 @@ MIXED_UP = (
 COMPENSATED = "points in the sensor's axes at the start of the sweep: motion is compensated"
 AS_FIRED = "points in the sensor's axes at the firing of each: motion is not compensated"
 IN_WORLD = "points in the axes of the world"
+_ACTORS_AT_START = "; points of actors are moved to the start of the sweep"
+_NO_KNOTS = np.empty((0, 7), np.float32)
 _PIECE = 250_000  # points that a thread or task reads at a time; several may read
-_FORMAT = 8
+_FORMAT = 9
 # Fields of `Sweeps` in a file, by their names: as arrays, and as JSON.
 _ARRAY_FIELDS = (
     "scans", "begins_ns", "ends_ns", "sensor", "actor_velocities", "actor_bounds", "actor_there",
-    "actor_comes", "knots",
+    "actor_comes", "actor_leaves", "actor_rows", "actor_knots", "knots",
 )  # fmt: skip
 _JSON_FIELDS = (
     "sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns", "stations",
@@ -115,6 +117,7 @@ class Sweeps:
     actor_bounds: Floats
     actor_there: Bools  # (a, n): whether each actor is in the scene when each sweep begins
     actor_comes: Bools  # (a, n): whether each actor appears during each sweep
+    actor_leaves: Bools  # (a, n): whether each actor leaves during each sweep
     coordinates: str  # frame of the cloud's points, "world" or "sensor"
     precision_m: float  # positions were rounded to multiples of this step
     epsg: int | None = None  # code of the coordinate system of the world
@@ -128,6 +131,12 @@ class Sweeps:
     knots: Floats32 = field(default_factory=lambda: STILL)  # (n, m, 7), from `knots_of`
     stations: int = 1  # number in the survey, each with as many sweeps of a sensor
     station_ns: int = 0  # time between the starts of two stations
+    # (a, n): row of `actor_knots` of each actor in each sweep, -1 if it is static or absent; empty
+    # if no actor moves.
+    actor_rows: Ints32 = field(default_factory=lambda: NO_ROWS)
+    actor_knots: Floats32 = field(default_factory=lambda: STILL)  # (r, k, 7), of `ActorSweeps`
+    # `points` moves the points of actors to where they were at the start of the sweep.
+    actors_at_start: bool = False
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -184,13 +193,84 @@ class Sweeps:
 
         Points without the column `time` count as fired in the middle of their scans.
         """
-        since_ns = self.since_ns(sweep, points)
+        return self._sensor_within(sweep, self._shares(sweep, points))
+
+    def span_ns(self, sweep: int) -> float:
+        """Return the time from the start of a sweep to its last beam, nanoseconds."""
         firing_ns = self.lidars[self.sensor[sweep]].firing_ns if self.lidars else 0.0
-        span_ns = self.ends_ns[sweep] - self.begins_ns[sweep] + firing_ns
-        knots = self.knots[sweep] if len(self.knots) else np.empty((0, 7), np.float32)
-        position = self.pose.positions[sweep]
-        rotation = self.pose.rotations[sweep]
-        return poses_at(knots, position, rotation, since_ns / max(span_ns, 1.0))
+        return float(self.ends_ns[sweep] - self.begins_ns[sweep]) + firing_ns
+
+    def _shares(self, sweep: int, points: Cloud) -> Floats:
+        """Return the elapsed part of a sweep at the firing of each point: (k,), 0 to 1."""
+        return np.clip(self.since_ns(sweep, points) / max(self.span_ns(sweep), 1.0), 0, 1)
+
+    def _sensor_within(self, sweep: int, shares: Floats) -> FiringPoses:
+        """Return the poses of the sensor at elapsed parts (k,) of a sweep."""
+        knots = self.knots[sweep] if len(self.knots) else _NO_KNOTS
+        return poses_at(knots, self.pose.positions[sweep], self.pose.rotations[sweep], shares)
+
+    def _actor_within(self, actor: int, sweep: int, shares: Floats) -> FiringPoses:
+        """Return the poses of an actor at elapsed parts (k,) of a sweep."""
+        row = self.actor_rows[actor, sweep] if len(self.actor_rows) else -1
+        knots = self.actor_knots[row] if row >= 0 else _NO_KNOTS
+        (rotation,) = matrices(self.actor_poses.quaternions[actor, [sweep]])
+        return poses_at(knots, self.actor_poses.positions[actor, sweep], rotation, shares)
+
+    def carrier_within(self, sweep: int, shares: Floats) -> SweepPoses:
+        """Return the poses of the carrier at elapsed parts (k,) of a sweep, or just after it."""
+        positions, rotations = self._sensor_within(sweep, shares).frames(len(shares))
+        number = self.sensor[sweep]
+        (mount,) = matrices(self.mounts.quaternions[[number]])
+        rotations = rotations @ mount.T
+        return _poses_of(positions - rotations @ self.mounts.positions[number], rotations)
+
+    def actor_within(self, actor: int, sweep: int, shares: Floats) -> SweepPoses:
+        """Return the poses of an actor at elapsed parts (k,) of a sweep, or just after it."""
+        return _poses_of(*self._actor_within(actor, sweep, shares).frames(len(shares)))
+
+    def with_actors_at_start(self, sweep: int, points: Cloud) -> Cloud:
+        """Move the points of actors to where they were at the start of their sweep.
+
+        A point is moved by the actor's pose at the start of the sweep, times the inverse of its
+        pose at the firing of the point, so that all points of a rigid actor lie in its box. Points
+        that a frozen sensor repeats stay as they are.
+        """
+        frozen = any(fault.kind == "frozen" for fault in self.faults_in(sweep))
+        actor = points["object"].astype(np.int64) - len(self.objects)
+        rows = np.flatnonzero(actor >= 0)
+        if len(self.actor_rows) and not frozen:
+            rows = rows[self.actor_rows[actor[rows], sweep] >= 0]
+        if not len(self.actor_rows) or frozen or not len(rows):
+            return points
+        moved = points[rows]
+        owners = actor[rows]
+        shares = self._shares(sweep, moved)
+        sensor = self._sensor_within(sweep, shares) if self.coordinates == "sensor" else None
+        masks = {owner: owners == owner for owner in np.unique(owners).tolist()}
+        bodies = {
+            owner: self._actor_within(owner, sweep, shares[mask]) for owner, mask in masks.items()
+        }
+
+        def at_start(positions: Floats) -> Floats:
+            in_world = positions if sensor is None else sensor.outward(positions)
+            for owner, mask in masks.items():
+                in_world[mask] = bodies[owner].to_start(in_world[mask])
+            return in_world if sensor is None else sensor.inward(in_world)
+
+        def turned(normals: Floats) -> Floats:
+            in_world = normals if sensor is None else sensor.turned_outward(normals)
+            for owner, mask in masks.items():
+                in_world[mask] = bodies[owner].turned_to_start(in_world[mask])
+            return in_world if sensor is None else sensor.turned_inward(in_world)
+
+        positions = points.positions.astype(np.float64)
+        positions[rows] = at_start(positions[rows])
+        columns = dict(points.columns)
+        for name, values in _with_vectors(moved, turned, lambda origins: origins).items():
+            if name in NORMAL:
+                columns[name] = columns[name].copy()
+                columns[name][rows] = values
+        return replace(points, positions=positions, columns=columns)
 
     def since_ns(self, sweep: int, points: Cloud) -> Floats:
         """Return the firing times of points, nanoseconds since the start of their sweep: (k,).
@@ -222,6 +302,11 @@ class Sweeps:
                 since_begin = np.where(better, candidate - begin_ns, since_begin)
                 smallest_distance = np.where(better, distance, smallest_distance)
         return np.asarray(since_begin, np.float64)
+
+    def frame_text(self, *, compensated: bool) -> str:
+        """Return the description of the frame of points for files."""
+        text = COMPENSATED if compensated else AS_FIRED
+        return text + _ACTORS_AT_START if self.actors_at_start else text
 
     @cached_property
     def carrier(self) -> SweepPoses:
@@ -265,6 +350,7 @@ class Sweeps:
             actor_bounds=np.empty((0, 2, 3)),
             actor_there=np.empty((0, 0), bool),
             actor_comes=np.empty((0, 0), bool),
+            actor_leaves=np.empty((0, 0), bool),
             coordinates="world",
             precision_m=0.001,
         )
@@ -287,7 +373,10 @@ class Sweeps:
             [np.full(len(first), n, np.uint8) for n, first in enumerate(firsts)]
         )
         firing_ns = np.array([lidar.firing_ns for lidar in traits])[sensor]
-        actors = _actor_sweeps(scene, begins_ns, ends_ns + firing_ns)
+        actors = ActorSweeps.from_scene(scene, begins_ns, ends_ns + firing_ns)
+        actor_quaternions = _poses_of(
+            actors.positions.reshape(-1, 3), actors.rotations.reshape(-1, 3, 3)
+        ).quaternions
         return cls(
             scans=np.append(np.concatenate(firsts), survey.scan_count),
             begins_ns=begins_ns,
@@ -301,11 +390,16 @@ class Sweeps:
             sensors=tuple(carried.name for carried in survey.carried),
             objects=tuple(scene.names),
             actors=tuple(actor.name for actor in scene.actors),
-            actor_poses=actors.poses,
+            actor_poses=SweepPoses(
+                actors.positions, actor_quaternions.reshape(*actors.positions.shape[:2], 4)
+            ),
             actor_velocities=actors.velocities,
             actor_bounds=actors.bounds,
             actor_there=actors.present,
             actor_comes=actors.comes,
+            actor_leaves=actors.leaves,
+            actor_rows=actors.rows,
+            actor_knots=actors.knots,
             coordinates=survey.coordinates,
             precision_m=survey.precision_m,
             epsg=survey.epsg,
@@ -341,15 +435,25 @@ class Sweeps:
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
         """Yield the points of each sweep from `first` to `stop` in order, empty sweeps included.
 
+        With `actors_at_start`, the points of actors are moved to the start of their sweep.
+
         Raises
         ------
         LidarError
             If the points are not in the order of scans, or are of a different survey.
         """
+        sweeps = self._points(cloud, first, len(self) if stop is None else stop)
+        if not self.actors_at_start:
+            yield from sweeps
+            return
+        for sweep, points in enumerate(sweeps, first):
+            yield self.with_actors_at_start(sweep, points)
+
+    def _points(self, cloud: CloudLike, first: int, stop: int) -> Iterator[Cloud]:
+        """Yield the points of each sweep from `first` to `stop` as they were fired."""
         sweep_parts: list[Cloud] = []
         empty = Cloud(np.empty((0, 3)), {c.name: np.empty(0, c.dtype) for c in cloud.table})
         current = first
-        stop = len(self) if stop is None else stop
         for chunk in cloud.chunks(_PIECE, cloud.row_of(int(self.scans[first])) if first else 0):
             sweep = np.searchsorted(self.scans, chunk["scan"], "right") - 1
             if sweep[0] < current or sweep[-1] >= len(self) or (np.diff(sweep) < 0).any():
@@ -482,16 +586,6 @@ class _SensorSweeps(NamedTuple):
     first_steps: Ints  # (n,): first time step of each sweep, counted from the start of its station
 
 
-class _ActorSweeps(NamedTuple):
-    """Actors during n sweeps, in fields of `Sweeps`."""
-
-    poses: SweepPoses  # (a, n)
-    velocities: Floats  # (a, n, 3)
-    bounds: Floats  # (a, 2, 3)
-    present: Bools  # (a, n)
-    comes: Bools  # (a, n)
-
-
 def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     """Return the sweeps of the sensor `number` of a survey."""
     path = survey.path
@@ -508,50 +602,6 @@ def _sensor_sweeps(survey: Survey, number: int) -> _SensorSweeps:
     cast_scans = np.array([spec.scan + spec.ahead for spec in specs])  # repeated if frozen
     first_steps = (cast_scans - firsts[0]) % survey.steps_each[number]
     return _SensorSweeps(np.concatenate(positions), np.concatenate(rotations), first_steps)
-
-
-def _actor_sweeps(scene: Scene, starts_ns: Floats, stops_ns: Floats) -> _ActorSweeps:
-    """Return the actors of a scene at the starts of sweeps, and whether they are there.
-
-    An actor that appears after the start of a sweep, or that has left, has the pose that it would
-    have if it moved as fast as at that moment, with the same rotation: its boxes then move evenly
-    from sweep to sweep.
-    """
-    poses = []
-    linear = []
-    present = []
-    comes = []
-    bounds = [actor.bounds for actor in scene.actors]
-    for actor, (lower, upper) in zip(scene.actors, bounds, strict=True):
-        appears_ns, leaves_ns = presence_ns(actor.trajectory)
-        times_ns = _times_of_presence(starts_ns, appears_ns, leaves_ns)
-        positions, rotations = full_poses(actor.trajectory, 0, times_ns)
-        speeds, rates = velocities(actor.trajectory, 0, times_ns)
-        beyond_s = (starts_ns - times_ns)[:, None] / 1e9
-        poses.append(_poses_of(positions + speeds * beyond_s + scene.origin, rotations))
-        lever_arms = applied(rotations, (lower + upper) / 2)
-        linear.append(speeds + cross(rates.T, lever_arms.T).T)
-        present.append((appears_ns <= starts_ns) & (starts_ns <= leaves_ns))
-        comes.append((starts_ns < appears_ns) & (appears_ns <= stops_ns))
-    count = len(starts_ns)
-    return _ActorSweeps(
-        SweepPoses(
-            np.reshape([pose.positions for pose in poses], (-1, count, 3)),
-            np.reshape([pose.quaternions for pose in poses], (-1, count, 4)),
-        ),
-        np.reshape(linear, (-1, count, 3)),
-        np.reshape(bounds, (-1, 2, 3)),
-        np.array(present, bool).reshape(-1, count),
-        np.array(comes, bool).reshape(-1, count),
-    )
-
-
-def _times_of_presence(times_ns: Floats, appears_ns: float, leaves_ns: float) -> Floats:
-    """Return the nearest times (n,) at which an actor is in the scene, within the rounding."""
-    # A trajectory may be said to end by a clock of seconds since 1970, in steps of 2.4e-7 s.
-    margin_ns = min(1e9 * CLOCK_S, (leaves_ns - appears_ns) / 2)
-    present = (appears_ns <= times_ns) & (times_ns <= leaves_ns)
-    return np.where(present, times_ns, times_ns.clip(appears_ns + margin_ns, leaves_ns - margin_ns))
 
 
 def _fired_rays(survey: Survey, first_steps: list[Ints]) -> FiredRays | None:

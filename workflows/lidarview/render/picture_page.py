@@ -325,8 +325,10 @@ class Page:
         } | options
         axes.set_title(text, loc="left", parse_math=False, **style)
 
-    def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
-        """Draw a legend of (name, colour) in the right margin.
+    def legend(
+        self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor", **options: Any
+    ) -> None:
+        """Draw a legend of (name, colour) in the right margin, with options of `key`.
 
         The last line counts the rest.
 
@@ -353,6 +355,7 @@ class Page:
                 for marker, name, colour in rows
             ],
             size,
+            **options,
         )
 
     def key(

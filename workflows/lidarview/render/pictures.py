@@ -61,7 +61,7 @@ def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     if is_visible.sum() > LEGEND_ROWS:
         order.sort(key=lambda k: k < first and counts[k] == 1)  # then copies
     entries = [(labels[k], colours[firsts[k]]) for k in order if is_visible[k]]
-    page.legend(entries, "Sensor" if len(shot.sensors) or shot.paths else "")
+    page.legend(entries, _sensor_label(shot))
     page.title("Scene", f"{words} · {shot.caption}", shot.models)
     return page
 
@@ -91,8 +91,17 @@ def draw_hits(
     axes = page.show(shot, shot.divided(pieces, owner).paint(colours, 0.5))
     page.lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(*limits), HITS_TITLE)
+    if label := _sensor_label(shot):
+        page.legend([], label, bbox_to_anchor=(0.842, 0.18))  # below the colour bar
     page.title("Hits", f"{plural(round(hit_counts.sum()), 'hit')} · {shot.caption}", shot.models)
     return page
+
+
+def _sensor_label(shot: SurfaceView) -> str:
+    """Return the entry of a legend for the marks of sensors; empty if there are none."""
+    if shot.paths:
+        return "Sensor path"
+    return "Sensor position" + "s" * (len(shot.sensors) > 1) if len(shot.sensors) else ""
 
 
 def _choose_rays(shot: SurfaceView, sample_rays: AnyFloats) -> AnyFloats:
@@ -130,7 +139,7 @@ def draw_cloud(
         positions = cloud.positions - shot.scene.origin
         image = with_points(image, shot, positions, coloured.paint(values), solid)
         if coloured.limits is None:
-            page.legend(coloured.labels)
+            page.legend(coloured.labels, _sensor_label(shot))
         else:
             unit = f" ({coloured.unit})"
             if not coloured.unit:

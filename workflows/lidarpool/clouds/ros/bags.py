@@ -36,7 +36,7 @@ from lidarsim.columns.bags import (
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.motion.bag_trajectories import read_bag
 from lidarsim.motion.trajectory import Track
-from lidarsim.sweeps.sweeps import AS_FIRED, COMPENSATED, Sweeps
+from lidarsim.sweeps.sweeps import Sweeps
 
 from .. import sweep_reader
 from ..frame_names import survey_start_ns
@@ -67,14 +67,15 @@ def write_rosbag2(
     layout: str,
     compensated: bool = False,
     organized: bool = False,
+    pose_rate_hz: float | None = None,
 ) -> None:
     """Write a bag, a folder for `ros2 bag play`, with the parameters of `write_mcap`."""
     laid_out = LaidOut(layout, compensated, organized)
     # Readers of Humble accept no later version: from 9 on, profiles are lists.
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
-        bag.set_custom_data("lidarpool", COMPENSATED if laid_out.compensated else AS_FIRED)
+        bag.set_custom_data("lidarpool", sweeps.frame_text(compensated=compensated))
         topics: dict[str, Any] = {}
-        for message in survey_messages(cloud, sweeps, laid_out):
+        for message in survey_messages(cloud, sweeps, laid_out, pose_rate_hz):
             if message.topic not in topics:
                 latched = (_LATCHED,) if message.topic in LATCHED_TOPICS else ()
                 topics[message.topic] = bag.add_connection(
@@ -93,13 +94,16 @@ def write_mcap(
     layout: str,
     compensated: bool = False,
     organized: bool = False,
+    pose_rate_hz: float | None = None,
 ) -> None:
     """Write an MCAP file.
 
     Each sweep is a PointCloud2 on `/NAME/points`, NAME from its sensor, or on `/points`. Points are
     in the sensor frame at their own firing, as drivers publish them, and have times; or
     compensated, in the sensor frame at the start of the sweep, without times. `/tf` has the frames
-    of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep;
+    of the carrier (`base_link`) and of actors in `map`, and `/clock` the time, both at each sweep.
+    `/tf` also has the frames at the end of the last sweep of each station, so that this sweep can
+    be deskewed, and with `pose_rate_hz` frames while the sweeps of the first sensor last.
     `/tf_static` has the sensors on the carrier, `/label_info` names of classes and `/material_info`
     names of materials (LabelInfo of vision_msgs). The survey begins at its start, or at `START_NS`
     without one. `/actors` has a MarkerArray of the boxes of actors at the start of each sweep.
@@ -128,7 +132,7 @@ def write_mcap(
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
-        write_rosbag2(folder, cloud, sweeps, layout, compensated, organized)
+        write_rosbag2(folder, cloud, sweeps, layout, compensated, organized, pose_rate_hz)
         (written,) = folder.glob("*.mcap")
         written.replace(path)
     finally:

@@ -11,7 +11,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from lidarsim.base.arrays import Floats32, Records
+from lidarsim.base.arrays import Floats32, Ints, Records
 from lidarsim.columns.bags import POINT_FIELDS
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.instruments import GNSS_FILE, IMU_FILE, Instruments
@@ -42,6 +42,8 @@ class Serialised(NamedTuple):
     cdr: bytes
 
 
+# The last frame is later than the last point, whose time some layouts round up.
+_ROUNDING_NS = 1000
 LATCHED_TOPICS = ("/tf_static", "/label_info", "/material_info")  # kept for late readers
 # Messages of vision_msgs, which rosbags lacks.
 _LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
@@ -57,9 +59,12 @@ def message_store() -> Typestore:
     return store
 
 
-def survey_messages(cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut) -> Iterator[RosMessage]:
+def survey_messages(
+    cloud: CloudLike, sweeps: Sweeps, laid_out: LaidOut, pose_rate_hz: float | None = None
+) -> Iterator[RosMessage]:
     """Yield the messages of a cloud, in the order of their times."""
-    messages = SurveyMessages(sweeps, laid_out, {column.name for column in cloud.table})
+    columns = {column.name for column in cloud.table}
+    messages = SurveyMessages(sweeps, laid_out, columns, pose_rate_hz)
     measured = messages.instruments()
     waiting = next(measured, None)
     yield from messages.static()
@@ -85,9 +90,18 @@ class SurveyMessages:
         How points are laid out.
     columns
         Names of the columns of the cloud.
+    pose_rate_hz
+        Frames per second on `/tf` while a sweep of the first sensor lasts; by default only those at
+        the starts of sweeps and at the end of the last.
     """
 
-    def __init__(self, sweeps: Sweeps, laid_out: LaidOut, columns: Collection[str]) -> None:
+    def __init__(
+        self,
+        sweeps: Sweeps,
+        laid_out: LaidOut,
+        columns: Collection[str],
+        pose_rate_hz: float | None = None,
+    ) -> None:
         self._make = _Messages(message_store().types)
         self._sweeps = sweeps
         self._laid_out = laid_out
@@ -104,6 +118,9 @@ class SurveyMessages:
         # Carrier and actors: frame and poses.
         self._moving = [(CARRIER, sweeps.carrier), *zip(self._actors, poses, strict=True)]
         self._start_ns = survey_start_ns(sweeps)
+        self._pose_rate_hz = pose_rate_hz
+        sweeps_per_sensor = np.bincount(sweeps.sensor, minlength=1)[sweeps.sensor]
+        self._sweeps_per_station = sweeps_per_sensor // sweeps.stations  # (n,), of each sensor
 
     def sweep_start_ns(self, sweep: int) -> int:
         """Return the start of a sweep, nanoseconds since 1970."""
@@ -138,7 +155,7 @@ class SurveyMessages:
         return _sent("/clock", clock(self._make.stamp(time_ns)), time_ns)
 
     def of_sweep(self, sweep: int, points: Cloud) -> Iterator[RosMessage]:
-        """Yield the messages of a sweep, which are sent at its start."""
+        """Yield the messages of a sweep, which are sent at its start, and frames while it lasts."""
         sweeps = self._sweeps
         time_ns = self.sweep_start_ns(sweep)
         yield _sent("/tf", self._make.transforms(self._frames_in_world(sweep), time_ns), time_ns)
@@ -148,6 +165,7 @@ class SurveyMessages:
         if self._actors:
             boxes = Boxes.from_points(sweeps, sweep, points)
             yield _sent("/actors", self._make.markers(boxes, self._actors, time_ns), time_ns)
+        yield from self._frames_within(sweep)
 
     def _measured(self, sweep: int, points: Cloud) -> dict[str, Any]:
         """Return the messages of a sensor's sweep, by the last part of their topics."""
@@ -187,6 +205,40 @@ class SurveyMessages:
             for (name, poses), is_present in zip(self._moving, present, strict=True)
             if is_present
         ]
+
+    def _frames_within(self, sweep: int) -> Iterator[RosMessage]:
+        """Yield the frames of the carrier and of actors after the start of a sweep."""
+        sweeps = self._sweeps
+        since_ns = self._pose_times(sweep)
+        if not len(since_ns):
+            return
+        shares = since_ns / sweeps.span_ns(sweep)
+        frames = [(CARRIER, sweeps.carrier_within(sweep, shares))]
+        stays = sweeps.actor_there[:, sweep] & ~sweeps.actor_leaves[:, sweep]
+        frames += [
+            (self._actors[actor], sweeps.actor_within(actor, sweep, shares))
+            for actor in np.flatnonzero(stays).tolist()
+        ]
+        for index, time_ns in enumerate((self.sweep_start_ns(sweep) + since_ns).tolist()):
+            in_world = [(WORLD, name, poses, index) for name, poses in frames]
+            yield _sent("/tf", self._make.transforms(in_world, time_ns), time_ns)
+
+    def _pose_times(self, sweep: int) -> Ints:
+        """Return the times of frames after the start of a sweep, (k,), ns since its start."""
+        sweeps = self._sweeps
+        span_ns = sweeps.span_ns(sweep)
+        times_ns = np.empty(0, np.int64)
+        if span_ns and self._pose_rate_hz and sweeps.sensor[sweep] == 0:
+            interval_ns = 1e9 / self._pose_rate_hz
+            count = int(np.ceil(span_ns / interval_ns)) - 1
+            times_ns = np.rint(interval_ns * np.arange(1, count + 1)).astype(np.int64)
+        if span_ns and (sweeps.numbers[sweep] + 1) % self._sweeps_per_station[sweep] == 0:
+            end_ns = int(span_ns) + _ROUNDING_NS
+            if sweep + 1 < len(sweeps) and sweeps.sensor[sweep + 1] == sweeps.sensor[sweep]:
+                next_ns = round(sweeps.begins_ns[sweep + 1] - sweeps.begins_ns[sweep])
+                end_ns = min(end_ns, next_ns - 1)  # the carrier is at the next station then
+            times_ns = np.append(times_ns, end_ns)
+        return times_ns
 
     def _point_cloud(self, rows: Records, header: Any) -> Any:
         """Return the PointCloud2 of points (height, width)."""

@@ -84,6 +84,7 @@ class PipelineJob(CommittedJob):
                 hit_count=int(summary["hits"]),
                 count=int(summary["points"]),
                 samples=samples[~np.isnan(samples[:, 0])],
+                _triangles=self.scene.triangles,
                 _survey=survey,
                 _read=self.points_of_scan,
             )

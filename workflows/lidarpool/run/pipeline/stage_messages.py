@@ -11,7 +11,8 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
-from lidarsim.base.arrays import Floats32
+from lidarsim.base.arrays import Floats32, Ints
+from lidarsim.base.errors import LidarError
 from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.value_texts import one_line
 from lidarsim.columns.cloud import Cloud
@@ -191,6 +192,7 @@ class ScanFrame:
     hit_count: int
     count: int
     samples: Floats32
+    _triangles: int = field(repr=False, compare=False)  # of the scene, with instances and actors
     _survey: Survey = field(repr=False, compare=False)
     _read: Callable[[int], Cloud] = field(repr=False, compare=False)
     __repr__ = one_line
@@ -199,6 +201,11 @@ class ScanFrame:
     def pose(self) -> Pose:
         """Pose of the sensor at the start of the scan, in the scene's local coordinates."""
         return self._survey.pose(self.scan)
+
+    @property
+    def time_ns(self) -> float:
+        """Start of the scan, nanoseconds since the start of the survey."""
+        return self._survey.begins_ns(self.scan)
 
     def points(self) -> Cloud:
         """Points of this scan, read from its part.
@@ -209,3 +216,35 @@ class ScanFrame:
             If the part cannot be read, such as after a run that was not kept.
         """
         return self._read(self.scan)
+
+    def hit_counts(self) -> Ints:
+        """Count the hits of this scan on each triangle of the scene.
+
+        Returns
+        -------
+        int64 (triangles,), for `Scene.faces`, then the triangles of each instance, then those of
+        each actor.
+
+        Raises
+        ------
+        LidarError
+            If the survey lacks the column `triangle` or thins out its hits, or as `points`.
+
+        Examples
+        --------
+        >>> def on_frame(frame):
+        ...     total += frame.hit_counts()     # colors of the faces in a live figure
+        """
+        survey = self._survey
+        if survey.keep_every > 1:
+            raise LidarError(
+                f"Hits of a frame cannot be counted, because the survey keeps only one of every "
+                f"{survey.keep_every} hits. Set `keep_every` to 1."
+            )
+        if all(column.name != "triangle" for column in survey.stored_columns):
+            raise LidarError(
+                "Hits of a frame cannot be counted without the column `triangle`. Add it to the "
+                "`columns` of the survey."
+            )
+        triangle = self.points()["triangle"]
+        return np.bincount(triangle[triangle >= 0], minlength=self._triangles)

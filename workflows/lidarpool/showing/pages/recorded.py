@@ -298,6 +298,7 @@ def recorded_sweeps(
         actor_bounds=np.zeros((0, 2, 3)),
         actor_there=np.zeros((0, count), np.bool_),
         actor_comes=np.zeros((0, count), np.bool_),
+        actor_leaves=np.zeros((0, count), np.bool_),
         coordinates="sensor" if any(pose is None for pose in poses) else "world",
         precision_m=0.001,
     )

@@ -31,7 +31,7 @@ class Ros2Bridge(Bridge):
     from `/clock` (`use_sim_time`), unless it is played at today's time.
     """
 
-    settings: ClassVar[tuple[str, ...]] = ("layout", "organized")
+    settings: ClassVar[tuple[str, ...]] = ("layout", "organized", "pose_rate_hz")
 
     def __init__(
         self,
@@ -54,7 +54,12 @@ class Ros2Bridge(Bridge):
     def format_of(cls, settings: Mapping[str, Any]) -> Format:
         """Return the format of bags with the same messages."""
         organized = bool(settings.get("organized"))
-        return Format("mcap", settings.get("layout", "velodyne"), organized=organized)
+        return Format(
+            "mcap",
+            settings.get("layout", "velodyne"),
+            organized=organized,
+            pose_rate_hz=settings.get("pose_rate_hz"),
+        )
 
     @property
     def description(self) -> str:
@@ -108,7 +113,10 @@ class Ros2Bridge(Bridge):
         """Return the messages of a lap, whose times are `shift_ns` later."""
         start_ns = survey_start_ns(self.sweeps) + shift_ns
         return SurveyMessages(
-            replace(self.sweeps, start_ns=start_ns), self._laid_out, self._columns
+            replace(self.sweeps, start_ns=start_ns),
+            self._laid_out,
+            self._columns,
+            self._format.pose_rate_hz,
         )
 
     def _publish_between(self) -> None:
