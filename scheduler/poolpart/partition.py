@@ -274,8 +274,11 @@ class Partition:
         ordered
             Results in the order of the items, or as they complete.
         window
-            Tasks under way at most. By default two for each slot, whose number may change during
-            the map; of short tasks, if `chunk` is given, as many as take 0.2 s, up to 512.
+            Maximum number of tasks in flight. By default, enough that workers do not wait for the
+            client: two tasks for each slot or, if tasks are short, as many as take one second.
+            The number doubles when workers and client have waited for each other, as with a client
+            that computes between results, up to 512 tasks and 64 MiB of items and results. It
+            follows the number of slots.
         chunk
             Items in a task; by default as many as take a tenth of a second, or longer if there
             are many slots, and have a mebibyte. Give 1 if items differ much, or must not wait for
@@ -390,8 +393,9 @@ class Partition:
         wait
             False returns a future at once; a thread of this process submits the tasks.
         window
-            Tasks under way at most. By default two for each slot, whose number may change
-            meanwhile.
+            Maximum number of tasks in flight. By default two for each slot, and more if slots
+            become idle before this process can submit the next tasks, up to 16 for each slot. The
+            default follows the number of slots.
         priority, retries, slots
             Of each task, as in `submit`.
         empty_s
