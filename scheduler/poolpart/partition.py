@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import inspect
+import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from contextvars import ContextVar
@@ -553,8 +555,10 @@ class Partition:
     def __enter__(self) -> Self:
         """Run everything that is computed or submitted in the block on these workers.
 
-        This covers `compute` and `persist` of Dask collections, `dask.compute`, and `Client.submit`
-        and `Client.map` of this partition's client, in this thread. Each task takes a slot.
+        This covers `compute` and `persist` of Dask collections, including dataframes,
+        `dask.compute`, and `Client.submit` and `Client.map` of this partition's client, in this
+        thread. Each task takes a slot. A dataframe that is created in the block and computed after
+        it runs on any worker.
 
         Examples
         --------
@@ -562,6 +566,10 @@ class Partition:
         ...     total = dask.array.ones(10**9).sum().compute()
         """
         resources = self._taking(1)
+        # Dataframes ignore annotations when they are created, and Dask warns of it once. It does
+        # apply annotations to all tasks when they are computed, as in this block.
+        annotations = {"resources": resources}
+        warnings.filterwarnings("ignore", re.escape(f"Dask annotations {annotations} detected."))
         with ExitStack() as stack:
             stack.enter_context(self.client.as_current())
             stack.enter_context(dask.annotate(resources=resources))
