@@ -91,7 +91,9 @@ def test_of_a_collection_that_a_partition_computes(start):
     assert "poolpart-inherit" not in client.cluster.scheduler.plugins
 
 
-@pytest.mark.parametrize("make", [shuffled, without_a_shuffle])
+@pytest.mark.parametrize(
+    "make", [pytest.param(shuffled, marks=pytest.mark.extended), without_a_shuffle]
+)
 def test_dataframes_stay_in_a_partition_without_a_false_alarm(start, monkeypatch, make):
     pytest.importorskip("pyarrow")
     collection = pytest.importorskip("dask.dataframe.dask_expr._collection")
