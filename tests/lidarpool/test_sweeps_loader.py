@@ -223,8 +223,8 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     told(lambda: lidarpool.sweeps(place), "is an unfinished data set: .*--resume")
     written("parquet"), written("mcap")
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
-    told(lambda: lidarpool.sweeps(written("parquet")), r'pip install "\.\[parquet\]"')
-    told(lambda: lidarpool.sweeps(written("mcap")), r'pip install "\.\[ros\]"')
+    told(lambda: lidarpool.sweeps(written("parquet")), r'pip install -e "\.\[parquet\]"')
+    told(lambda: lidarpool.sweeps(written("mcap")), r'pip install -e "\.\[ros\]"')
 
 
 @pytest.mark.parametrize(

@@ -108,8 +108,8 @@ def test_rules_for_a_partition_that_workers_were_started_with(start):
     with pytest.raises(PoolError, match=message):
         pool.divide({"CPU": n_workers(1), "OTHER": rest()})
     message = (
-        r"0 of 3 are left for it\. Start more, or list it first\. 2 declare the resource CPU already,"
-        r".* dissolve their partitions\. .* give a rule with minimum=0, and call resize with source\."
+        r"0 of 3 are left for it\. Start more, or list it first\. 2 declare the resource CPU "
+        r"already, .* dissolve their partitions\. .* with minimum=0, and call resize with source\."
     )
     with pytest.raises(PoolError, match=message):
         pool.divide({"ALL": n_workers(1), "OTHER": n_workers(1)})
