@@ -461,15 +461,16 @@ class Results(Iterator[Any]):
             return Chunk(first, rows[:size])
         if not fresh:
             return None
-        rows: list[Row] = []
+        longest_s = math.inf if any(stage.chunk for stage in self._stages) else SEND_S
+        taken: list[Row] = []
         started = time.monotonic()
         for row in islice(self._source, size):
-            rows.append(row)
-            if time.monotonic() - started > SEND_S:
+            taken.append(row)
+            if time.monotonic() - started > longest_s:
                 break
         first = self._items_read
-        self._items_read += len(rows)
-        return Chunk(first, rows) if rows else None
+        self._items_read += len(taken)
+        return Chunk(first, taken) if taken else None
 
     def _target_s(self) -> float:
         return max(CHUNK_S, CHUNK_S_PER_SLOT * max(self._slots))

@@ -32,11 +32,11 @@ def second_copy() -> str:
             )
     if _is_chosen(root, os.environ):
         return ""
-    for other in (_editable_checkout(), _checkout_of(Path.cwd())):
-        if other not in (None, root):
+    for checkout in (_editable_checkout(), _checkout_of(Path.cwd())):
+        if checkout not in (None, root):
             return (
                 f"There are two copies of lidarpool: it is imported from {root}, so that changes "
-                f"in {other} have no effect. {_REMEDY}"
+                f"in {checkout} have no effect. {_REMEDY}"
             )
     return ""
 
