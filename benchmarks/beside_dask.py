@@ -236,7 +236,7 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     if options.quick:
         options.pairs = options.wide_pairs = 1
         options.tasks = options.wide_tasks = 100
-        options.short_pairs = 1
+        options.short_pairs = options.busy = 1
         options.short_tasks = 10
         options.trips = 20
         options.workers = 4
@@ -245,7 +245,7 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     def row(name: str, work: Work, clusters: Clusters, count: int, pairs: int) -> None:
         rows[name] = figures = compare(work, clusters, count, pairs)
         print(
-            f"{name:<12} processor {figures['processor_us']:7.0f} µs, beside Dask "
+            f"{name:<14} processor {figures['processor_us']:7.0f} µs, beside Dask "
             f"{figures['processor_us_dask']:7.0f} ({figures['processor_ratio']:.3f}); elapsed "
             f"{figures['wall_us']:7.0f} µs, beside {figures['wall_us_dask']:7.0f} "
             f"({figures['wall_ratio']:.3f})",
