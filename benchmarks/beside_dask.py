@@ -6,6 +6,9 @@ poolpart, in turn. The schedulers are processes of their own.
 - `submit`: `Partition.submit` beside `Client.submit(resources=)`;
 - `map`: `Partition.map(chunk=1)` beside `Client.map(resources=)` and `gather`; `map_items` the
   same without `chunk`, so that several items share a task;
+- `busy_map`: 300 tasks that sleep 50 ms, on two slots, while other processes keep all cores busy;
+  `busy_map_slow` the same for a client that sleeps 20 ms after each result, and `quiet_map` and
+  `quiet_map_slow` without the other processes;
 - `pipe`: round trips of an item through a task, by two `Pipe`s beside two `Queue`s;
 - `wide_submit` and `wide_map`: 20,000 tasks over 200 workers, which are threads of one process.
 
@@ -20,9 +23,12 @@ from __future__ import annotations
 import argparse
 import gc
 import json
+import os
 import statistics
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -107,6 +113,42 @@ def map_work(clusters: Clusters, chunk: int | None) -> Work:
     return Work(ours, theirs)
 
 
+def sleep_briefly(_: int) -> None:
+    """Do a short task, which takes no processor time."""
+    time.sleep(0.05)
+
+
+def short_map_work(clusters: Clusters, client_sleeps_s: float) -> Work:
+    """Return a map of short tasks, each on both slots of a worker, so that two run at a time."""
+
+    def read(results: Iterable[Any]) -> None:
+        for _ in results:
+            time.sleep(client_sleeps_s)
+
+    def ours(count: int) -> None:
+        read(clusters.partition.map(sleep_briefly, range(count), slots=SLOTS))
+
+    def theirs(count: int) -> None:
+        both = {NAME: SLOTS}
+        futures = clusters.plain.map(sleep_briefly, range(count), resources=both, pure=False)
+        read(future.result() for future in futures)
+
+    return Work(ours, theirs)
+
+
+@contextmanager
+def busy_cores(count: int) -> Iterator[None]:
+    """Keep a number of cores busy."""
+    command = [sys.executable, "-c", "while True: pass"]
+    processes = [subprocess.Popen(command) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for burning in processes:
+            burning.kill()
+            burning.wait()
+
+
 def echo(incoming: Any, outgoing: Any, count: int) -> None:
     """Pass items on, in a task."""
     for _ in range(count):
@@ -182,6 +224,9 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     parser.add_argument("--pairs", type=int, default=9)
     parser.add_argument("--tasks", type=int, default=4_000, help="of submit and map, in each half")
     parser.add_argument("--trips", type=int, default=1_000, help="round trips of an item")
+    parser.add_argument("--short-tasks", type=int, default=300, help="of 50 ms, in each half")
+    parser.add_argument("--short-pairs", type=int, default=5)
+    parser.add_argument("--busy", type=int, default=os.cpu_count(), help="processes beside them")
     parser.add_argument("--workers", type=int, default=200, help="of the wide clusters")
     parser.add_argument("--wide-tasks", type=int, default=20_000)
     parser.add_argument("--wide-pairs", type=int, default=3)
@@ -191,6 +236,8 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     if options.quick:
         options.pairs = options.wide_pairs = 1
         options.tasks = options.wide_tasks = 100
+        options.short_pairs = options.busy = 1
+        options.short_tasks = 10
         options.trips = 20
         options.workers = 4
     rows: dict[str, dict[str, float]] = {}
@@ -198,7 +245,7 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
     def row(name: str, work: Work, clusters: Clusters, count: int, pairs: int) -> None:
         rows[name] = figures = compare(work, clusters, count, pairs)
         print(
-            f"{name:<12} processor {figures['processor_us']:7.0f} µs, beside Dask "
+            f"{name:<14} processor {figures['processor_us']:7.0f} µs, beside Dask "
             f"{figures['processor_us_dask']:7.0f} ({figures['processor_ratio']:.3f}); elapsed "
             f"{figures['wall_us']:7.0f} µs, beside {figures['wall_us_dask']:7.0f} "
             f"({figures['wall_ratio']:.3f})",
@@ -210,6 +257,11 @@ def main(arguments: list[str] | None = None) -> dict[str, dict[str, float]]:
         row("map", map_work(clusters, 1), clusters, options.tasks, options.pairs)
         row("map_items", map_work(clusters, None), clusters, options.tasks, options.pairs)
         row("pipe", pipe_work(clusters), clusters, options.trips, options.pairs)
+        for load, busy in ("quiet", 0), ("busy", options.busy):
+            for name, client_sleeps_s in (f"{load}_map", 0.0), (f"{load}_map_slow", 0.02):
+                work = short_map_work(clusters, client_sleeps_s)
+                with busy_cores(busy):
+                    row(name, work, clusters, options.short_tasks, options.short_pairs)
     with wide_clusters(options.workers) as clusters:
         row("wide_submit", submit_work(clusters), clusters, options.wide_tasks, options.wide_pairs)
         row("wide_map", map_work(clusters, 1), clusters, options.wide_tasks, options.wide_pairs)

@@ -169,7 +169,8 @@ def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
     return (
         f"Workers were started with the resource {name!r}, and the rule does not take all of them "
         f"({names_of(members)} would be left): {use}, or give a rule that takes all, such as "
-        "rest(), or another name."
+        "rest(), or another name. A partition of another name, with minimum=0, takes workers from "
+        f"{name!r} by resize(1, source={name!r})."
     )
 
 

@@ -27,6 +27,7 @@ from distributed.protocol.pickle import dumps, loads
 
 from .errors import PoolError
 from .internals.client import gather, slots_lent, when_done
+from .map_lead import Lead
 from .membership import Prospects, prospects
 from .worker_wait import WAIT_S, WorkerWait, check_wait
 
@@ -34,9 +35,11 @@ logger = logging.getLogger(__name__)
 
 NOTE = "poolpart: "  # how the notes that name a failed item start
 MOST_ITEMS = 1024
-MOST_TASKS = 512  # under way, unless there are more slots: then two a slot
+MOST_TASKS = 512  # in flight, unless there are more slots: then two a slot
 GROWTH = 4  # most items in a chunk, in multiples of those that have come back
 MOST_BYTES = 2**20
+MOST_BYTES_IN_FLIGHT = 64 * 2**20  # of all tasks, unless two tasks a slot have more
+SEND_S = 0.05  # longest time for which items of a slow iterable are held back
 LOOK_S = 5.0  # between looks at the number of slots
 CHUNK_S = 0.1  # target time of a task …
 CHUNK_S_PER_SLOT = 0.005  # … or longer with many slots, so that the scheduler keeps up
@@ -59,7 +62,7 @@ class ChunkResult:
     """Result of a chunk."""
 
     results: list[Any]  # at least one; results of all items, unless one failed or time was up
-    seconds: float  # seconds from start to end
+    seconds: tuple[float, ...]  # from start to end, by stage
     nbytes: int  # estimated size of items and results
 
     def __sizeof__(self) -> int:
@@ -126,9 +129,8 @@ def run_chunk(
             results.append(_sendable(error))
         if time.perf_counter() - start > patience_s:
             break
-    seconds = time.perf_counter() - start
-    if previous is not None:
-        seconds += previous.seconds
+    before = () if previous is None else previous.seconds
+    seconds = (*before, time.perf_counter() - start)
     return ChunkResult(results, seconds, sizeof(calls) + sizeof(results))
 
 
@@ -184,7 +186,15 @@ class ChunkSize:
         """Return the number of items for the next chunk."""
         by_time = target_s / max(self._item_s, 1e-9)
         by_bytes = MOST_BYTES / max(self._item_bytes, 1.0)
-        return int(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
+        return round(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
+
+    def chunks(self, items: int, seconds: float, nbytes: int) -> int:
+        """Return how many chunks of so many items take `seconds`, or have `nbytes` in all."""
+        if not self._tried:
+            return 0
+        by_time = seconds / max(items * self._item_s, 1e-9)
+        by_bytes = nbytes / max(items * self._item_bytes, 1.0)
+        return int(min(by_time, by_bytes))
 
 
 @dataclass(frozen=True)
@@ -268,6 +278,7 @@ class Results(Iterator[Any]):
         self._items_read = 0  # items read from the source
         self._unfinished: list[tuple[int, Sequence[Row]]] = []  # heap of items to be sent again
         self._size = ChunkSize()
+        self._lead = Lead()
         self._running: dict[Future, Chunk] = {}
         self._ended: queue.SimpleQueue[Future] = queue.SimpleQueue()  # tasks that were sent
         # {index of the first item: a chunk that has ended, and its result or the failed task}
@@ -363,11 +374,19 @@ class Results(Iterator[Any]):
         if not self._running:
             self._submit()
         if self._running:
+            self._look_for_idle_slots()
             self._take_back(self._wait())
             self._deliver()
             self._submit()
         else:
             self.close()
+
+    def _look_for_idle_slots(self) -> None:
+        """Grow if the client is about to wait while slots idle, as behind a slow item, in order."""
+        in_flight = len(self._running) - self._ended.qsize()
+        if self._ended.empty() and in_flight < max(self._slots):
+            self._lead.grow()
+            self._submit()
 
     def _look(self) -> None:
         """Read the number of slots: partitions grow, shrink, and lose workers.
@@ -387,11 +406,21 @@ class Results(Iterator[Any]):
         # Avoid a message for each chunk; the tasks under way keep the slots busy.
         if self._running and free < window // 4:
             return
-        chunks: list[Chunk] = []
         # Chunks that came out of order take room as well, but not from earlier items.
         fresh = free - len(self._undelivered)
-        while len(chunks) < free and (chunk := self._next_chunk(size, len(chunks) < fresh)):
+        started = time.monotonic()
+        chunks: list[Chunk] = []
+        for number in range(free):
+            chunk = self._next_chunk(size, number < fresh)
+            if chunk is None:
+                break
             chunks.append(chunk)
+            if time.monotonic() - started > SEND_S:
+                self._run(chunks)
+                if self._ready or not self._ended.empty():
+                    return  # read results first, because items come slowly
+                chunks = []
+                started = time.monotonic()
         self._run(chunks)
 
     def _sizes(self) -> tuple[int, int]:
@@ -401,10 +430,10 @@ class Results(Iterator[Any]):
         slots = zip(self._stages, self._slots, strict=True)
         window = sum(stage.window or max(2, 2 * number) for stage, number in slots)
         if not any(stage.window for stage in self._stages):
-            # With smaller chunks than would be learned, as many items under way as with those:
-            # else workers wait for the next message, and messages take most of the time.
-            grown = min(MOST_TASKS // len(self._stages), window * learned // size)
-            window = max(window, grown)
+            slot_count = max(1, sum(self._slots))
+            # Work for the lead in each slot.
+            grown = self._size.chunks(size, slot_count * self._lead.seconds, MOST_BYTES_IN_FLIGHT)
+            window = max(window, min(grown, MOST_TASKS // len(self._stages)))
         return size, window
 
     def _run(self, chunks: Sequence[Chunk], previous_tasks: list[Future] | None = None) -> None:
@@ -432,10 +461,16 @@ class Results(Iterator[Any]):
             return Chunk(first, rows[:size])
         if not fresh:
             return None
-        rows = list(islice(self._source, size))
+        longest_s = math.inf if any(stage.chunk for stage in self._stages) else SEND_S
+        taken: list[Row] = []
+        started = time.monotonic()
+        for row in islice(self._source, size):
+            taken.append(row)
+            if time.monotonic() - started > longest_s:
+                break
         first = self._items_read
-        self._items_read += len(rows)
-        return Chunk(first, rows) if rows else None
+        self._items_read += len(taken)
+        return Chunk(first, taken) if taken else None
 
     def _target_s(self) -> float:
         return max(CHUNK_S, CHUNK_S_PER_SLOT * max(self._slots))
@@ -443,11 +478,13 @@ class Results(Iterator[Any]):
     def _wait(self) -> list[Future]:
         """Wait until tasks are done, and lend the slots of a task of a partition meanwhile."""
         ended: list[Future] = []
+        started = time.monotonic()
         with slots_lent(self._ended.empty()):
             while not ended:
                 self._check_while_waiting()
                 with suppress(queue.Empty):
                     ended.append(self._ended.get(timeout=1))
+        self._lead.count_wait(time.monotonic() - started)
         while not self._ended.empty():
             ended.append(self._ended.get())
         return ended
@@ -477,7 +514,16 @@ class Results(Iterator[Any]):
         for future, answer in zip(finished, answers, strict=True):
             chunk = self._running.pop(future)
             self._undelivered[chunk.first] = chunk, answer
-            self._size.learn(max(1, len(answer.results)), answer.seconds, answer.nbytes)
+            self._size.learn(max(1, len(answer.results)), sum(answer.seconds), answer.nbytes)
+            self._lead.count_task(self._busy_s(answer.seconds))
+        self._lead.review(self._sizes()[1])
+
+    def _busy_s(self, seconds: Sequence[float]) -> dict[str, float]:
+        """Return how long a task kept its slots busy, over their number, by partition."""
+        busy_s: dict[str, float] = {}
+        for stage, stage_s, slots in zip(self._stages, seconds, self._slots, strict=True):
+            busy_s[stage.partition] = busy_s.get(stage.partition, 0.0) + stage_s / max(1, slots)
+        return busy_s
 
     def _deliver(self) -> None:
         """Queue the results to be delivered next."""
@@ -491,7 +537,7 @@ class Results(Iterator[Any]):
                 if not _of_item(error):
                     self._failed = chunk, answer
                     return
-                answer = ChunkResult([error], 0.0, 0)
+                answer = ChunkResult([error], (), 0)
             count = len(answer.results)
             self._ready.extend(answer.results)
             self._next_item += count

@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import inspect
+import re
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from contextvars import ContextVar
@@ -274,8 +276,11 @@ class Partition:
         ordered
             Results in the order of the items, or as they complete.
         window
-            Tasks under way at most. By default two for each slot, whose number may change during
-            the map; of short tasks, if `chunk` is given, as many as take 0.2 s, up to 512.
+            Maximum number of tasks in flight. By default, enough that workers do not wait for the
+            client: two tasks for each slot or, if tasks are short, as many as take one second.
+            The number doubles when workers and client have waited for each other, as with a client
+            that computes between results, up to 512 tasks and 64 MiB of items and results. It
+            follows the number of slots.
         chunk
             Items in a task; by default as many as take a tenth of a second, or longer if there
             are many slots, and have a mebibyte. Give 1 if items differ much, or must not wait for
@@ -390,8 +395,9 @@ class Partition:
         wait
             False returns a future at once; a thread of this process submits the tasks.
         window
-            Tasks under way at most. By default two for each slot, whose number may change
-            meanwhile.
+            Maximum number of tasks in flight. By default two for each slot, and more if slots
+            become idle before this process can submit the next tasks, up to 16 for each slot. The
+            default follows the number of slots.
         priority, retries, slots
             Of each task, as in `submit`.
         empty_s
@@ -549,8 +555,10 @@ class Partition:
     def __enter__(self) -> Self:
         """Run everything that is computed or submitted in the block on these workers.
 
-        This covers `compute` and `persist` of Dask collections, `dask.compute`, and `Client.submit`
-        and `Client.map` of this partition's client, in this thread. Each task takes a slot.
+        This covers `compute` and `persist` of Dask collections, including dataframes,
+        `dask.compute`, and `Client.submit` and `Client.map` of this partition's client, in this
+        thread. Each task takes a slot. A dataframe that is created in the block and computed after
+        it runs on any worker.
 
         Examples
         --------
@@ -558,6 +566,10 @@ class Partition:
         ...     total = dask.array.ones(10**9).sum().compute()
         """
         resources = self._taking(1)
+        # Dataframes ignore annotations when they are created, and Dask warns of it once. It does
+        # apply annotations to all tasks when they are computed, as in this block.
+        annotations = {"resources": resources}
+        warnings.filterwarnings("ignore", re.escape(f"Dask annotations {annotations} detected."))
         with ExitStack() as stack:
             stack.enter_context(self.client.as_current())
             stack.enter_context(dask.annotate(resources=resources))

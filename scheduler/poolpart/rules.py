@@ -290,7 +290,10 @@ def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) 
         verb = "declares" if len(elsewhere) == 1 else "declare"
         advice = (
             f" {len(elsewhere)} {verb} the resource{'s' if len(resources) > 1 else ''} "
-            f"{', '.join(resources[:9])} already, and a worker belongs to one partition."
+            f"{', '.join(resources[:9])} already, and a worker belongs to one partition. To divide "
+            "the workers anew, dissolve their partitions. To move workers of a partition, even if "
+            "they were started with its resource, give a rule with minimum=0, and call resize with "
+            "source."
         )
     if not isinstance(rule, Named):
         return f"{len(free)} of {len(pool)} are left for it. Start more, or list it first.{advice}"

@@ -269,7 +269,7 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
         DataSet(Storage.at(tmp_path / "file"), "kitti").write_job(JobRow(0, "0"), job(0), sweeps)
     assert "\n" not in str(told.value)
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
-    with pytest.raises(LidarError, match=r'pip install "\.\[parquet\]"'):
+    with pytest.raises(LidarError, match=r'pip install -e "\.\[parquet\]"'):
         DataSet(place, "parquet").write_job(JobRow(0, "0"), job(0), sweeps)
 
 

@@ -1,12 +1,16 @@
 """What is to be fixed first in an environment."""
 
+import json
 import re
 import socket
 from contextlib import closing
+from importlib.metadata import PackageNotFoundError
+from types import SimpleNamespace
 
 import pytest
 
-from lidarpool.cli import doctor
+from lidarpool.base.software import PACKAGES
+from lidarpool.cli import doctor, installed_copies
 from lidarsim.base.extras import install_command
 from raybeam import installation
 
@@ -15,6 +19,7 @@ SOUND = {
     "gpus": [],
     "backends": {"cuda": "CuPy is not installed", "tiles": "ready"},
     "open3d": "ready",
+    "second_copy": "",
 }
 
 
@@ -33,6 +38,7 @@ def test_nothing_is_wrong_without_a_gpu():
         ),
         ({"machine": {"available_memory_gib": 0.4, "disk_gib": {}}}, "0.4 GiB of memory are free"),
         ({"machine": {"available_memory_gib": 9, "disk_gib": {"/tmp": 0.2}}}, "/tmp has 0.2 GiB"),
+        ({"second_copy": "There are two copies"}, "There are two copies"),
         ({"open3d": "it lacks libGL", "gpus": ["GPU-1"]}, "it lacks libGL"),
     ],
 )
@@ -61,8 +67,8 @@ def test_a_port_that_is_in_use(monkeypatch):
 def test_extras_are_added_in_the_checkout(monkeypatch):
     monkeypatch.setattr(installation, "find_spec", lambda name: "a spec")
     at = "in lidarpool's checkout (docs/install.md#extras)"
-    assert install_command("lidarpool[las]") == f'pip install ".[las]" {at}'
-    assert install_command("lidarpool") == f"pip install . {at}"
+    assert install_command("lidarpool[las]") == f'pip install -e ".[las]" {at}'
+    assert install_command("lidarpool") == f"pip install -e . {at}"
     assert install_command("torch") == "pip install torch"
     assert f"extras         added {at}" in doctor.in_words(doctor.examine())
 
@@ -74,5 +80,73 @@ def test_an_extra_that_is_missing_names_its_command(monkeypatch):
         lambda name: ["laspy>=2.5; extra == 'las'", "nowhere>=1; extra == 's3'", "numpy>=2"],
     )
     states = doctor._extras()
-    assert states["las"] == "ready" and states["s3"] == 'pip install ".[s3]"'
+    assert states["las"] == "ready" and states["s3"] == 'pip install -e ".[s3]"'
     assert "dev" not in states
+
+
+FOLDERS = {"raybeam": "kernels", "poolpart": "scheduler"}
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Return a function that fakes where packages are, and what is installed as editable."""
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    monkeypatch.chdir(tmp_path)
+    checkout = tmp_path / "checkout"
+    site = tmp_path / "site-packages"
+    for package in PACKAGES:
+        for folder in (checkout / FOLDERS.get(package, "workflows"), site):
+            (folder / package).mkdir(parents=True)
+            (folder / package / "__init__.py").touch()
+
+    def install(in_site=(), editable=False):
+        def find_spec(package):
+            in_checkout = checkout / FOLDERS.get(package, "workflows")
+            folder = site if package in in_site else in_checkout
+            return SimpleNamespace(origin=str(folder / package / "__init__.py"))
+
+        url = {"url": checkout.as_uri(), "dir_info": {"editable": True} if editable else {}}
+        found = SimpleNamespace(read_text=lambda name: json.dumps(url))
+        monkeypatch.setattr(installed_copies, "find_spec", find_spec)
+        monkeypatch.setattr(installed_copies, "distribution", lambda name: found)
+        return checkout, site
+
+    return install
+
+
+def test_a_copy_that_hides_an_editable_installation_is_reported(install):
+    install(editable=True)
+    assert installed_copies.second_copy() == ""
+    checkout, site = install(in_site=PACKAGES, editable=True)
+    assert installed_copies.second_copy() == (
+        f"There are two copies of lidarpool: it is imported from {site}, so that changes in "
+        f"{checkout} have no effect. Uninstall lidarpool, lidarsim, poolpart and raybeam, then run "
+        + install_command("lidarpool")
+    )
+
+
+def test_packages_of_several_folders_are_reported(install):
+    checkout, site = install(in_site=["raybeam"], editable=True)
+    assert (
+        f"raybeam is imported from {site}, and lidarpool from {checkout}. Uninstall"
+        in installed_copies.second_copy()
+    )
+
+
+def test_a_checkout_that_is_not_what_runs_is_reported_unless_it_was_chosen(install, monkeypatch):
+    checkout, site = install(in_site=PACKAGES)
+    assert installed_copies.second_copy() == ""
+    monkeypatch.chdir(checkout / "workflows")
+    assert f"changes in {checkout} have no effect" in installed_copies.second_copy()
+    monkeypatch.setenv("PYTHONPATH", str(site))
+    assert installed_copies.second_copy() == ""
+
+
+def test_packages_that_are_not_installed_have_no_second_copy(install, monkeypatch):
+    def fail(name):
+        raise PackageNotFoundError(name)
+
+    checkout, _ = install()
+    monkeypatch.setattr(installed_copies, "distribution", fail)
+    monkeypatch.chdir(checkout)
+    assert installed_copies.second_copy() == ""

@@ -539,7 +539,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     with pytest.raises(LidarError, match="gone does not exist: make it first"):
         Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
-    with pytest.raises(LidarError, match=r'laspy and lazrs: pip install "\.\[las\]"'):
+    with pytest.raises(LidarError, match=r'laspy and lazrs: pip install -e "\.\[las\]"'):
         Format("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}
 

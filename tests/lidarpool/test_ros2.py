@@ -263,5 +263,5 @@ def test_without_the_extra_the_error_says_what_to_install(monkeypatch):
             monkeypatch.setitem(sys.modules, name, None)
         elif name.startswith("lidarpool.showing.playback."):
             monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(LidarError, match=r'--as ros2 needs cyclonedds.*pip install "\.\[ros'):
+    with pytest.raises(LidarError, match=r'--as ros2 needs cyclonedds.*pip install -e "\.\[ros'):
         bridge_class("ros2")

@@ -228,7 +228,7 @@ def test_without_rasterio_names_and_codes_count(tmp_path, monkeypatch):
     for name in ("zone", "zone by code", "grid"):
         assert open_recording(paths[name]).notes == ()
     (note,) = open_recording(paths["equal areas"]).notes
-    assert "whose scale is taken as true" in note and 'pip install ".[geo]"' in note
+    assert "whose scale is taken as true" in note and 'pip install -e ".[geo]"' in note
     with pytest.raises(LidarError, match=r"by rasterio: .*\.\[geo\]"):
         scene_of_points(paths["wkt"], epsg=32632)
 

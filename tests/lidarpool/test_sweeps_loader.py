@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import pickle
@@ -9,6 +10,7 @@ import pydoc
 import shutil
 import threading
 import types
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import chain, pairwise
@@ -26,6 +28,7 @@ from lidarpool import LidarError, Scene, Sweep
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS
 from lidarpool.datasets.dataset import INDEX_FILE
+from lidarpool.recordings.opening import open_recording
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -223,8 +226,8 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     told(lambda: lidarpool.sweeps(place), "is an unfinished data set: .*--resume")
     written("parquet"), written("mcap")
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
-    told(lambda: lidarpool.sweeps(written("parquet")), r'pip install "\.\[parquet\]"')
-    told(lambda: lidarpool.sweeps(written("mcap")), r'pip install "\.\[ros\]"')
+    told(lambda: lidarpool.sweeps(written("parquet")), r'pip install -e "\.\[parquet\]"')
+    told(lambda: lidarpool.sweeps(written("mcap")), r'pip install -e "\.\[ros\]"')
 
 
 @pytest.mark.parametrize(
@@ -392,3 +395,17 @@ def test_without_torch(written, monkeypatch):
     monkeypatch.setattr("lidarpool.datasets.loader.find_spec", lambda name: None)
     with pytest.raises(LidarError, match="needs PyTorch: pip install torch"):
         lidarpool.sweeps(written("kitti")).torch()
+
+
+def test_bags_are_closed_with_the_data_set_or_recording_that_reads_them(written):
+    """Python warns of files that it has to close."""
+    data_set = written("mcap")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        saved = lidarpool.sweeps(data_set)
+        sweep = saved[0]
+        recording = open_recording(data_set / "bags/00.mcap", f"/{sweep.sensor}/points")
+        assert len(recording.read(0)[0]) == len(sweep.points) > 0
+        del saved, recording
+        gc.collect()
+    assert [str(warning.message) for warning in caught] == []

@@ -301,11 +301,11 @@ def test_a_port_of_thousands_of_digits_is_refused_in_a_line():
 def test_what_is_missing_names_its_extra(room, monkeypatch, tmp_path):
     monkeypatch.setattr("lidarpool.showing.viewers.viewer.find_spec", lambda name: None)
     scanner = Scanner(room, Sensor.grid(), backend="numpy")
-    with pytest.raises(LidarError, match=r'needs foxglove-sdk: pip install "\.\[live\]"'):
+    with pytest.raises(LidarError, match=r'needs foxglove-sdk: pip install -e "\.\[live\]"'):
         Foxglove(scanner)
-    with pytest.raises(LidarError, match=r'needs rerun-sdk: pip install "\.\[rerun\]"'):
+    with pytest.raises(LidarError, match=r'needs rerun-sdk: pip install -e "\.\[rerun\]"'):
         Rerun(scanner)
-    with pytest.raises(LidarError, match=r'needs foxglove-sdk: pip install "\.\[live\]"'):
+    with pytest.raises(LidarError, match=r'needs foxglove-sdk: pip install -e "\.\[live\]"'):
         simulate(room, Survey(poses=[(0, 0, 1)]), live="foxglove")
     scenario = write_scenario(tmp_path)
     outcome = CliRunner().invoke(cli, ["play", str(scenario), "--as", "foxglove"])

@@ -687,7 +687,7 @@ def test_without_ifcopenshell_a_line_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "find_spec", lambda name: None)
     path = tmp_path / "a.ifc"
     path.write_text("ISO-10303-21;\nEND-ISO-10303-21;\n")
-    with pytest.raises(LidarError, match=r"ifcopenshell reads: pip install \"\.\[ifc\]\""):
+    with pytest.raises(LidarError, match=r"ifcopenshell reads: pip install -e \"\.\[ifc\]\""):
         load_meshes(path)
 
 

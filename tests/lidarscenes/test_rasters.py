@@ -80,7 +80,7 @@ def upward_area(mesh):
 
 def test_without_the_library_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(rasters, "find_spec", lambda name: None)
-    with pytest.raises(LidarError, match=r'pip install "\.\[geo\]" in lidarpool'):
+    with pytest.raises(LidarError, match=r'pip install -e "\.\[geo\]" in lidarpool'):
         load_meshes(write(tmp_path / "m.tif"))
 
 

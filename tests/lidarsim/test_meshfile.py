@@ -290,7 +290,7 @@ def test_missing_and_folders(tmp_path):
 
 def test_without_the_library_of_openusd_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(usd, "find_spec", lambda name: None)
-    with pytest.raises(LidarError, match=r'pip install "\.\[usd\]" in lidarpool'):
+    with pytest.raises(LidarError, match=r'pip install -e "\.\[usd\]" in lidarpool'):
         load_meshes(write(tmp_path / "m.usda", "#usda 1.0\n"))
 
 
@@ -322,7 +322,7 @@ def test_formats_of_a_package_that_is_not_installed_name_it(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, more_formats.__name__, None)
     package = more_formats.__name__.partition(".")[0]
     with pytest.raises(
-        LidarError, match=f"{package} reads more: pip install \\. in lidarpool's checkout"
+        LidarError, match=f"{package} reads more: pip install -e \\. in lidarpool's checkout"
     ):
         load_meshes(write(tmp_path / "m.usd", "#usda 1.0"))
     assert len(load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)))) == 2

@@ -6,7 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from distributed import Client, Event, Queue, as_completed
+from distributed import Client, Event, Queue, as_completed, wait
 from tests.poolpart.helpers import LONG_S, join, leave, wait_for, worker_name
 
 from poolpart import Partition, Pipe, PipeClosed, PipeFailed, PoolError
@@ -41,6 +41,20 @@ def test_of_a_pipe_without_items(client, a, make_pipe):
     pipe.close()
     assert a.for_each(pipe, abs) == 0
     assert repr(a) == "<Partition 'A': 2 workers, 4 slots>"
+
+
+@pytest.mark.parametrize(("window", "counts"), [(None, [2, 4, 8, 16, 16, 4]), (3, [3] * 16 + [2])])
+def test_more_tasks_are_in_flight_if_slots_were_idle(b, monkeypatch, window, counts):
+    in_flight = []
+
+    def wait_for_all(futures, **_):
+        """Return late, like a client that is short of processor time."""
+        in_flight.append(len(futures))
+        wait(futures)
+
+    monkeypatch.setattr("poolpart.extras.for_each.wait", wait_for_all)
+    assert b.for_each(range(50), abs, window=window) == 50
+    assert in_flight == counts
 
 
 def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):

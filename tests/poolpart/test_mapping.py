@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 from distributed import CancelledError, Client, Event, as_completed, get_worker
+from tests.daemons import wait_until
 from tests.poolpart.helpers import LONG_S, join, kill, leave, twice, wait_for
 
 from poolpart import Partition, Pool, PoolError, n_workers, named, rest
@@ -152,8 +153,8 @@ def read_task_clock():
 
 
 def last_on_task_clock(x):
-    """Take 5 ms, or 60 ms from item 100 on, however busy the machine is."""
-    task_clock.seconds = read_task_clock() + (0.005 if x < 100 else 0.06)
+    """Take 5 ms, or an hour from item 100 on, however busy the machine is."""
+    task_clock.seconds = read_task_clock() + (0.005 if x < 100 else 3600)
     return x
 
 
@@ -176,6 +177,61 @@ def test_the_window_of_small_chunks_grows_with_short_items_and_shrinks_with_long
         next(results)
     wait_until(lambda: task_count(client) <= 4 * a.slots)  # those that are done go a moment later
     results.close()
+
+
+ended_items = []  # of the tasks below, which run in this process
+
+
+def wait_if_first(x, *, event, nbytes):
+    if x == 0:
+        Event(event).wait(LONG_S)
+    else:
+        ended_items.append(x)
+    return bytes(nbytes)
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize(
+    ("options", "nbytes", "count", "ended"),
+    [
+        ({}, 1, 200, range(199, 200)),  # the default is at most 512
+        ({"window": 4}, 1, 50, range(3, 4)),
+        ({}, 4 * 2**20, 40, range(12, 16)),  # 64 MiB, with the slow item
+    ],
+)
+def test_others_go_on_behind_a_slow_item_up_to_the_window_and_a_limit_of_memory(
+    a, client, gate, options, nbytes, count, ended
+):
+    ended_items.clear()
+    options = {"chunk": 1, "event": gate.name, "nbytes": nbytes, **options}
+    results = a.map(wait_if_first, range(count), **options)
+    lengths = []
+    reader = threading.Thread(target=lambda: lengths.extend(map(len, results)))
+    reader.start()
+    wait_until(lambda: len(ended_items) >= ended[0] and task_count(client) == 1)
+    assert len(ended_items) in ended
+    assert not lengths
+    gate.set()
+    reader.join()
+    assert lengths == [nbytes] * count
+
+
+def wait_for_those_before(count):
+    """Yield numbers, each as soon as the tasks of all earlier numbers have ended."""
+    for number in range(count):
+        wait_until(lambda number=number: len(ended_items) >= number)
+        yield number
+
+
+def note_end(x):
+    ended_items.append(x)
+    return x
+
+
+def test_items_of_a_slow_iterable_are_sent_as_they_come(a, monkeypatch):
+    monkeypatch.setattr("poolpart.mapping.SEND_S", 0.0)
+    ended_items.clear()
+    assert list(a.map(note_end, wait_for_those_before(12))) == list(range(12))
 
 
 def test_what_dask_does_with_results(a, client):

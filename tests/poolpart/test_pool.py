@@ -107,11 +107,28 @@ def test_rules_for_a_partition_that_workers_were_started_with(start):
     )
     with pytest.raises(PoolError, match=message):
         pool.divide({"CPU": n_workers(1), "OTHER": rest()})
-    message = "0 of 3 are left for it. Start more, or list it first. 2 declare the resource CPU"
+    message = (
+        r"0 of 3 are left for it\. Start more, or list it first\. 2 declare the resource CPU "
+        r"already, .* dissolve their partitions\. .* with minimum=0, and call resize with source\."
+    )
     with pytest.raises(PoolError, match=message):
         pool.divide({"ALL": n_workers(1), "OTHER": n_workers(1)})
     parts = pool.divide({"CPU": n_workers(2), "OTHER": rest()})
     assert [[w.name for w in part.workers] for part in parts.values()] == [["a", "b"], ["c"]]
+
+
+def test_workers_of_a_partition_that_they_were_started_with_move_to_another(start):
+    cpu = {"resources": {"CPU": 1}}
+    pool = Pool.from_client(start({"a": cpu, "b": cpu, "c": cpu}))
+    part = pool.divide({"PART": n_workers(2, minimum=0)})["PART"]
+    assert len(part) == 0
+    part.resize(2, source="CPU")
+    assert [len(part), len(pool["CPU"])] == [2, 1]
+    (other,) = pool["CPU"].workers
+    assert part.submit(worker_name).result() != other.name
+    assert pool["CPU"].submit(worker_name).result() == other.name
+    pool["CPU"].grow(2, source="PART")
+    assert [len(part), len(pool["CPU"])] == [0, 3]
 
 
 def test_rules_for_workers_that_were_started_with_two_resources(start):

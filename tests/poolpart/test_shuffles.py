@@ -1,5 +1,7 @@
 """Rechunking and shuffling by P2P stay in the partition of the tasks, and end."""
 
+import warnings
+
 import dask
 import numpy as np
 import pytest
@@ -42,6 +44,14 @@ def shuffled():
     )
 
 
+def without_a_shuffle():
+    frame = pytest.importorskip("dask.dataframe")
+    import pandas as pd
+
+    table = frame.from_pandas(pd.DataFrame({"x": range(16)}), npartitions=8)
+    return table.map_partitions(worker_name, meta={"x": int})["x"].unique()
+
+
 def names(values):
     return {chr(int(value)) for value in np.ravel(values)}
 
@@ -79,3 +89,23 @@ def test_of_a_collection_that_a_partition_computes(start):
     assert names(places) == {w.name for w in parts["B"].workers}
     Pool.from_client(client).dissolve()
     assert "poolpart-inherit" not in client.cluster.scheduler.plugins
+
+
+@pytest.mark.parametrize(
+    "make", [pytest.param(shuffled, marks=pytest.mark.extended), without_a_shuffle]
+)
+def test_dataframes_stay_in_a_partition_without_a_false_alarm(start, monkeypatch, make):
+    pytest.importorskip("pyarrow")
+    collection = pytest.importorskip("dask.dataframe.dask_expr._collection")
+    client = start(CLUSTER)
+    part = Pool.from_client(client).divide({"A": n_workers(2), "B": rest()})["A"]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        monkeypatch.setattr(collection, "_WARN_ANNOTATIONS", True)  # Dask warns once in a process
+        with part:
+            assert names(make().compute()) == {worker.name for worker in part.workers}
+        assert not caught
+        monkeypatch.setattr(collection, "_WARN_ANNOTATIONS", True)
+        with dask.annotate(priority=3):
+            make()
+    assert ["{'priority': 3}" in str(warning.message) for warning in caught] == [True]

@@ -73,9 +73,10 @@ def test_beside_dask(tmp_path, capsys):
     rows = beside_dask.main(["--quick", "--json", str(path)])
     assert json.loads(path.read_text()) == rows
     small, wide = {"submit", "map", "map_items", "pipe"}, {"wide_submit", "wide_map"}
-    assert rows.keys() == small | wide
+    short = {"quiet_map", "quiet_map_slow", "busy_map", "busy_map_slow"}
+    assert rows.keys() == small | wide | short
     assert all(row["wall_us"] > 0 and row["wall_ratio"] > 0 for row in rows.values())
-    assert capsys.readouterr().out.count("beside Dask") == 6
+    assert capsys.readouterr().out.count("beside Dask") == 10
 
 
 def test_adapting(tmp_path, capsys):

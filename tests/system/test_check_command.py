@@ -220,7 +220,7 @@ def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
     outcome = check(text=exported)
     assert outcome.code == 2
-    assert 'it cannot run:\nThe format las needs laspy and lazrs: pip install "' in outcome.err
+    assert 'it cannot run:\nThe format las needs laspy and lazrs: pip install -e "' in outcome.err
 
 
 def test_an_error_of_several_jobs_is_a_line_with_its_jobs(tmp_path, lidarpool):

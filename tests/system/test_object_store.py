@@ -243,7 +243,7 @@ def test_without_the_package_that_opens_it(lidarpool, monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.delitem(_registry, "s3", raising=False)
     refused = lidarpool("demo", "--out", f"{BUCKET}/x")
-    assert refused.code == 2 and 'pip install ".[s3]" in lidarpool\'s checkout' in refused.err
+    assert refused.code == 2 and 'pip install -e ".[s3]" in lidarpool\'s checkout' in refused.err
     assert len(refused.err.splitlines()) == 1
 
 

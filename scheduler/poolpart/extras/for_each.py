@@ -18,6 +18,7 @@ from ..pipe import Pipe, take_beside
 from ..worker_wait import WorkerWait, check_wait
 
 LOOK_S = 5.0  # between looks at the number of slots
+MOST_PER_SLOT = 16  # tasks in flight, without a window
 
 
 class Submitter(Protocol):
@@ -87,8 +88,10 @@ def _items_of(source: object) -> _PipeItems | _IterableItems:
 class ItemTasks:
     """Tasks for the items of a pipe or an iterable, at most `window` of them under way.
 
-    No window is two tasks a slot, so that each slot has the next item at hand. Items that have no
-    task yet stay where they are, so that producers wait when the tasks are slower than they are.
+    No window is two tasks a slot, so that each slot has the next item at hand. The number doubles
+    if fewer tasks than slots are left of a full window by the time this process notices: then slots
+    were idle. Items that have no task yet stay where they are, so that producers wait when the
+    tasks are slower than they are.
     """
 
     def __init__(
@@ -112,6 +115,8 @@ class ItemTasks:
         # {key of a task: the task, the number of its item and the item}
         self._running: dict[str, tuple[Future, int, Any]] = {}
         self._window = window or 1
+        self._slots = 0  # of the partition
+        self._per_slot = 2  # tasks in flight, without a window
         self._next_look = 0.0
         self._wait = WorkerWait(partition.name, "for_each", empty_s)
         self._stopped = False
@@ -132,7 +137,11 @@ class ItemTasks:
                 else:
                     items = self._items.take(futures, free, LOOK_S)
                     self._submit(items)
+                full = len(self._running) >= self._window
                 self._check()
+                if full and len(self._running) < self._slots:
+                    self._per_slot = min(2 * self._per_slot, MOST_PER_SLOT)
+                    self._set_window()
         except BaseException as error:
             self._cancel()
             reason = f"{funcname(self._function)} has failed: {error!r}"
@@ -165,11 +174,15 @@ class ItemTasks:
         of_partition = prospects(
             partition.client, partition.name, self._options["slots"], partition.by_rule
         )
-        if self._given_window is None:
-            self._window = max(2, 2 * of_partition.running)
+        self._slots = of_partition.running
+        self._set_window()
         if self._running:
             self._wait.check(of_partition)
         self._next_look = time.monotonic() + LOOK_S
+
+    def _set_window(self) -> None:
+        if self._given_window is None:
+            self._window = max(2, self._per_slot * self._slots)
 
     def _submit(self, items: Sequence[Any]) -> None:
         """Submit a task for each item, unless this was stopped."""

@@ -25,6 +25,7 @@ from raybeam.installation import install_command
 
 from ..base.open3d_module import load_open3d
 from ..report.report import versions
+from .installed_copies import second_copy
 
 READY = "ready"
 FREE = "free"
@@ -59,6 +60,7 @@ def examine() -> dict[str, Any]:
         "backends": {name: reason or READY for name, reason in available_backends().items()},
         "open3d": _open3d_state(),
         "extras": _extras(),
+        "second_copy": second_copy(),
         "ports": {str(port): _port_state(port) for port in PORTS},
     }
     return {**figures, "fix_first": _fix_first(figures)}
@@ -90,7 +92,7 @@ def _extras() -> dict[str, str]:
             and not requirement.marker.evaluate({"extra": ""})
         ]
         is_ready = all(map(_is_installed, requirements_of_extra))
-        states[name] = READY if is_ready else install_command(f".[{name}]")
+        states[name] = READY if is_ready else install_command("-e", f".[{name}]")
     return states
 
 
@@ -141,6 +143,8 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
             "Each process compiles its loops for 20 s, as there is no folder to keep them: set "
             "NUMBA_CACHE_DIR to a folder that can be written"
         )
+    if figures["second_copy"]:
+        yield figures["second_copy"]
 
 
 def in_words(figures: dict[str, Any]) -> list[str]:

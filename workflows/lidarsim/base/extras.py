@@ -18,12 +18,15 @@ def install_command(*requirements: str) -> str:
     """
     from raybeam.installation import install_command  # raybeam imports NumPy
 
-    local = [
-        f".{name.removeprefix('lidarpool')}" if name.partition("[")[0] == "lidarpool" else name
-        for name in requirements
-    ]
-    command = install_command(*local)
-    return command if local == [*requirements] else f"{command} in {CHECKOUT}"
+    words: list[str] = []
+    for name in requirements:
+        if name.partition("[")[0] == "lidarpool":
+            # Editable: a copy beside a checkout would hide changes of the checkout.
+            words += ["-e", f".{name.removeprefix('lidarpool')}"]
+        else:
+            words.append(name)
+    command = install_command(*words)
+    return command if words == [*requirements] else f"{command} in {CHECKOUT}"
 
 
 def need(package: str, extra: str, purpose: str) -> None:

@@ -57,12 +57,14 @@ def is_bag(path: Path) -> bool:
 
 
 def open_bag(path: Path, name: str) -> Reader:
-    """Open a bag.
+    """Open a bag, which is closed when it is no longer used.
 
     Raises LidarError, which begins with `name`, if that is impossible.
     """
     need("rosbags", "ros", f"{name} is read")
-    from rosbags.rosbag2 import Reader, ReaderError
+    from rosbags.rosbag2 import ReaderError
+
+    from .closing_bag import ClosingBag
 
     with reading(name):
         for file in path.iterdir() if path.is_dir() else [path]:
@@ -73,7 +75,7 @@ def open_bag(path: Path, name: str) -> Reader:
                 elif file.suffix.lower() == ".zstd":
                     check_packed(file)
         try:
-            bag = Reader(path)
+            bag = ClosingBag(path)
             bag.open()
         except ReaderError as error:
             if "Profile is not ros2" not in str(error):

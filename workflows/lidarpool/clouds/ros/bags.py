@@ -19,7 +19,6 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32
@@ -33,6 +32,7 @@ from lidarsim.columns.bags import (
     open_bag,
     point_columns,
 )
+from lidarsim.columns.closing_bag import ClosingBag
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.motion.bag_trajectories import read_bag
 from lidarsim.motion.trajectory import Track
@@ -147,9 +147,9 @@ class Reader(sweep_reader.Reader):
         return [self.entry.path_of("mcap")]
 
     @cached_property
-    def _bag(self) -> Bag:
+    def _bag(self) -> ClosingBag:
         # AnyReader would parse the definitions of messages, which takes longer than a sweep.
-        bag = Bag(self.local(self.files(0)[0]))
+        bag = ClosingBag(self.local(self.files(0)[0]))
         bag.open()
         return bag
 

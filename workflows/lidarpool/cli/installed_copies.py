@@ -1,0 +1,81 @@
+"""Copies of lidarpool's packages beside each other, of which Python imports only one."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+from lidarsim.base.extras import install_command
+
+from ..base.software import PACKAGES
+
+_FOLDERS_OF_CHECKOUT = ("kernels", "scheduler", "workflows")
+
+
+def second_copy() -> str:
+    """Return advice if there is a second copy of the packages, or ""."""
+    roots = {name: root for name in PACKAGES if (root := _root_of(name)) is not None}
+    root = roots.get("lidarpool")
+    if root is None:
+        return ""
+    for name, other in roots.items():
+        if other != root:
+            return (
+                f"There are two copies of lidarpool's packages: {name} is imported from {other}, "
+                f"and lidarpool from {root}. {_REMEDY}"
+            )
+    if _is_chosen(root, os.environ):
+        return ""
+    for checkout in (_editable_checkout(), _checkout_of(Path.cwd())):
+        if checkout not in (None, root):
+            return (
+                f"There are two copies of lidarpool: it is imported from {root}, so that changes "
+                f"in {checkout} have no effect. {_REMEDY}"
+            )
+    return ""
+
+
+_REMEDY = (
+    f"Uninstall lidarpool, lidarsim, poolpart and raybeam, then run {install_command('lidarpool')}"
+)
+
+
+def _root_of(package: str) -> Path | None:
+    """Return the checkout or site-packages folder that a package is imported from."""
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        return None
+    folder = Path(spec.origin).resolve().parents[1]
+    return folder.parent if folder.name in _FOLDERS_OF_CHECKOUT else folder
+
+
+def _is_chosen(root: Path, environment: Mapping[str, str]) -> bool:
+    """Return whether the user has put a checkout on PYTHONPATH."""
+    entries = environment.get("PYTHONPATH", "").split(os.pathsep)
+    return any(Path(entry).resolve().is_relative_to(root) for entry in entries if entry)
+
+
+def _editable_checkout() -> Path | None:
+    """Return the checkout that is installed as editable."""
+    try:
+        text = distribution("lidarpool").read_text("direct_url.json")
+    except PackageNotFoundError:
+        return None
+    source = json.loads(text or "{}")
+    if not source.get("dir_info", {}).get("editable"):
+        return None
+    return Path(url2pathname(urlsplit(source["url"]).path)).resolve()
+
+
+def _checkout_of(folder: Path) -> Path | None:
+    """Return the checkout that a folder is in."""
+    for candidate in (folder.resolve(), *folder.resolve().parents):
+        if (candidate / "workflows" / "lidarpool" / "__init__.py").is_file():
+            return candidate
+    return None
