@@ -136,6 +136,7 @@ export class Picture {
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enableDamping: true, dampingFactor: 0.18, zoomToCursor: true, screenSpacePanning: true });
     this.controls.addEventListener("change", () => { this.dirty = true; changed(); });
+    this.controls.addEventListener("start", () => { this.touched = true; }); // by a user
     this.pointMaterial = new THREE.ShaderMaterial({
       vertexShader: POINT_VERTEX, fragmentShader: POINT_FRAGMENT,
       uniforms: {
@@ -535,6 +536,11 @@ export class Picture {
     this.useParallel(side !== "all");
   }
 
+  // Whether the carrier flies, far above what is looked at.
+  get isHigh() {
+    return this.sensors.some((sensor) => sensor.moves) && this.carrier.z - this.middle.z > 0.1 * this.extent;
+  }
+
   // Behind and above the carrier, looking ahead; or to the middle, if it stands.
   lookFromSensor() {
     if (!this.carrier) return;
@@ -543,9 +549,15 @@ export class Picture {
     const ahead = !moving && inwards.length() > 0.1 * this.extent ? inwards.normalize() : this.heading;
     const back = 0.14 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.3 * this.extent);
     const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, 0.6 * back));
-    if (moving && this.carrier.z - this.middle.z > 0.1 * this.extent) target.z = this.middle.z; // the ground is far below
+    if (this.isHigh) target.z = this.middle.z; // the ground is far below
     this.useParallel(false);
     this.place(eye, target);
+  }
+
+  // Moves the camera with the local origin.
+  shift(way) {
+    const by = new THREE.Vector3(...way);
+    this.place(this.camera.position.clone().add(by), this.controls.target.clone().add(by));
   }
 
   place(position, target) {
