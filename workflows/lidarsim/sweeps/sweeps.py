@@ -55,7 +55,7 @@ _JSON_FIELDS = (
 
 
 def numbered_places(positions: Floats) -> Ints:
-    """Number positions (n, 3) from 1 in order; a repeated position keeps its number: int64 (n,).
+    """Return a number from 1 for each position (n, 3), the same for equal positions: int64 (n,).
 
     Examples
     --------

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -129,11 +128,13 @@ def _row_ranges(points: Points, scans: ScanRanges) -> list[tuple[int, int]]:
     """Return the ranges of rows, start and stop, that contain ranges of scans."""
     if isinstance(points, StationPoints):
         return _row_ranges(points.points, scans)
-    results = points.results if isinstance(points, JoinedPoints) else [(0, points)]
-    row_ranges = (
-        (first, result.rows_of(scan_range)) for first, result in results for scan_range in scans
-    )
-    return sorted((first + start, first + stop) for first, (start, stop) in row_ranges)
+    if isinstance(points, JoinedPoints):
+        return sorted(
+            (first + start, first + stop)
+            for first, result in points.results
+            for start, stop in _row_ranges(result, scans)
+        )
+    return sorted(points.rows_of(scan_range) for scan_range in scans)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from PIL import Image
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.arrays import Ints
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import explained
 from lidarsim.base.even_samples import even_indices
@@ -133,32 +133,48 @@ def from_above(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) 
     numbers; many are red dots.
     """
     rows, columns = counts.shape
-    shade = np.log1p(counts[::-1])
-    weakest = np.where(counts[::-1] > 0, _WEAKEST, 0)  # single points are visible, too
-    pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
+    letter = max(rows / 30, columns / 55)  # height of letters
+    size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
+    return (
+        f'<svg viewBox="0 0 {columns} {rows + 2.2 * letter:.1f}" font-size="{letter:.2f}">'
+        f'<image {size} href="{_shaded(counts[::-1])}"/>'
+        f'<g class="stations">{_drawn_marks(marks, letter)}</g>'
+        f"{_scale_bar(columns * pixel_m, pixel_m, rows + 1.9 * letter, letter)}</svg>"
+    )
+
+
+def _shaded(counts: Ints) -> str:
+    """Return the address of a picture of numbers of points (rows, columns)."""
+    shade = np.log1p(counts)
+    weakest = np.where(counts > 0, _WEAKEST, 0)  # single points are visible, too
+    pixels = np.full((*counts.shape, 4), (53, 105, 176, 0), np.uint8)
     pixels[..., 3] = np.maximum(255 * shade / max(shade.max(), 1), weakest)
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "PNG")
-    source = f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
-    size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
-    letter = max(rows / 30, columns / 55)  # height of letters
-    is_numbered = 1 < len(marks) <= MAX_NUMBERED
-    radius = (0.8 if is_numbered else 0.25) * letter
-    dots = "".join(
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}"/>'
-        + (f'<text x="{x:.1f}" y="{y + 0.34 * letter:.1f}">{number}</text>' if is_numbered else "")
+    return f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
+
+
+def _drawn_marks(marks: Sequence[_Mark], letter: float) -> str:
+    """Draw stations as discs with their numbers, or as dots if there are many or only one."""
+    if not 1 < len(marks) <= MAX_NUMBERED:
+        radius = 0.25 * letter
+        return "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}"/>' for x, y, _ in marks)
+    return "".join(
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{0.8 * letter:.2f}"/>'
+        f'<text x="{x:.1f}" y="{y + 0.34 * letter:.1f}">{number}</text>'
         for x, y, number in marks
     )
-    length_m = nice_step(columns * pixel_m / 8)
+
+
+def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> str:
+    """Draw a scale bar of about an eighth of a width, with its length."""
+    length_m = nice_step(width_m / 8)
     length = length_m / pixel_m
-    unit = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
-    bar = rows + 1.9 * letter
+    words = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
+    end = 0.4 * letter
     return (
-        f'<svg viewBox="0 0 {columns} {rows + 2.2 * letter:.1f}" font-size="{letter:.2f}">'
-        f'<image {size} href="{source}"/><g class="stations">{dots}</g>'
-        f'<path class="scale" d="M0 {bar - 0.4 * letter:.1f}V{bar:.1f}H{length:.1f}'
-        f'v{-0.4 * letter:.1f}"/><text class="scale" x="{length + 0.5 * letter:.1f}" '
-        f'y="{bar:.1f}">{unit}</text></svg>'
+        f'<path class="scale" d="M0 {bottom - end:.1f}V{bottom:.1f}H{length:.1f}v{-end:.1f}"/>'
+        f'<text class="scale" x="{length + 0.5 * letter:.1f}" y="{bottom:.1f}">{words}</text>'
     )
 
 

@@ -168,7 +168,9 @@ class LivePage(RunPage):
         header, arrays = job.view.answer(question, *arguments)
         if question == "state":
             is_sample = not isinstance(job.view.points, CloudFile)
-            header |= {"live": True, "sampled": is_sample, "title": self._title} | points
+            suffix = "" if self._title == "lidarpool" else " - lidarpool"
+            title = f"{self._title}{suffix}"
+            header |= {"live": True, "sampled": is_sample, "title": title} | points
         return header, arrays
 
     def _news(self) -> dict[str, Any]:

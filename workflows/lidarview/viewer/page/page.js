@@ -692,7 +692,9 @@ function buildTime() {
   $("time").hidden = !timed;
   if (!timed) return;
   clock.play = iconButton("play", "Play (space)", () => setPlaying(!playing));
-  clock.show = menu("", SHOWS.filter(([value]) => !(+value >= (stationary() ? 0 : state.duration))), chosen.show, (value) => { clock.own = true; setShow(value); });
+  const shows = SHOWS.filter(([value]) => !(+value >= (stationary() ? 0 : state.duration)))
+    .map(([value, text]) => [value, value === "sweep" && steps.length === state.stations.length - 1 ? "one station" : text]);
+  clock.show = menu("", shows, chosen.show, (value) => { clock.own = true; setShow(value); });
   explain(clock.show, "Points that are shown");
   clock.slider = element("input", { type: "range", min: 0, max: sliderEnd(), step: stationary() ? 1 : "any", value: stationary() ? stepNow() : chosen.time });
   explain(clock.slider, stationary() ? "Station" : "Time, seconds");
@@ -1223,7 +1225,8 @@ async function begin() {
   buildTime();
   buildTools();
   picture.setTime(chosen.time);
-  if (drives && !picture.isHigh) look("sensor");
+  picture.resize(); // the player and the panel take their places
+  look(drives && !picture.isFlying ? "sensor" : "all");
   if (!$("time").hidden) tellTime();
   setClip(chosen.clip);
   showRays();

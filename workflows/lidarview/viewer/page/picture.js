@@ -11,6 +11,7 @@ const THEMES = {
 const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0, CLIP = 0x2f8fe0;
 const FOV = 45; // degrees, from the upper to the lower edge
 const SIDES = { all: [0.55, -1, 0.62], inside: [0.12, -0.25, 1], top: [0, 0, 1], side: [1, 0, 0], front: [0, -1, 0] };
+const FLIGHT_M = 10; // height of a carrier that flies
 const PICKED_WITHIN = 6; // pixels
 const SAME_SURFACE = 1.03; // times the distance of the nearest
 const AS_POINTS = 0.25; // alpha of pixels that are points: only these get eye-dome lighting
@@ -536,10 +537,13 @@ export class Picture {
     this.useParallel(side !== "all");
   }
 
-  // Whether the carrier flies, far above what is looked at.
+  // Whether a moving carrier is far above what is looked at.
   get isHigh() {
     return this.sensors.some((sensor) => sensor.moves) && this.carrier.z - this.middle.z > 0.1 * this.extent;
   }
+
+  // A car does not fly, however small its surroundings are.
+  get isFlying() { return this.isHigh && this.carrier.z - this.middle.z > FLIGHT_M; }
 
   // Behind and above the carrier, looking ahead; or to the middle, if it stands.
   lookFromSensor() {
