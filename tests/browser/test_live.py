@@ -36,7 +36,7 @@ def live(monkeypatch):
     monkeypatch.setattr("lidarpool.run.pipeline.policies.scans_per_batch", lambda *_: 10)
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
     job = OneJob(Job(Scene.seed(), survey))
-    with live_page(port=0, browser=False) as live:
+    with live_page(title="yard", port=0, browser=False) as live:
         yield live, job
 
 
@@ -92,6 +92,7 @@ def opened(new_tab, live):
     """Open the page of a run that has not begun."""
     tab = new_tab(live.page.url)
     tab.wait_for(lambda text: "starting" in text)
+    assert tab.value("document.title") == "yard - lidarpool"
     return tab
 
 
@@ -119,6 +120,10 @@ def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
     assert run.points.complete
     total = f"{run.points.parts.point_count:,} points"
     tab.wait_for(lambda text: "done" in text and total in text)
+    rays = "[lidarpool.chosen.rays, lidarpool.picture.rays?.visible ?? false]"
+    tab.wait_for(lambda _: tab.value(rays) == [False, False])  # rays would hide the points
+    assert tab.value("document.title") == "yard - lidarpool"
+    assert tab.value("document.querySelector('#panel h1').textContent") == "yard"
     other.wait_for(lambda text: "done" in text and total in text)
     tab.wait_for(lambda _: len(colours(tab.picture(tmp_path / "live.png"))) > 200)
     assert tab.errors == []

@@ -128,12 +128,12 @@ def test_a_large_cloud_is_drawn_by_a_sample_until_all_points_are_read(kinds, new
     view = growing_view(place_of(kinds, "las"))
     with page_server(view.answer, port=0) as page:
         tab = new_tab(page.url)
-        tab.wait_for(lambda text: drawn(tab) > 0 and "points are read meanwhile" in text)
+        tab.wait_for(lambda text: drawn(tab) > 0 and "Reading the points … 0 %" in text)
         tab.choose("colour", "intensity")
         is_drawn.set()
         total = f"{view.total:,} points"
         tab.wait_for(lambda text: text.count(total) == 1 and drawn(tab) == view.total)
-        assert "meanwhile" not in tab.text and "intensity" in tab.text
+        tab.wait_for(lambda text: "Reading" not in text and "intensity" in text)
         assert tab.value("lidarpool.chosen.colour") == "intensity" and tab.errors == []
 
 

@@ -1,5 +1,6 @@
 """The pictures of a report, looked at in a browser that prefers light or dark pages."""
 
+import re
 import subprocess
 import sys
 
@@ -14,6 +15,42 @@ PLACE = """(() => {
   const box = figure.querySelector('svg').getBoundingClientRect();
   return [box.left, box.top, box.width, box.height].map(Math.round);
 })()"""
+
+
+# What is cut off on a page: elements whose content is wider than they are.
+CUT = """[...document.querySelectorAll('body, .scroll, table, tr, td, th, dd, dt, figcaption')]
+  .filter((e) => e.scrollWidth > e.clientWidth + 1 && e.clientWidth && !e.matches('.bars *'))
+  .map((e) => `${e.tagName} ${e.textContent.trim().slice(0, 60)}`)"""
+
+
+WIDE = re.compile(r'<table class="wide">.*?</table>', re.DOTALL)
+
+
+def with_long_numbers(table):
+    """Return a table with numbers as long as those of large surveys."""
+    return re.sub(r"(<td[^>]*>)[\d,.]+(?=</td>)", r"\g<1>814,000,000,123", table[0])
+
+
+def test_no_number_or_label_is_cut_off(new_tab, tmp_path):
+    origin = [691_000, 5_334_000, 515]
+    for name, noise in (("a", "{range_m: 0.02}"), ("b", "{}")):
+        text = f"{SCENARIO}world: {{origin: {origin}, epsg: 25832}}\nnoise: {noise}\n"
+        (tmp_path / f"{name}.yaml").write_text(f"{text}cloud: {{columns: [time, range]}}\n")
+        run = [sys.executable, "-m", "lidarpool", "run", f"{name}.yaml", "--out", name]
+        subprocess.run(run, cwd=tmp_path, check=True, timeout=180, capture_output=True)
+    compare = [sys.executable, "-m", "lidarpool", "compare", "a", "b"]
+    subprocess.run(compare, cwd=tmp_path, check=True, timeout=180, capture_output=True)
+    tab = new_tab("about:blank")
+    for page in ("a/report.html", "lidarpool-compare/compare.html"):
+        text = (tmp_path / page).read_text("utf-8")
+        (tmp_path / "long.html").write_text(WIDE.sub(with_long_numbers, text), "utf-8")
+        for size in ((1400, 900), (390, 844)):
+            tab.resize(*size)
+            for name in (page, "long.html") if size[0] < 600 else (page,):
+                tab.open((tmp_path / name).as_uri())
+                tab.wait_for(lambda text: "Nearest" in text or "Sensor and scene" in text)
+                assert tab.value(CUT) == [], (name, size)
+                assert tab.value("document.documentElement.scrollWidth") <= size[0]
 
 
 def test_pictures_are_dark_where_the_browser_is(new_tab, tmp_path):

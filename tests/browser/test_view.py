@@ -114,6 +114,93 @@ def test_stations_are_numbered_and_a_place_is_told_in_the_coordinate_system(new_
         assert tab.errors == []
 
 
+def test_a_player_of_stations_counts_them(new_tab, tmp_path):
+    scene = Scene.from_meshes([box("Room", (20, 20, 0.1))])
+    poses = [Pose((5 * k, 0, 2)) for k in range(3)]
+    survey = Survey(Sensor.grid(layers=4, rays_per_revolution=36), poses, steps=36)
+    sweeps = Sweeps.from_survey(survey, scene)
+    view = View(CloudFile(spiral(tmp_path / "cloud.ply", WET), [WET]), None, sweeps)
+    with page_server(view.answer, port=0) as page:
+        tab = opened(new_tab, page)
+        tab.wait_for(lambda text: "station 1 of 3" in text and " s ·" not in text)
+        tab.key("ArrowRight")
+        tab.wait_for(lambda text: "station 2 of 3" in text and 0 < drawn(tab) < COUNT)
+        slider = "document.querySelector('#time .line input')"
+        assert tab.value(f"[{slider}.min, {slider}.max, {slider}.value]") == ["0", "2", "1"]
+        tab.key(" ")
+        tab.wait_for(lambda text: "station 3 of 3" in text)
+        tab.key(" ")
+        tab.choose("colour", "station")
+        tab.wait_for(lambda text: all(f"station {k}\n" in text for k in (1, 2, 3)))
+        assert tab.errors == []
+
+
+# Largest distance from the middle of the picture, 1 at its sides, of points {x, y, z, …}.
+FARTHEST = """((places) => {
+  const m = lidarpool.picture.matrix.elements;
+  let most = 0;
+  for (let k = 0; k < places.length; k += 3) {
+    const [x, y, z] = places.subarray(k, k + 3), w = m[3] * x + m[7] * y + m[11] * z + m[15];
+    if (w <= 0) return Infinity;
+    for (const axis of [0, 1]) {
+      const clip = m[axis] * x + m[axis + 4] * y + m[axis + 8] * z + m[axis + 12];
+      most = Math.max(most, Math.abs(clip) / w);
+    }
+  }
+  return most;
+})"""
+
+
+@pytest.mark.parametrize("size", [(1400, 900), (390, 844)])
+def test_a_flight_opens_with_all_of_its_site_and_a_cloud_with_its_sides(new_tab, tmp_path, size):
+    scene = Scene.from_meshes([box("Ground", (40, 30, 6))])
+    flown = Track([0, 2], [[-20, 5, 60], [20, 5, 60.0]])
+    survey = Survey(Sensor.grid(layers=4), steps=360, trajectory=flown)
+    content, _ = PictureContent.before_casting(scene, survey)
+    file = CloudFile(spiral(tmp_path / "cloud.ply", WET), [WET])
+    corners = "lidarpool.state.arrays.corners"
+    for view, places in (
+        (View(file, content, Sweeps.from_survey(survey, scene)), corners),
+        (
+            View(file),
+            "Object.values(lidarpool.picture.layers)[0].geometry.attributes.position.array",
+        ),
+    ):
+        with page_server(view.answer, port=0) as page:
+            tab = new_tab("about:blank")
+            tab.resize(*size)
+            tab.open(page.url)
+            tab.wait_for(lambda _, tab=tab: tab.value(f"window.{PICTURE}?.drawn") == COUNT)
+            assert 0.8 < tab.value(f"{FARTHEST}({places})") < 1
+
+
+def test_a_server_that_is_busy_at_first_is_asked_again(view, new_tab):
+    asked = []
+
+    def answer(question, *arguments):
+        asked.append(question)
+        if asked.count(question) < 3:
+            raise OSError("not yet")
+        return view.answer(question, *arguments)
+
+    with page_server(answer, port=0) as page:
+        tab = opened(new_tab, page)
+        tab.wait_for(lambda text: "30,000 points" in text and drawn(tab) == COUNT)
+
+
+def test_a_question_that_fails_is_named(view, new_tab):
+    def answer(question, *arguments):
+        if question == "surface":
+            raise OSError("the disk is gone")
+        return view.answer(question, *arguments)
+
+    with page_server(answer, port=0) as page:
+        tab = opened(new_tab, page)
+        words = 'The server could not answer "surface" (500 Internal Server Error).'
+        tab.wait_for(lambda text: words in text)
+        assert drawn(tab) == COUNT
+
+
 def test_a_page_that_loads_says_so_and_its_heading_is_whole(view, new_tab):
     name = "a survey of the long hall, the yard behind it and the road to the harbour"
     asked = threading.Event()

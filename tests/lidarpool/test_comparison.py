@@ -533,6 +533,19 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
     assert "no sweeps" in (tmp_path / "out/compare.html").read_text()
 
 
+def test_range_images_are_yellow_where_it_is_near():
+    page = comparison.draw_ranges(compare(cloud(), cloud()))
+    (image,) = page.figure.axes[0].images
+    colors = np.asarray(image.get_array()).reshape(-1, 3)
+    green = colors[:, 1]  # rises from violet to yellow
+    order = np.argsort(green)
+    assert colors[order[-1]] == pytest.approx([0.99, 0.91, 0.14], abs=0.02), "yellow"
+    columns = np.argsort(green.reshape(RINGS, COLUMNS).mean(axis=0))
+    azimuth = image.get_extent()[0] - columns * 360 / COLUMNS
+    near, far = np.cos(2 * np.radians(azimuth[[-1, 0]]))  # of the room: -1 is near, 1 is far
+    assert near < -0.99 and far > 0.99
+
+
 def test_a_ring_that_only_one_sees_is_noted():
     there = np.ones((RINGS, COLUMNS), bool)
     there[3] = False

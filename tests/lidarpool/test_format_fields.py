@@ -374,11 +374,28 @@ def test_compensated_formats_are_so_whatever_the_clouds_frame(tmp_path, name, co
         else:
             with pye57.E57(str(tmp_path / "out")) as file:
                 raw = file.read_scan_raw(sweep)
-                assert (
-                    file.get_header(sweep)["name"].value() == f"sweep {sweep}, motion compensated"
-                )
+                name = f"sweep {sweep + 1}, motion compensated"
+                assert file.get_header(sweep)["name"].value() == name
             placed = np.stack([raw[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
         np.testing.assert_allclose(placed, inside, atol=5e-5)
+
+
+@pytest.mark.parametrize(
+    ("poses", "turns", "names"),
+    [
+        (2, 1, ["station 1", "station 2"]),
+        (2, 2, [f"station {k}, sweep {n}" for k in (1, 2) for n in (1, 2)]),
+        (1, 1, ["station 1"]),
+        (1, 2, ["station 1, sweep 1", "station 1, sweep 2"]),
+    ],
+)
+def test_scans_of_an_e57_are_named_by_their_stations(tmp_path, poses, turns, names):
+    sensor = load_sensor("velodyne/vlp16")
+    survey = Survey(sensor, [(k, 0, 2) for k in range(poses)], steps=36 * turns)
+    save_cloud(cloud_of(survey, room()), tmp_path / "out.e57")
+    with pye57.E57(str(tmp_path / "out.e57")) as file:
+        found = [file.get_header(k)["name"].value() for k in range(file.scan_count)]
+    assert found == names
 
 
 def test_what_contradicts_a_frame_is_noted():

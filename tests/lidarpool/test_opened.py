@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from tests.drives import points_of, the_scene, the_sweeps, write_set
+from tests.e57_files import write_scans
 
 from lidarpool import (
     LidarError,
@@ -22,6 +23,7 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.result_commands import view as view_command
+from lidarpool.clouds import las
 from lidarpool.clouds.ros import bags
 from lidarpool.clouds.writing import Format
 from lidarpool.recordings.opening import open_recording
@@ -35,7 +37,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.viewer.sharing import page_of
-from lidarview.viewer.view import IN_SENSOR_AXES
+from lidarview.viewer.view import IN_SENSOR_AXES, View
 
 FORMATS = (
     "las", "laz", "parquet", "pcd", "images", "e57", "kitti", "nuscenes", "webdataset", "mcap",
@@ -155,10 +157,10 @@ def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypat
     view = growing_view(folder / name)
     state = state_of(view)
     assert state["growing"] and state["points"] == len(cloud) and not state["exports"]
-    assert f"all {len(cloud):,} points are read meanwhile" in state["note"]
     asked = {"colour": "z", "most": "100000"}
     assert view.answer("points", asked, bool)[0]["count"] == 4000
-    assert growth_of(view) == {"complete": True, "error": ""}
+    growth = growth_of(view)
+    assert (growth["complete"], growth["error"], growth["share"]) == (True, "", 1.0)
     grown = state_of(view)
     assert "growing" not in grown and grown["version"] > state["version"]
     assert grown["exports"] and not grown["note"]
@@ -169,6 +171,55 @@ def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypat
     (tmp_path / name).write_bytes(content[: len(content) // 2])
     view.answer("points", asked, bool)
     assert "is cut short" in growth_of(view)["error"]
+
+
+def test_more_points_of_a_large_cloud_are_shown_while_it_is_read(exported, monkeypatch):
+    folder, cloud, _ = exported
+    monkeypatch.setattr(recorded, "LARGE_POINTS", 1000)
+    monkeypatch.setattr(recorded, "_SAMPLE_POINTS", 400)
+    monkeypatch.setattr(las, "CHUNK_POINTS", -(-len(cloud) // 2))
+    view = growing_view(folder / "cloud.las")
+    seen = []
+    show = View.show
+
+    def record(self, points, **options):
+        show(self, points, **options)
+        growth, _ = view.answer("growth", {}, bool)
+        seen.append((growth["share"], len(points)))
+
+    monkeypatch.setattr(View, "show", record)
+    view.answer("points", {"colour": "z", "most": "100000"}, bool)
+    assert growth_of(view)["version"] > 1
+    half = -(-len(cloud) // 2)
+    assert seen[:2] == [(0.5, 400 + half), (1.0, 400 + len(cloud))]
+
+
+def test_scans_of_stations_are_named_and_do_not_move(tmp_path):
+    scene = Scene.from_meshes([box("Floor", (30, 30, 0.1))])
+    survey = Survey(Sensor.grid(layers=6), [Pose((k, 0, 2)) for k in (0, 3, 6)])
+    rig = Rig(scene, survey)
+    part = columns_of([*rig.cast(0, survey.scan_count)])
+    table = [column for column in survey.stored_columns if column.name not in "xyz"]
+    sweeps = Sweeps.from_survey(survey, scene)
+    cloud = part.cloud((SCAN, *table), survey.precision_m, scene.origin)
+    cloud = replace(cloud, sweeps=lambda: sweeps)
+    save_cloud(cloud, tmp_path / "own.e57")
+    points = {f"cartesian{axis}": (np.arange(3.0), "double") for axis in "XYZ"}
+    pose = {"translation": {"x": 5.0, "y": 0.0, "z": 0.0}}
+    other = [{"fields": points, "name": "Gate"}, {"fields": points, "name": "", "pose": pose}]
+    write_scans(tmp_path / "other.e57", other)
+    expected = {
+        "own.e57": ["", "station 1", "station 2", "station 3"],
+        "other.e57": ["", "Gate", "station 2"],
+    }
+    for name, stations in expected.items():
+        view = open_view(tmp_path / name)
+        state = state_of(view)
+        assert state["stations"] == stations and not state["note"], name
+        assert [sensor["moves"] for sensor in state["sensors"]] == [False]
+        numbers = view.shown_points.values("station", slice(None))
+        assert np.unique(numbers).tolist() == list(range(1, len(stations)))
+        assert "station" in state["colours"]
 
 
 def test_files_of_other_programs(tmp_path):

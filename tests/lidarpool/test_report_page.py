@@ -176,14 +176,22 @@ def test_pictures_come_into_the_page_when_they_are_drawn(write, tmp_path):
 def test_the_points_are_shown_from_above(write):
     places = np.array([(0, 0, 0), (0, 0, 1), (0, 0, 2), (10, 0, 0), (0, 5, 0.0)])
     places += 1000
-    columns = {name: np.zeros(5, np.int32) for name in ("scan", "channel", "object")}
-    (source,) = html.fromstring(write(cloud=Cloud(places, columns))[0]).xpath("//image/@href")
+    columns_by_name = {name: np.zeros(5, np.int32) for name in ("scan", "channel", "object")}
+    page = html.fromstring(write(cloud=Cloud(places, columns_by_name))[0])
+    (source,) = page.xpath("//image/@href")
     with Image.open(io.BytesIO(b64decode(source.partition(",")[2]))) as image:
         shade = np.asarray(image)[..., 3]
     rows, columns = shade.shape
     assert 25 < columns <= 50 and 1.8 < columns / rows < 2.2  # 10 by 5 m
     assert (shade[-1, 0], shade[-1, -1], shade[0, 0]) == (255, 127, 127)  # the north is up
     assert np.count_nonzero(shade) == 3
+    (bar,) = page.xpath("//path[@class='scale']/@d")
+    (length,) = page.xpath("//text[@class='scale']/text()")
+    pixels = float(re.search(r"H([\d.]+)", bar)[1])
+    pixel_m = 0.256
+    assert length == "2 m" and pixels * pixel_m == pytest.approx(2, abs=0.02)
+    (key,) = page.xpath("//span[@class='key']")
+    assert re.sub(" +", " ", key.text_content()) == "15.3 45.8 points per m²"  # 1 and 3 in a pixel
 
 
 def test_sensors_within_the_points_are_marked_from_above(write):
@@ -191,6 +199,7 @@ def test_sensors_within_the_points_are_marked_from_above(write):
     columns = {name: np.zeros(3, np.int32) for name in ("scan", "channel", "object")}
     page = html.fromstring(write(cloud=Cloud(corners, columns))[0])
     marks = [(float(c.get("cx")), float(c.get("cy"))) for c in page.xpath("//circle")]
+    assert page.xpath("//g[@class='stations']/text/text()") == ["1", "2"]
     (size,) = page.xpath("//image")
     rows = int(size.get("height"))
     pixels = 1 / 0.256  # per metre; the first row and column are of points 1 m from the marks

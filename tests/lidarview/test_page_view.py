@@ -10,6 +10,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import trimesh
+from matplotlib import colormaps
 
 from lidarpool import LidarError, Pose, Scene, SceneInstance, SceneMesh, Sensor, Survey, Track
 from lidarpool.showing.pages.opened import open_views
@@ -313,6 +314,39 @@ def test_stations_have_the_numbers_of_the_picture_of_stations(name, places, labe
     assert moving["labels"] == []
 
 
+def test_points_are_colored_filtered_and_played_by_station(tmp_path, spun):
+    view = open_result(result_in(tmp_path / "one", spun))
+    state, arrays = told(view, "state")
+    assert state["stations"] == ["", "station 1", "station 2"]
+    assert arrays["sweep_station"].tolist() == [1, 2]
+    legend = told(view, "points", colour="station", most=ALL)[0]["legend"]
+    assert [(name, value) for name, _, value in legend["labels"]] == [
+        ("station 1", 1), ("station 2", 2),
+    ]  # fmt: skip
+    assert set(places(view, filter="station,2,2")[:, 0].tolist()) == {3}
+    assert told(view, "counts", name="station")[0]["counts"] == [(1, 10), (2, 10)]
+    named = replace(view, names={"station": ("", "gate", "")})
+    assert told(named, "state")[0]["stations"] == ["", "gate", "station 2"]
+    one = replace(view, sweeps=replace(spun, stations=1))  # of a carrier
+    assert "station" not in one.columns and not told(one, "state")[0]["stations"]
+
+
+def test_the_first_picture_of_a_cloud_has_its_sides_but_no_outliers():
+    rng = np.random.default_rng(2)
+    places = rng.uniform((-60, -20, 0), (60, 20, 8), (20_000, 3))
+    places[0] = (-70, 0, 0)  # beyond most, but not an outlier
+    places[1] = (0, 0, -500)
+    state, arrays = told(View(HeldPoints(Cloud(places, {}))), "state")
+    inside = np.delete(places, 1, axis=0)
+    assert np.allclose(state["box"], [inside.min(axis=0), inside.max(axis=0)])
+    corners = arrays["corners"]
+    assert len(corners) <= 200
+    for direction in rng.normal(size=(50, 3)):
+        direction /= np.linalg.norm(direction)
+        missing = (inside @ direction).max() - (corners @ direction).max()
+        assert 0 <= missing < 0.01 * 140, direction
+
+
 def test_the_page_is_told_of_the_coordinate_system(tmp_path, spun):
     of_zone = replace(spun, epsg=25832)
     one = open_result(result_in(tmp_path / "one", of_zone))
@@ -355,7 +389,8 @@ def test_several_results_are_one_view_with_a_colour_each_and_are_played_together
     rows = told(view, "points", colour="scan", most=ALL)[1]["rows"]
     again = [one.points.values("scan", slice(None))] * 2
     assert view.points.values("scan", rows).tolist() == np.concatenate(again).tolist()
-    assert told(view, "point", row=len(view.points) - 1)[0]["columns"][-1] == ["result", "after"]
+    point = told(view, "point", row=len(view.points) - 1)[0]["columns"]
+    assert point[-2:] == [["result", "after"], ["station", "station 2"]]
     assert not told(one, "state")[0]["results"]
 
 
@@ -418,7 +453,9 @@ def test_a_range_image_has_channels_from_above_and_azimuth_from_left_to_right():
     assert image.shape[0] == 8 and 300 < image.shape[1] <= 432
     assert (image[[0, 7], :, 3] > 0).mean() > 0.8
     assert not image[1:7].any()
-    assert not np.array_equal(image[0, 100], image[7, 100])  # the upper is farther
+    yellow, violet = as_bytes(colormaps["viridis"](np.array([1.0, 0.0]))[:, :3])
+    near, far = image[7, 100, :3], image[0, 100, :3]  # the upper is farther
+    assert np.array_equal(near, yellow) and np.array_equal(far, violet)
     left = spots[:, 1] > 1  # y is to the left
     half = range_image(spots[left], away[left], channels[left], (5.0, 9.0))
     assert half[[0, 7]].any(axis=2).any(axis=0).mean() > 0.8  # it fills its picture

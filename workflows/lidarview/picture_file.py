@@ -23,6 +23,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks
 from lidarsim.survey.survey import Survey
+from lidarsim.sweeps.sweeps import numbered_places
 
 PICTURE_FILE = "pictures.npz"
 
@@ -58,12 +59,10 @@ class SensorPositions:
         """
         if self.moves or not len(self.positions):
             return []
-        _, first, group = np.unique(self.positions, axis=0, return_index=True, return_inverse=True)
-        if len(first) == 1:
+        numbers = numbered_places(self.positions)
+        if numbers.max() == 1:
             return [self.name] * len(self.positions)
-        number = np.empty(len(first), np.int64)
-        number[np.argsort(first)] = np.arange(1, len(first) + 1)
-        return [f"{self.name} {n}".strip() for n in number[group.ravel()].tolist()]
+        return [f"{self.name} {number}".strip() for number in numbers.tolist()]
 
     def position_at(self, time_ns: float) -> Floats:
         """Return the position at a time, (3,)."""

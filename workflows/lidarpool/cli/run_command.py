@@ -69,7 +69,7 @@ def run_scenario(
         return
     assert options.out is not None, "commands write"
     run_notes = {"extent": extent or "page", "scans": job.survey.scan_count}
-    jobs = OneJob(job, shard)
+    jobs = OneJob(job, shard, title=built.scenario.title)
     output = StoredOutput({**made_of, **run_notes})
     with result_folder(options.out), page_of(jobs, options.live) as page:
         result = Run(jobs, options, output, terminal, page).execute()
@@ -96,7 +96,7 @@ def _run_survey(
     assert options.out is not None, "commands write"
     for note in advice(built):
         terminal.tell(note)
-    jobs = OneJob(job)
+    jobs = OneJob(job, title=built.scenario.title)
     extent = extent or "page"
     output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, note_on)
     with page_of(jobs, options.live) as page:

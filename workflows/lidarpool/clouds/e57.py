@@ -53,6 +53,7 @@ _COLUMNS = {
 # Columns whose values the flags mark as invalid.
 _FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLOURS}
 _GRAY = 188  # byte of a color that is unknown: half of the light
+_MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
 _MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
 _FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
@@ -121,11 +122,25 @@ def _write_scan(
         header |= {f"{axis}Minimum": float(low), f"{axis}Maximum": float(high)}
     file.write_scan_raw(
         data,
-        name=f"sweep {sweep}, motion compensated",
+        name=_scan_name(sweeps, sweep),
         rotation=quaternion,
         translation=position,
         scan_header=SimpleNamespace(**header),
     )
+
+
+def _scan_name(sweeps: Sweeps, sweep: int) -> str:
+    """Return the name of a scan, such as "station 3" or "roof, sweep 1, motion compensated"."""
+    sensor = sweeps.sensor[sweep]
+    number = int(sweeps.numbers[sweep])
+    per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
+    parts = [sweeps.sensors[sensor]] if len(sweeps.sensors) > 1 else []
+    is_standing = not len(sweeps.knots)
+    if is_standing:
+        parts.append(f"station {max(int(sweeps.station_numbers[sweep]), 1)}")
+    if not is_standing or per_station > 1:
+        parts.append(f"sweep {number % per_station + 1}")
+    return ", ".join(parts) + ("" if is_standing else _MOVING)
 
 
 class _File(pye57.E57):
@@ -246,7 +261,11 @@ def open_file(source: RecordingSource) -> Recording:
             notes += check_metric_format(system, points @ pose[:3, :3].T + pose[:3, 3])
             # Else the points are in no such system.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
-        sweeps = SweepFiles(len(headers), read, notes=tuple(notes), epsg=epsg)
+        names = [_stated_name(header) for header in headers]
+        stations = [] if any(name.endswith(_MOVING) for name in names) else names
+        sweeps = SweepFiles(
+            len(headers), read, notes=tuple(notes), epsg=epsg, stations=tuple(stations)
+        )
     return source.of_sensors({"": sweeps})
 
 
@@ -418,8 +437,13 @@ def _number(node: Any) -> float:
 
 def _name(header: Any, number: int) -> str:
     """Return the name of a scan in messages."""
-    name = str(header.node["name"].value()) if header.node.isDefined("name") else ""
-    return f"scan {number + 1}" + (f" ({printable(name)!r})" if name else "")
+    name = _stated_name(header)
+    return f"scan {number + 1}" + (f" ({name!r})" if name else "")
+
+
+def _stated_name(header: Any) -> str:
+    """Return the name that a scan states, or an empty string."""
+    return printable(str(header.node["name"].value())) if header.node.isDefined("name") else ""
 
 
 def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:

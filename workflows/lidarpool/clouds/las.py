@@ -299,7 +299,7 @@ def _name(name: str) -> str:
 def open_file(source: RecordingSource) -> Recording:
     """Open the points of a .las or .laz, in parts.
 
-    A sample is read evenly in the file.
+    A sample consists of runs of points, evenly in the file.
     """
     path = source.path
     with reading(source.name):

@@ -44,6 +44,7 @@ class SweepFiles(NamedTuple):
     notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
     calibration: Path | None = None  # KITTI's calib.txt, which may not exist
     epsg: int | None = None  # EPSG code of the file's system, if that is in metres
+    stations: Sequence[str] = ()  # name of each sweep if each is from a station; "" for unnamed
 
 
 class SeveralSensorsError(LidarError):
@@ -155,6 +156,7 @@ class Recording:
     frame_poses: Callable[[], Floats | None] | None = None
     sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
     calibration: Path | None = None  # KITTI's calib.txt, which may not exist
+    stations: Sequence[str] = ()  # name of each sweep if each is from a station; "" for unnamed
     noise_filter: NoiseFilter | None = None  # applied by `read`; None if nothing is left out
     # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
     fired: Callable[[int], FiredPoints] | None = None
@@ -275,6 +277,7 @@ class RecordingSource:
             sequence=files.sequence,
             calibration=files.calibration,
             epsg=files.epsg,
+            stations=files.stations,
         )
 
     def named(self, clauses: Iterable[str]) -> tuple[str, ...]:

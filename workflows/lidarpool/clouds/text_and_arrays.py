@@ -49,7 +49,8 @@ def _open_ptx(source: RecordingSource) -> Recording:
         scan = scans[number]
         return scan.positions, scan.columns, scan.pose
 
-    return source.recording(len(scans), read, metres=source.chosen_metres())
+    stations = [""] * len(scans)
+    return source.recording(len(scans), read, metres=source.chosen_metres(), stations=stations)
 
 
 def read_points(path: Path) -> FilePoints:

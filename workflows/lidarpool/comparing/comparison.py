@@ -43,7 +43,6 @@ ONLY_B = theme.rgb("#101418")
 NO_RETURN = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
 GAP_LABELS = ("only A has a return", "only B has a return", "no return")
 # colour maps
-RANGE_COLOURS = "viridis"
 RESIDUAL_COLOURS = "RdBu_r"
 DISTANCE_COLOURS = "plasma"
 RESIDUAL_SCALE = 6.0  # end of the scale, in median absolute deviations: about four sigma
@@ -151,7 +150,7 @@ def draw_ranges(comparison: Comparison) -> Page:
         page.heading(axes, words)
     ramp = np.linspace(0, 1, 256)
     frame = (0.862, layout.image_bottom(1), 0.014, 2 * share + layout.gap / layout.page_height)
-    page.colour_bar(theme.mapped(RANGE_COLOURS, ramp), range_scale, "range, m", frame)
+    page.colour_bar(theme.mapped(theme.RANGE_COLOURS, ramp), range_scale, "range, m", frame)
     frame = (0.862, layout.bottom / layout.page_height, 0.014, share)
     page.colour_bar(theme.mapped(RESIDUAL_COLOURS, ramp), residual_scale, "A − B, mm", frame)
     return page
@@ -167,7 +166,7 @@ def _range_scale(images: RangeImages) -> LogNorm:
 def _range_colours(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
     """Return the colours (r, c, …) of the ranges of A (0) or B (1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
-    colours = theme.mapped(RANGE_COLOURS, scale(ranges).filled(0))
+    colours = theme.mapped(theme.RANGE_COLOURS, scale(ranges).filled(0))
     colours[~images.returned[index]] = NO_RETURN
     return colours
 
@@ -209,8 +208,8 @@ def draw_rings(comparison: Comparison) -> Page:
     page = Page((WIDTH, 760))
     page.title("Residuals by ring", f"A − B in {image['residual']['cells']:,} {image['paired_by']}")
     has_gaps = image["no_return"] is not None
-    width = 0.24 if has_gaps else 0.4
-    gap = 0.075 if has_gaps else 0.1
+    width = 0.225 if has_gaps else 0.4
+    gap = 0.0975 if has_gaps else 0.1
     second_x = LEFT + width + gap
     third_x = second_x + (width + gap)
     frames = [(x, 0.13, width, 0.64) for x in (LEFT, second_x, third_x)]
@@ -319,6 +318,7 @@ def _draw_intensities(page: Page, comparison: Comparison) -> None:
     intensity_a, intensity_b = comparison.intensities
     bins = _intensity_bins(intensity_b), _intensity_bins(intensity_a)
     axes.hist2d(intensity_b, intensity_a, bins, norm=LogNorm(), cmap="viridis", rasterized=True)
+    axes.locator_params(nbins=6)  # labels of small numbers are long
     axes.grid(False)
     correlation = f"rank correlation {figures['rank_correlation']:.3f}"
     page.heading(axes, f"{correlation} of {figures['pairs']:,} {figures['of']}")

@@ -78,8 +78,8 @@ class SweepImages(NamedTuple):
         differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
         words = f"difference, red where the twin is farther, to {1000 * _DIFFERENCE_M:.0f} mm"
         images = [
-            _Image("range, recorded", self.range_m, ranges, "viridis"),
-            _Image("range, in the twin", self.simulated_m, ranges, "viridis"),
+            _Image("range, recorded", self.range_m, ranges, theme.RANGE_COLOURS),
+            _Image("range, in the twin", self.simulated_m, ranges, theme.RANGE_COLOURS),
             _Image(words, self.simulated_m - self.range_m, differences, "RdBu_r"),
         ]
         if self.intensity is not None and self.simulated_intensity is not None:

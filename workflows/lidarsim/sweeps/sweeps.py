@@ -56,6 +56,20 @@ _JSON_FIELDS = (
 )  # fmt: skip
 
 
+def numbered_places(positions: Floats) -> Ints:
+    """Return a number from 1 for each position (n, 3), the same for equal positions: int64 (n,).
+
+    Examples
+    --------
+    >>> numbered_places(np.array([[5.0, 0, 0], [1, 0, 0], [5, 0, 0]]))
+    array([1, 2, 1])
+    """
+    _, first, group = np.unique(positions, axis=0, return_index=True, return_inverse=True)
+    number = np.empty(len(first), np.int64)
+    number[np.argsort(first)] = np.arange(1, len(first) + 1)
+    return np.asarray(number[group.ravel()])
+
+
 @dataclass(frozen=True, eq=False)
 class SweepPoses:
     """Poses of a sensor, carrier or actor at the start of each sweep."""
@@ -325,6 +339,19 @@ class Sweeps:
     def actor_types(self) -> list[str]:
         """Types of the actors."""
         return [type_of(actor) for actor in self.actors]
+
+    @cached_property
+    def station_numbers(self) -> Ints:
+        """Station of each sweep, from 1, or 0 without several stations: int64 (n,).
+
+        A station that a sensor returns to keeps its first number.
+        """
+        numbers = np.zeros(len(self), np.int64)
+        if self.stations > 1:
+            for sensor in np.unique(self.sensor):
+                of_sensor = self.sensor == sensor
+                numbers[of_sensor] = numbered_places(self.pose.positions[of_sensor])
+        return numbers
 
     @cached_property
     def numbers(self) -> Ints:

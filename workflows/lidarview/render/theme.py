@@ -19,6 +19,7 @@ MUTED = "#5d6876"
 CLAY = "#d9dde2"
 UNSEEN = "#c9ccd1"
 SENSOR = "#e0182d"
+RANGE_COLOURS = "viridis_r"  # colour map of range images: yellow is near
 VEIL = 0.085  # share of MUTED over the page: the ground in a rendered picture
 # In pictures within a page, the style of the page defines these colours.
 STYLED = {

@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import Column
 
 RESULT = Column("result", "uint8", "", "result that the point is of", kind="label")
+STATION = Column("station", "int64", "", "station from which the point was scanned", kind="label")
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK_ROWS = 1 << 15  # rows that are read at a time
@@ -96,7 +96,45 @@ class JoinedPoints:
         )
 
 
-Points = CloudFile | HeldPoints | JoinedPoints
+@dataclass(frozen=True, eq=False)
+class StationPoints:
+    """Points with a further column, the station from which each point was scanned."""
+
+    points: CloudFile | HeldPoints | JoinedPoints
+    scans: Ints  # (n,): first scan of each sweep, ascending
+    stations: Ints  # (n,): station of each sweep
+
+    @property
+    def table(self) -> tuple[Column, ...]:
+        """Columns beside the positions."""
+        return (*self.points.table, STATION)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def values(self, name: str, row_selection: Ints | slice) -> AnyArray:
+        """Return the values of a column at rows, as the points without the column do."""
+        if name != STATION.name:
+            return self.points.values(name, row_selection)
+        scans = self.points.values("scan", row_selection)
+        sweep = np.searchsorted(self.scans, scans, "right") - 1
+        return np.asarray(self.stations[np.maximum(sweep, 0)])
+
+
+Points = CloudFile | HeldPoints | JoinedPoints | StationPoints
+
+
+def _row_ranges(points: Points, scans: ScanRanges) -> list[tuple[int, int]]:
+    """Return the ranges of rows, start and stop, that contain ranges of scans."""
+    if isinstance(points, StationPoints):
+        return _row_ranges(points.points, scans)
+    if isinstance(points, JoinedPoints):
+        return sorted(
+            (first + start, first + stop)
+            for first, result in points.results
+            for start, stop in _row_ranges(result, scans)
+        )
+    return sorted(points.rows_of(scan_range) for scan_range in scans)
 
 
 @dataclass(frozen=True)
@@ -290,16 +328,7 @@ class PointFinder:
         """
         ranges = [(0, len(self.points))]  # ranges of rows, first and after the last
         if scans is not None:
-            points = self.points
-            results: Sequence[tuple[int, Any]] = [(0, points)]
-            if isinstance(points, JoinedPoints):
-                results = points.results
-            row_ranges = (
-                (first, result.rows_of(scan_range))
-                for first, result in results
-                for scan_range in scans
-            )
-            ranges = sorted((first + start, first + stop) for first, (start, stop) in row_ranges)
+            ranges = _row_ranges(self.points, scans)
         total = sum(stop - start for start, stop in ranges)
         if point_filter == Filter() and (eye is None or total <= max_points):
             numbers = even_indices(total, max_points)

@@ -9,7 +9,7 @@ import numpy as np
 from lidarsim.base.arrays import Bytes, Floats, Ints
 from lidarsim.scene.colours import as_bytes
 
-from ..render.theme import mapped
+from ..render.theme import RANGE_COLOURS, mapped
 
 _IMAGE_WIDTH = 1024  # most columns of a range image
 
@@ -80,7 +80,7 @@ def _range_colours(ranges: Floats, limits: tuple[float, float]) -> Bytes:
     lower, upper = limits
     shade = np.clip((ranges - lower) / max(upper - lower, 1e-9), 0, 1)
     colours = np.full((len(ranges), 4), 255, np.uint8)
-    colours[:, :3] = as_bytes(mapped("viridis_r", shade))
+    colours[:, :3] = as_bytes(mapped(RANGE_COLOURS, shade))
     return colours
 
 

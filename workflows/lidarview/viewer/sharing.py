@@ -333,14 +333,15 @@ def _packed(header: dict[str, Any], arrays: dict[str, AnyArray]) -> str:
 
 def _thinned(view: View, max_points: int) -> Answer:
     """Choose points, fewer where points are dense, and pack all their columns."""
-    rows, _ = PointFinder(view.points, view.origin).find(_SAMPLE_POINTS)
-    world = positions(view.points, rows)
+    points = view.shown_points
+    rows, _ = PointFinder(points, view.origin).find(_SAMPLE_POINTS)
+    world = positions(points, rows)
     cell_m = max(float(np.linalg.norm(np.ptp(world, axis=0))) / _CELLS, 1e-9)
     cells = ((world - world.min(axis=0)) / cell_m).astype(np.int64) @ [1 << 20, 1 << 10, 1]
     _, cell_of_point, counts = np.unique(cells, return_inverse=True, return_counts=True)
     shares = even_shares(counts, max_points)[cell_of_point]
     chosen = np.random.default_rng(0).random(len(rows)) < shares
-    columns = {c.name: view.points.values(c.name, rows[chosen]) for c in view.points.table}
+    columns = {c.name: points.values(c.name, rows[chosen]) for c in points.table}
     order = _compact_order(columns, int(chosen.sum()))
     return _packed_points(
         view,

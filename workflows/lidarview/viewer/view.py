@@ -42,11 +42,13 @@ from ..render.colouring import (
     with_composed,
     word_of,
 )
+from ..render.surface import spiral
 from ..render.theme import object_colours
 from .legends import Legend, legend_of
 from .point_selection import (
     BLOCK_ROWS,
     RESULT,
+    STATION,
     Abandoned,
     Eye,
     Filter,
@@ -55,6 +57,7 @@ from .point_selection import (
     PointFinder,
     Points,
     ScanRanges,
+    StationPoints,
     corners_of,
     positions,
     read_scans,
@@ -67,7 +70,8 @@ MAX_POINTS = 20_000_000  # points in an answer, and in a download
 MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
 _SAMPLE = 100_000  # points for colour scales and limits
 _MAX_COUNTED = 20_000_000  # points whose labels are counted; of more, a sample
-_CORNERS = 1000  # points of a cloud that are in the first picture
+_CORNERS = 200  # directions whose outermost points of a cloud are in the first picture
+_MAX_BEYOND = 0.5  # points farther outside the middle 99 % than this share of it are outliers
 _MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
 _MAX_NAMES = 2000  # named values of a column that a menu of the page lists
 _NS = 1e9
@@ -122,11 +126,6 @@ class View:
             if pictured.planning is not None and pictured.planning.best is not None:
                 self.path = pictured.planning.best.corners
         self.origin, self._bounds, self._corners = self._extent()
-        other_columns = {
-            column.name: column for column in self.points.table if column not in POSITION
-        }
-        self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # columns to colour and filter by
-        self._coloured = with_composed(self.columns)
         self._lock = threading.Lock()
         self._surface: ShownSurface | None = None
         self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
@@ -139,11 +138,31 @@ class View:
         With `keep_scales`, the colour scales of earlier points stay.
         """
         self.points = points
-        self._finder = PointFinder(points, self.origin)
+        self._finder = PointFinder(self._with_stations(points), self.origin)
+        other_columns = {
+            column.name: column for column in self._finder.points.table if column not in POSITION
+        }
+        self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # columns to colour and filter by
+        self._coloured = with_composed(self.columns)
         if not keep_scales:
             # {(column, filter, limits of the scale): colour scale}
             self._colourings: dict[tuple[Any, ...], Colouring] = {}
         self.version += 1
+
+    def _with_stations(self, points: Points) -> Points:
+        """Return points with their stations, if the survey has several."""
+        sweeps = self.sweeps
+        names = [column.name for column in points.table]
+        if sweeps is None or not sweeps.station_numbers.any() or "scan" not in names:
+            return points
+        if isinstance(points, StationPoints) or STATION.name in names:
+            return points
+        return StationPoints(points, sweeps.scans[:-1], sweeps.station_numbers)
+
+    @property
+    def shown_points(self) -> Points:
+        """Points with all columns that the page shows."""
+        return self._finder.points
 
     # -- properties of the survey ---------------------------------------------------------
 
@@ -164,7 +183,8 @@ class View:
             local = sweeps.pose.positions[of_sensor] - self.origin
             if sweeps.coordinates != "world":  # each point is in the frame of its sensor
                 local = np.zeros_like(local)
-            moves = len(np.unique(local, axis=0)) > len(local) / 2 > 1
+            is_standing = bool(sweeps.station_numbers.any())
+            moves = not is_standing and len(np.unique(local, axis=0)) > len(local) / 2 > 1
             sensors.append(SensorPositions(sweeps.begins_ns[of_sensor], local, moves, name))
         return sensors
 
@@ -193,10 +213,20 @@ class View:
         starts = np.unique(self.sweeps.begins_ns)
         return float(starts[-1] + (np.diff(starts).min() if len(starts) > 1 else 0))
 
+    @property
+    def _station_names(self) -> Sequence[str]:
+        """Names of the stations 0 (none), 1, 2, …, or an empty sequence without stations."""
+        if self.sweeps is None or not self.sweeps.station_numbers.any():
+            return ()
+        names = self.names.get(STATION.name) or [""] * (1 + self.sweeps.station_numbers.max())
+        return ["", *(name or f"station {k}" for k, name in enumerate(names[1:], 1))]
+
     def _names(self, column: str) -> Sequence[str]:
         """Return the names of the values 0, 1, 2, … of a column, or an empty sequence."""
         if column == RESULT.name and self.results:
             return self.results
+        if column == STATION.name:
+            return self._station_names
         if column in self.names:
             return self.names[column]
         if self.pictured is not None and column in self.columns:
@@ -277,6 +307,7 @@ class View:
             arrays["sweep_scans"] = sweeps.scans.astype(np.float64)
             arrays["sweep_begins"] = sweeps.begins_ns / _NS
             arrays["sweep_sensor"] = sweeps.sensor
+            arrays["sweep_station"] = sweeps.station_numbers.astype(np.int32)
         pictured = self.pictured
         object_count = len(self._names("object"))
         static_count = object_count - len(self.actors)
@@ -316,6 +347,8 @@ class View:
                 for number, actor in enumerate(self.actors, static_count)
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
+            # Actors move with the time, which stations alone do not need.
+            "stations": [] if self.actors else self._station_names,
             "results": legend_of(colours_of(result_numbers, RESULT, self.results))["labels"],
             "exports": self._export_formats,
             "actor_colours": as_bytes(object_colours(object_count))[static_count:].tolist(),
@@ -546,7 +579,7 @@ class View:
 
     def _point(self, row: int) -> Answer:
         """Return the position of a point, world coordinates, and all its columns in words."""
-        points = self.points
+        points = self.shown_points
         if not 0 <= row < len(points):
             raise KeyError(row)
         rows = np.array([row])
@@ -671,33 +704,41 @@ def _add_counts(counts: Counter[int], values: AnyArray) -> None:
 def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
     """Return an origin (3,) for points, their local box (2, 3) and points (k, 3), metres.
 
-    The box is without outliers; the points are a sample within the box.
+    The box is without outliers; the points are the outermost of the others in all directions.
     Each coordinate of the origin is 0, or whole metres for points farther than 10 km from 0.
     """
     sample = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):
         empty_box = np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
         return np.zeros(3), empty_box, corners_of(empty_box)
-    box = np.percentile(sample, [0.5, 99.5], axis=0)
+    lower, upper = np.percentile(sample, [0.5, 99.5], axis=0)
+    margin = _MAX_BEYOND * (upper - lower)
+    inside = sample[((sample >= lower - margin) & (sample <= upper + margin)).all(axis=1)]
+    inside = inside if len(inside) else sample
+    box = np.stack([inside.min(axis=0), inside.max(axis=0)])
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
-    inside = sample[((sample >= box[0]) & (sample <= box[1])).all(axis=1)]
-    few = inside[:: len(inside) // _CORNERS + 1] if len(inside) else corners_of(box)
-    return origin, box - origin, few - origin
+    local = inside - origin
+    outermost = [int((local @ direction).argmax()) for direction in spiral(_CORNERS, -1.0)]
+    return origin, box - origin, local[np.unique(outermost)]
 
 
 class GrowingView:
     """A view of a sample of points, which a view of all points replaces once these are read.
 
     `read` returns the view of all points; a thread calls it after the first points of the sample
-    are answered. `total` is the number of all points.
+    are answered. `read` gets a function that shows more points, with the share of the points that
+    has been read. `total` is the number of all points.
     """
 
-    def __init__(self, sample: View, total: int, read: Callable[[], View]) -> None:
+    def __init__(
+        self, sample: View, total: int, read: Callable[[Callable[[Points, float], None]], View]
+    ) -> None:
         self.total = total
         self.note = sample.note
         self._view = sample
         self._read = read
         self._complete = False
+        self._share = 0.0  # of the points that were read
         self._error = ""
         self._reading: threading.Thread | None = None
         self._lock = threading.Lock()
@@ -705,15 +746,15 @@ class GrowingView:
     def answer(self, question: str, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Answer a question of the page, as `View.answer`.
 
-        The question "growth" asks whether all sweeps are read.
+        The question "growth" asks for the share of the points that was read.
         """
         if question == "growth":
-            return {"complete": self._complete, "error": self._error}, {}
+            header = {"complete": self._complete, "error": self._error, "share": self._share}
+            return header | {"version": self._view.version}, {}
         is_sample = not self._complete
         header, arrays = self._view.answer(question, arguments, abandoned)
         if question == "state" and is_sample:
-            note = f"{self.note} A sample; all {self.total:,} points are read meanwhile.".strip()
-            header |= {"growing": True, "points": self.total, "note": note, "exports": []}
+            header |= {"growing": True, "points": self.total, "exports": []}
         if question == "points":
             self._start()
         return header, arrays
@@ -728,10 +769,15 @@ class GrowingView:
     def _grow(self) -> None:
         """Read all points, and replace the sample."""
         try:
-            view = self._read()
+            view = self._read(self._show)
         except LidarError as error:
             self._error = str(error)
             return
         view.version += self._view.version
         self._view = view
         self._complete = True
+
+    def _show(self, points: Points, share: float) -> None:
+        """Show more points, a share of all of which has been read."""
+        self._share = share
+        self._view.show(points, keep_scales=True)

@@ -20,7 +20,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 from PIL import Image
 
-from lidarsim.base.arrays import Floats, Ints
+from lidarsim.base.arrays import Ints
 from lidarsim.base.declared import declared
 from lidarsim.base.errors import explained
 from lidarsim.base.even_samples import even_indices
@@ -41,7 +41,9 @@ from ..report import STAGES, in_order
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
 WIDTH = 1000  # units of the drawing, which the page scales
 ROW = 18  # height of a row
-MAX_MARKS = 200  # sensors' positions in the plan
+MAX_MARKS = 200  # stations in the picture from above
+MAX_NUMBERED = 30  # stations that have their numbers there
+_WEAKEST = 40  # opacity of a pixel with a single point, of 255
 MAX_ROWS = 24  # rows of a partition; the busiest are drawn
 _THIN = 1.2  # smallest width of a bar, in units
 _GAP = 0.6  # bars closer than this are drawn as one
@@ -70,14 +72,15 @@ def write_page(
         If the file cannot be written.
     """
     has_model = any(mounted.sensor.name for mounted in result.survey.carried)
-    marks = _sensor_pixels(result, cloud)
+    marks = _station_marks(result, cloud)
     text = rendered(
         "page.html",
         report=report,
         cloud=cloud,
         name="" if scenario is None or has_model else scenario.title,
-        pictures={"above": from_above(cloud.above, marks)},
-        has_marks=len(marks) > 0,
+        pictures={"above": from_above(cloud.above, cloud.pixel_m, marks)},
+        marks=len(marks),
+        densities=_density_ends(cloud),
         changed=_changed,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
         scenario=_written(scenario) if scenario else "",
@@ -99,41 +102,88 @@ def put_picture(page: Path, name: str, svg: str) -> None:
         Storage.at(page.parent, durable=False).write(page.name, text.encode())
 
 
-def _sensor_pixels(result: RunResult, cloud: CloudCounts) -> Floats:
-    """Return columns and rows, from the north, of the positions of standing sensors: (n, 2).
+class _Mark(NamedTuple):
+    """A station seen from above."""
 
-    Positions outside the bounds of the points are left out.
-    """
+    column: float  # pixels from the west
+    row: float  # pixels from the north
+    number: int
+
+
+def _station_marks(result: RunResult, cloud: CloudCounts) -> list[_Mark]:
+    """Return the stations of sensors that stand within the bounds of the points."""
     survey = result.survey
     if survey.coordinates != "world" or survey.path.moves or not len(result.points):
-        return np.empty((0, 2))
+        return []
     indices = even_indices(survey.path.stations, MAX_MARKS)
     positions = np.array([survey.path.pose(int(k)).position for k in indices])
     rows, columns = cloud.above.shape
     pixels = (positions[:, :2] + result.scene.origin[:2] - cloud.corner) / cloud.pixel_m
     is_within = ((pixels >= 0) & (pixels <= (columns, rows))).all(axis=1)
-    return np.stack([pixels[:, 0], rows - pixels[:, 1]], axis=1)[is_within]
+    return [
+        _Mark(float(x), float(rows - y), int(index) + 1)
+        for (x, y), index in zip(pixels[is_within], indices[is_within], strict=True)
+    ]
 
 
-def from_above(counts: Ints, marks: Iterable[Sequence[float]] | Floats = ()) -> str:
-    """Draw numbers of points (rows, columns), the first row in the south, as SVG.
+def from_above(counts: Ints, pixel_m: float = 1.0, marks: Sequence[_Mark] = ()) -> str:
+    """Draw numbers of points (rows, columns), the first row in the south, as SVG with a scale.
 
-    The page inverts the lightness of the points where the page is dark. `marks` (n, 2) are columns
-    and rows, from the north, of red dots.
+    The page inverts the lightness of the points where the page is dark. Few `marks` have their
+    numbers; many are red dots.
     """
     rows, columns = counts.shape
-    shade = np.log1p(counts[::-1])
-    weakest = np.where(counts[::-1] > 0, 40, 0)  # least of 255: single points are visible, too
-    pixels = np.full((rows, columns, 4), (53, 105, 176, 0), np.uint8)
+    letter = max(rows / 30, columns / 55)  # height of letters
+    size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
+    return (
+        f'<svg viewBox="0 0 {columns} {rows + 2.2 * letter:.1f}" font-size="{letter:.2f}">'
+        f'<image {size} href="{_shaded(counts[::-1])}"/>'
+        f'<g class="stations">{_drawn_marks(marks, letter)}</g>'
+        f"{_scale_bar(columns * pixel_m, pixel_m, rows + 1.9 * letter, letter)}</svg>"
+    )
+
+
+def _shaded(counts: Ints) -> str:
+    """Return the address of a picture of numbers of points (rows, columns)."""
+    shade = np.log1p(counts)
+    weakest = np.where(counts > 0, _WEAKEST, 0)  # single points are visible, too
+    pixels = np.full((*counts.shape, 4), (53, 105, 176, 0), np.uint8)
     pixels[..., 3] = np.maximum(255 * shade / max(shade.max(), 1), weakest)
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "PNG")
-    source = f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
-    size = f'width="{columns}" height="{rows}" style="image-rendering: pixelated"'
-    radius = max(rows, columns) / 130
-    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}"/>' for x, y in marks)
-    image = f'<image {size} href="{source}"/>'
-    return f'<svg viewBox="0 0 {columns} {rows}">{image}<g fill="#d62f3d">{dots}</g></svg>'
+    return f"data:image/png;base64,{b64encode(data.getvalue()).decode()}"
+
+
+def _drawn_marks(marks: Sequence[_Mark], letter: float) -> str:
+    """Draw stations as discs with their numbers, or as dots if there are many or only one."""
+    if not 1 < len(marks) <= MAX_NUMBERED:
+        radius = 0.25 * letter
+        return "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:.2f}"/>' for x, y, _ in marks)
+    return "".join(
+        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{0.8 * letter:.2f}"/>'
+        f'<text x="{x:.1f}" y="{y + 0.34 * letter:.1f}">{number}</text>'
+        for x, y, number in marks
+    )
+
+
+def _scale_bar(width_m: float, pixel_m: float, bottom: float, letter: float) -> str:
+    """Draw a scale bar of about an eighth of a width, with its length."""
+    length_m = nice_step(width_m / 8)
+    length = length_m / pixel_m
+    words = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
+    end = 0.4 * letter
+    return (
+        f'<path class="scale" d="M0 {bottom - end:.1f}V{bottom:.1f}H{length:.1f}v{-end:.1f}"/>'
+        f'<text class="scale" x="{length + 0.5 * letter:.1f}" y="{bottom:.1f}">{words}</text>'
+    )
+
+
+def _density_ends(cloud: CloudCounts) -> tuple[float, float] | None:
+    """Return the lowest and highest points per square meter in `above`, or None without points."""
+    counts = cloud.above[cloud.above > 0]
+    if not len(counts):
+        return None
+    return float(counts.min()) / cloud.pixel_m**2, float(counts.max()) / cloud.pixel_m**2
 
 
 def rendered(

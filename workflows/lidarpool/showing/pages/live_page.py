@@ -167,7 +167,10 @@ class LivePage(RunPage):
             return self._news() | header | points, arrays
         header, arrays = job.view.answer(question, *arguments)
         if question == "state":
-            header |= {"live": True, "sampled": not isinstance(job.view.points, CloudFile)} | points
+            is_sample = not isinstance(job.view.points, CloudFile)
+            suffix = "" if self._title == "lidarpool" else " - lidarpool"
+            title = f"{self._title}{suffix}"
+            header |= {"live": True, "sampled": is_sample, "title": title} | points
         return header, arrays
 
     def _news(self) -> dict[str, Any]:

@@ -7,10 +7,9 @@ view each; a data set is a list of jobs with a view each (`job_list.py`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lidarscenes.files.formats import ROBOTS
 from lidarsim.base.errors import LidarError, MissingFileError, explained
@@ -23,6 +22,9 @@ from lidarview.viewer.view import CLOUD, GrowingView, View
 
 from ...datasets.dataset import INDEX_FILE
 from .downloads import downloads
+
+if TYPE_CHECKING:  # recordings are imported when one is opened
+    from .recorded import OnPart
 
 _TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
 _TRAJECTORY_ADVICE = "name it in a scenario, as trajectory: FILE"
@@ -56,11 +58,13 @@ def open_view(
     keep_noise: bool = False,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
     tell: Callable[[str], None] = lambda note: None,
+    on_part: OnPart = lambda *_: None,
 ) -> View:
     """Open a result, a cloud, a recording, an exported file or folder, a mesh or a scenario.
 
     Points that a cloud withholds or classifies as noise are left out without `keep_noise`.
-    `of_mesh` are the unit and up axis of a mesh; `tell` is called with each note on a scene.
+    `of_mesh` are the unit and up axis of a mesh; `tell` is called with each note on a scene,
+    and `on_part` with each part of a cloud of another program.
 
     LidarError if the path has an unfinished run, or nothing that is read.
     """
@@ -80,17 +84,17 @@ def open_view(
         if (path / CLOUD).exists():
             return open_result(path, downloads())
         refuse_unfinished(path)
-        return _recorded(path, title, keep_noise)
+        return _recorded(path, title, keep_noise, on_part)
     suffix = path.suffix.lower()
     if suffix == ".ply":
         try:
             view = open_result(path, downloads())
         except LidarError:  # text, or of another program
-            return _recorded(path, title, keep_noise)
+            return _recorded(path, title, keep_noise, on_part)
         if not len(view.points):
             raise LidarError(f"{path} has no points.")
         return view
-    return _recorded(path, title, keep_noise)
+    return _recorded(path, title, keep_noise, on_part)
 
 
 def _is_previewed(path: Path) -> bool:
@@ -116,14 +120,15 @@ def _is_previewed(path: Path) -> bool:
 # of a result are shown two seconds earlier.
 
 
-def _recorded(path: Path, title: str, keep_noise: bool) -> View:
+def _recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View:
     """Return the view of a recording."""
     from ...recordings.opening import UnknownFormatError, open_sensors
     from .recorded import recorded_view
 
     may_be_trajectory = path.suffix.lower() in _TRAJECTORIES
     try:
-        return recorded_view(open_sensors(path, keep_noise=keep_noise), title, downloads())
+        sensors = open_sensors(path, keep_noise=keep_noise)
+        return recorded_view(sensors, title, downloads(), on_part)
     except UnknownFormatError as error:
         advice = f"{_TRAJECTORY_ADVICE}, or " if may_be_trajectory else error.advice
         raise LidarError(
@@ -137,21 +142,22 @@ def _recorded(path: Path, title: str, keep_noise: bool) -> View:
 
 
 def growing_view(path: Path, *, keep_noise: bool = False) -> GrowingView | None:
-    """Return the view of a sample of a large .las or .laz, until all its points are read.
+    """Return the view of a large .las or .laz, which shows more points while they are read.
 
     None for other files and folders. LidarError if the file cannot be read.
     """
     if path.suffix.lower() not in (".las", ".laz") or not path.is_file():
         return None
     from ...recordings.opening import open_recording
-    from .recorded import LARGE_POINTS, sampled_view
+    from . import recorded
 
     recording = open_recording(path, keep_noise=keep_noise)
-    if recording.sample is None or (recording.point_count or 0) < LARGE_POINTS:
+    if recording.sample is None or (recording.point_count or 0) < recorded.LARGE_POINTS:
         return None
-    sampled = sampled_view(recording, f"{path.resolve().name} - lidarpool")
-    full = partial(open_view, path, keep_noise=keep_noise)
-    return GrowingView(sampled, recording.point_count or 0, full)
+    title = f"{path.resolve().name} - lidarpool"
+    return recorded.growing_view(
+        recording, title, lambda on_part: open_view(path, keep_noise=keep_noise, on_part=on_part)
+    )
 
 
 def _preview(path: Path, of_mesh: Mapping[str, Any], tell: Callable[[str], None]) -> View:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,14 +16,17 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import TABLE, Column, Kind, Scale
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
-from lidarview.viewer.point_selection import OrderedPoints
-from lidarview.viewer.view import Downloads, View
+from lidarview.viewer.point_selection import STATION, HeldPoints, OrderedPoints, Points
+from lidarview.viewer.view import Downloads, GrowingView, View
 
 from ...clouds.recording import Recording
 
 MAX_POINTS = 20_000_000  # points of a recording, in memory
 LARGE_POINTS = 2_000_000  # a larger cloud is shown by a sample while it is read
 _SAMPLE_POINTS = 200_000
+_GROWING_POINTS = 1_000_000  # points that are shown before all are read, beside the sample
+# Receives positions (n, 3) and columns of a part of a cloud, and the share that has been read.
+OnPart = Callable[[Floats, Mapping[str, AnyArray], float], None]
 _SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
 _RINGS = ("ring", "laser_id", "laser_number", "line", "beam")  # names of the column `channel`
 _NAMES = {"classification": "class", "label": "class", "NormalX": "normal_x", "NormalY": "normal_y"}
@@ -124,16 +127,21 @@ def _described(name: str, values: AnyArray) -> Column:
 
 
 def recorded_view(
-    sensors: Mapping[str, Recording], title: str, downloads: Downloads | None
+    sensors: Mapping[str, Recording],
+    title: str,
+    downloads: Downloads | None,
+    on_part: OnPart = lambda *_: None,
 ) -> View:
     """Return the view of the sensors of a recording, {name: recording}, with a player of sweeps.
+
+    `on_part` is called with each part of a cloud that was read.
 
     LidarError if a recording is damaged, or has no points.
     """
     first = next(iter(sensors.values()))
     notes = [*dict.fromkeys(note for recording in sensors.values() for note in recording.notes)]
     if first.is_cloud:
-        cloud = _cloud_of(first)
+        cloud = _cloud_of(first, on_part)
         sweeps = None
         notes += first.left_out_notes
     else:
@@ -142,7 +150,11 @@ def recorded_view(
     if not len(cloud):
         left_out = "".join(f" {note}." for note in first.left_out_notes)
         raise LidarError(f"{first.name} has no points.{left_out}")
-    names = {"class": ASPRS_CLASSES} if first.name.lower().endswith((".las", ".laz")) else {}
+    names: dict[str, Sequence[str]] = {}
+    if first.name.lower().endswith((".las", ".laz")):
+        names["class"] = ASPRS_CLASSES
+    if sweeps is not None and sweeps.station_numbers.any():
+        names[STATION.name] = _station_names(first, sweeps)
     return View(
         OrderedPoints(cloud),
         None,
@@ -155,24 +167,53 @@ def recorded_view(
     )
 
 
-def sampled_view(recording: Recording, title: str) -> View:
-    """Return the view of an even sample of a cloud that has `Recording.sample`, within a second."""
+def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
+    """Return the names of the stations 0 (none), 1, 2, …, with "" for unnamed stations."""
+    numbers = sweeps.station_numbers.tolist()
+    names = [""] * (max(numbers) + 1)
+    for number, name in zip(numbers, recording.stations, strict=False):  # some may not be read
+        names[number] = names[number] or name
+    return names
+
+
+def sampled_view(recording: Recording, title: str) -> tuple[View, Pieces]:
+    """Return the view of a sample of a cloud that has `Recording.sample`, and its points.
+
+    The sample consists of runs of points, which are read within a second.
+    """
     pieces = Pieces()
     assert recording.sample is not None
     with reading(recording.name):
         positions, columns, _ = recording.sample(_SAMPLE_POINTS)
         pieces.add(positions * recording.metres, columns)
     names = {"class": ASPRS_CLASSES}
-    return View(
-        OrderedPoints(pieces.cloud()),
+    view = View(
+        HeldPoints(pieces.cloud()),
         note=" ".join(recording.notes),
         title=title,
         names=names,
         stated_epsg=recording.epsg,
     )
+    return view, pieces
 
 
-def _cloud_of(recording: Recording) -> Cloud:
+def growing_view(recording: Recording, title: str, read: Callable[[OnPart], View]) -> GrowingView:
+    """Return a view that shows a sample of a cloud, and more points while `read` reads all."""
+    total = recording.point_count or 0
+    sampled, pieces = sampled_view(recording, title)
+    step = -(-total // _GROWING_POINTS)
+
+    def grow(show: Callable[[Points, float], None]) -> View:
+        def on_part(positions: Floats, columns: Mapping[str, AnyArray], share: float) -> None:
+            pieces.add(positions[::step], {name: v[::step] for name, v in columns.items()})
+            show(HeldPoints(pieces.cloud()), share)
+
+        return read(on_part)
+
+    return GrowingView(sampled, total, grow)
+
+
+def _cloud_of(recording: Recording, on_part: OnPart) -> Cloud:
     """Read a cloud.
 
     Of a large cloud, take one point in a few.
@@ -188,6 +229,7 @@ def _cloud_of(recording: Recording) -> Cloud:
                 positions = positions * recording.metres
             columns = {name: np.asarray(values)[::step] for name, values in columns.items()}
             pieces.add(positions, columns)
+        on_part(positions, columns, (number + 1) / recording.count)
     return pieces.cloud()
 
 
@@ -237,11 +279,13 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     notes = []
     if len(poses) < len(ordered):
         notes.append(f"The first {len(poses):,} of {plural(len(ordered), 'sweep')} are shown.")
-    if not is_timed and len(ordered) > 1:
+    are_stations = all(recording.stations for recording in recordings)
+    if not is_timed and len(ordered) > 1 and not are_stations:
         notes.append("The recording has no times: ten sweeps a second are assumed.")
     counts = [len(positions) for positions in pieces.positions]
     cloud = pieces.cloud(scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
-    return cloud, recorded_sweeps(ordered[: len(poses)], poses, [*sensors]), notes
+    sweeps = recorded_sweeps(ordered[: len(poses)], poses, [*sensors])
+    return cloud, replace(sweeps, stations=len(sweeps) if are_stations else 1), notes
 
 
 def _frame_poses(recording: Recording) -> Floats | None:

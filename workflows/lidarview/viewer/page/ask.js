@@ -7,9 +7,26 @@ const TYPES = {
 export async function ask(what, asked = {}, signal = undefined) {
   const query = new URLSearchParams(Object.entries(asked).filter(([, value]) => value !== undefined));
   if (inFile("state?")) return what === "points" ? pointsOf(asked) : what === "point" ? pointOf(asked.row) : held(`${what}?${query}`);
-  const answer = await fetch(`${what}?${query}`, { signal });
-  if (!answer.ok) throw new Error(`${what}: ${answer.status}`);
-  return unpacked(await answer.arrayBuffer());
+  return unpacked(await answerTo(what, `${what}?${query}`, signal));
+}
+
+// A server that starts, or that is busy, is asked again after these pauses.
+const PAUSES_MS = [250, 500, 1000, 0];
+
+async function answerTo(what, address, signal) {
+  for (const pause of PAUSES_MS) {
+    let words = "";
+    try {
+      const answer = await fetch(address, { signal });
+      if (answer.ok) return await answer.arrayBuffer();
+      words = `The server could not answer "${what}" (${answer.status} ${answer.statusText}). The terminal of the command shows the reason.`;
+      if (answer.status < 500) throw new Error(words);
+    } catch (error) {
+      if (!(error instanceof TypeError)) throw error;
+    }
+    if (!pause) throw words ? new Error(words) : new TypeError("The server of this page has ended.");
+    await new Promise((done) => setTimeout(done, pause));
+  }
 }
 
 function unpacked(bytes) {

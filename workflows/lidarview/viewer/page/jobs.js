@@ -141,6 +141,6 @@ $("buttons").append(themeButton(), stop);
 follow("jobs", () => ({ newest: follows && !document.hidden ? 1 : undefined }), NEWS_MS, show).catch((error) => {
   console.warn(error);
   $("slots").replaceChildren(); // it goes on no more
-  $("state").textContent = "The server of this page has ended.";
+  $("state").textContent = error.message;
   $("state").className = "bad";
 });

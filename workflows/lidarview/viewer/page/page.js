@@ -21,6 +21,8 @@ const FAINT = 0.2; // opacity of grey surfaces before points, so that these come
 const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
 
 const $ = (id) => document.getElementById(id);
+for (const kind of ["error", "unhandledrejection"])
+  addEventListener(kind, ({ error, reason }) => { if (error ?? reason) failed(error ?? reason); });
 const picture = new Picture($("canvas"), $("labels"), $("handles"), $("axes"), $("scale"), () => moved());
 const theme = themeButton((chosenOne) => picture.setTheme(chosenOne));
 
@@ -41,15 +43,22 @@ let lost = false;
 function failed(error) {
   if (error.name === "AbortError") return;
   console.warn(error);
+  say(error.message, true);
   if (error instanceof TypeError) {
     lost = true;
     setPlaying(false);
-    say("The server of this page has ended.", true);
   }
 }
 
 function sayRead() {
   if ($("hint").textContent === READING) say("");
+}
+
+// Says how far a run is, unless something else is said.
+let saidState = "";
+function sayState(words) {
+  if (["", READING, "Loading …", saidState].includes($("hint").textContent)) say(words);
+  saidState = words;
 }
 
 function say(words, bad = false) {
@@ -386,10 +395,11 @@ function later(act, ms = 120) {
 function buildPanel() {
   const columns = state.columns.map((column) => column.name);
   panel.facts = element("div", { id: "facts" });
+  const name = state.title.replace(/ - lidarpool$/, "");
   const head = element(
-    "header", {}, element("h1", { textContent: document.title.replace(/ - lidarpool$/, "") }),
+    "header", {}, element("h1", { textContent: name }),
     iconButton("link", "Copy the link to this view", copyLink),
-    iconButton("picture", "Save the picture", () => picture.save(`${document.title}.png`)),
+    iconButton("picture", "Save the picture", () => picture.save(`${name}.png`)),
     iconButton("help", "Keys and mouse (?)", showKeys), theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
   );
   panel.legend = element("div");
@@ -403,7 +413,7 @@ function buildPanel() {
     menu("at most", BUDGETS.map((count) => [count, `${(count / 1e6).toLocaleString("en")} million`]), chosen.budget, (value) => { chosen.budget = +value; shownKey = null; refresh(); }),
     tick("shade by depth", chosen.shading, (on) => { chosen.shading = on; picture.strength = on ? 1 : 0; picture.dirty = true; }),
   );
-  const parts = [head, panel.progress, panel.facts];
+  const parts = [head, panel.progress, ...(state.live ? [stop] : []), panel.facts];
   if (state.results.length) parts.push(section("Results", true, (panel.results = element("div"))));
   parts.push(points);
   if (state.scene_colours) {
@@ -419,7 +429,7 @@ function buildPanel() {
         chosen.opacity = picture.opacity = value;
         picture.dirty = true;
       })),
-      ...(state.scanner ? [] : [tick("sample rays", chosen.rays, (on) => { chosen.rays = on; showRays(); })]),
+      ...(state.scanner ? [] : [(panel.rays = tick("sample rays", chosen.rays, (on) => { chosen.rays = on; showRays(); }))]),
       ...(picture.actors.length ? [tick("boxes and names", chosen.boxes, (on) => { chosen.boxes = on; picture.showBoxes(on); })] : []),
     ));
   }
@@ -659,30 +669,40 @@ function showClipBox(on) {
 // -- time --------------------------------------------------------------------------------
 
 let steps = []; // beginnings of the sweeps of the sensors that are shown, ascending
+let stationAt = new Map(); // {beginning of a sweep: its station}
 const clock = {};
 
 function buildSteps() {
-  const begins = sweeps.filter((sweep) => picture.sensors[sweep.sensor]?.shown).map((sweep) => sweep.begin);
-  steps = [...new Set(begins)].sort((a, b) => a - b);
-  if (clock.ticks) drawTicks();
+  const shown = sweeps.filter((sweep) => picture.sensors[sweep.sensor]?.shown);
+  stationAt = new Map(shown.map((sweep) => [sweep.begin, sweep.station]));
+  steps = [...stationAt.keys()].sort((a, b) => a - b);
+  if (!clock.ticks) return;
+  if (stationary()) clock.slider.max = sliderEnd();
+  drawTicks();
 }
 
+// The slider has the time of a drive, or the number of a sweep where nothing moves but from station to station.
+const stationary = () => state.stations.length > 0;
 const duration = () => Math.max(state.duration, 1e-9);
+const sliderEnd = () => (stationary() ? Math.max(steps.length - 1, 1) : duration());
+const stepNow = () => lastNotAbove(steps, chosen.time + 1e-9);
 
 function buildTime() {
   const timed = sweeps.length > 0 && picture.sensors.length > 0;
   $("time").hidden = !timed;
   if (!timed) return;
   clock.play = iconButton("play", "Play (space)", () => setPlaying(!playing));
-  clock.show = menu("", SHOWS.filter(([value]) => !(+value >= state.duration)), chosen.show, (value) => { clock.own = true; setShow(value); });
+  const shows = SHOWS.filter(([value]) => !(+value >= (stationary() ? 0 : state.duration)))
+    .map(([value, text]) => [value, value === "sweep" && steps.length === state.stations.length - 1 ? "one station" : text]);
+  clock.show = menu("", shows, chosen.show, (value) => { clock.own = true; setShow(value); });
   explain(clock.show, "Points that are shown");
-  clock.slider = element("input", { type: "range", min: 0, max: duration(), step: "any", value: chosen.time, title: "Time" });
-  clock.slider.setAttribute("aria-label", "time, seconds");
-  clock.slider.oninput = () => { leaveAll(); setTime(+clock.slider.value); };
+  clock.slider = element("input", { type: "range", min: 0, max: sliderEnd(), step: stationary() ? 1 : "any", value: stationary() ? stepNow() : chosen.time });
+  explain(clock.slider, stationary() ? "Station" : "Time, seconds");
+  clock.slider.oninput = () => { leaveAll(); setTime(stationary() ? steps[+clock.slider.value] : +clock.slider.value); };
   clock.ticks = element("canvas");
   clock.now = element("span", { className: "now" });
   clock.speed = menu("", SPEEDS.map((speed) => [speed, `${speed}×`]), chosen.speed, (value) => { chosen.speed = +value; });
-  explain(clock.speed, "Speed; 1× is as fast as the survey");
+  explain(clock.speed, stationary() ? "Speed; 1× is a station a second" : "Speed; 1× is as fast as the survey");
   clock.loop = iconButton("loop", "Play again from the start", () => { chosen.loop = !chosen.loop; showToggles(); });
   clock.follow = button("Follow", () => setFollow(!chosen.follow));
   clock.follow.title = "Move the camera with the carrier";
@@ -720,6 +740,19 @@ function drawTicks() {
   pen.scale(ratio, ratio);
   const room = 8, at = (time) => room + (width - 2 * room) * (time / duration()); // a thumb is 16 pixels wide
   pen.fillStyle = style.getPropertyValue("--line");
+  if (stationary()) {
+    pen.fillStyle = style.getPropertyValue("--muted");
+    pen.font = "11px system-ui, sans-serif";
+    pen.textAlign = "center";
+    let free = 0; // where no number is yet
+    steps.forEach((time, k) => {
+      const x = room + ((width - 2 * room) * k) / sliderEnd();
+      if (x < free || stationAt.get(time) === stationAt.get(steps[k - 1])) return;
+      pen.fillText(stationAt.get(time), x, 14);
+      free = x + 24;
+    });
+    return;
+  }
   if (steps.length < width / 3) for (const time of steps) pen.fillRect(at(time), 0, 1, 4);
   if (!state.duration) return; // one sweep of a cloud alone: nobody knows how long it took
   const most = width / 70, step = [1, 2, 5, 10].map((n) => n * 10 ** Math.floor(Math.log10(duration() / most))).find((n) => duration() / n <= most);
@@ -749,7 +782,7 @@ function leaveAll() {
 
 function setTime(time) {
   chosen.time = Math.min(Math.max(time, 0), duration());
-  clock.slider.value = chosen.time;
+  clock.slider.value = stationary() ? stepNow() : chosen.time;
   picture.setTime(chosen.time);
   tellTime();
   const ready = refresh();
@@ -758,16 +791,17 @@ function setTime(time) {
 }
 
 function tellTime() {
-  const digits = duration() < 100 ? 3 : 1;
-  const index = lastNotAbove(steps, chosen.time + 1e-9);
-  clock.now.textContent = `${chosen.time.toFixed(digits)} s · sweep ${index + 1} of ${steps.length}`;
+  const digits = duration() < 100 ? 3 : 1, index = stepNow(), station = stationAt.get(steps[index]), last = state.stations.length - 1;
+  const of = steps.length === last ? "" : ` · sweep ${index + 1} of ${steps.length}`, name = state.stations[station];
+  clock.now.textContent = stationary() ? `station ${station} of ${last}${name === `station ${station}` ? "" : ` · ${name}`}${of}`
+    : `${chosen.time.toFixed(digits)} s · sweep ${index + 1} of ${steps.length}`;
 }
 
 function stepBy(count) {
   if (!steps.length) return;
   setPlaying(false);
   leaveAll();
-  const index = lastNotAbove(steps, chosen.time + 1e-9);
+  const index = stepNow();
   const back = count < 0 && chosen.time - steps[Math.max(index, 0)] > 1e-6 ? 1 : 0;
   setTime(steps[Math.min(Math.max(index + count + back, 0), steps.length - 1)]);
 }
@@ -784,8 +818,15 @@ function setPlaying(on) {
 
 // The time of a sweep does not pass before its points are there.
 function play(seconds) {
-  let time = chosen.time + seconds * chosen.speed;
-  if (time >= duration()) {
+  let time = chosen.time + seconds * chosen.speed, ended = time >= duration();
+  if (stationary()) {
+    clock.waited = (clock.waited ?? 0) + seconds * chosen.speed;
+    if (clock.waited < 1) return;
+    clock.waited = 0;
+    ended = stepNow() + 1 >= steps.length;
+    time = ended ? steps[0] : steps[stepNow() + 1];
+  }
+  if (ended) {
     if (!chosen.loop) {
       setTime(duration());
       setPlaying(false);
@@ -953,7 +994,7 @@ function takeState(told) {
   sweeps = [];
   if (arrays.sweep_scans) {
     arrays.sweep_begins.forEach((begin, index) => {
-      const sweep = { first: arrays.sweep_scans[index], last: arrays.sweep_scans[index + 1] - 1, begin, sensor: arrays.sweep_sensor[index], index };
+      const sweep = { first: arrays.sweep_scans[index], last: arrays.sweep_scans[index + 1] - 1, begin, sensor: arrays.sweep_sensor[index], station: arrays.sweep_station[index], index };
       sweeps.push(sweep);
       own[sweep.sensor]?.sweeps.push(sweep);
     });
@@ -986,13 +1027,15 @@ function placeMoved(arrays, time) {
 }
 
 // What is new of a run, or of a scanner.
-const known = { rays: null, hits: null, ends: 0 };
+const known = { rays: null, hits: null, ends: 0, over: false };
 async function news(told) {
   if (told.rays_version !== known.rays) {
     known.rays = told.rays_version;
     picture.setRays(told.arrays.rays);
   }
   tellRun(told);
+  if (told.over && panel.rays?.box.checked && !known.over) panel.rays.box.click(); // they hide the points of a result
+  known.over = told.over;
   if (told.arrays.actor_places) placeMoved(told.arrays, told.time);
   else if (told.time !== null && !told.over) picture.setTime(told.time);
   state.points = told.points;
@@ -1014,18 +1057,32 @@ async function news(told) {
     takeState(await ask("state"));
     picture.setTime(chosen.time);
     buildSteps();
+    buildPanel();
     buildTime();
+    legendText = "";
     shownKey = null;
     refresh();
     await loadSurface();
   }
 }
 
-// Of a large file, a sample is shown first: waits for all points, and takes them.
+// Of a large file, a sample is shown first, and more points while they are read.
 async function grow() {
-  const told = await follow("growth", () => ({}), NEWS_MS, ({ complete: all, error }) => all || error);
-  if (told.error) return say(told.error, true);
+  const told = await follow("growth", () => ({}), NEWS_MS, ({ complete: all, error, share, version }) => {
+    say(`Reading the points … ${Math.round(100 * share)} %`);
+    if (all || error) return true;
+    if (version !== state.version) {
+      state.version = version;
+      refresh();
+    }
+    return false;
+  });
+  say(told.error, Boolean(told.error));
+  if (told.error) return;
+  const { origin } = state;
   takeState(await ask("state"));
+  if (picture.touched) picture.shift(less(origin, state.origin));
+  else picture.frame(state.box, state.arrays.corners, state.bounds); // the sample lacks its sides
   buildPanel();
   legendText = "";
   shownKey = null;
@@ -1035,7 +1092,9 @@ async function grow() {
 function tellRun(told) {
   const since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
   const pace = told.rate && !told.over ? `, ${told.rate}  ${told.left && `${told.left} left`}` : "";
-  if (NARROW.matches && !lost) say(told.over ? "" : told.state);
+  const [, done, whole] = told.stages.at(-1) ?? [];
+  if (told.title) document.title = `${told.over || !whole ? "" : `${Math.floor((100 * done) / whole)}% `}${told.title}${told.title === "lidarpool" ? "" : " - lidarpool"}`;
+  sayState(told.over || (!NARROW.matches && told.points) ? "" : told.state);
   const head = element("div", {}, element("b", { textContent: told.state }), since, pace);
   replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(slots));
 }
@@ -1144,7 +1203,6 @@ async function begin() {
   const told = await follow("state", () => ({}), NEWS_MS, (it) => {
     if (it.columns) return true;
     $("panel").replaceChildren(panel.progress, stop); // its only job has not begun
-    say("");
     tellRun(it);
     if (it.failures[0]) say(it.failures[0].error, true);
     return false;
@@ -1167,7 +1225,8 @@ async function begin() {
   buildTime();
   buildTools();
   picture.setTime(chosen.time);
-  if (drives) look("sensor");
+  picture.resize(); // the player and the panel take their places
+  look(drives && !picture.isFlying ? "sensor" : "all");
   if (!$("time").hidden) tellTime();
   setClip(chosen.clip);
   showRays();
@@ -1192,7 +1251,6 @@ async function begin() {
   };
   requestAnimationFrame(frame);
   if (state.live) {
-    panel.progress.after(stop);
     follow("news", () => ({}), NEWS_MS, news).catch((error) => {
       failed(error);
       panel.progress.replaceChildren(); // it goes on no more
@@ -1204,10 +1262,7 @@ async function begin() {
   await loadSurface();
 }
 
-begin().catch((error) => {
-  console.error(error);
-  say("The page could not be read: is its server still there?", true);
-});
+begin().catch(failed);
 
 // For tests and for the console of curious users.
 Object.assign(window, { lidarpool: { picture, chosen, get state() { return state; }, get playing() { return playing; }, get steps() { return steps; } } });

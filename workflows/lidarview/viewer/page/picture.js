@@ -11,6 +11,7 @@ const THEMES = {
 const RED = 0xe0182d, GREEN = 0x149650, DISC = 0x78828f, MARK = 0xff00a0, CLIP = 0x2f8fe0;
 const FOV = 45; // degrees, from the upper to the lower edge
 const SIDES = { all: [0.55, -1, 0.62], inside: [0.12, -0.25, 1], top: [0, 0, 1], side: [1, 0, 0], front: [0, -1, 0] };
+const FLIGHT_M = 10; // height of a carrier that flies
 const PICKED_WITHIN = 6; // pixels
 const SAME_SURFACE = 1.03; // times the distance of the nearest
 const AS_POINTS = 0.25; // alpha of pixels that are points: only these get eye-dome lighting
@@ -136,6 +137,7 @@ export class Picture {
     this.controls = new THREE.OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enableDamping: true, dampingFactor: 0.18, zoomToCursor: true, screenSpacePanning: true });
     this.controls.addEventListener("change", () => { this.dirty = true; changed(); });
+    this.controls.addEventListener("start", () => { this.touched = true; }); // by a user
     this.pointMaterial = new THREE.ShaderMaterial({
       vertexShader: POINT_VERTEX, fragmentShader: POINT_FRAGMENT,
       uniforms: {
@@ -535,6 +537,14 @@ export class Picture {
     this.useParallel(side !== "all");
   }
 
+  // Whether a moving carrier is far above what is looked at.
+  get isHigh() {
+    return this.sensors.some((sensor) => sensor.moves) && this.carrier.z - this.middle.z > 0.1 * this.extent;
+  }
+
+  // A car does not fly, however small its surroundings are.
+  get isFlying() { return this.isHigh && this.carrier.z - this.middle.z > FLIGHT_M; }
+
   // Behind and above the carrier, looking ahead; or to the middle, if it stands.
   lookFromSensor() {
     if (!this.carrier) return;
@@ -543,9 +553,15 @@ export class Picture {
     const ahead = !moving && inwards.length() > 0.1 * this.extent ? inwards.normalize() : this.heading;
     const back = 0.14 * this.extent, target = this.carrier.clone().addScaledVector(ahead, 0.3 * this.extent);
     const eye = this.carrier.clone().addScaledVector(ahead, -back).add(new THREE.Vector3(0, 0, 0.6 * back));
-    if (moving && this.carrier.z - this.middle.z > 0.1 * this.extent) target.z = this.middle.z; // the ground is far below
+    if (this.isHigh) target.z = this.middle.z; // the ground is far below
     this.useParallel(false);
     this.place(eye, target);
+  }
+
+  // Moves the camera with the local origin.
+  shift(way) {
+    const by = new THREE.Vector3(...way);
+    this.place(this.camera.position.clone().add(by), this.controls.target.clone().add(by));
   }
 
   place(position, target) {
