@@ -259,18 +259,22 @@ def _coverage_figures(coverage: SurveyCoverage, built: Built) -> dict[str, Any]:
 def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, list[str]]:
     """Build a scenario whose poses do not matter.
 
-    Returns its notes, which are printed at once.
+    Returns its notes and warnings, which are printed at once.
     """
     from ..scenario.advice import advice
     from ..scenario.build import build
     from ..scenario.default_poses import Placing
+    from ..scenario.georeference import place_problem
 
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=False)
     notes = advice(replace(built, placing=Placing(())))
     for note in notes:
         terminal.tell(note)
-    return built, notes
+    placed = built.scene.georeferenced(built.scenario.world.origin)
+    if problem := place_problem(placed, built.survey.epsg):
+        terminal.warn(problem)
+    return built, [*notes, *terminal.warnings]
 
 
 def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
