@@ -159,7 +159,7 @@ def test_a_scene_outside_the_area_of_use_is_told_with_both_remedies():
     [no_origin] = placed_at((0, 0), epsg=25832)
     assert no_origin.endswith("local coordinates, set world.origin to the place of their zero.")
     with pytest.raises(
-        LidarError, match="Switzerland. If the files .* set world.epsg to the system"
+        LidarError, match=r"Switzerland\. If the files .* set world\.epsg to the system"
     ):
         placed_at((600_000, 200_000), epsg=2056)
     with pytest.raises(LidarError, match=r"outside the area of use of EPSG:31467") as wrong:
