@@ -167,8 +167,7 @@ def plan_stations(
 
     Examples
     --------
-    >>> from lidarpool import Sensor
-    >>> from lidarsim.scene.actors import box
+    >>> from lidarpool import Sensor, box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
     >>> plan = plan_stations(room, Sensor.grid(vertical_fov_deg=180), slant_deg=90)
     >>> len(plan.stations), plan.visible_m2.round().tolist()
@@ -243,8 +242,7 @@ def survey_coverage(
     Examples
     --------
     >>> import numpy as np
-    >>> from lidarpool import Sensor
-    >>> from lidarsim.scene.actors import box
+    >>> from lidarpool import Sensor, box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
     >>> floor = np.mgrid[-4:4.1:0.1, -3:3.1:0.1, 0:1].reshape(3, -1).T
     >>> found = survey_coverage(

@@ -512,7 +512,7 @@ def _materials(
 
     Classes of actors, copies and traffic come from the scenario; classes of other objects come from
     files. `vehicles` are the last actors of the scene, with their entries of the traffic. Rows of
-    objects are indices into `scene.all_names`.
+    objects are indices into `scene.object_names`.
     """
     vehicle_classes = [entry.semantic_class for _, entry in vehicles]
     default_material = Material("*")
@@ -523,7 +523,7 @@ def _materials(
         materials = [default_material]
     for classed_object in classed:
         materials = _with_object_class(materials, classed_object, kinds)
-    first_vehicle_row = len(scene.all_names) - len(vehicles)
+    first_vehicle_row = len(scene.object_names) - len(vehicles)
     for semantic_class in sorted({number for number in vehicle_classes if number is not None}):
         vehicle_rows = np.array(
             [

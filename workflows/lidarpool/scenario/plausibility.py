@@ -149,7 +149,7 @@ def _position_warnings(
                 f"surfaces{advice}; if it is the sensor's housing, give its name as unseen of the "
                 "sensor"
             )
-    for actor, name in enumerate(scene.all_names[len(scene.names) :]):
+    for actor, name in enumerate(scene.object_names[len(scene.names) :]):
         masks = (unseen[sample.sensor] for sample in samples)
         is_seen = [mask is None or not mask[len(scene.names) + actor] for mask in masks]
         inside = _inside_actor(scene.actors[actor], samples) & is_seen
