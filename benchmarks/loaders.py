@@ -100,7 +100,7 @@ def write(folder, name):
     rows = np.arange(count)
     columns = {"scan": np.arange(count) * scans // count}
     columns |= {"ray": rows % 40, "channel": rows % 4, "class": rng.integers(0, 30, count)}
-    columns |= {"object": rng.integers(0, len(scene.all_names), count)}
+    columns |= {"object": rng.integers(0, len(scene.object_names), count)}
     columns |= {"intensity": rng.random(count, np.float32), "time": columns["scan"] * 1000}
     columns["reflectivity"] = rng.integers(0, 256, count).astype(np.uint8)
     cloud = lp.Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)

@@ -8,9 +8,8 @@ try:
 except ImportError as error:
     raise SystemExit("This example needs Newton: pip install newton") from error
 
-from lidarpool import Follower, Noise, load_sensor, save_cloud
+from lidarpool import Follower, Noise, box, load_sensor, save_cloud
 from lidarsim.motion.rotations import matrices
-from lidarsim.scene.actors import box
 from lidarsim.scene.transform import affine
 
 STEP_S = 1 / 240

@@ -7,8 +7,7 @@ try:
 except ImportError as error:
     raise SystemExit("This example needs PyBullet: pip install pybullet") from error
 
-from lidarpool import Follower, Noise, load_sensor, save_cloud
-from lidarsim.scene.actors import box
+from lidarpool import Follower, Noise, box, load_sensor, save_cloud
 
 STEP_S = 1 / 240  # of PyBullet, by default
 DURATION_S = 0.55

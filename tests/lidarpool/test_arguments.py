@@ -44,6 +44,7 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
+    box,
     compare,
     fit,
     load_robot,
@@ -81,6 +82,11 @@ WRONG = {
     ],
     Beams: [("x", "array of numbers"), ([[1], [2, 3]], "[[1")],
     Beams.even: [("4", 60, "layers is '4'"), (4.5, 60, "whole")],
+    box: [
+        (3, (1, 1, 1), "name is 3"),
+        ("Car", 4, "list of numbers"),
+        ("Car", (4, 2), "size_m[2] is missing"),
+    ],
     Campaign: [
         (3, 4, "make is 3; it must be a function"),
         (print, "4", "count is '4'; it must be a whole number"),
@@ -257,6 +263,29 @@ def test_options_that_a_call_does_not_take_are_refused(call, keyword, says):
     with pytest.raises(TypeError) as raised:
         call(**{keyword: True})
     assert f"unexpected keyword argument {keyword!r}" in str(raised.value)
+    assert says in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "keyword", "says"),
+    [
+        (partial(Material, "Car"), "class_", "Did you mean 'semantic_class'?"),
+        (
+            partial(Actor, box("Car", (4, 2, 1))),
+            "class_",
+            "such as Material('Car', semantic_class=1)",
+        ),
+        (partial(Pose, (0, 0, 0)), "heading_deg", "'yaw_deg'? It is 90 minus a compass heading."),
+        (partial(Pose, (0, 0, 0)), "yaw", "Did you mean 'yaw_deg'?"),
+        (partial(Scanner, SCENE, GRID), "visibility", "Did you mean 'visibility_km'?"),
+        (partial(SCANNER.sweep, (0, 0, 1)), "start", "sweep() got an unexpected keyword argument"),
+    ],
+)
+def test_unknown_arguments_are_refused_with_a_hint(call, keyword, says):
+    with pytest.raises(
+        TypeError, match=f"got an unexpected keyword argument '{keyword}'"
+    ) as raised:
+        call(**{keyword: 1})
     assert says in str(raised.value)
 
 

@@ -74,7 +74,7 @@ def test_bytes_and_counts_are_those_of_a_cloud_written_at_once(
         counts = growing.finish(tmp_path / "grown.ply", points)
     save_cloud(points, tmp_path / "whole.ply")
     assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    expected = counts_of(points, len(SCENE.all_names), len(SCENE.material_names))
+    expected = counts_of(points, len(SCENE.object_names), len(SCENE.material_names))
     assert counted(counts) == counted(expected)
     sweeps = Sweeps.from_survey(SURVEY, SCENE)
     again = write_cloud(tmp_path / "again.ply", points, sweeps, SCENE)
@@ -96,7 +96,7 @@ def test_bytes_and_counts_do_not_depend_on_threads_and_blocks(
         grown = growing.finish(tmp_path / "grown.ply", points)
     save_cloud(points, tmp_path / "whole.ply")
     assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    expected = counts_of(points, len(SCENE.all_names), len(SCENE.material_names))
+    expected = counts_of(points, len(SCENE.object_names), len(SCENE.material_names))
     assert counted(grown) == counted(expected)
 
 
@@ -136,7 +136,7 @@ def test_a_late_part_far_away_makes_all_positions_double(store, tmp_path, far_fi
     assert read_cloud(tmp_path / "grown.ply").positions.dtype == np.float64
     save_cloud(points, tmp_path / "whole.ply")
     assert (tmp_path / "grown.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
-    expected = counts_of(points, len(SCENE.all_names), len(SCENE.material_names))
+    expected = counts_of(points, len(SCENE.object_names), len(SCENE.material_names))
     assert counted(counts) == counted(expected)
 
 

@@ -492,7 +492,7 @@ def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind, ti
             found, expected = view.points.values(name, slice(None)), np.asarray(points)[:, axis]
             np.testing.assert_allclose(np.sort(found), np.sort(expected), atol=2e-3)
         words = dict(jobs.answer(f"job/{number}/point", {"row": "0"}, bool)[0]["columns"])
-        assert kind == "mcap" or words["object"] in scene.all_names
+        assert kind == "mcap" or words["object"] in scene.object_names
     for question in ("job/3/state", "job/9/state", "news"):
         with pytest.raises(KeyError):
             jobs.answer(question, {}, bool)

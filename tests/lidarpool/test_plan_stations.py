@@ -1,6 +1,7 @@
 """Stations for terrestrial scans: areas that are known by hand, and where nobody can stand."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -151,6 +152,53 @@ def test_what_cannot_be_is_refused(given, says):
     given = {"scene": Scene.from_meshes(rooms()), "sensor": EVERYWHERE, **given}
     with pytest.raises(LidarError, match=says):
         plan_stations(**given)
+
+
+def test_targets_are_covered_and_other_objects_only_occlude():
+    """Of a house on open ground, with a screen in front of a wall, only the walls count."""
+    house = [
+        placed("Ground", (40, 40, 0.2), (0, 0, -0.2)),
+        placed("House", (6, 6, 4), (0, 0, 0)),
+        placed("Screen", (0.2, 8, 4), (3.15, 0, 0)),
+    ]
+    scene = Scene.from_meshes(house)
+    options = {"spacing_m": 4.0, "slant_deg": 85}
+    plan = plan_stations(scene, EVERYWHERE, targets=["Ho*"], coverage=0.95, **options)
+    assert plan.targets.tolist() == [False, True, False]
+    assert 2 <= len(plan.stations) <= 6
+    # Three sides of 24 m²: neither the roof, nor the side behind the screen.
+    assert plan.visible_m2.tolist() == [0, pytest.approx(72, rel=0.02), 0]
+    assert plan.covered_m2[1] == pytest.approx(plan.coverage[-1] * plan.visible_m2[1])
+    open_scene = Scene.from_meshes(house[:2])
+    unscreened = plan_stations(open_scene, EVERYWHERE, targets=["House"], count=1, **options)
+    assert unscreened.visible_m2[1] == pytest.approx(96, rel=0.02)
+    with pytest.raises(LidarError, match=r"target 'Hose' fits no object\. Did you mean 'House'\?"):
+        plan_stations(scene, EVERYWHERE, targets=["House", "Hose"])
+    with pytest.raises(LidarError, match="No target is visible"):
+        buried = [*house, placed("Buried", (1, 1, 1), (0, 0, 1))]
+        plan_stations(Scene.from_meshes(buried), EVERYWHERE, targets=["Buried"], **options)
+
+
+def test_the_report_names_the_targets(tmp_path):
+    house = [
+        placed("Ground", (30, 30, 0.2), (0, 0, -0.2)),
+        placed("House", (4, 4, 2), (0, 0, 0)),
+        placed("Tower", (2, 2, 5), (0, 9, 0)),
+    ]
+    write_scene(tmp_path / "site.glb", Scene.from_meshes(house))
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("scene: site.glb\nposes: [[-8, 0, 1.7]]\nsensor: ouster/os0-128\n")
+    x, y = np.full(40, -2.0), np.linspace(-2, 2, 40)
+    np.save(tmp_path / "scan.npy", np.stack([x, y, 0 * x + 1], axis=1))
+    command = ["stations", str(plan), "--of", str(tmp_path / "scan.npy"), "--target", "H*"]
+    command += ["--slant", "90"]
+    figures = json.loads(CliRunner().invoke(cli, [*command, "--json"]).stdout)
+    assert [*figures["objects"]] == ["House"]
+    assert figures["seen_m2"] == pytest.approx(8, rel=0.1)  # the side that faces the station
+    assert figures["covered"] == pytest.approx(0.2 / 2, rel=0.2)  # a strip of 0.2 m
+    text = CliRunner().invoke(cli, [*command, "--target", "Tower"]).stdout
+    assert re.match(r"1 station see [\d,]+ m² of H\* and Tower, and [\d.]+% of it is within", text)
+    assert "Ground" not in text
 
 
 def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):

@@ -310,3 +310,17 @@ def test_the_command_brings_a_cloud_to_another_system(tmp_path):
     assert "note:" in done.output and "to EPSG:32632" in done.output
     lower, upper = Scene.load(tmp_path / "a.glb").bounds
     np.testing.assert_allclose((upper - lower)[:2], SIDE_M, atol=3.5)  # and a surfel's edges
+
+
+def test_coordinates_of_another_system_are_told(tmp_path):
+    points = ground("EPSG:32632")
+    lowest = [*points[:, :2].min(axis=0) - 1000, 0]
+    local = written(tmp_path / "a.las", points - lowest, wkt("EPSG:25832"))
+    _, notes = bounds_of(local)
+    assert (
+        "has coordinates, x 1,014.5, y 1,014.5, outside the area of use of EPSG:25832" in notes[0]
+    )
+    swapped = written(tmp_path / "b.las", points, wkt("EPSG:31467"))
+    with pytest.raises(LidarError, match=r"EPSG:31467.*area of use \(Germany.*wrong") as refused:
+        scene_of_points(swapped)
+    assert "326" not in str(refused.value).partition("wrong system")[2]

@@ -154,7 +154,7 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     read = scenario(tmp_path)
     built = build(read)
     assert [actor.name for actor in built.scene.actors] == ["car (a.1)", "Person (p)", "car (a.1)"]
-    assert built.scene.all_names[2:] == ("car (a.1)", "Person (p)", "car (a.1).2")
+    assert built.scene.object_names[2:] == ("car (a.1)", "Person (p)", "car (a.1).2")
     first, person, again = (actor.trajectory for actor in built.scene.actors)
     assert [way.presence_ns for way in (first, person, again)] == [
         (0, 1e9), (1e9, 2e9), (3e9, 4e9)
@@ -405,7 +405,7 @@ def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
         ],
     )
     job = build(read).job()
-    names = job.scene.all_names
+    names = job.scene.object_names
     assert names[2:] == ("car (a.1)", "walker (a.1)", "car (a.1).2")
     table = Surfaces(job.scene, tuple(job.survey.materials)).materials
     assert table.semantic_class.tolist() == [2, 2, 10, 2, 10]

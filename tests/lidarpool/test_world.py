@@ -1,6 +1,7 @@
 """The section world: a survey in local coordinates, and what is written in a coordinate system."""
 
 import json
+import re
 from pathlib import Path
 
 import laspy
@@ -19,6 +20,7 @@ from lidarpool.clouds.writing import Format
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.empty_cloud import empty_cloud_reason
+from lidarpool.scenario.plausibility import implausibilities
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.showing.pages.preview import first_sweeps
 from lidarsim.scene.files.stated_system import StatedSystem
@@ -136,6 +138,80 @@ def test_notes_and_reasons_have_the_coordinates_of_the_scenario():
     assert "the sensor begins at (900.000, 0.000, 1.000)" in reason and "500" not in reason
     built = build(Scenario.from_data({**PLAN, "world": {"origin": ORIGIN}}))
     assert "500,000" not in " ".join(advice(built))
+
+
+def placed_at(place, **world):
+    """Return the warnings of a room at a place of its file's coordinates."""
+    copies = [{"name": "Room", "box": [8, 6, 3], "at": [[*place, 0]]}]
+    data = {"scene": {"copies": copies}, "poses": [[place[0], place[1], 1]], "world": world}
+    return implausibilities(build(Scenario.from_data({**PLAN, **data}), plans=False))
+
+
+def test_a_scene_outside_the_area_of_use_is_told_with_both_remedies():
+    [twice] = placed_at(ORIGIN, epsg=25832, origin=ORIGIN)
+    assert re.fullmatch(
+        r"The scene is at x 1,000,000, y 10,800,000, outside the area of use of EPSG:25832 \(.*\), "
+        r"which is Europe .*\. If the files of the scene have world coordinates, remove "
+        r"world\.origin, which puts it inside\. Otherwise, set world\.epsg to the system of these "
+        r"coordinates\.",
+        twice,
+    )
+    [no_origin] = placed_at((0, 0), epsg=25832)
+    assert no_origin.endswith("local coordinates, set world.origin to the place of their zero.")
+    with pytest.raises(
+        LidarError, match=r"Switzerland\. If the files .* set world\.epsg to the system"
+    ):
+        placed_at((600_000, 200_000), epsg=2056)
+    with pytest.raises(LidarError, match=r"outside the area of use of EPSG:31467") as wrong:
+        placed_at(ORIGIN, epsg=31467)
+    assert "such as EPSG:32632, by which they are inside this area" in str(wrong.value)
+    assert "EPSG:32626" not in str(wrong.value)
+
+
+@pytest.mark.parametrize(
+    ("place", "world"),
+    [
+        ((0, 0), {"epsg": 25832, "origin": ORIGIN}),
+        ((3000, 3000), {"epsg": 25832, "origin": ORIGIN}),
+        ((12_345, 400_000), {"epsg": 25832, "origin": [500_000, 5_000_000]}),  # without leading 5
+        (ORIGIN, {"epsg": 25832}),
+        (ORIGIN, {}),
+        ((0, 0), {}),
+        ((0, 0), {"origin": ORIGIN}),
+        ((0, 0), {"epsg": 27700, "origin": [530_000, 180_000]}),  # the grid's zero is in its area
+    ],
+)
+def test_scenes_in_their_system_are_not_told(place, world):
+    assert placed_at(place, **world) == []
+
+
+@pytest.mark.parametrize("epsg", [{}, {"epsg": 25832}])
+def test_an_origin_that_is_added_twice_is_told_wherever_it_ends(epsg):
+    [twice] = placed_at((300_000, 4_000_000), origin=[290_000, 4_010_000], **epsg)
+    assert twice == (
+        "world.origin, x 290,000, y 4,010,000, is added to coordinates that are near it already, "
+        "as the files of the scene are at x 300,000, y 4,000,000. If these are world coordinates, "
+        "remove world.origin."
+    )
+
+
+@pytest.mark.extended(keep=("check",))
+@pytest.mark.parametrize("command", ["check", "run", "stations"])
+def test_commands_warn_of_the_place(tmp_path, command):
+    scenario = tmp_path / "room.yaml"
+    copies = [{"name": "Room", "box": [8, 6, 3], "at": [[*ORIGIN, 0]]}]
+    scene = {"copies": copies, "ground": {"height_m": 0, "margin_m": 3}}
+    world = {"epsg": 25832, "origin": ORIGIN}
+    data = {**PLAN, "scene": scene, "poses": [[*ORIGIN, 1]], "world": world}
+    scenario.write_text(yaml.safe_dump(data))
+    options = {
+        "check": [],
+        "run": ["--out", f"{tmp_path}/out", "--only", "cloud"],
+        "stations": ["--sensor", "riegl-vz400", "--count", "1", "--out", f"{tmp_path}/plan"],
+    }
+    outcome = CliRunner().invoke(cli, [command, str(scenario), *options[command]])
+    assert outcome.exit_code == 0, outcome.output
+    assert outcome.output.count("The scene is at x 1,000,000, y 10,800,000, outside the") == 1
 
 
 @pytest.mark.slow

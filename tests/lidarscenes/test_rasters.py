@@ -564,3 +564,9 @@ def test_a_raster_alone_is_a_survey(tmp_path):
     at = np.array(built.placing.poses[0].position)
     assert np.hypot(*(at[:2] - [X0 + 60, Y0 - 60])) < 23
     assert at[2] == pytest.approx(101 + ((at[0] - X0) / 2 - 0.5) / 10)
+
+
+def test_a_raster_that_states_the_wrong_system_is_refused(tmp_path):
+    path = write(tmp_path / "m.tif", crs="EPSG:31467", place=from_origin(5e5, 5.4e6, 2, 2))
+    with pytest.raises(LidarError, match=r"EPSG:31467 \(.*area of use \(Germany.*a_srs EPSG:CODE"):
+        read(path)

@@ -463,7 +463,7 @@ def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground)
         sensors=[Mounted(sensor, mount)], trajectory=DRIVE, columns=COLUMNS, precision_m=1e-4
     )
     batches = list(Rig(scene, survey, "numpy").cast(0, survey.scan_count))
-    hits = dict.fromkeys(scene.all_names, 0)
+    hits = dict.fromkeys(scene.object_names, 0)
     for batch in batches:
         # Where the sensor was when the ray was fired, with poses made here.
         place, rotation = DRIVE.poses(0, batch.time.astype(np.float64))

@@ -14,10 +14,12 @@ from lidarsim.scene.files.coordinate_systems import (
     crs_of_code,
     crs_of_text,
     ground_scale,
+    outside_system,
     scale_problem,
     suggested_epsg,
     target_problem,
     transformed,
+    zone_in_area,
     zone_in_metres,
 )
 from lidarsim.survey.survey import Survey
@@ -141,3 +143,39 @@ def test_meshes_in_a_stretched_system_are_told_the_factor():
     assert scale_problem("EPSG:25832", 5e5, 5e6) == scale_problem("no system", 0, 0) == ""
     problem = scale_problem("+proj=merc +datum=WGS84", 1e6, 6e6)
     assert problem.startswith("whose metre is 0.676 m") and ": scale [0.676" in problem
+
+
+@needs_registry
+@pytest.mark.parametrize(
+    ("epsg", "x", "y", "area"),
+    [
+        (25832, 5e5, 5.4e6, ""),
+        (25832, 8.5e5, 5.4e6, ""),  # Bavaria reaches beyond the zone
+        (25833, 1.05e6, 7.9e6, ""),  # all of Norway is in zone 33
+        (25832, 1e6, 10.8e6, "EPSG:25832 (ETRS89 / UTM zone 32N), which is Europe between 6°E and"),
+        (25832, 0, 0, "EPSG:25832"),  # local coordinates
+        (31467, 3.5e6, 5.4e6, ""),
+        (31467, 5e5, 5.4e6, "EPSG:31467 (DHDN / 3-degree Gauss-Kruger zone 3), which is Germany"),
+        (2056, 2.6e6, 1.2e6, ""),
+        (2056, 6e5, 2e5, "EPSG:2056 (CH1903+ / LV95), which is Liechtenstein; Switzerland"),
+        (7415, 155_000, 463_000, ""),  # compound
+        (3460, 2e6, 4e6, ""),  # Fiji, on both sides of the date line
+        (3460, 2e6, 8e6, "EPSG:3460"),
+        (3857, 1e6, 6e6, ""),
+        (1024, 0, 0, ""),  # no system
+    ],
+)
+def test_places_far_outside_the_area_of_use_are_told(epsg, x, y, area):
+    clause = outside_system(epsg, x, y)
+    assert clause.startswith(f"the area of use of {area}") if area else clause == ""
+
+
+@needs_registry
+def test_zones_of_coordinates_that_are_taken_for_another_system():
+    assert zone_in_area(31467, 5e5, 5.4e6) == 32632
+    assert zone_in_area(28992, 650_000, 5.77e6) == 32631
+    assert zone_in_area(27700, 5e5, 5.7e6) is None  # three zones fit
+    assert zone_in_area(31467, 5e5, 0) is None
+    assert suggested_epsg(crs_of_code(31467), 5e5, 5.4e6) is None  # not a zone in the Atlantic
+    problem = scale_problem("EPSG:31467", 5e5, 5.4e6)
+    assert problem.startswith("whose area of use (Germany") and "scale" not in problem

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -227,6 +229,39 @@ def test_a_station_may_end_a_rounding_beyond_the_last_pose():
 def test_poses_that_make_no_track(arguments, message):
     with pytest.raises(LidarError, match=message):
         Track(*arguments)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_angles_of_a_track_are_those_of_poses(smooth):
+    times = np.array([0.0, 2, 5])
+    places = np.arange(9.0).reshape(3, 3)
+    angles = np.array([[10, 0, -5], [100, 3, 0], [170, -4, 8.0]])
+    yaw, pitch, roll = angles.T
+    track = Track(times, places, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll, smooth=smooth)
+    for time, (y, p, r) in zip(times, angles, strict=True):
+        pose = track.pose(0, time * 1e9)
+        assert (pose.yaw_deg, pose.pitch_deg, pose.roll_deg) == pytest.approx((y, p, r), abs=1e-9)
+    straight = Track(times[:2], places[:2], yaw_deg=[350, 370])
+    assert straight.pose(0, 1e9).yaw_deg == pytest.approx(0, abs=1e-9)
+    level = Track(times[:2], places[:2], yaw_deg=30)
+    assert level.pose(0, 1e9).yaw_deg == pytest.approx(30)
+    copied = replace(level, beyond="hold")
+    np.testing.assert_array_equal(copied.quaternions, level.quaternions)
+
+
+@pytest.mark.parametrize(
+    ("angles", "message"),
+    [
+        ({"roll_deg": 3}, "Give yaw_deg beside roll_deg, for example"),
+        ({"yaw_deg": [1, 2, 3]}, r"yaw_deg must be one finite angle, or one for each of the 2"),
+        ({"yaw_deg": np.nan}, "one finite angle"),
+        ({"yaw_deg": "north"}, "array of numbers"),
+        ({"yaw_deg": 3, "quaternions": [[0, 0, 0, 1]] * 2}, "quaternions and yaw_deg both give"),
+    ],
+)
+def test_angles_that_make_no_track(angles, message):
+    with pytest.raises(LidarError, match=message):
+        Track([0, 1], [[0, 0, 0], [1, 0, 0]], **angles)
 
 
 def test_rounded_quaternions_are_scaled():

@@ -159,7 +159,7 @@ def test_a_thick_pane_shifts_light_and_makes_the_way_longer(turn_deg, backend):
     found = cast([pane, *side], ray(), backend=backend, materials=materials)
     path = thick / math.cos(within)
     air = 60 - path * math.cos(angle - within)
-    wall = Scene.from_meshes([pane, *side]).all_names.index("Wall")
+    wall = Scene.from_meshes([pane, *side]).object_names.index("Wall")
     expected = air + 1.5 * path - bool(shift)
     assert (found["object"][0] == wall) == (not shift)
     assert found["range"] == pytest.approx([expected], abs=4e-4)
@@ -435,7 +435,7 @@ def test_light_through_bodies_is_as_traced_face_by_face(kind):
         path = Path(starts[ray], ahead, (starts[ray], ahead))
         expected += [(ray, *one) for one in sorted(traced(bodies, path), key=lambda one: one[1])]
     ray, number, optical, energy, ghost = map(np.array, zip(*expected, strict=True))
-    assert [*scene.all_names] == [body.mesh.name for body in bodies]
+    assert [*scene.object_names] == [body.mesh.name for body in bodies]
     assert found["ray"].tolist() == ray.tolist()
     assert found["object"].tolist() == number.tolist()
     assert (found["cause"] != 0).tolist() == ghost.tolist()

@@ -267,6 +267,23 @@ def test_an_actor_stands_where_it_was_put(scene):
         scanner.sweep((0, 0, 1), start_s=9)
 
 
+def test_points_have_the_names_and_classes_of_objects_and_actors():
+    scene = Scene.seed().with_actors([Actor(box(name, (2, 2, 2))) for name in ("Car", "Van")])
+    assert scene.object_names == (*scene.names, "Car", "Van")
+    materials = [Material("Van", semantic_class=9), Material("*", semantic_class=2)]
+    scanner = Scanner(scene, load_sensor("velodyne/vlp16"), columns=["class"], materials=materials)
+    scanner.move("Car", Pose((5, 0, 0)))
+    scanner.move("Van", Pose((-5, 0, 0)))
+    cloud = scanner.sweep((0, 0, 1))
+    names = np.array(scanner.scene.object_names)[cloud["object"]]
+    for name, x in (("Car", 4), ("Van", -4)):
+        on_side = (np.abs(cloud.positions[:, 0] - x) < 1e-3) & (
+            np.abs(cloud.positions[:, 1]) < 0.99
+        )
+        assert on_side.sum() > 50 and (names[on_side] == name).all()
+    np.testing.assert_array_equal(cloud["class"], np.where(names == "Van", 9, 2))
+
+
 @pytest.mark.extended
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
 def test_a_moved_actor_is_like_one_that_was_there_before(scene, physics):

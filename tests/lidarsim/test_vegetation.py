@@ -170,7 +170,7 @@ def test_moved_and_turned_crowns_hold_the_same_leaves():
     mirrored[0, 3] = 4
     for meshes in ([inwards, wall], [SceneInstance(crown, mirrored), wall]):
         found = cast(meshes, rays(), AT, materials=materials)
-        number = Scene.from_meshes(meshes).all_names.index("Crown")
+        number = Scene.from_meshes(meshes).object_names.index("Crown")
         assert gap(found, leaves=number) == pytest.approx(math.exp(-0.4 * 4), rel=0.015)
     way = Track([0.0, 10.0], [(4, 0, 0), (4, 0, 0)])
     scene = Scene.from_meshes([wall]).with_actors(

@@ -83,8 +83,8 @@ def backend(request, monkeypatch):
 def same_points(cloud, scene, other, other_scene):
     """Check that clouds of two scenes have equal points, of objects with equal names."""
     assert cloud.positions.tobytes() == other.positions.tobytes()
-    names = np.array(scene.all_names)[cloud.object]
-    assert names.tolist() == np.array(other_scene.all_names)[other.object].tolist()
+    names = np.array(scene.object_names)[cloud.object]
+    assert names.tolist() == np.array(other_scene.object_names)[other.object].tolist()
     for name in ("ray", "time"):
         assert cloud[name].tobytes() == other[name].tobytes(), name
     for name in ("range", "intensity"):
@@ -143,7 +143,7 @@ def test_each_sensor_of_a_survey_has_its_own_unseen_objects(kind, backend):
             assert made[column].tobytes() == single[column].tobytes(), (name, column)
         assert np.array_equal(tally_of([batch]), tally_of([expected]))
         assert int(tally_of([batch]).sum()) == int(batch.hit_counts.sum()) > 100
-        seen = {scene.all_names[k] for k in np.unique(made["object"])}
+        seen = {scene.object_names[k] for k in np.unique(made["object"])}
         assert not seen & {*unseen[name]}
         assert {first, second, "Car"} - {*unseen[name]} <= seen
 
@@ -191,7 +191,7 @@ def test_a_sensor_may_see_nothing_at_all(kind, backend):
     scene = scene_of(objects(kind))
     static = Scanner(scene, GRID, unseen=scene.names, columns=COLUMNS, backend=backend)
     cloud = static.sweep(HERE, number=1)
-    assert {scene.all_names[k] for k in np.unique(cloud.object)} <= {"Car", "Van"} and len(cloud)
+    assert {scene.object_names[k] for k in np.unique(cloud.object)} <= {"Car", "Van"} and len(cloud)
     blind = Scanner(scene, GRID, unseen="*", columns=COLUMNS, backend=backend)
     assert not len(blind.sweep(HERE, number=1))
     assert np.isinf(blind.ranges([(0, 0, 1)])).all()

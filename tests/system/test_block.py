@@ -35,7 +35,7 @@ def scanned(tmp_path_factory):
 
 def of(job, columns, name):
     """Rows of an object's points."""
-    return columns["object"] == job.scene.all_names.index(name)
+    return columns["object"] == job.scene.object_names.index(name)
 
 
 @pytest.mark.slow
@@ -70,7 +70,7 @@ def test_lane_markings_stand_out_and_cars_have_their_class(scanned):
     assert white.sum() > 100 < asphalt.sum()
     ratio = np.median(columns["reflectance"][white]) / np.median(columns["reflectance"][asphalt])
     assert ratio > 4
-    names = np.array([name.split(" (")[0] for name in job.scene.all_names])
+    names = np.array([name.split(" (")[0] for name in job.scene.object_names])
     kinds = names[columns["object"]]
     assert set(columns["class"][np.isin(kinds, ["Car", "Van"])]) == {10}
     assert (kinds == "Maple").sum() + np.char.startswith(kinds, "Maple.").sum() > 1000

@@ -8,7 +8,7 @@ import trimesh
 import yaml
 from PIL import Image
 
-from lidarpool.report.result_pictures import COLOURS, COVERED, UNCOVERED
+from lidarpool.report.result_pictures import COLOURS, COVERED, OTHER, UNCOVERED
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
@@ -87,6 +87,35 @@ def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lid
     assert "of 100 stations already see all that can be seen" in outcome.out
     written = Scenario.load(hall / "a/b/stations.yaml")
     assert [entry.file for entry in written.scene.files] == ["../../hall.glb"]
+
+
+@pytest.mark.extended
+def test_targets_are_in_all_that_is_written(hall, lidarpool):
+    arguments = ("--sensor", "vlp16", "--count", "1", "--spacing", "2", "--slant", "85")
+    targets = ("--target", "Wall-*", "--target", "Column")
+    outcome = lidarpool("stations", "hall.glb", *arguments, *targets)
+    assert outcome.code == 0, outcome.err
+    assert " m² of Wall-* and Column\n" in outcome.out
+    assert "Floor" not in outcome.out and "Column " in outcome.out
+    head = (hall / "hall-stations/stations.yaml").read_text()
+    assert "% of what\n# can be seen of Wall-* and Column." in head
+    assert pixels_of_kind(hall / "hall-stations/stations.png", OTHER) > 10_000
+
+
+@pytest.mark.extended
+def test_open_ground_that_decides_is_noted(tmp_path, lidarpool):
+    scene = trimesh.Scene()
+    for name, size in {"Ground": (40, 40, 0.2), "Hut": (3, 3, 3)}.items():
+        scene.add_geometry(trimesh.creation.box(size), node_name=name, geom_name=name)
+    (tmp_path / "site.glb").write_bytes(scene.export(file_type="glb"))
+    arguments = ("site.glb", "--up-axis", "z", "--sensor", "riegl-vz400", "--spacing", "5")
+    outcome = lidarpool("stations", *arguments, "--count", "1")
+    assert "note: Ground has " in outcome.out and "name them with --target" in outcome.out
+    outcome = lidarpool(
+        "stations", *arguments, "--count", "1", "--target", "Hut", "--overwrite", "--json"
+    )
+    figures = json.loads(outcome.out)
+    assert [*figures["objects"]] == ["Hut"] and figures["notes"] == []
 
 
 @pytest.mark.parametrize(

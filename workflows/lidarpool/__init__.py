@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from lidarsim.motion.trajectory import Pose, Track
     from lidarsim.motion.trajectory_files import load_trajectory
     from lidarsim.packets.sweep_packets import Packets
-    from lidarsim.scene.actors import Actor
+    from lidarsim.scene.actors import Actor, box
     from lidarsim.scene.scene import Scene
     from lidarsim.scene.scene_instances import SceneInstance
     from lidarsim.scene.scene_mesh import SceneMesh
@@ -94,6 +94,7 @@ __all__ = [
     "Track",
     "Twin",
     "__version__",
+    "box",
     "compare",
     "fit",
     "load_robot",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .motion.trajectory import Pose, Track
     from .motion.trajectory_files import load_trajectory
     from .packets.sweep_packets import Packets
-    from .scene.actors import Actor
+    from .scene.actors import Actor, box
     from .scene.scene import Scene
     from .scene.scene_instances import SceneInstance
     from .scene.scene_mesh import SceneMesh
@@ -60,6 +60,7 @@ __all__ = [
     "Survey",
     "Track",
     "__version__",
+    "box",
     "export_sensor",
     "load_sensor",
     "load_trajectory",
@@ -76,7 +77,7 @@ _MODULES = {
     "motion.trajectory": ("Pose", "Track"),
     "motion.trajectory_files": ("load_trajectory",),
     "packets.sweep_packets": ("Packets",),
-    "scene.actors": ("Actor",),
+    "scene.actors": ("Actor", "box"),
     "scene.scene": ("Scene",),
     "scene.scene_instances": ("SceneInstance",),
     "scene.scene_mesh": ("SceneMesh",),

@@ -189,7 +189,7 @@ class PictureContent:
         if column == TABLE["cause"]:
             return CAUSES
         names = {
-            "object": self.scene.all_names,
+            "object": self.scene.object_names,
             "class": self.classes,
             "material": self.materials,
         }

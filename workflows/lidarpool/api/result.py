@@ -36,7 +36,7 @@ class Result(RunResult):
     @property
     def objects(self) -> tuple[str, ...]:
         """Names of the objects, in the order of the column `object`."""
-        return self.scene.all_names
+        return self.scene.object_names
 
     @checked
     def report(

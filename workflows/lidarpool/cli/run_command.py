@@ -220,7 +220,7 @@ def _result_lines(
     yield (
         f"{scans_in_words(job.survey.scan_count, job.survey.sweep_count)}, "
         f"{plural(result.rays, 'ray')}, "
-        f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
+        f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.object_names), 'object')}"
         f"{f' and {hits_on_none:,} on none' if hits_on_none > 0 else ''}, "
         f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"

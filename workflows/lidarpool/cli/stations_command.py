@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.words import plural, without_common_prefix
+from lidarsim.base.words import joined, plural, printable, without_common_prefix
 
 from . import completion
 from . import shared_options as options
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
 _SHOWN_OBJECTS = 12
+_MOST_OF_THE_AREA = 0.75  # share of an object that decides where the stations are
 
 
 def _share(text: str) -> float:
@@ -54,6 +55,14 @@ def _share(text: str) -> float:
     shell_complete=completion.sensors,
     help="The instrument: a model of lidarpool sensors, with or without its maker.  [default: the "
     "scenario's]",
+)
+@click.option(
+    "--target",
+    "targets",
+    metavar="NAME",
+    multiple=True,
+    help="Object to cover, by its name or a pattern with * and ?; may be given several times. "
+    "Other objects only occlude.  [default: all]",
 )
 @options.path(
     "--of",
@@ -107,8 +116,8 @@ def stations(
     """Choose stations for a terrestrial scan, or say what a scan has covered.
 
     Places on the floor are tried, and whichever adds most to what is covered comes next. Coverage
-    is by area, of what any of these places sees. A scenario with the stations is written, and a
-    picture of what they cover.
+    is by area, of what any of these places sees of the objects to cover. A scenario with the
+    stations is written, and a picture of what they cover.
 
     With --of, the stations of the scenario are taken, and of the area that they see, the share
     near points of a result, or of any cloud that `lidarpool compare` reads.
@@ -116,6 +125,7 @@ def stations(
     \b
     Examples:
       lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
+      lidarpool stations site.glb --sensor riegl-vz400 --coverage 95% --target "Wall*" --target Roof
       lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
       lidarpool stations hall-stations/stations.yaml --of hall-scan
@@ -131,7 +141,8 @@ def stations(
         if not within_m > 0:
             raise LidarError(f"--within is {within_m:g}; it must be greater than 0 m.")
         scenario = Scenario.load(scene, of_mesh)
-        _show_coverage(scenario, cloud, within_m, settings["slant_deg"], settings["as_json"])
+        sight = {key: settings[key] for key in ("slant_deg", "targets")}
+        _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
     elif model is None:
         raise click.UsageError("--sensor says which instrument stands there: give its model.")
     else:
@@ -161,13 +172,19 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
         plan = plan_stations(built.scene, sensor, **settings)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
-    file.write_text(_stations_scenario(scenario, folder, model, plan), "utf-8", newline="\n")
+    file.write_text(
+        _stations_scenario(scenario, folder, model, plan, settings["targets"]),
+        "utf-8",
+        newline="\n",
+    )
     with terminal.status("drawing the picture"):
         draw_stations(plan).save(folder / PICTURE_FILE)
     shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
+    if not settings["targets"]:
+        shortfalls += _target_notes(plan, built)
     figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
     note_lines = map("note: {}".format, shortfalls)
-    options.show(figures, chain(_plan_lines(plan, built), note_lines), as_json)
+    options.show(figures, chain(_plan_lines(plan, built, settings["targets"]), note_lines), as_json)
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
         click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
@@ -189,7 +206,13 @@ def _refuse_beside_cloud(scene: Path, settings: dict[str, Any]) -> None:
 
 
 def _show_coverage(
-    scenario: Scenario, cloud: Path, within_m: float, slant_deg: float, as_json: bool
+    scenario: Scenario,
+    cloud: Path,
+    as_json: bool,
+    *,
+    within_m: float,
+    slant_deg: float,
+    targets: Sequence[str],
 ) -> None:
     """Print what the stations of a scenario see, and what a cloud covers of it."""
     from ..plan.stations import survey_coverage
@@ -216,19 +239,24 @@ def _show_coverage(
             built.survey.carried[0].sensor,
             positions,
             clouds,
+            targets=targets,
             within_m=within_m,
             slant_deg=slant_deg,
         )
     if not coverage.seen_m2.any():
-        raise LidarError("The stations see no surface: check their poses, and the scene's unit.")
+        raise LidarError(
+            f"The stations see no surface{_of_targets(targets)}: check their poses, and the unit "
+            "of the scene."
+        )
     figures = _coverage_figures(coverage, built) | {
         "stations": len(positions),
         "within_m": within_m,
         "notes": [*notes, *recording.left_out_notes],
     }
     head = (
-        f"{plural(len(positions), 'station')} see {figures['seen_m2']:,.0f} m², and "
-        f"{figures['covered']:.1%} of it is within {within_m:g} m of a point"
+        f"{plural(len(positions), 'station')} see {figures['seen_m2']:,.0f} m²"
+        f"{_of_targets(targets)}, and {figures['covered']:.1%} of it is within {within_m:g} m of "
+        "a point"
     )
     table = _object_lines(built.scene.names, coverage.seen_m2, coverage.covered_m2, "seen")
     note_lines = map("note: {}".format, recording.left_out_notes)
@@ -245,13 +273,16 @@ def _station_positions(built: Built) -> Floats:
 
 def _coverage_figures(coverage: SurveyCoverage, built: Built) -> dict[str, Any]:
     """Return the figures of what a cloud covers for --json."""
-    rows = zip(built.scene.names, coverage.seen_m2, coverage.covered_m2, strict=True)
+    names = built.scene.names
+    rows = zip(names, coverage.targets, coverage.seen_m2, coverage.covered_m2, strict=True)
     seen_m2 = float(coverage.seen_m2.sum())
     return {
         "seen_m2": seen_m2,
         "covered": float(coverage.covered_m2.sum()) / seen_m2,
         "objects": {
-            name: {"seen_m2": float(seen), "covered_m2": float(area)} for name, seen, area in rows
+            name: {"seen_m2": float(seen), "covered_m2": float(area)}
+            for name, is_target, seen, area in rows
+            if is_target
         },
     }
 
@@ -259,18 +290,40 @@ def _coverage_figures(coverage: SurveyCoverage, built: Built) -> dict[str, Any]:
 def _built_with_notes(scenario: Scenario, terminal: Terminal) -> tuple[Built, list[str]]:
     """Build a scenario whose poses do not matter.
 
-    Returns its notes, which are printed at once.
+    Returns its notes and warnings, which are printed at once.
     """
     from ..scenario.advice import advice
     from ..scenario.build import build
     from ..scenario.default_poses import Placing
+    from ..scenario.georeference import place_problem
 
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=False)
     notes = advice(replace(built, placing=Placing(())))
     for note in notes:
         terminal.tell(note)
-    return built, notes
+    placed = built.scene.georeferenced(built.scenario.world.origin)
+    if problem := place_problem(placed, built.survey.epsg):
+        terminal.warn(problem)
+    return built, [*notes, *terminal.warnings]
+
+
+def _of_targets(targets: Sequence[str]) -> str:
+    """Return «of Wall* and Roof» with a space before it, or empty if all objects are covered."""
+    return f" of {joined(targets)}" if targets else ""
+
+
+def _target_notes(plan: StationPlan, built: Built) -> Iterator[str]:
+    """Yield a note if all objects are covered, and one of them has most of the area."""
+    visible_m2 = plan.visible_m2
+    largest = int(visible_m2.argmax())
+    share = float(visible_m2[largest] / visible_m2.sum())
+    if share > _MOST_OF_THE_AREA and (visible_m2 > 0).sum() > 1:
+        yield (
+            f"{printable(built.scene.names[largest])} has {share:.0%} of the area that can be "
+            "seen, so that it decides where the stations are. If other objects matter, name them "
+            "with --target"
+        )
 
 
 def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) -> Iterator[str]:
@@ -287,7 +340,9 @@ def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) ->
         yield f"{len(plan.stations)} of {count} stations already see all that can be seen"
 
 
-def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: StationPlan) -> str:
+def _stations_scenario(
+    scenario: Scenario, folder: Path, model: str, plan: StationPlan, targets: Sequence[str]
+) -> str:
     """Return the text of a scenario whose poses are the stations."""
     import yaml
 
@@ -310,9 +365,9 @@ def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: Stati
         "cloud": {"columns": ["range"]},
     }
     head = (
-        f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen: "
-        f"{plan.coverage[-1]:.1%} of what\n# can be seen is covered. Steps are of 10 degrees: one "
-        "turn from each.\n"
+        f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. They "
+        f"cover {plan.coverage[-1]:.1%} of what\n# can be seen{_of_targets(targets)}. Steps are of "
+        "10 degrees: one turn from each.\n"
     )
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
@@ -320,6 +375,7 @@ def _stations_scenario(scenario: Scenario, folder: Path, model: str, plan: Stati
 def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]) -> dict[str, Any]:
     """Return the figures of a plan for --json."""
     names = built.scene.names
+    rows = zip(names, plan.targets, plan.visible_m2, plan.covered_m2, strict=True)
     return {
         "sensor": sensor,
         "places": len(plan.candidates),
@@ -330,7 +386,8 @@ def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]
         ],
         "objects": {
             name: {"visible_m2": float(visible), "covered_m2": float(covered)}
-            for name, visible, covered in zip(names, plan.visible_m2, plan.covered_m2, strict=True)
+            for name, is_target, visible, covered in rows
+            if is_target
         },
         "epsg": built.survey.epsg,
         "world_origin": [*built.scenario.world.origin],
@@ -338,12 +395,12 @@ def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]
     }
 
 
-def _plan_lines(plan: StationPlan, built: Built) -> Iterator[str]:
+def _plan_lines(plan: StationPlan, built: Built, targets: Sequence[str]) -> Iterator[str]:
     """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
     names = built.scene.names
     yield (
         f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
-        f"{plan.visible_m2.sum():,.0f} m²"
+        f"{plan.visible_m2.sum():,.0f} m²{_of_targets(targets)}"
     )
     yield "station        x          y          z   covered     added"
     previous_share = 0.0
@@ -353,7 +410,7 @@ def _plan_lines(plan: StationPlan, built: Built) -> Iterator[str]:
         yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
         previous_share = share
     yield from _object_lines(names, plan.visible_m2, plan.covered_m2, "can be seen")
-    blind = int((plan.visible_m2 == 0).sum())
+    blind = int((plan.targets & (plan.visible_m2 == 0)).sum())
     if blind:
         yield f"out of sight from all places: {plural(blind, 'object')}"
     yield from options.world_lines(built.survey.epsg, built.scenario.world.origin)

@@ -147,7 +147,7 @@ class _Messages:
         self._osi = osi
         self._sweeps = sweeps
         self.start_ns = GPS_NS if sweeps.start_ns is None else sweeps.start_ns
-        self._host = osi.Identifier(value=len(sweeps.all_names))
+        self._host = osi.Identifier(value=len(sweeps.object_names))
         major, minor, patch = map(int, osi.__version_osi__.split("."))
         self._version = osi.InterfaceVersion(
             version_major=major, version_minor=minor, version_patch=patch

@@ -49,7 +49,7 @@ class Pieces(pieces.Pieces):
                 *((column, np.dtype(column.dtype)) for column in cloud.table),
             )
         ]
-        objects = "\n".join(sweeps.all_names)  # names that the column `object` counts
+        objects = "\n".join(sweeps.object_names)  # names that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
         words |= {} if sweeps.epsg is None else {"crs": f"EPSG:{sweeps.epsg}"}
         words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}

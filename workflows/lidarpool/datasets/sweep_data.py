@@ -69,7 +69,7 @@ class Sweep:
             points=positions,
             columns=columns,
             pose=sweeps.pose.matrix(number),
-            object_names=sweeps.all_names,
+            object_names=sweeps.object_names,
             faults=sweeps.faults_in(number),
             _boxes=(sweeps, boxes, index),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
@@ -15,6 +15,8 @@ from lidarscenes.procedural.floor import SLAB_M
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
+from lidarsim.base.words import name_hint
+from lidarsim.media.materials import rows_named
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor, Spin
@@ -93,15 +95,16 @@ class Sight:
 class StationPlan:
     """Stations in the order of their choice, and the area that they cover.
 
-    Coverage is by area, of the sides of surfaces that at least one candidate sees.
+    Coverage is by area, of the sides of surfaces of the targets that at least one candidate sees.
     """
 
     stations: Floats  # (s, 3) world metres
     coverage: Floats  # (s,) share in 0 to 1, after each station
     candidates: Floats  # (c, 3) world metres
     spacing_m: float  # spacing of the candidates
-    visible_m2: Floats  # (objects,) area that candidates see
-    covered_m2: Floats  # (objects,) area that the stations see
+    targets: Bools  # (objects,) whether an object is to be covered; other objects only occlude
+    visible_m2: Floats  # (objects,) area of targets that candidates see
+    covered_m2: Floats  # (objects,) area of targets that the stations see
     scene: Scene  # the planned scene: all triangles, without instances and actors
     sight: Sight
 
@@ -110,9 +113,10 @@ class StationPlan:
 class SurveyCoverage:
     """The area that stations see, and how much of it a cloud has points on.
 
-    Areas are of the sides of surfaces; the sides of a thin wall count separately.
+    Areas are of the sides of surfaces of the targets; the sides of a thin wall count separately.
     """
 
+    targets: Bools  # (objects,) whether the area of an object counts
     seen_m2: Floats  # (objects,) area that the stations see
     covered_m2: Floats  # (objects,) area of that with a point of the cloud nearby
 
@@ -122,6 +126,7 @@ def plan_stations(
     scene: Scene,
     sensor: Sensor,
     *,
+    targets: Sequence[str] = (),
     count: Annotated[int | None, Field(ge=1, le=MAX_STATIONS)] = None,
     coverage: Annotated[float | None, Field(gt=0, le=1)] = None,
     height_m: Annotated[float, Field(gt=0, le=1e6)] = 1.7,
@@ -139,11 +144,14 @@ def plan_stations(
         Scene to scan; actors are ignored.
     sensor
         The instrument, upright. Its range and field of view count.
+    targets
+        Names of the objects to cover, or patterns with * and ?. Other objects only occlude. By
+        default, all objects are covered.
     count
         Number of stations; fewer if these already see everything.
     coverage
-        Instead of `count`: share of the area that any candidate sees, in (0, 1]. With neither,
-        stations are chosen for as long as each adds 1 %. There are at most 100 stations.
+        Instead of `count`: share of the area of targets that any candidate sees, in (0, 1]. With
+        neither, stations are chosen for as long as each adds 1 %. There are at most 100 stations.
     height_m
         Of the instrument above the floor, metres.
     spacing_m
@@ -154,13 +162,12 @@ def plan_stations(
     Raises
     ------
     LidarError
-        If a value is out of range, the sensor does not look all around, or no candidate stands on
-        a floor or sees a surface.
+        If a value is out of range, a target fits no object, the sensor does not look all around,
+        or no candidate stands on a floor or sees a surface of a target.
 
     Examples
     --------
-    >>> from lidarpool import Sensor
-    >>> from lidarsim.scene.actors import box
+    >>> from lidarpool import Sensor, box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
     >>> plan = plan_stations(room, Sensor.grid(vertical_fov_deg=180), slant_deg=90)
     >>> len(plan.stations), plan.visible_m2.round().tolist()
@@ -169,15 +176,16 @@ def plan_stations(
     if count is not None and coverage is not None:
         raise LidarError("count and coverage both say when to stop: give one of them.")
     scene = replace(SimplifiedScene.from_scene(scene).scene, actors=())
+    is_target = _target_mask(scene.names, targets)
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _default_spacing_m(scene)
     positions = candidates(scene, sight.caster, height_m, spacing_m)
-    visibility = _visibility(scene, sight, positions)
+    visibility = _visibility(_sample_surfaces(scene, is_target), sight, positions)
     if not len(visibility.area_m2):
         raise LidarError(
-            f"Nothing is visible from {len(positions):,} places at {height_m:g} m: check the unit "
-            "of the scene, the range of the sensor, and the slant."
+            f"{'No target' if targets else 'Nothing'} is visible from {len(positions):,} places at "
+            f"{height_m:g} m: check the unit of the scene, the range of the sensor, and the slant."
         )
     min_gain = MIN_GAIN if count is None and coverage is None else 0.0
     choice = _choose_rows(visibility, count or MAX_STATIONS, coverage or 1.0, min_gain)
@@ -189,6 +197,7 @@ def plan_stations(
         coverage=np.array(choice.shares),
         candidates=positions + scene.origin,
         spacing_m=spacing_m,
+        targets=is_target,
         visible_m2=np.bincount(owner, visibility.area_m2, objects).astype(np.float64),
         covered_m2=np.bincount(owner, covered_m2, objects).astype(np.float64),
         scene=scene,
@@ -202,6 +211,7 @@ def survey_coverage(
     positions: Floats,
     clouds: Iterable[Floats],
     *,
+    targets: Sequence[str] = (),
     within_m: float = 0.1,
     slant_deg: float = 80.0,
 ) -> SurveyCoverage:
@@ -217,6 +227,8 @@ def survey_coverage(
         The stations (s, 3), world metres.
     clouds
         Points (n, 3) each, world metres, which are held in memory one by one.
+    targets
+        Names of the objects whose area counts, or patterns with * and ?; by default all objects.
     within_m
         Surface within this distance of a point is covered, metres.
     slant_deg
@@ -225,13 +237,12 @@ def survey_coverage(
     Raises
     ------
     LidarError
-        If the sensor does not look all around.
+        If a target fits no object, or the sensor does not look all around.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from lidarpool import Sensor
-    >>> from lidarsim.scene.actors import box
+    >>> from lidarpool import Sensor, box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
     >>> floor = np.mgrid[-4:4.1:0.1, -3:3.1:0.1, 0:1].reshape(3, -1).T
     >>> found = survey_coverage(
@@ -241,8 +252,9 @@ def survey_coverage(
     ([180.0], True)
     """
     scene = SimplifiedScene.from_scene(scene).scene
+    is_target = _target_mask(scene.names, targets)
     sight = Sight(scene, sensor, slant_deg)
-    samples = _sample_surfaces(scene)
+    samples = _sample_surfaces(scene, is_target)
     has_point = np.zeros(len(samples.points), np.bool_)
     for points in clouds:
         missing = np.flatnonzero(~has_point)
@@ -255,9 +267,21 @@ def survey_coverage(
     seen_m2 = samples.area_m2 * ((sides > 0).any(axis=0) + (sides < 0).any(axis=0).astype(int))
     objects = len(scene.names)
     return SurveyCoverage(
+        is_target,
         np.bincount(samples.owner, seen_m2, objects).astype(np.float64),
         np.bincount(samples.owner, seen_m2 * has_point, objects).astype(np.float64),
     )
+
+
+def _target_mask(names: Sequence[str], targets: Sequence[str]) -> Bools:
+    """Return whether objects (n,) are targets: all without `targets`, names or patterns."""
+    mask = np.full(len(names), not targets)
+    for pattern in targets:
+        rows = rows_named(pattern, names)
+        if not len(rows):
+            raise LidarError(f"The target {pattern!r} fits no object.{name_hint(pattern, names)}")
+        mask[rows] = True
+    return mask
 
 
 class _Visibility(NamedTuple):
@@ -268,9 +292,8 @@ class _Visibility(NamedTuple):
     area_m2: Floats  # (n,), area that a side stands for
 
 
-def _visibility(scene: Scene, sight: Sight, positions: Floats) -> _Visibility:
+def _visibility(samples: _SurfaceSamples, sight: Sight, positions: Floats) -> _Visibility:
     """Return the sides of surfaces that candidates at local positions (c, 3) see."""
-    samples = _sample_surfaces(scene)
     sides = np.stack([sight.sides(p, samples.points, samples.normals) for p in positions])
     # Each side of a surface counts by itself: of a thin wall, the side in each room.
     visible = np.concatenate([sides > 0, sides < 0], axis=1)
@@ -458,14 +481,18 @@ class _SurfaceSamples(NamedTuple):
     area_m2: Floats  # (n,), area that a point stands for
 
 
-def _sample_surfaces(scene: Scene) -> _SurfaceSamples:
-    """Return points evenly spread by area within each object, the same at every call."""
+def _sample_surfaces(scene: Scene, is_target: Bools) -> _SurfaceSamples:
+    """Return points evenly spread by area within each target, the same at every call.
+
+    `is_target` is a mask of the objects.
+    """
     order = np.argsort(scene.face_object, kind="stable")
+    order = order[is_target[scene.face_object[order]]]
     corners = scene.vertices[scene.faces[order]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     doubled = np.linalg.norm(normals, axis=1)
     areas = np.bincount(scene.face_object[order], doubled / 2, len(scene.names)).astype(np.float64)
-    min_count = max(1, min(_OBJECT_POINTS, _POINTS // len(scene.names)))
+    min_count = max(1, min(_OBJECT_POINTS, _POINTS // int(is_target.sum())))
     counts = np.round(_POINTS * areas / areas.sum()).astype(int)
     counts = np.maximum(counts, np.where(areas > 0, min_count, 0))
     rng = np.random.default_rng(0)

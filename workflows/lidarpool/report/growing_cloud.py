@@ -161,7 +161,7 @@ class CloudWriter:
         for _ in range(self.threads):
             counts = CloudCounts(
                 points.table,
-                len(scene.all_names),
+                len(scene.object_names),
                 len(scene.material_names),
                 points.precision_m,
                 points.origin,

@@ -89,7 +89,8 @@ def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
         "hits_on_surfaces": int(result.hit_counts.sum()) if cloud.no_surface else result.hit_count,
         "points": len(result.points),
         "points_by_object": {
-            name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
+            name: int(count)
+            for name, count in zip(scene.object_names, cloud.by_object, strict=True)
         }
         | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
         "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
@@ -150,7 +151,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         for mounted, returns in zip(survey.carried, survey.returns_each, strict=True)
     ]
     return {
-        "objects": len(scene.all_names),
+        "objects": len(scene.object_names),
         "triangles": scene.triangles,
         "origin": scene.origin.tolist(),
         "epsg": survey.epsg,

@@ -46,8 +46,8 @@ MAX_TRIALS = 1000
 _BEST_WIDTH = 2.0  # line of the best path, points
 PATH_COLOUR = "#d6336c"
 TRIAL_COLOUR = "#5b8fd0"
-COVERED, UNCOVERED, HIDDEN = range(3)  # hidden from all candidates
-COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY)])
+COVERED, UNCOVERED, HIDDEN, OTHER = range(4)  # hidden from all candidates; no target
+COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY, "#c8bda6")])
 _BLOCK = 4  # pixels a side
 
 
@@ -318,23 +318,23 @@ def draw_stations(plan: StationPlan) -> Page:
     page = Page(SIZE)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLOURS, 0.6))
     page.numbers(axes, shot)
-    names = ("covered", "not covered", "out of sight")
-    page.legend([*zip(names, COLOURS, strict=True)], "station")
+    names = ["covered", "not covered", "out of sight"] + ["not a target"] * (not plan.targets.all())
+    page.legend([*zip(names, COLOURS, strict=False)], "station")
     candidates = plural(len(plan.candidates), "place")
+    targets = "" if plan.targets.all() else f" of {plural(int(plan.targets.sum()), 'object')}"
     page.title(
         plural(len(plan.stations), "station").capitalize(),
-        f"{plan.coverage[-1]:.1%} covered of what can be seen from {candidates}",
+        f"{plan.coverage[-1]:.1%} covered of what can be seen{targets} from {candidates}",
         plan.sight.sensor.model,
     )
     return page
 
 
 def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
-    """Return the shot with COVERED, UNCOVERED or HIDDEN in place of triangles."""
+    """Return the shot with COVERED, UNCOVERED, HIDDEN or OTHER in place of triangles."""
     stations, candidates = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     visibility = _PixelVisibility.from_shot(shot, plan)
-    kinds = np.full(shot.pixel_samples.triangle.size, HIDDEN)
-    surface = np.flatnonzero(shot.pixel_samples.triangle >= 0)
+    kinds, surface = _initial_kinds(shot, plan, shot.pixel_samples)
     covered = visibility.from_any(stations, shot.pixel_samples, surface)
     kinds[surface[covered]] = COVERED
     uncovered = surface[~covered]
@@ -342,10 +342,10 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
     tested, group = _pixels_of_blocks(shot, uncovered)
     visible = visibility.from_any(candidates, shot.pixel_samples, uncovered[tested])
     kinds[uncovered[visible[group]]] = UNCOVERED
-    samples_per_edge = shot.edge_samples.triangle.size // max(len(shot.edges), 1)
-    pixel_kinds = np.where(kinds[shot.edges] == COVERED, HIDDEN, kinds[shot.edges])
-    edge_kinds = np.repeat(pixel_kinds, samples_per_edge)
-    edge_surface = np.flatnonzero(shot.edge_samples.triangle >= 0)
+    edge_kinds, edge_surface = _initial_kinds(shot, plan, shot.edge_samples)
+    samples_per_edge = len(edge_kinds) // max(len(shot.edges), 1)
+    pixel_kinds = np.repeat(kinds[shot.edges], samples_per_edge)
+    edge_kinds[(edge_kinds == HIDDEN) & (pixel_kinds == UNCOVERED)] = UNCOVERED
     is_covered = visibility.from_any(stations, shot.edge_samples, edge_surface)
     edge_kinds[edge_surface[is_covered]] = COVERED
     return replace(
@@ -353,6 +353,14 @@ def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
         pixel_samples=_painted(shot.pixel_samples, kinds),
         edge_samples=_painted(shot.edge_samples, edge_kinds),
     )
+
+
+def _initial_kinds(shot: SurfaceView, plan: StationPlan, samples: Samples) -> tuple[Ints, Ints]:
+    """Return HIDDEN or OTHER for each sample (n,), and the indices of samples of targets."""
+    is_target = plan.targets[plan.scene.face_object[shot.part.parents]]  # of triangles
+    on_surface = samples.triangle >= 0
+    on_target = on_surface & is_target[samples.triangle]
+    return np.where(on_surface & ~on_target, OTHER, HIDDEN), np.flatnonzero(on_target)
 
 
 def _pixels_of_blocks(shot: SurfaceView, pixels: Ints) -> tuple[Ints, Ints]:

@@ -124,7 +124,7 @@ def forecast(
         "occupied": occupied,  # True if the folder of the result holds another result
         "notes": notes,
         "warnings": warnings,
-        "objects": len(job.scene.all_names),
+        "objects": len(job.scene.object_names),
         "triangles": job.scene.triangles,
         "masked": list(job.scene.masked),
         "unseen": _unseen(job),  # {name of a sensor: names of the objects that it does not see}
@@ -269,7 +269,7 @@ def _unseen(job: Job) -> dict[str, list[str]]:
     """
     scene = job.scene
     pairs = zip(job.survey.carried, unseen_objects(scene, job.survey), strict=True)
-    names = scene.all_names
+    names = scene.object_names
     return {
         carried.name: [names[row] for row in np.flatnonzero(mask)]
         for carried, mask in pairs

@@ -56,7 +56,7 @@ def fields_of(scene: Scene, survey: Survey, planning: Planning | None) -> dict[s
     size_m = np.ptp(scene.bounds, axis=0)
     values: dict[str, Any] = {
         "scene": {
-            "objects": len(scene.all_names),
+            "objects": len(scene.object_names),
             "triangles": scene.triangles,
             "size": " x ".join(f"{side:.6g}" for side in size_m) + " m",
         }

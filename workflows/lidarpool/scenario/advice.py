@@ -133,7 +133,7 @@ def _colour_note(built: Built) -> str:
             "a column or reflectance: texture needs colours, but nothing in the scene has any, "
             "so that all is grey"
         )
-    names = scene.all_names
+    names = scene.object_names
     kinds = scene.surface_kinds
     table = MaterialTable.build(built.survey.materials, kinds, voxels=scene.has_voxels)
     textured = np.zeros(len(names), np.bool_)

@@ -28,7 +28,6 @@ from lidarsim.media.materials import (
 from lidarsim.media.weather import Weather
 from lidarsim.motion.trajectory import CENTRE, Pose, Track
 from lidarsim.scene.actors import Actor, check_spray
-from lidarsim.scene.files.coordinate_systems import target_problem
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.casting.static_bodies import warn_of_reach
@@ -45,6 +44,7 @@ from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
 from .default_poses import Placing, place_sensor
+from .georeference import check_epsg, warn_of_place
 from .ground import StandingSurfaces
 from .osi_traffic import OSI_SUFFIXES, read_osi
 from .scenario import Scenario
@@ -139,6 +139,7 @@ class Job:
             )
         if survey.epsg is not None:
             check_epsg(survey.epsg, scene)
+        warn_of_place(scene, survey.epsg)
         warn_of_grey(scene, survey)
         warn_of_reach(scene, survey)
 
@@ -350,22 +351,6 @@ def _build_traffic(
         return _traffic_actors(scenario.traffic, shapes, standing, start_s, duration_s)
 
 
-def check_epsg(epsg: int, scene: Scene) -> None:
-    """Check that a coordinate system is in metres that are true where a scene is.
-
-    Raises
-    ------
-    LidarError
-        If lengths in the system are wrong by more than 1 % in the middle of the scene, or not in
-        metres. Without rasterio, only systems for maps of the world are refused.
-    """
-    lower, upper = scene.bounds + scene.origin
-    x, y, _ = ((lower + upper) / 2).tolist()
-    why_there = ", where the scene is (world.origin moves it)"
-    if problem := target_problem(epsg, x, y, why_there=why_there):
-        raise LidarError(f"world.epsg (in Python epsg=) is {problem}.")
-
-
 def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
     """Return the EPSG code of the rasters whose placement keeps x and y, or None.
 
@@ -527,7 +512,7 @@ def _materials(
 
     Classes of actors, copies and traffic come from the scenario; classes of other objects come from
     files. `vehicles` are the last actors of the scene, with their entries of the traffic. Rows of
-    objects are indices into `scene.all_names`.
+    objects are indices into `scene.object_names`.
     """
     vehicle_classes = [entry.semantic_class for _, entry in vehicles]
     default_material = Material("*")
@@ -538,7 +523,7 @@ def _materials(
         materials = [default_material]
     for classed_object in classed:
         materials = _with_object_class(materials, classed_object, kinds)
-    first_vehicle_row = len(scene.all_names) - len(vehicles)
+    first_vehicle_row = len(scene.object_names) - len(vehicles)
     for semantic_class in sorted({number for number in vehicle_classes if number is not None}):
         vehicle_rows = np.array(
             [

@@ -22,6 +22,7 @@ from lidarsim.survey.survey import Survey
 
 from .build import Built
 from .default_poses import seen_from, surroundings_of
+from .georeference import place_problem
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
 AIR_SPEED_M_S = 350.0  # faster than the aircraft that carry lidars
@@ -75,7 +76,7 @@ class _SensorPosition(NamedTuple):
 
 
 def implausibilities(built: Built) -> list[str]:
-    """Return warnings of poses, motions and noise that real surveys do not have.
+    """Return warnings of places, poses, motions and noise that real surveys do not have.
 
     Poses that were chosen for the user are not judged. Some thousand rays are cast in scenes with
     a moderate number of triangles.
@@ -86,7 +87,9 @@ def implausibilities(built: Built) -> list[str]:
     samples = [] if chosen else _sample_positions(survey)
     positions = np.array([sample.position for sample in samples]).reshape(-1, 3)
     surroundings = surroundings_of(scene, positions) if samples else None
-    warnings = [*_noise_warnings(survey, _sight_m(scene, surroundings, positions))]
+    placed = scene.georeferenced(built.scenario.world.origin)
+    warnings = [*filter(None, [place_problem(placed, survey.epsg)])]
+    warnings += [*_noise_warnings(survey, _sight_m(scene, surroundings, positions))]
     if not chosen:
         warnings += _position_warnings(scene, survey, surroundings, samples)
     if survey.path.moves:
@@ -146,7 +149,7 @@ def _position_warnings(
                 f"surfaces{advice}; if it is the sensor's housing, give its name as unseen of the "
                 "sensor"
             )
-    for actor, name in enumerate(scene.all_names[len(scene.names) :]):
+    for actor, name in enumerate(scene.object_names[len(scene.names) :]):
         masks = (unseen[sample.sensor] for sample in samples)
         is_seen = [mask is None or not mask[len(scene.names) + actor] for mask in masks]
         inside = _inside_actor(scene.actors[actor], samples) & is_seen

@@ -41,6 +41,7 @@ from lidarsim.scene.files.coordinate_systems import (
     is_local,
     linear_unit,
     longitude_latitude,
+    missed_area,
     projjson,
     target_problem,
     transformed,
@@ -370,6 +371,12 @@ def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
         scale = ground_scale(crs, *middle.tolist())
         target = crs
         if scale is not None and not scale.is_true:
+            if (area := missed_area(crs, *middle.tolist())) is not None:
+                raise MeshFileError(
+                    f"states {crs_name(crs)}, whose area of use ({area}) is not at its x "
+                    f"{middle[0]:,.9g}, y {middle[1]:,.9g}. State the system of its coordinates "
+                    "(gdal_edit.py -a_srs EPSG:CODE FILE)"
+                )
             target = _zone_crs(source, middle)
             notes.append(
                 f"is in {crs_name(crs)}, whose metre is {scale} long on the ground here: brought "

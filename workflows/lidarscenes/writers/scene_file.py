@@ -71,7 +71,7 @@ def check_target(path: Path) -> None:
 def _encoded(suffix: str, scene: Scene) -> bytes:
     """Return the content of a file with a suffix of `SUFFIXES`."""
     if scene.has_voxels.any():
-        name = scene.all_names[scene.has_voxels.argmax()]
+        name = scene.object_names[scene.has_voxels.argmax()]
         raise LidarError(f"{name!r} is of voxels, which cannot be written: name its .vox file.")
     if suffix == ".ply":
         if scene.origin.any():

@@ -6,6 +6,7 @@ import builtins
 import inspect
 import sys
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import InitVar
 from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
@@ -78,6 +79,8 @@ def words_of(kind: Any) -> str:
     args = get_args(kind)
     if kind in (None, NoneType):
         return "None"
+    if isinstance(kind, InitVar):
+        return words_of(kind.type)
     if origin is Annotated:
         return words_of(args[0])
     if origin in (Union, UnionType):

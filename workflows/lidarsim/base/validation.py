@@ -40,10 +40,22 @@ from .errors import ArgumentError, LidarError
 from .section_fields import LIMITS, limits_of
 from .signatures import ReadableSignature, readable
 from .value_texts import one_line, shown
+from .words import did_you_mean
 
 P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
+
+_OF_MATERIALS = " Classes belong to materials, such as Material('Car', semantic_class=1)."
+_OF_HEADINGS = " Did you mean 'yaw_deg'? It is 90 minus a compass heading."
+# {name that is tried: {an argument of the function or class: advice}}, where `did_you_mean` does
+# not help.
+_ADVICE = {
+    "class_": {"semantic_class": " Did you mean 'semantic_class'?", "mesh": _OF_MATERIALS},
+    "semantic_class": {"mesh": _OF_MATERIALS},
+    "heading_deg": {"yaw_deg": _OF_HEADINGS},
+    "heading": {"yaw_deg": _OF_HEADINGS},
+}
 
 # No further fields, finite numbers, no conversion of text to numbers.
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -71,7 +83,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def checked_function(*args: P.args, **kwargs: P.kwargs) -> R:
-        # Python reports too many, too few and unknown arguments.
+        refuse_unknown(function, kwargs)
+        # Python reports too many and too few arguments.
         _check(function, {**dict(zip(_defaults(function), args, strict=False)), **kwargs})
         return function(*args, **kwargs)
 
@@ -91,10 +104,15 @@ def checked_fields(cls: C) -> C:
     """
     post_init: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
 
-    def __post_init__(self: Any) -> None:  # noqa: N807
+    def __post_init__(self: Any, *init_vars: Any) -> None:  # noqa: N807
         _check(cls, vars(self))
-        post_init(self)
+        post_init(self, *init_vars)
 
+    def __new__(kind: type, /, *args: Any, **kwargs: Any) -> Any:  # noqa: N807
+        refuse_unknown(kind, kwargs)
+        return object.__new__(kind)
+
+    cls.__new__ = __new__  # type: ignore[method-assign]
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
     cls.__signature__ = ReadableSignature()  # type: ignore[attr-defined]
     cls.__pydantic_config__ = STRICT  # type: ignore[attr-defined]
@@ -142,6 +160,33 @@ def _check(target: Any, values: Mapping[str, Any]) -> None:
             validator.validate_python(without_numpy(values))
         except ValidationError as error:
             raise ArgumentError(argument_error(error, hints)) from None
+
+
+def refuse_unknown(target: Any, arguments: Collection[str]) -> None:
+    """Raise TypeError for names that are no arguments of a function or class, with a hint."""
+    if not arguments:
+        return
+    known = _keywords(target)
+    if known is None:
+        return
+    for name in arguments:
+        if name in known:
+            continue
+        advice = _ADVICE.get(name, {})
+        hints = (advice[argument] for argument in advice if argument in known)
+        place = target.__qualname__.removesuffix(".__init__")
+        hint = next(hints, "") or did_you_mean(name, known)
+        raise TypeError(f"{place}() got an unexpected keyword argument {name!r}.{hint}")
+
+
+@cache
+def _keywords(target: Any) -> frozenset[str] | None:
+    """Return the names of the arguments of a function or class, or None if it takes any name."""
+    function = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
+    parameters = inspect.signature(function).parameters
+    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values()):
+        return None
+    return frozenset(parameters)
 
 
 def without_numpy(value: Any) -> Any:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, InitVar, dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
@@ -23,6 +23,7 @@ from ..base.vectors import (
     matmul,
     matmul_of_components,
 )
+from ..base.words import joined
 from .headings import CurveHeadings, Heading, headed_poses
 from .rotations import (
     check_rotations,
@@ -316,18 +317,25 @@ class Track:
     beyond
         Before the first and after the last time "refuse" raises an error. An actor stays at its
         first or last pose with "hold", and is not in the scene with "absent".
+    yaw_deg, pitch_deg, roll_deg
+        Angles of the poses in place of `quaternions`, as in `Pose`: (k,), or one angle for all
+        poses, degrees. Pitch and roll need yaw; they are zero by default. The track keeps them as
+        `quaternions`.
 
     Raises
     ------
     LidarError
         If there are fewer than two poses, a number is not finite, times do not ascend, a
-        quaternion is invalid, or the station is not within the times.
+        quaternion is invalid, or the station is not within the times. If there are both
+        quaternions and angles, or pitch or roll without yaw.
 
     Examples
     --------
     >>> track = Track([0, 2], [[0, 0, 1], [20, 0, 1]])
     >>> track.pose(0, 0.5e9).position, track.duration_ns
     ((5.0, 0.0, 1.0), 2000000000.0)
+    >>> Track([0, 2], [[0, 0, 1], [20, 0, 1]], yaw_deg=[0, 90]).pose(0, 1e9).yaw_deg
+    45.0
     """
 
     times_s: Floats
@@ -337,10 +345,22 @@ class Track:
     start_s: float | None = None
     duration_s: float | None = None
     beyond: Beyond = "refuse"
+    _: KW_ONLY
+    yaw_deg: InitVar[ArrayLike | None] = None
+    pitch_deg: InitVar[ArrayLike | None] = None
+    roll_deg: InitVar[ArrayLike | None] = None
     stations: ClassVar[int] = 1
     moves: ClassVar[bool] = True
 
-    def __post_init__(self) -> None:
+    def __post_init__(
+        self,
+        yaw_deg: ArrayLike | None,
+        pitch_deg: ArrayLike | None,
+        roll_deg: ArrayLike | None,
+    ) -> None:
+        angles = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg}
+        if given := {name: angle for name, angle in angles.items() if angle is not None}:
+            self._set_quaternions(given)
         self._set_poses()
         self._set_span()
 
@@ -372,6 +392,26 @@ class Track:
         _check_times(times)
         batch = TrackBatch.from_matrices(times, matrices, beyond)
         return [_BatchTrack.of_batch(batch, number) for number in range(len(matrices))]
+
+    def _set_quaternions(self, angles: Mapping[str, ArrayLike]) -> None:
+        """Set the quaternions of poses by their angles, {name: (k,) or one for all, degrees}."""
+        if self.quaternions is not None:
+            raise LidarError(
+                f"quaternions and {joined([*angles])} both give the rotations. Give one of them."
+            )
+        if "yaw_deg" not in angles:
+            raise LidarError(f"Give yaw_deg beside {joined([*angles])}, for example yaw_deg=0.")
+        poses = np.size(self.times_s)
+        table = np.zeros((poses, 3))
+        for axis, name in enumerate(("yaw_deg", "pitch_deg", "roll_deg")):
+            values = as_array(name, angles.get(name, 0.0))
+            if values.shape not in ((), (poses,)) or not np.isfinite(values).all():
+                raise LidarError(
+                    f"{name} must be one finite angle, or one for each of the {poses} poses, not "
+                    f"{shown(angles[name])}."
+                )
+            table[:, axis] = values
+        object.__setattr__(self, "quaternions", quaternions_of(rotations_of(table)))
 
     def _set_poses(self) -> None:
         """Check and freeze times, positions and quaternions."""

@@ -12,7 +12,7 @@ import numpy as np
 from ..base.arrays import Floats, Indices
 from ..base.elementary import interp
 from ..base.errors import LidarError, prefixed
-from ..base.validation import checked_fields
+from ..base.validation import checked, checked_fields
 from ..base.vectors import length, products, turned
 from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
@@ -289,8 +289,22 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
     return SceneMesh(name, *parts, colours=colours, animation=animation, materials=materials)
 
 
+@checked
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
-    """Return a box of a length, width and height, its origin in the middle of its underside."""
+    """Return the mesh of a box, with its origin in the middle of its underside.
+
+    Parameters
+    ----------
+    name
+        Name of the object.
+    size_m
+        Length along x, width along y and height along z, meters.
+
+    Examples
+    --------
+    >>> box("Car", (4.5, 1.8, 1.5)).bounds.tolist()
+    [[-2.25, -0.9, 0.0], [2.25, 0.9, 1.5]]
+    """
     corners = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
     sides = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     faces = [[a, b, c] for a, b, c, _ in sides] + [[a, c, d] for a, _, c, d in sides]

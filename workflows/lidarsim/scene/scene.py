@@ -60,6 +60,7 @@ class Scene:
         int32 (f,), for each triangle the index of its object in `names`.
     names
         Names of the static objects, without duplicates; an object's number is its index.
+        `object_names` has the actors, too.
     origin
         float64 (3,), whole metres, plus `world_origin`.
     world_origin
@@ -95,14 +96,14 @@ class Scene:
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
-        objects = plural(len(self.all_names), "object")
+        objects = plural(len(self.object_names), "object")
         return f"<Scene: {objects}, {plural(self.triangles, 'triangle')}, {sides} m>"
 
     def _repr_html_(self) -> str:
         """Return the table of the main figures, and a picture if a package draws scenes."""
         sides = " × ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
         rows = {
-            "scene": f"{plural(len(self.all_names), 'object')}: {listed(self.all_names, 8)}",
+            "scene": f"{plural(len(self.object_names), 'object')}: {listed(self.object_names, 8)}",
             "triangles": f"{self.triangles:,}",
             "extent": f"{sides} m",
         }
@@ -343,8 +344,11 @@ class Scene:
         return scene
 
     @property
-    def all_names(self) -> tuple[str, ...]:
-        """Names of all objects, first the static objects, then the actors."""
+    def object_names(self) -> tuple[str, ...]:
+        """Names of all objects, first the static objects, then the actors.
+
+        The column `object` holds indices into these names.
+        """
         if not self.actors:
             return self.names
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
@@ -352,7 +356,7 @@ class Scene:
     @property
     def surface_kinds(self) -> SurfaceKinds:
         """Kinds of surfaces: a kind for each material of each object, actors last."""
-        names = self.all_names
+        names = self.object_names
         static = [()] * len(self.names) if self.materials is None else self.materials.names
         moving = [
             () if actor.mesh.materials is None else actor.mesh.materials.names
@@ -404,7 +408,7 @@ class Scene:
             owners = set(instances.owners(lambda part: part.mask is not None).tolist())
         first_actor = len(self.names)
         owners |= {first_actor + i for i, actor in enumerate(self.actors) if actor.mesh.cutouts}
-        return tuple(name for i, name in enumerate(self.all_names) if i in owners)
+        return tuple(name for i, name in enumerate(self.object_names) if i in owners)
 
     @property
     def coloured(self) -> list[Colours]:
@@ -420,7 +424,7 @@ class Scene:
     @property
     def has_colours(self) -> Bools:
         """True for each object with a colour, actors after the static objects: (objects,)."""
-        has_colour = np.zeros(len(self.all_names), np.bool_)
+        has_colour = np.zeros(len(self.object_names), np.bool_)
         if (colours := self.colours) is not None:
             grey = np.array([image is GREY for image in colours.images])
             # Faces without a colour have the image `GREY` if other faces are coloured.
@@ -481,14 +485,14 @@ class Scene:
         meshes = [actor.placed(time_ns) for actor in self.actors]
         moving = [(mesh.vertices, mesh.faces.astype(np.int32)) for mesh in meshes]
         owners = np.repeat(
-            np.arange(len(self.names), len(self.all_names), dtype=np.int32),
+            np.arange(len(self.names), len(self.object_names), dtype=np.int32),
             [len(mesh.faces) for mesh in meshes],
         )
         sizes = [len(self.faces), *(len(faces) for _, faces in moving)]
         return Scene(
             *stacked([(self.vertices, self.faces), *moving]),
             np.append(self.face_object, owners),
-            self.all_names,
+            self.object_names,
             self.origin,
             world_origin=self.world_origin,
             colours=join_colours([self.colours, *(mesh.colours for mesh in meshes)], sizes),

@@ -155,7 +155,7 @@ class Scanner:
         except ValueError as error:  # wrong threads or device
             raise LidarError(str(error)) from error
         self._actors = list(scene.actors)
-        self._numbers = {name: number for number, name in enumerate(scene.all_names)}
+        self._numbers = {name: number for number, name in enumerate(scene.object_names)}
         # Objects whose triangles are all in instances.
         self._movable = np.zeros(len(scene.names), np.bool_)
         if scene.instances is not None:
@@ -362,8 +362,7 @@ class Scanner:
 
         Examples
         --------
-        >>> from lidarpool import Actor, Scanner, Scene, load_sensor
-        >>> from lidarsim.scene.actors import box
+        >>> from lidarpool import Actor, Scanner, Scene, box, load_sensor
         >>> cars = [Actor(box(f"Car {number}", (4.5, 1.8, 1.5))) for number in range(3)]
         >>> scene = Scene.seed().with_actors(cars)
         >>> scanner = Scanner(scene, load_sensor("velodyne/vlp16"))

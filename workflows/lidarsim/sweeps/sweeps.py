@@ -331,7 +331,7 @@ class Sweeps:
         return _poses_of(self.pose.positions - lever_arms, rotations)
 
     @cached_property
-    def all_names(self) -> tuple[str, ...]:
+    def object_names(self) -> tuple[str, ...]:
         """Names that the column `object` counts: of objects, then of actors."""
         return (*self.objects, *self.actors)
 

@@ -63,8 +63,7 @@ class Follower:
     Examples
     --------
     >>> import numpy as np
-    >>> from lidarpool import Follower, load_sensor
-    >>> from lidarsim.scene.actors import box
+    >>> from lidarpool import Follower, box, load_sensor
     >>> ground = box("Ground", (80, 80, 0.1))
     >>> sensor = load_sensor("velodyne/vlp16")
     >>> follower = Follower([box("Car", (4, 2, 1.5))], sensor, static=[ground])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -34,6 +35,20 @@ _BLOCK_POINTS = 100_000  # reprojected at a time, through lists of Python
 UNNAMED = ("unnamed", "unknown", "")  # names by GDAL and PROJ of systems without a name
 POLAR_EPSG = (5041, 5042)  # universal polar stereographic, of the north and of the south
 _POLAR_DEG = 84.0  # from this latitude on, the polar stereographic projection replaces UTM
+# Systems are used beyond the area that the registry states, but not this far, degrees of arc: UTM
+# zone 33 serves all of Norway, 30 degrees wide, and zone 32 all of Bavaria.
+_AREA_MARGIN_DEG = 5.0
+_ELSEWHERE_DEG = 20.0  # coordinates this far from the area are likely those of another system
+_AREA_LETTERS = 90  # of the name of an area in messages
+# Northings within the zones of each family of UTM codes, in metres, for places that need no
+# registry to be recognized.
+_UTM_NORTHINGS_M = {
+    range(32601, 32661): (0.0, 9.4e6),
+    range(32701, 32761): (1.1e6, 10e6),
+    range(25828, 25839): (4e6, 9.4e6),
+    range(26901, 26924): (1.6e6, 9.4e6),
+}
+_UTM_ZONE_HALF_WIDTH_M = 400_000.0  # a zone at the equator reaches to 333 km from its middle
 _WGS84_ELLIPSOID = (6378137.0, 298.257223563)  # semi-major axis in metres, inverse flattening
 
 # Projections that are made for lengths of countries, by letters of their names.
@@ -70,6 +85,44 @@ class GroundScale:
         if self.is_even:
             return f"{(self.shortest + self.longest) / 2:.3g} m"
         return f"{self.shortest:.3g} to {self.longest:.3g} m"
+
+
+@dataclass(frozen=True)
+class AreaOfUse:
+    """The area on Earth where a coordinate system is meant to be used.
+
+    Attributes
+    ----------
+    name
+        The area in words, by the registry.
+    west, south, east, north
+        Bounds in degrees; `west` is greater than `east` if the area crosses the date line.
+    """
+
+    name: str
+    west: float
+    south: float
+    east: float
+    north: float
+
+    def __str__(self) -> str:
+        name = self.name.partition(". ")[0].rstrip(".")
+        return textwrap.shorten(name, _AREA_LETTERS, placeholder=" …")
+
+    @property
+    def width(self) -> float:
+        """Width in degrees of longitude."""
+        return (self.east - self.west) % 360 or 360.0
+
+    def reaches(self, longitude: float, latitude: float, margin_deg: float = 0.0) -> bool:
+        """Return True for a place within `margin_deg` of the area, in degrees of arc."""
+        if not self.south - margin_deg <= latitude <= self.north + margin_deg:
+            return False
+        cosine = float(sin_cos(np.radians(np.array([latitude])))[1][0])
+        margin = margin_deg / max(cosine, 1e-6)
+        if self.width + 2 * margin >= 360:
+            return True
+        return (longitude - self.west + margin) % 360 <= self.width + 2 * margin
 
 
 def has_registry() -> bool:
@@ -215,6 +268,89 @@ def _transformed_places(source: Any, target: Any, places: Floats) -> Floats | No
     return moved if np.isfinite(moved).all() else None
 
 
+def area_of_use(crs: Any) -> AreaOfUse | None:
+    """Return the area of use of a coordinate system, or None if the registry states none.
+
+    `crs` must not be compound.
+    """
+    code = crs.to_epsg(confidence_threshold=90)
+    described = projjson(crs_of_code(code) if code else crs)
+    stated = [part for part in (described, *described.get("usages", ())) if part.get("bbox")]
+    if not stated:
+        return None
+    usage = min(stated, key=lambda part: len(part.get("area", "")))
+    sides = ("west_longitude", "south_latitude", "east_longitude", "north_latitude")
+    return AreaOfUse(str(usage.get("area", "")), *(float(usage["bbox"][side]) for side in sides))
+
+
+def missed_area(
+    crs: Any, x: float, y: float, margin_deg: float = _ELSEWHERE_DEG
+) -> AreaOfUse | None:
+    """Return the area of use of a system if a place is not within `margin_deg` of it, else None.
+
+    None also for a system whose area is not known.
+
+    Parameters
+    ----------
+    crs
+        A `rasterio.crs.CRS`, not compound.
+    x, y
+        Coordinates of the place, in the unit of the system.
+    """
+    area = area_of_use(crs)
+    if area is None:
+        return None
+    place = longitude_latitude(crs, x, y)
+    is_near = place is not None and area.reaches(*place, margin_deg)
+    return None if is_near else area
+
+
+def outside_system(epsg: int, x: float, y: float) -> str:
+    """Return a clause that names a system and its area of use if a place is far outside, else "".
+
+    Far is 5 degrees of arc. The clause is such as «the area of use of EPSG:2056 (CH1903+ / LV95),
+    which is Liechtenstein; Switzerland». Empty for a code that is not known, for a system that is
+    not projected, and without rasterio.
+    """
+    if _is_in_zone(epsg, x, y) or not has_registry():
+        return ""
+    crs = crs_of_code(epsg)
+    horizontal = None if crs is None else horizontal_part(crs)[0]
+    if horizontal is None or not horizontal.is_projected:
+        return ""
+    area = missed_area(horizontal, x, y, _AREA_MARGIN_DEG)
+    if area is None:
+        return ""
+    named = f", which is {area}" if area.name else ""
+    return f"the area of use of {crs_name(crs)}{named}"
+
+
+def _is_in_zone(epsg: int, x: float, y: float) -> bool:
+    """Return True for a place in a UTM zone without the registry, which takes half a second."""
+    for codes, (south_m, north_m) in _UTM_NORTHINGS_M.items():
+        if epsg in codes:
+            return abs(x - _UTM_MIDDLE_M) <= _UTM_ZONE_HALF_WIDTH_M and south_m <= y <= north_m
+    return False
+
+
+def zone_in_area(epsg: int, x: float, y: float) -> int | None:
+    """Return the only UTM zone by which a place is in the area of use of a system, an EPSG code.
+
+    For coordinates of a UTM zone that were taken for coordinates of the system. None if no zone
+    fits, or several, and without rasterio.
+    """
+    crs = crs_of_code(epsg) if has_registry() else None
+    area = None if crs is None else area_of_use(horizontal_part(crs)[0])
+    if area is None:
+        return None
+    longitudes = np.arange(area.west, area.west + area.width, 1.0).tolist()
+    latitude = (area.south + area.north) / 2
+    codes = {zone_in_metres((at + 180) % 360 - 180, latitude) for at in longitudes}
+    places = {code: longitude_latitude(crs_of_code(code), x, y) for code in codes - {epsg}}
+    fitting = [code for code, at in places.items() if at is not None and area.reaches(*at)]
+    return fitting[0] if len(fitting) == 1 else None
+
+
 def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
     """Return the scale of a projected system at a place in its own unit.
 
@@ -296,8 +432,15 @@ def zone_in_metres(longitude: float, latitude: float) -> int:
 
 
 def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
-    """Return the EPSG code of a system in true metres at a place, or None if it is not on Earth."""
-    place = longitude_latitude(horizontal_part(crs)[0], x, y)
+    """Return the EPSG code of a system in true metres at a place, or None if it is not on Earth.
+
+    None also for a place far outside the system's area of use, whose coordinates are likely those
+    of another system.
+    """
+    horizontal = horizontal_part(crs)[0]
+    if missed_area(horizontal, x, y) is not None:
+        return None
+    place = longitude_latitude(horizontal, x, y)
     return None if place is None else zone_in_metres(*place)
 
 
@@ -350,9 +493,12 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
         is_known = system.removeprefix("EPSG:") in map(str, WORLD_EPSG)
         return "whose metres are not true to scale" if is_known else ""
     crs = crs_of_text(system)
-    scale = None if crs is None else ground_scale(horizontal_part(crs)[0], x, y)
+    horizontal = None if crs is None else horizontal_part(crs)[0]
+    scale = None if crs is None else ground_scale(horizontal, x, y)
     if scale is None or scale.is_true:
         return ""
+    if (area := missed_area(horizontal, x, y)) is not None:
+        return f"whose area of use ({area}) is not where the coordinates are"
     clause = f"whose metre is {scale} long on the ground here"
     if scale.is_even and in_system:
         factor = f"{(scale.shortest + scale.longest) / 2:.6g}"
@@ -395,8 +541,8 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
     if scale.is_true:
         return ""
     advice = "choose a system for this place"
-    if code := suggested_epsg(horizontal, x, y):
-        advice = f"EPSG:{code} has true metres there"
+    if place := longitude_latitude(horizontal, x, y):
+        advice = f"EPSG:{zone_in_metres(*place)} has true metres there"
     return f"{name}, whose metre is {scale} long at x {x:.9g}, y {y:.9g}{why_there}: {advice}"
 
 

@@ -33,7 +33,9 @@ from .coordinate_systems import (
     is_geocentric,
     is_true_in_utm,
     is_utm,
+    missed_area,
     need_registry,
+    outside_system,
     projection_kind,
     projjson,
     suggested_epsg,
@@ -328,8 +330,8 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
     Without rasterio, or where PROJ cannot tell, the name of the projection counts.
     """
     middle = np.median(positions[:, :2], axis=0) if len(positions) else np.zeros(2)
-    if system.is_in_utm_zone(positions):
-        return _Scale()  # without the registry, which takes half a second to load
+    if system.is_in_utm_zone(positions):  # the registry takes half a second to load
+        return _Scale(note=_place_note(system, middle) if len(positions) else "")
     horizontal = None
     if system.crs is not None and not is_geocentric(system.crs):
         horizontal, _ = horizontal_part(system.crs)
@@ -340,15 +342,31 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
         return _Scale() if horizontal.is_geographic else _scale_by_name(system)
     if not scale.is_true:
         problem = f"is in {system.name}, whose metre is {scale} long on the ground here"
+        if (area := missed_area(horizontal, *middle.tolist())) is not None:
+            x, y = middle.tolist()
+            problem = (
+                f"states {system.name}, whose area of use ({area}) is not at its x {x:.9g}, "
+                f"y {y:.9g}, so that it may state the wrong system"
+            )
         return _Scale(problem, suggested_epsg(horizontal, *middle.tolist()))
     corners = np.array([positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)])
     scales = [ground_scale(horizontal, x, y) for x in corners[:, 0] for y in corners[:, 1]]
     error = max((scale.error for scale in scales if scale is not None), default=0.0)
     if error <= MAX_SCALE_ERROR:
-        return _Scale()
+        return _Scale(note=_place_note(system, middle))
     return _Scale(
         note=f"is so wide that lengths of {system.name} are wrong by {error:.1%} at its edges"
     )
+
+
+def _place_note(system: StatedSystem, middle: Floats) -> str:
+    """Return a clause on coordinates far outside the system's area of use, or "".
+
+    `middle` (2,) is the middle of the positions, in the unit of the system.
+    """
+    x, y = middle.tolist()
+    area = outside_system(system.epsg, x, y) if system.epsg is not None else ""
+    return f"has coordinates, x {x:,.9g}, y {y:,.9g}, outside {area}" if area else ""
 
 
 def _scale_by_name(system: StatedSystem) -> _Scale:

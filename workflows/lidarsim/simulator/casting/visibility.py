@@ -17,7 +17,7 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
 
     Returns
     -------
-    For each sensor a mask (objects,), in the order of `Scene.all_names`; None if the sensor sees
+    For each sensor a mask (objects,), in the order of `Scene.object_names`; None if the sensor sees
     all objects.
 
     Raises
@@ -27,7 +27,7 @@ def unseen_objects(scene: Scene, survey: Survey) -> tuple[Bools | None, ...]:
     """
     if not any(carried.unseen for carried in survey.carried):
         return (None,) * len(survey.carried)
-    names = scene.all_names
+    names = scene.object_names
     object_rows = {name: row for row, name in enumerate(names)}
     masks: list[Bools | None] = []
     for carried in survey.carried:

@@ -198,7 +198,7 @@ def _retro_clusters(
     owners = surfaces.triangle_kinds.material_kinds.object
     if unseen is not None:
         retro = retro & ~unseen[owners]
-    has_retro = np.zeros(len(scene.all_names), np.bool_)  # one for each object
+    has_retro = np.zeros(len(scene.object_names), np.bool_)  # one for each object
     has_retro[owners[retro]] = True
 
     def clusters_of(
