@@ -64,6 +64,7 @@ def test_as_json(campaign, lidarpool):
     found = json.loads(lidarpool("check", campaign, "--json").out)
     assert found["can_run"] and found["count"] == 9
     keep = {"format": "mcap", "layout": "ouster", "compensated": False}
+    keep |= {"compensated_actors": False, "pose_rate_hz": None}
     assert found["keep"] == keep
     assert [job["number"] for job in found["jobs"]] == [0, 2, 4, 6, 8]
     one = json.loads(lidarpool("check", campaign, "--json", "--job", 4).out)
