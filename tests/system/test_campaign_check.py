@@ -60,6 +60,15 @@ def test_one_job_is_shown_like_a_scenario(campaign, lidarpool):
     assert outcome.out.rstrip().endswith("campaign.yaml --job 3")
 
 
+@pytest.mark.parametrize(
+    ("options", "message"), [((), "Add --live."), (("--live",), "--pace applies to a survey only.")]
+)
+def test_a_campaign_has_no_pace(campaign, lidarpool, options, message):
+    refused = lidarpool("run", campaign, *options, "--pace", 1, "--out", campaign.parent / "ds")
+    assert refused.code == 2 and message in refused.err
+    assert not (campaign.parent / "ds").exists()
+
+
 def test_as_json(campaign, lidarpool):
     found = json.loads(lidarpool("check", campaign, "--json").out)
     assert found["can_run"] and found["count"] == 9

@@ -749,8 +749,6 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
         (["--job", 99], "there is no job 99"),
         (["--resume", "--overwrite"], "overwrite remove what resume"),
         (["--only", "cloud"], "for one survey"),
-        (["--pace", 1], "--pace sets the pace of the live page. Add --live."),
-        (["--live", "--pace", 1], "--pace applies to a survey only."),
         (["--resume", "--fresh"], "--fresh"),
         (["--retry-failed", "--fresh"], "--fresh"),
         (["--retry-failed", "--job", 1], "--retry-failed"),
