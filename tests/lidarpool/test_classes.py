@@ -198,6 +198,8 @@ def test_nuscenes_has_labels_and_categories(saved, scene, sweeps):
     # The devkit allows no gaps between labels; boxes of "Car 1" have the category of class "car".
     names = check_lidarseg(folder)
     assert names == dict(enumerate(["none", "road", "Straße", NAMES[20], "car", "Van"]))
+    numbers = [row.get("class") for row in tables_of(folder)["category"]]
+    assert numbers == [0, *NAMES, None]
     labels = np.fromfile(folder / "lidarseg/v1.0-lidarpool/samples-rear_left-000001.pcd.bin", "u1")
     points = points_of(scene, 0)
     expected = points["class"][points.scan // SCANS == TURNS + 1]

@@ -55,7 +55,7 @@ def test_poses_between_knots_are_on_straight_lines():
     shares = np.array([-0.1, 0, 0.2, 0.5, 0.7, 1, 1.3])
     poses = poses_at(knots, start, mount.as_matrix(), shares)
     points = np.random.default_rng(1).normal(size=(len(shares), 3)) * 9
-    for number, share in enumerate(shares.clip(0, 1)):
+    for number, share in enumerate(shares):  # before the first and after the last, extrapolated
         first = 0 if share < 0.5 else 1
         part = 2 * share - first
         mean = knots[first] + part * (knots[first + 1].astype(float) - knots[first])

@@ -60,10 +60,18 @@ def test_one_job_is_shown_like_a_scenario(campaign, lidarpool):
     assert outcome.out.rstrip().endswith("campaign.yaml --job 3")
 
 
+@pytest.mark.parametrize(("options", "word"), [((), "--live"), (("--live",), "survey")])
+def test_a_campaign_has_no_pace(campaign, lidarpool, options, word):
+    refused = lidarpool("run", campaign, *options, "--pace", 1, "--out", campaign.parent / "ds")
+    assert refused.code == 2 and "--pace" in refused.err and word in refused.err
+    assert not (campaign.parent / "ds").exists()
+
+
 def test_as_json(campaign, lidarpool):
     found = json.loads(lidarpool("check", campaign, "--json").out)
     assert found["can_run"] and found["count"] == 9
     keep = {"format": "mcap", "layout": "ouster", "compensated": False}
+    keep |= {"compensated_actors": False, "pose_rate_hz": None}
     assert found["keep"] == keep
     assert [job["number"] for job in found["jobs"]] == [0, 2, 4, 6, 8]
     one = json.loads(lidarpool("check", campaign, "--json", "--job", 4).out)

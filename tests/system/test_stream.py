@@ -22,6 +22,7 @@ from tests.drives import SCANS, TURNS, the_scene
 import lidarpool as lp
 from lidarpool import Campaign, Job, LidarError, Mounted, Noise, Pose, Sensor, Survey, Sweep
 from lidarpool.base.tracing import trace_to
+from lidarsim.motion.rotations import matrices
 
 SCENE = the_scene()
 SWEEPS = 2 * TURNS  # of a job
@@ -109,6 +110,31 @@ def test_normals_and_origins_are_in_the_axes_of_the_points(client):
         cosine = -(ray * normal).sum(axis=1) / sweep.columns["range"]
         expected = np.cos(np.radians(sweep.columns["incidence_deg"]))
         np.testing.assert_allclose(cosine, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize(("compensated", "outside_m"), [(False, 0.3), (True, 0.003)])
+def test_points_of_actors_are_moved_into_their_boxes(cluster_client, compensated, outside_m):
+    """A car passes at 5 m/s, so that it moves by 0.5 m in a sweep."""
+
+    def past(number: int, rng: np.random.Generator) -> Job:
+        car = replace(SCENE.actors[0], trajectory=lp.Track([0, 1], [[2, 5, 0], [7, 5, 0]]))
+        job = make(number, rng)
+        survey = replace(job.survey, noise=Noise(), precision_m=1e-3)
+        return replace(job, scene=replace(SCENE, actors=(car,)), survey=survey)
+
+    keep = {"format": "kitti", "compensated_actors": compensated}
+    farthest_m = []
+    for sweep in Campaign(past, 1, keep=keep).stream(client=cluster_client):
+        (actor,) = sweep.boxes.objects
+        points = sweep.points[sweep.objects == actor]
+        assert len(points) == sweep.boxes.points[0]
+        inside = (points - sweep.boxes.centres[0]) @ matrices(sweep.boxes.quaternions)[0]
+        outside = np.abs(inside) - sweep.boxes.sizes[0] / 2
+        farthest_m.append(outside.max(initial=0))
+    if compensated:
+        assert max(farthest_m) < outside_m
+    else:
+        assert max(farthest_m) > outside_m
 
 
 @pytest.mark.slow

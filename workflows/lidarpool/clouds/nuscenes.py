@@ -196,17 +196,21 @@ def _categories(kinds: Iterable[Any], classes: Mapping[int, str]) -> list[dict[s
     """Return the rows of all named classes and categories of actors, each name once.
 
     Rows of classes are in the order of their labels. If jobs give one name to several numbers,
-    the number is appended to the name.
+    the number is appended to the name. The field `class`, beside those of nuScenes, is the number
+    of a class.
     """
     rows_by_name = {row["name"]: row for row in kinds}
-    names = {_NO_CLASS: None}
+    numbers: dict[str, int | None] = {_NO_CLASS: 0}
     for number in sorted(classes):
         name = classes[number]
-        names[f"{name} ({number})" if name in names else name] = None
-    names |= dict.fromkeys(rows_by_name)
+        numbers[f"{name} ({number})" if name in numbers else name] = number
+    names = numbers | {name: None for name in rows_by_name if name not in numbers}
     return [
-        {"token": name, "name": name, "description": "", **rows_by_name.get(name, {}), "index": n}
-        for n, name in enumerate(names)
+        {"token": name, "name": name, "description": ""}
+        | rows_by_name.get(name, {})
+        | {"index": index}
+        | ({} if number is None else {"class": number})
+        for index, (name, number) in enumerate(names.items())
     ]
 
 
@@ -471,6 +475,11 @@ class _DataSet:
         if (tables / "lidarseg.json").exists():
             rows = self._table("lidarseg").values()
             self._labels = {row["sample_data_token"]: row["filename"] for row in rows}
+        self._classes = np.arange(256, dtype=np.uint16)  # of labels; their numbers in our own sets
+        known = self._labels and (tables / "category.json").exists()
+        for row in self._table("category").values() if known else ():
+            if "class" in row:
+                self._classes[row["index"]] = row["class"]
 
     def _table(self, name: str) -> dict[str, _Row]:
         rows = json.loads(read_input(self._tables / f"{name}.json"))
@@ -523,7 +532,7 @@ class _DataSet:
         columns = read_float_columns(file, NUSCENES)
         positions = take_positions(columns)
         for label_file in label_files:
-            columns["class"] = np.frombuffer(read_input(label_file), "u1")
+            columns["class"] = self._classes[np.frombuffer(read_input(label_file), "u1")]
         calibration = _pose_of(self._calibrated[row["calibrated_sensor_token"]])
         return positions, columns, _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
 
