@@ -189,12 +189,19 @@ class ChunkSize:
         return round(max(1, min(GROWTH * self._tried, by_time, by_bytes, MOST_ITEMS)))
 
     def chunks(self, items: int, seconds: float, nbytes: int) -> int:
-        """Return how many chunks of so many items take `seconds`, or have `nbytes` in all."""
+        """Return how many chunks of so many items take `seconds`, or have `nbytes` in all.
+
+        Return 0 before any item has come back.
+        """
         if not self._tried:
             return 0
         by_time = seconds / max(items * self._item_s, 1e-9)
         by_bytes = nbytes / max(items * self._item_bytes, 1.0)
         return int(min(by_time, by_bytes))
+
+    def will_grow(self, items: int) -> bool:
+        """Return whether few items have come back, so that later chunks may have more items."""
+        return items >= GROWTH * self._tried
 
 
 @dataclass(frozen=True)
@@ -426,10 +433,14 @@ class Results(Iterator[Any]):
     def _sizes(self) -> tuple[int, int]:
         """Return the number of items in the next chunk, and the number of tasks under way."""
         learned = self._size.items(self._target_s())
-        size = next((stage.chunk for stage in self._stages[::-1] if stage.chunk), learned)
+        given = next((stage.chunk for stage in self._stages[::-1] if stage.chunk), None)
+        size = given or learned
         slots = zip(self._stages, self._slots, strict=True)
         window = sum(stage.window or max(2, 2 * number) for stage, number in slots)
-        if not any(stage.window for stage in self._stages):
+        # Items of quick calls are not all sent in chunks of the few that were tried first.
+        if not any(stage.window for stage in self._stages) and (
+            given or not self._size.will_grow(size)
+        ):
             slot_count = max(1, sum(self._slots))
             # Work for the lead in each slot.
             grown = self._size.chunks(size, slot_count * self._lead.seconds, MOST_BYTES_IN_FLIGHT)
