@@ -455,7 +455,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         ("gt.osi", "is not read: it is a trace of OSI, name it as the traffic of a scenario, or"),
         ("osi.mcap", "osi.mcap: it has no messages of ROS 2: record PointCloud2, or, if it is a "),
         ("none.ply", "none.ply has no points"),
-        ("robot.xacro", "expand it first"),
+        ("robot.xacro", "Expand it first"),
         ("lost", r"lost cannot be read: No such file or directory, .*lost/samples/.*bin"),
         ("none.las", "does not exist"),
     ):

@@ -150,14 +150,14 @@ CONTROLLER = (
             ({"here": "<instance_controller url='#c'/>", "libraries": CONTROLLER.format(by)}, by)
             for by in ("skin", "morph")
         ],
-        ({"here": f"<skew>45 1 0 0 0 1 0</skew>{HERE}"}, "by <skew>"),
+        ({"here": f"<skew>45 1 0 0 0 1 0</skew>{HERE}"}, "contains <skew>"),
         ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "by a matrix that is none"),
         ({"primitive": f"<triangles>{V}<p>0 1 9</p></triangles>"}, "refer to vertices 0 to 9"),
-        ({"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")}, "of 5 corners, and"),
-        ({"accessor": 'count="9" stride="3"'}, "id='p'> announces 9 x 3 numbers, and 24 are there"),
+        ({"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")}, "with 5 corners but"),
+        ({"accessor": 'count="9" stride="3"'}, "id='p'> declares 9 x 3 numbers but contains 24"),
         ({"numbers": "nan " + SQUARES[2:]}, "1 of the 4 vertices .* NaN"),
         *[
-            ({"asset": f'<unit meter="{metres}"/>'}, "its unit|could not convert")
+            ({"asset": f'<unit meter="{metres}"/>'}, "the unit|could not convert")
             for metres in ("0,01", "0", "nan")
         ],
         ({"doctype": '<!DOCTYPE C [<!ENTITY i SYSTEM "file:///etc/passwd">]>', "numbers": "&i;"},

@@ -223,7 +223,7 @@ def test_models_are_looked_for_in_variables_and_downloads(tmp_path, monkeypatch)
     assert heights == {"one/link": 0, "two/link": 0, "cone/link": 10, "older/link": 2, "t/link": 10}
     monkeypatch.delenv("GAZEBO_MODEL_PATH")
     _, _, notes = load(tmp_path / "worlds", text)
-    assert len(notes) == 1 and notes[0].endswith("lacks 1 model, which is left out: two")
+    assert len(notes) == 1 and notes[0].endswith("refers to 1 missing model: two. It was skipped.")
     assert load(tmp_path / "worlds", text, assets=tmp_path / "b")[2] == []
 
 
@@ -237,7 +237,7 @@ def test_above_a_world_only_folders_with_a_configuration_are_models(tmp_path):
     text = world(include("model://tree"), include("model://letters"))
     objects, _, notes = load(deep, text)
     assert list(objects) == ["tree/link"]
-    assert notes[0].endswith("lacks 1 model, which is left out: letters")
+    assert notes[0].endswith("refers to 1 missing model: letters. It was skipped.")
 
     mesh = model("m", link(inside=shape("<mesh><uri>{}</uri></mesh>")))
     for part in (
@@ -249,13 +249,15 @@ def test_above_a_world_only_folders_with_a_configuration_are_models(tmp_path):
         with pytest.raises(LidarError) as caught:
             load(deep, world(part))
         assert (
-            f"is in {tmp_path / 'private'}, which has no model.config: name the folder that "
+            f"is in {tmp_path / 'private'}, which has no model.config. Name the folder that "
             "contains it as assets."
         ) in str(caught.value)
         assert load(deep, world(part), assets=tmp_path)[0]
     (deep / "link.dae").symlink_to(tmp_path / "private" / "house.dae")
     for name in ("link.dae", "../../private/house.dae", f"file://{tmp_path}/private/house.dae"):
-        with pytest.raises(LidarError, match=r"leads out of .*city: put the file there"):
+        with pytest.raises(
+            LidarError, match=r"refers to a file outside .*city.* Move the file there"
+        ):
             load(deep, world(mesh.format(name)))
         assert load(deep, world(mesh.format(name)), assets=tmp_path)[0]
     write(tmp_path / "private" / "package.xml", "<package/>")
@@ -272,7 +274,7 @@ def test_beside_a_folder_of_worlds_models_have_a_configuration_or_are_of_a_packa
     for uri in ("../private/house.dae", "private/house.dae", "model://own/house.dae"):
         assert load(tmp_path / "worlds", world(mesh.format(uri)))[0]
     text = world(mesh.format("model://private/house.dae"))
-    with pytest.raises(LidarError, match=r"which has no model\.config: name the folder"):
+    with pytest.raises(LidarError, match=r"which has no model\.config\. Name the folder"):
         load(tmp_path / "worlds", text)
     write(tmp_path / "package.xml", "<package/>")
     assert load(tmp_path / "worlds", text)[0]
@@ -289,11 +291,17 @@ def test_missing_things_are_named_and_the_rest_is_there(tmp_path):
     objects, _, notes = load(tmp_path, world(*parts, "<lava/>", "<gz:thing/>", "<lava/>"))
     assert list(objects) == ["m/a"]
     lacking, files, unknown, collisions = notes
-    assert lacking.endswith("2 models, which are left out, in 3 places: crate, Someone/House")
-    assert files.endswith("lacks 1 file, which is left out: model://crate/a.dae")
-    assert unknown.endswith("are not read: world/lava, model/wheel, geometry/blob")
-    assert collisions.endswith("collision shapes and no visuals, and are left out: n::d")
-    with pytest.raises(LidarError, match="has nothing that a lidar sees: it lacks crate"):
+    assert lacking.endswith(
+        "2 missing models in 3 places: crate, Someone/House. They were skipped."
+    )
+    assert files.endswith("refers to 1 missing file: model://crate/a.dae. It was skipped.")
+    assert unknown.endswith("were skipped: world/lava, model/wheel, geometry/blob.")
+    assert collisions.endswith("without visuals, whose collision shapes were skipped: n::d.")
+    with pytest.raises(
+        LidarError,
+        match=r"contains nothing that a lidar can detect\. It refers to missing models or files: "
+        "crate",
+    ):
         load(tmp_path, world(include("model://crate")))
     objects, _, _ = load(tmp_path, world(*parts), geometry="collision")
     assert list(objects) == ["n/d"]
@@ -366,7 +374,7 @@ def test_meshes_keep_the_axes_of_their_file(tmp_path):
     assert bounds(item) == [[-0.5, -0.5, 0], [0.5, 0.5, 0]]
     secret = write(tmp_path / "secret.dae", DAE)
     for uri in ("../../../secret.dae", f"file://{secret}", "model://leg/../../../secret.dae"):
-        with pytest.raises(LidarError, match="leads out of") as caught:
+        with pytest.raises(LidarError, match="refers to a file outside") as caught:
             mesh(uri)
         assert len(str(caught.value).splitlines()) == 1
 
@@ -424,7 +432,7 @@ def test_actors_follow_their_waypoints(tmp_path):
         assert walker.name == "walker" and np.ptp(walker.mesh.bounds[:, 2]) == 6
         assert np.allclose(positions[:2], [[0, 0, 1], [2, 0, 1]])
         assert np.allclose(positions[2, :2], at_5_5, atol=0.01), loop
-        assert notes[0].endswith("has actors, whose skins are at rest")
+        assert notes[0].endswith("contains actors, whose skins are not animated.")
     objects, actors, _ = load(
         tmp_path, world(f"<actor name='a'><pose>1 2 3 0 0 0</pose>{skin}</actor>")
     )
@@ -441,7 +449,9 @@ def test_a_loop_that_ends_early_is_noted(tmp_path):
     actor = f"<actor name='walker'>{skin}{script}</actor>"
     _, (walker,), notes = load(tmp_path, world(model("g", link()), actor))
     assert walker.trajectory.times_s[-1] == 49  # 5,000 waypoints at most
-    assert any("walker, with so many waypoints that it loops for 49 s alone" in n for n in notes)
+    assert any(
+        "walker with so many waypoints that its loop is repeated for only 49 s" in n for n in notes
+    )
 
 
 def test_skins_of_actors_are_at_rest(tmp_path):
@@ -456,14 +466,14 @@ def test_skins_of_actors_are_at_rest(tmp_path):
     assert bounds(objects["a"]) == [[0, 0, 0.005], [1, 0, 3.005]]  # its unit is a centimetre
     mesh = model("m", link(inside=shape("<mesh><uri>walk.dae</uri></mesh>")), link("box"))
     _, _, (note,) = load(tmp_path, world(mesh))
-    assert "walk.dae, which is left out: walk.dae moves vertices by a skin" in note
+    assert "walk.dae, which was skipped: walk.dae deforms vertices with a skin" in note
 
 
 BROKEN = {
     "model 'a': link 'l': <pose> is '1 2 3'; it must be 6 finite": world(
         model("a", link("l", pose="<pose>1 2 3</pose>"))
     ),
-    "whose quaternion has no length": world(
+    "whose quaternion has zero length": world(
         model("a", link("l", pose="<pose rotation_format='quat_xyzw'>1 2 3 0 0 0 0</pose>"))
     ),
     "must be 6 finite numbers": world(model("a", link("l", pose="<pose>1 2 3 0 0 x</pose>"))),
@@ -487,16 +497,16 @@ BROKEN = {
         model("a", link(inside=shape("<sphere><radius>-1</radius></sphere>")))
     ),
     "it declares XML entities": "<!DOCTYPE s [<!ENTITY a 'b'>]>" + world(model("a", link())),
-    "names an XML entity, 'a'": world(model("&a;", link())),
-    "is cut short (its last element, <world>, has no end)": sdf("<world name='w'>").replace(
+    "uses the XML entity 'a'": world(model("&a;", link())),
+    "is cut short (its last element, <world>, is not closed)": sdf("<world name='w'>").replace(
         "</sdf>", ""
     ),
-    "line 1 has an end </sdf> without its start": sdf("<world name='w'>"),
-    "line 2 has a tag that is none of XML": "<sdf>\n<world name=w></world></sdf>",
-    "nested deeper than 200": "<sdf>" + "<a>" * 300,
-    "begins with <robot>": "<robot/>",
-    "is of Gazebo before 1.9": "<gazebo version='1.0'/>",
-    "it has no elements": "just text",
+    "line 1 contains </sdf> without a matching start tag": sdf("<world name='w'>"),
+    "line 2 contains an invalid tag": "<sdf>\n<world name=w></world></sdf>",
+    "nested more than 200 levels deep": "<sdf>" + "<a>" * 300,
+    "root element is <robot>": "<robot/>",
+    "has the format of Gazebo before version 1.9": "<gazebo version='1.0'/>",
+    "it contains no elements": "just text",
 }
 
 
@@ -516,12 +526,12 @@ def test_models_without_end_are_refused(tmp_path):
         many = [include(f"model://m{k + 1}", f"<name>n{i}</name>") for i in range(10)]
         add_model(tmp_path, f"m{k}", sdf(model(f"m{k}", *many, link())))
     add_model(tmp_path, "m8")
-    with pytest.raises(LidarError, match="places more than 200,000"):
+    with pytest.raises(LidarError, match="contains more than 200,000"):
         load(tmp_path, world(include("model://m0")))
     Image.fromarray(np.zeros((3000, 3000), np.uint8)).save(tmp_path / "huge.png")
     text = "<heightmap><uri>huge.png</uri><size>8 4 10</size></heightmap>"
     _, _, (note,) = load(tmp_path, world(model("a", link()), model("b", link(inside=shape(text)))))
-    assert note.endswith("huge.png, which is left out: huge.png has too many pixels")
+    assert note.endswith("huge.png, which was skipped: huge.png has too many pixels.")
 
 
 ROBOT = """<model name='robot'><pose>2 1 0 0 0 1.5707963267948966</pose>
@@ -568,14 +578,17 @@ def test_a_full_turn_has_no_direction_twice_and_other_lidars_are_told(tmp_path):
     result = CliRunner().invoke(import_, [str(path), "--out", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     assert "noise of type 'custom'" in result.output
-    assert "geometry: collision of scene.files" in result.output
+    assert "geometry: collision in scene.files" in result.output
     sensor = load_sensor(tmp_path / "out" / "scan.yaml", step_deg=360)
     assert sensor.period == 4
     data = yaml.safe_load((tmp_path / "out" / "scenario.yaml").read_text())
     assert list(data["sensors"]) == ["robot::mast::scan", "other::mast::scan"]
     result = CliRunner().invoke(import_, [str(path), "--out", str(tmp_path / "out")])
     assert "exists" in str(result.exception)
-    for text, words in ((world(model("m", link())), "it has no lidar"), ("<sdf>", "has no end")):
+    for text, words in (
+        (world(model("m", link())), "it contains no sensor"),
+        ("<sdf>", "is not closed"),
+    ):
         arguments = [str(write(path, text)), "-o", str(tmp_path / "x")]
         with pytest.raises(LidarError, match=f"cannot be converted to a scenario: .*{words}"):
             CliRunner().invoke(import_, arguments, catch_exceptions=False)
@@ -629,7 +642,7 @@ def test_lidars_see_visuals_by_masks_and_flags(tmp_path):
         model("lost", link(inside=visual("v", 1, shape("<mesh><uri>no.dae</uri></mesh>")))),
     )  # fmt: skip
     _, data, scenario = imported(tmp_path, text)
-    assert "Not as in" not in (tmp_path / "out" / "scenario.yaml").read_text()
+    assert "Not supported" not in (tmp_path / "out" / "scenario.yaml").read_text()
     sensors = data["sensors"]
     assert "unseen" not in sensors["all"]
     assert sensors["top"]["unseen"] == ["boat/hull/helper", "water/link", "buoy/link"]
@@ -640,7 +653,7 @@ def test_lidars_see_visuals_by_masks_and_flags(tmp_path):
         "boat/hull", "boat/hull/helper", "water/link", "quay [1]/link", "quay [2]/a",
         "quay [2]/b", "buoy/link",
     )  # fmt: skip
-    assert any("visibility_flags> of 0, which are left out: boat::hull" in note
+    assert any("visibility_flags> are 0, which were skipped: boat::hull" in note
                for note in built.findings.notes)  # fmt: skip
     seen = {}
     for batch in Rig(built.scene, built.survey, "numpy").cast(0, 4):
@@ -684,16 +697,18 @@ def test_elements_of_lidars_that_are_not_read_are_listed(tmp_path):
     robot = robot.replace("<noise>", "<visibility/><ros:x/><noise><bias_mean>1</bias_mean>")
     robot = robot.replace("</link></model>", "<sensor name='b' type='gpu_lidr'/></link></model>")
     output, _, _ = imported(tmp_path, world(robot, include("model://ground_plane")))
-    listed = ("robot::mast::scan: elements that are not read: sensor/updaterate, lidar/visibility, "
-              "scan/vertcal, vertical/sample, range/mx")  # fmt: skip
+    listed = (
+        "robot::mast::scan: elements that SDFormat does not define (sensor/updaterate, "
+        "lidar/visibility, scan/vertcal, vertical/sample, range/mx"
+    )
     text = (tmp_path / "out" / "scenario.yaml").read_text()
-    kind = "sensor 'robot::mast::b' is of the unknown type 'gpu_lidr'. Did you mean"
-    for words in (listed, "a bias of its noise", kind):
+    kind = "sensor 'robot::mast::b' has the unknown type 'gpu_lidr'. Did you mean"
+    for words in (listed, "the bias of the noise", kind):
         assert words in output and words in text
     text = ROBOT.replace("<lidar>", "<lidr>").replace("</lidar>", "</lidr>")
     with pytest.raises(LidarError, match=r"neither <lidar> nor <ray>\. Did you mean 'lidr'"):
         imported(tmp_path / "x", world(text))
-    with pytest.raises(LidarError, match=r"it has no lidar .* is of the unknown type 'lidarr'"):
+    with pytest.raises(LidarError, match=r"it contains no sensor .* has the unknown type 'lidarr'"):
         imported(tmp_path / "y", world(ROBOT.replace("gpu_lidar", "lidarr")))
 
 
@@ -736,7 +751,7 @@ def test_what_fell_for_a_long_time_is_left_out_and_named(tmp_path, name):
     objects, _, notes = load(tmp_path, world(model("kept", link()), element, state))
     assert list(objects) == ["kept/link"]
     notes = [note for note in notes if "skins" not in note]
-    assert len(notes) == 1 and "1,000 km and more away, or nowhere: left out are fallen" in notes[0]
+    assert len(notes) == 1 and "1,000 km away or without a finite position (fallen" in notes[0]
     scene = Scene.load(tmp_path / "w.sdf")
     assert np.abs(scene.bounds).max() <= 0.5 and not scene.origin.any()
 
@@ -745,9 +760,11 @@ def test_lidars_of_models_that_fell_are_listed(tmp_path):
     fallen = ROBOT.replace("'robot'", "'fallen'").replace("2 1 0", "2 1 -7.5e8")
     output, data, scenario = imported(tmp_path, world(ROBOT, fallen))
     assert list(data["sensors"]) == ["scan"]
-    assert "1,000 km and more away, or nowhere: left out are fallen" in output
+    assert "1,000 km away or without a finite position (fallen" in output
     assert build(scenario).scene.names == ("robot/base",)
-    with pytest.raises(LidarError, match=r"it has no lidar.*left out are fallen"):
+    with pytest.raises(
+        LidarError, match=r"it contains no sensor of type gpu_lidar.*finite position \(fallen"
+    ):
         imported(tmp_path / "x", world(fallen))
 
 

@@ -286,7 +286,7 @@ def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
     inside = '<FWFSettings beamSampleQuality="2"/><detectorSettings accuracy_m="0"/>' + inside
     made, scene, of = imported(device, inside, around=template)
     assert scenario_of(made).returns.subrays == 7 and scenario_of(made).noise.range_m == 0
-    assert made.left_out == ["maxNOR=3 of S/1: all returns of a pulse are kept"]
+    assert made.left_out == ["maxNOR=3 of S/1 (all returns of a pulse are kept)"]
     (batch,) = Rig(scene, of, "numpy").cast(0, 3)
     columns = {column.name: column.make(batch) for column in of.stored_columns}
     assert np.ptp(columns["z"]) <= 1 and len(columns["z"]) == 300
@@ -311,7 +311,7 @@ def test_waveform_settings_become_those_of_returns(imported):
         "peaks",
         0.6,
     )
-    assert made.left_out == ["maxFullwaveRange_ns: waveforms are as long as their echoes"]
+    assert made.left_out == ["maxFullwaveRange_ns (waveforms are as long as their echoes)"]
     assert of.returns_each[0].system_ns(of.carried[0].sensor.optics) == pytest.approx(4 / 2.35482)
     assert of.visibility_km == pytest.approx(10 * np.log(20) / 3.91)
     nm = of.carried[0].sensor.optics.wavelength_nm
@@ -388,7 +388,7 @@ def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
         parts["../spectra/loam.txt"] = "Name: loam\n\n1.0\t20.0\n2.0\t40.0 \n"
     made, _, _ = imported(device, legs('pulseFreq_hz="1000"'), parts=parts)
     assert [m.reflectance for m in scenario_of(made).materials] == [0.3, None] * known
-    assert ("the spectrum 'loam', which is not there" in " ".join(made.left_out)) != known
+    assert ("the missing spectrum 'loam'" in " ".join(made.left_out)) != known
 
 
 def test_a_trajectory_of_its_own_is_followed(imported):
@@ -419,7 +419,7 @@ def test_times_of_a_trajectory_must_be_seconds(imported):
         '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20"/></leg>'
     )
     rows = "".join(f"{1403636580 + t}000000000,0,0,90,{t},2,30\n" for t in range(3))
-    words = r"way\.trj is not a usable .* probably nanoseconds; HELIOS\+\+ expects seconds"
+    words = r"way\.trj cannot be used .* probably nanoseconds; HELIOS\+\+ expects seconds"
     with pytest.raises(LidarError, match=words):
         imported(
             scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10),
@@ -432,8 +432,8 @@ def test_times_of_a_trajectory_must_be_seconds(imported):
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        ('"t", "roll", "pitch", "heading", "x", "y", "z"', "'heading' is not known"),
-        ('"t", "x", "pitch", "yaw", "x", "y", "z"', "a name is there twice"),
+        ('"t", "roll", "pitch", "heading", "x", "y", "z"', "Unknown names: 'heading'"),
+        ('"t", "x", "pitch", "yaw", "x", "y", "z"', "A name occurs twice"),
         ('"t", "x", "y", "z"', "7 columns, named t, x, y, z"),
     ],
 )
@@ -469,16 +469,16 @@ def test_what_is_not_taken_over_is_named(imported, survey, tmp_path):
     assert result.exit_code == 0, result.output
     told = [line for line in result.output.splitlines() if line.startswith("not supported: ")]
     assert told == [
-        "not supported: noise of the platform: positionXNoise",
-        "not supported: <deflectionError> of S/1: errors by a formula",
-        "not supported: <dmotion> of part 0: it stands as it is at first",
-        "not supported: <swap> of 30 parts, part 2 to part 31: they stand as they are at first",
-        "not supported: part 1, detailedvoxels of c.vox: intersectionMode fixed, left out",
+        "not supported: platform noise (positionXNoise)",
+        "not supported: <deflectionError> of S/1",
+        "not supported: <dmotion> in part 0 (the part is static)",
+        "not supported: <swap> in 30 parts, part 2 to part 31 (the parts are static)",
+        "not supported: part 1, detailedvoxels of c.vox with intersectionMode fixed (skipped)",
     ]
     head = (tmp_path / "out" / "scenario.yaml").read_text().splitlines()
     assert head[1:6] == [f"# N{line[1:]}." for line in told]
     again = CliRunner().invoke(import_, [str(survey(device, inside)), "-o", str(tmp_path / "out")])
-    assert "exists: name another" in str(again.exception)
+    assert "already exists. Pass another folder" in str(again.exception)
 
 
 LASER = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
@@ -521,8 +521,8 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     table = MaterialTable.build(built.survey.materials, built.scene.surface_kinds)
     assert table.reflectance.tolist() == [0.3, 0.5]
     assert made.left_out[-2:] == [
-        "part 1, ladlut: leaf angles are spherical",
-        "part 2, detailedvoxels of parts/crown.vox: intersectionMode scaled, left out",
+        "ladlut in part 1 (leaf angles are spherical)",
+        "part 2, detailedvoxels of parts/crown.vox with intersectionMode scaled (skipped)",
     ]
 
 
@@ -601,22 +601,25 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("<survey", "<survey <"), "fly.xml is not readable XML"),
+        (("<survey", "<survey <"), "fly.xml is not valid XML"),
         (("<document", '<!DOCTYPE a [<!ENTITY e "">]><document'), "declares an XML entity"),
-        (("devices.xml#s", "devices.xml#t"), "no <scanner> 't' in .*devices.xml"),
-        (("devices.xml#s", "lasers.xml#s"), "no file 'lasers.xml'.*--assets"),
-        (('scanner="devices.xml#s"', ""), "names no scanner"),
-        (("ground.obj", "grund.obj"), "scene 'field', part 0: there is no file .*grund.obj"),
-        (("objloader", "xyzloader"), "part 0: .*ground.obj has rows that are no points"),
+        (("devices.xml#s", "devices.xml#t"), "devices.xml has no <scanner> 't'"),
+        (("devices.xml#s", "lasers.xml#s"), "the file 'lasers.xml' is neither.*--assets"),
+        (('scanner="devices.xml#s"', ""), "<survey> has no scanner"),
+        (("ground.obj", "grund.obj"), "scene 'field', part 0: the file .*grund.obj' is neither"),
+        (("objloader", "xyzloader"), "part 0: .*ground.obj has rows that are not points"),
         (('x="3"', 'x="three"'), "leg 1: x is 'three'; it must be a number"),
-        (('x="3" y="4"', 'x="0" y="0"'), "no two legs are at different places"),
-        (('movePerSec_m="10"', 'movePerSec_m="0"'), "leg 0: movePerSec_m is 0; it never ends"),
+        (('x="3" y="4"', 'x="0" y="0"'), "all legs have the same position"),
+        (('movePerSec_m="10"', 'movePerSec_m="0"'), "leg 0: movePerSec_m is 0; it must be above 0"),
         (("<scannerSettings ", '<scannerSettings template="none" '), "no <scannerSettings> 'none'"),
         (('pulseFreq_hz="1000"', 'pulseFreq_hz="0"'), "leg 0: S/1 has no pulseFreq_hz above 0"),
-        (('pulseFreq_hz="1000"', 'active="false"'), "no leg scans anything"),
-        (("#plane", "#tripod"), "leg 0: nothing moves"),
-        (('pulseFreq_hz="1000"', 'headRotatePerSec_deg="9"'), "only one with rotating optics may"),
-        (('optics="conic"', 'optics="flash"'), "optics 'flash'; there are rotating, oscillating"),
+        (('pulseFreq_hz="1000"', 'active="false"'), "no leg has an active scanner"),
+        (("#plane", "#tripod"), "leg 0: neither the platform nor the head moves"),
+        (('pulseFreq_hz="1000"', 'headRotatePerSec_deg="9"'), "supported only for rotating optics"),
+        (
+            ('optics="conic"', 'optics="flash"'),
+            "optics 'flash'; it must be one of rotating, oscillating",
+        ),
     ],
 )
 def test_mistakes_are_told_in_a_line_and_nothing_is_written(survey, tmp_path, change, message):

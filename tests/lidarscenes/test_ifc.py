@@ -221,7 +221,7 @@ def test_storeys_are_selected_by_name(house, forked, tmp_path):
     scene = Scene.load(house, storeys=["Upper floor"])
     assert scene.names == ("IfcWall North",)
     with pytest.raises(
-        LidarError, match="has no storey 'Attic'; it has the storeys 'Ground floor', 'Upper floor'"
+        LidarError, match=r"has no storey 'Attic'\. Its storeys are 'Ground floor', 'Upper floor'"
     ):
         Scene.load(house, storeys=["Upper floor", "Attic"])
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
@@ -266,7 +266,7 @@ def test_units_are_those_of_the_project(forked, tmp_path, schema, prefix, unit_m
     (mesh,) = load_meshes(path, materials=True, tell=notes.append)
     assert mesh.bounds[:, 0] == pytest.approx([4, 6])
     assert mesh.materials.names == ("Concrete",)
-    assert ["states no unit of length" in note for note in notes] == [True] * (prefix == "")
+    assert ["states no length unit" in note for note in notes] == [True] * (prefix == "")
 
 
 def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
@@ -293,24 +293,26 @@ def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
     notes = []
     load_meshes(model.write(path), tell=notes.append)
     assert notes == [
-        f"{path} has a map conversion, which is not applied: translation [691000.5, 5336000.25, "
-        "500] and rotation_deg [0, 0, 90] move it into EPSG:25832"
+        f"{path} contains a map conversion, which was not applied. To move the building to "
+        "EPSG:25832, use translation [691000.5, 5336000.25, 500] and rotation_deg [0, 0, 90]."
     ]
     system.Name = "EPSG:3857"
     load_meshes(model.write(path), tell=notes.append)
     if find_spec("rasterio") is not None:
-        assert "into EPSG:3857, whose metre is 0.72" in notes[1]
-        assert notes[1].endswith("long on the ground here, unlike that of the building")
+        assert "to EPSG:3857, whose metre is 0.72" in notes[1]
+        assert "long on the ground here, unlike the meter of the building, use" in notes[1]
     system.Name = "EPSG:25832"
     del notes[1]
     conversion.Scale = 0.5
     load_meshes(model.write(path), tell=notes.append)
-    assert notes[1].endswith("cannot be used: its scale, 500, does not fit its units")
+    assert notes[1].endswith(
+        "cannot be used because its scale, 500, is not consistent with its units."
+    )
     model.file.remove(conversion)
     model.site.RefLatitude = (48, 8, 15, 600_000)
     model.site.RefLongitude = (-11, -34, -30, -600_000)
     load_meshes(model.write(path), tell=notes.append)
-    assert notes[2].endswith("the position of its site, 48.1377° N, 11.5752° W, which is not used")
+    assert notes[2].endswith("a site position, 48.1377° N, 11.5752° W, which was ignored.")
 
 
 def with_map_sets(model, owner, system, conversion, names=("ePSet_MapConversion",)):
@@ -362,7 +364,9 @@ def test_the_map_unit_of_property_sets_counts(
     system = {"Name": "EPSG:2056"} | ({"MapUnit": unit} if unit else {})
     with_map_sets(model, model.project, system, PLACE | scale)
     note = map_note(model, tmp_path / "a.ifc")
-    assert note.startswith(f"has a map conversion, which is not applied: translation {translation}")
+    assert (
+        "To move the building to EPSG:2056" in note and f", use translation {translation}" in note
+    )
 
 
 @needs_ifcopenshell
@@ -373,13 +377,13 @@ def test_property_sets_of_a_map_are_found_wherever_they_are(forked, tmp_path, ow
     numbers = {key: str(value) for key, value in PLACE.items()}
     with_map_sets(model, getattr(model, owner), {"Name": "EPSG:2056"}, numbers, [name])
     note = map_note(model, tmp_path / "a.ifc")
-    assert "translation [2600000, 1200000, 500] moves it into EPSG:2056" in note
+    assert "to EPSG:2056, use translation [2600000, 1200000, 500]. Alternatively" in note
 
 
 @needs_ifcopenshell
 @pytest.mark.parametrize(("system", "conversion", "reason"), [
-    ({"MapUnit": "furlong"}, PLACE, "its map unit 'furlong' is not a known unit of length"),
-    ({}, PLACE | {"Northings": "1.2e6 m"}, "Northings is '1.2e6 m', not a number"),
+    ({"MapUnit": "furlong"}, PLACE, "its map unit 'furlong' is not a known length unit"),
+    ({}, PLACE | {"Northings": "1.2e6 m"}, "Northings is '1.2e6 m', which is not a number"),
 ])  # fmt: skip
 def test_a_map_conversion_that_is_not_understood_is_noted(
     forked, tmp_path, system, conversion, reason
@@ -387,7 +391,7 @@ def test_a_map_conversion_that_is_not_understood_is_noted(
     model = Model("IFC2X3")
     with_map_sets(model, model.site, system, conversion)
     note = map_note(model, tmp_path / "a.ifc")
-    assert note == f"has a map conversion that cannot be used: {reason}"
+    assert note == f"contains a map conversion that cannot be used because {reason}."
 
 
 @needs_ifcopenshell
@@ -396,7 +400,7 @@ def test_map_conversions_that_differ_are_noted(forked, tmp_path):
     for owner, height in ((model.site, 0.0), (model.building, 3.0)):
         with_map_sets(model, owner, {}, PLACE | {"OrthogonalHeight": height})
     note = map_note(model, tmp_path / "a.ifc")
-    assert note.endswith("cannot be used: the file has 2 property sets of it that differ")
+    assert note.endswith("because the file contains 2 property sets with different values for it.")
 
 
 @needs_ifcopenshell
@@ -404,8 +408,8 @@ def test_a_map_scale_of_1_between_units_is_ignored(forked, tmp_path):
     model = Model("IFC2X3", "MILLI")
     with_map_sets(model, model.site, {"MapUnit": "METRE"}, PLACE | {"Scale": 1.0})
     note = map_note(model, tmp_path / "a.ifc")
-    assert "translation [2600000, 1200000, 500] moves it" in note
-    assert note.endswith("it is ignored, and the units count")
+    assert "use translation [2600000, 1200000, 500]. Alternatively" in note
+    assert note.endswith("The scale was ignored, and the units were used instead.")
 
 
 @needs_ifcopenshell
@@ -423,7 +427,10 @@ def test_map_scales_of_axes_and_angles_are_told_apart(forked, tmp_path):
         FactorZ=1.0,
     )
     path = tmp_path / "a.ifc"
-    assert "and scale [0.9996, 0.9996, 1] move it into EPSG:2056" in map_note(model, path)
+    assert (
+        "to EPSG:2056, use translation [2600000, 1200000, 500] and scale [0.9996, 0.9996, 1]."
+        in map_note(model, path)
+    )
     model.file.remove(scaled)
     create(
         "IfcRigidOperation",
@@ -433,7 +440,7 @@ def test_map_scales_of_axes_and_angles_are_told_apart(forked, tmp_path):
         SecondCoordinate=create("IfcPlaneAngleMeasure", 8.0),
     )
     note = map_note(model, path)
-    assert note.endswith("cannot be used: it states longitude and latitude, not meters")
+    assert note.endswith("because it is in longitude and latitude instead of meters.")
 
 
 def test_equal_shapes_are_shared(forked, tmp_path, monkeypatch):
@@ -505,7 +512,7 @@ def test_a_shape_of_edges_with_styles_is_noted(forked, tmp_path):
     (mesh,) = load_meshes(model.write(tmp_path / "a.ifc"), materials=True, tell=notes.append)
     assert mesh.name == "IfcWall W"
     [note] = notes
-    assert "1 element of which ifcopenshell makes no triangles: 'IfcBeam Line'" in note
+    assert "1 element that ifcopenshell cannot convert to triangles: 'IfcBeam Line'" in note
 
 
 def test_elements_that_openings_take_away_are_noted(forked, tmp_path):
@@ -522,7 +529,7 @@ def test_elements_that_openings_take_away_are_noted(forked, tmp_path):
     (mesh,) = load_meshes(path, materials=True, tell=notes.append)
     assert mesh.name == "IfcWall W"
     [note] = notes
-    assert "1 element of which ifcopenshell makes no triangles: 'IfcBeam Gone'" in note
+    assert "1 element that ifcopenshell cannot convert to triangles: 'IfcBeam Gone'" in note
 
 
 @pytest.mark.parametrize(
@@ -579,9 +586,9 @@ def test_errors_name_the_schemas_that_are_read(house, forked, tmp_path, schema, 
     with pytest.raises(LidarError) as caught:
         load_meshes(path)
     assert str(caught.value) == (
-        f"{path} is of the schema {schema!r}, and IFC2X3, IFC2X3_FINAL, IFC2X3_TC1, IFC4, "
+        f"{path} uses the IFC schema {schema!r}, but only IFC2X3, IFC2X3_FINAL, IFC2X3_TC1, IFC4, "
         "IFC4X3, IFC4X3_ADD1, IFC4X3_ADD2, IFC4X3_TC1, IFC4_ADD1, IFC4_ADD2, IFC4_ADD2_TC1 are "
-        "read: export it in one of these."
+        "supported. Export it with one of these schemas."
     )
 
 
@@ -608,7 +615,7 @@ def test_elements_without_triangles_are_noted(forked, tmp_path):
     load_meshes(model.write(tmp_path / "a.ifc"), tell=notes.append)
     [note] = notes
     assert note.endswith(
-        "is read without 1 element of which ifcopenshell makes no triangles: 'IfcBeam Thin'"
+        "was read without 1 element that ifcopenshell cannot convert to triangles: 'IfcBeam Thin'."
     )
 
 
@@ -627,10 +634,10 @@ def test_broken_files_are_refused_in_a_line(house, forked, tmp_path):
     text = house.read_text()
     path = tmp_path / "a.ifc"
     for broken, reason in (
-        ("solid ice", "it does not begin with ISO-10303-21"),
+        ("solid ice", "it does not start with ISO-10303-21"),
         (text[: len(text) // 2], "the end of the file is missing"),
         (text.replace("'IFC4'", "'IFC9'"), "IFC9"),
-        (two_storeys_without_elements(text), "holds no elements with a shape"),
+        (two_storeys_without_elements(text), "contains no elements with a shape"),
     ):
         path.write_text(broken)
         with pytest.raises(LidarError) as caught:
@@ -653,7 +660,7 @@ def test_unknown_entities_are_noted(house, forked, tmp_path):
     path.write_text(house.read_text().replace("IFCSLAB(", "IFCSLEB("))
     notes = []
     assert len(load_meshes(path, tell=notes.append)) == 3
-    assert any("without which ifcopenshell reads it" in n and "IFCSLEB" in n for n in notes)
+    assert any("that ifcopenshell ignored" in n and "IFCSLEB" in n for n in notes)
 
 
 @pytest.mark.slow
@@ -678,7 +685,9 @@ def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
 @needs_ifcopenshell
 def test_a_process_that_wants_too_much_ends_itself_only(house, monkeypatch):
     monkeypatch.setattr(reader, "MIN_MEMORY_BYTES", 60 * 2**20)
-    with pytest.raises(LidarError, match=r"\(ifcopenshell ended with .*, or needs more than"):
+    with pytest.raises(
+        LidarError, match=r"\(ifcopenshell exited with .*, possibly because it needs more than"
+    ):
         load_meshes(house)
 
 
@@ -687,7 +696,9 @@ def test_without_ifcopenshell_a_line_names_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "find_spec", lambda name: None)
     path = tmp_path / "a.ifc"
     path.write_text("ISO-10303-21;\nEND-ISO-10303-21;\n")
-    with pytest.raises(LidarError, match=r"ifcopenshell reads: pip install -e \"\.\[ifc\]\""):
+    with pytest.raises(
+        LidarError, match=r"ifcopenshell. Install it with `pip install -e \"\.\[ifc\]\""
+    ):
         load_meshes(path)
 
 
@@ -705,5 +716,5 @@ def test_a_process_that_dies_within_a_frame_is_reported(tmp_path, monkeypatch, c
     monkeypatch.setattr(reader, "find_spec", lambda name: True)
     path = tmp_path / "a.ifc"
     path.write_text("ISO-10303-21;\nEND-ISO-10303-21;\n")
-    with pytest.raises(LidarError, match="ifcopenshell ended with SIGSEGV"):
+    with pytest.raises(LidarError, match="ifcopenshell exited with SIGSEGV"):
         load_meshes(path)

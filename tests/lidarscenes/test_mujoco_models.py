@@ -166,7 +166,7 @@ def test_a_scenario_takes_the_options(room):
     for change, message in (
         ({"keyframe": "hom"}, "no keyframe 'hom'. Did you mean 'home'"),
         ({"exclude": ["flor"]}, "no body or geom 'flor'. Did you mean 'floor'"),
-        ({"groups": [5]}, r"sees in the groups \(5,\)"),
+        ({"groups": [5]}, r"can detect in the groups \(5,\)"),
         (
             {"file": "meshes/wedge.obj"},
             "wedge.obj has no keyframe, groups and exclude, options of .xml",
@@ -206,7 +206,7 @@ def test_rangefinders_become_sensors_that_measure_as_in_mujoco(room):
     out = room.parent / "out"
     result = CliRunner().invoke(import_, [str(room), "--out", str(out)])
     assert result.exit_code == 0, result.output
-    assert "also meet geoms of group 3: groups of" in result.output
+    assert "rangefinder hits on geoms of group 3 (to get them, set groups in" in result.output
     scenario = yaml.safe_load((out / "scenario.yaml").read_text())
     assert [*scenario["sensors"]] == ["robot", "depth", "lens", "arm"]
     assert scenario["sensors"]["arm"]["max_range_m"] == 4.5
@@ -247,8 +247,8 @@ def test_models_without_usable_rangefinders_make_no_scenario(tmp_path):
         '</worldbody><sensor><rangefinder camera="c"/></sensor>',
     )
     for text, message in (
-        (world(BOX), "no rangefinder that becomes a sensor: lidarpool init --mesh m.xml"),
-        (mjcf(*large), "'c': it has 307,200 rays, of at most 65,536"),
+        (world(BOX), "no rangefinder that can become a sensor.*lidarpool init --mesh m.xml"),
+        (mjcf(*large), "'c' .it has 307,200 rays, and the limit is 65,536"),
         (mjcf("<worldbodi/>"), "Schema violation"),
     ):
         write(path, text)
@@ -262,15 +262,18 @@ def test_models_without_usable_rangefinders_make_no_scenario(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<robot/>", "is a robot in URDF: give it the ending .urdf"),
-        ("<document/>", "a survey of HELIOS.*lidarpool import"),
-        ("<fcd-export/>", "floating car data of SUMO"),
-        ("<note/>", "is XML, but no model of MuJoCo: it begins with <note>"),
+        ("<robot/>", "is a URDF robot. Change its extension to .urdf"),
+        ("<document/>", "a HELIOS.*lidarpool import"),
+        ("<fcd-export/>", "SUMO floating car data"),
+        ("<note/>", "not a MuJoCo model. Its root element is <note>"),
         ("v 1 2 3", "cannot be read"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><mujoco/>', "declares XML entities"),
         (world(BOX, "<geom/>"), "Error"),
-        (world(), "nothing that a lidar sees"),
-        (world('<geom type="box" size="1 1 1" rgba="1 1 1 0"/>'), "nothing that a lidar sees"),
+        (world(), "nothing that a lidar can detect"),
+        (
+            world('<geom type="box" size="1 1 1" rgba="1 1 1 0"/>'),
+            "nothing that a lidar can detect",
+        ),
         (mjcf('<include file="no.xml"/>'), "no.xml"),
         (mjcf('<include file="../other.xml"/>'), r"'\.\./other.xml', but only files in its own"),
         (mjcf('<compiler meshdir=".."/><asset><mesh file="other.xml"/></asset>'), "but only files"),
@@ -289,7 +292,7 @@ def test_other_files_are_refused_in_a_line(tmp_path, text, message):
 
 def test_too_many_geoms_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(model_file, "MAX_NODES", 9)
-    with pytest.raises(LidarError, match="has 10 geoms, of at most 9"):
+    with pytest.raises(LidarError, match="has 10 geoms, and the limit is 9"):
         load(write(tmp_path / "m.xml", world(BOX * 10)))
 
 
@@ -308,12 +311,14 @@ def test_files_of_named_folders_are_read(tmp_path):
 def test_soft_bodies_are_noted(tmp_path):
     soft = '<flexcomp name="f" type="grid" count="3 3 3" spacing="1 1 1" dim="3" radius=".1"/>'
     _, notes = load(write(tmp_path / "m.xml", world(BOX, soft)))
-    assert notes == [f"{tmp_path / 'm.xml'} has 1 flex, which are left out"]
+    assert notes == [f"{tmp_path / 'm.xml'} contains soft bodies, which were skipped: 1 flex."]
 
 
 def test_mujoco_is_asked_for(room, monkeypatch):
     monkeypatch.setattr(model_file, "find_spec", lambda name: None)
-    with pytest.raises(LidarError, match="which MuJoCo reads: pip install mujoco"):
+    with pytest.raises(
+        LidarError, match=r"which requires the package mujoco\. Install it with `pip install mujoco"
+    ):
         load(room)
 
 

@@ -567,10 +567,10 @@ def test_classes_and_materials(tmp_path):
     [
         ("<geoReference><![CDATA[+proj=utm +zone=32 +datum=WGS84]]></geoReference>", "EPSG:32632"),
         ("<geoReference>epsg:25833</geoReference>", "EPSG:25833"),
-        ("<geoReference>+proj=tmerc +lat_0=48</geoReference>", "which is not used"),
+        ("<geoReference>+proj=tmerc +lat_0=48</geoReference>", "which was ignored"),
         (
             '<geoReference>EPSG:25833</geoReference><offset x="1000" y="-5" z="2" hdg="0"/>',
-            "is not applied: translation [1000, -5, 2] moves it into EPSG:25833",
+            "was not applied. To move the roads to EPSG:25833, use translation [1000, -5, 2]",
         ),
     ],
 )
@@ -599,7 +599,7 @@ def test_unknown_elements_are_named_once(tmp_path):
     notes = []
     objects = "<objects><bridge s='1' length='2'/><bridge s='5' length='2'/></objects>"
     load(tmp_path, document(road(more=objects + "<railroad/>" + "<userData/>")), notes)
-    assert [note.partition(" is read ")[2] for note in notes] == ["without 1 railroad, 2 bridge"]
+    assert [note.partition(" were skipped: ")[2] for note in notes] == ["1 railroad, 2 bridge."]
 
 
 def test_what_is_left_out_is_counted_in_words(tmp_path):
@@ -607,7 +607,7 @@ def test_what_is_left_out_is_counted_in_words(tmp_path):
         notes = []
         things = "".join(f"<object id='{k}' s='1' t='0' type='pole'/>" for k in range(count))
         load(tmp_path, document(road(more=f"<objects>{things}</objects>")), notes)
-        assert [note.partition(" is read without ")[2] for note in notes] == [words]
+        assert [note.partition(" were skipped: ")[2] for note in notes] == [f"{words}."]
 
 
 TINY_DASHES = mark('<type name="x"><line length="1e-9" space="1e-9"/></type>', "broken")
@@ -620,18 +620,18 @@ ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
     ("text", "message"),
     [
         ("<A/>", "not OpenDRIVE"),
-        (document(road(), header='<header revMajor="2"/>'), "OpenDRIVE 2, and 1.4 to 1.8"),
-        (document(road(length=-5)), "length -5, which is negative"),
-        (document(road(length="nan")), "length 'nan', not a number"),
-        (document(road(length="1e300")), "a road '1' of 1e\\+300 m"),
-        (document(road(shape="<circle/>")), "a <geometry> of circle"),
+        (document(road(), header='<header revMajor="2"/>'), "OpenDRIVE 2, but only"),
+        (document(road(length=-5)), "length -5, which must not be negative"),
+        (document(road(length="nan")), "length 'nan', which is not a number"),
+        (document(road(length="1e300")), "the road '1' with a length of 1e\\+300 m"),
+        (document(road(shape="<circle/>")), "<geometry> with circle"),
         (
             document(road()).replace('length="100"', 'length="2000"', 1),
-            "of 2,000 m, whose geometry ends at 100 m",
+            "of 2,000 m, but its geometry ends at 100 m",
         ),
         (document(road()).replace("planView", "view"), "without geometry"),
         (document(road(shape='<arc curvature="1e99"/>')), "would unpack to"),
-        (document(road(shape='<paramPoly3 pRange="normalized"/>')), "has no length"),
+        (document(road(shape='<paramPoly3 pRange="normalized"/>')), "with zero length"),
         (document(road(section(right=lane(-1, width(4) + TINY_DASHES)))), "would unpack to"),
         # Its samples are more than its triangles, which would fit.
         (

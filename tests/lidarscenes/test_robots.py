@@ -133,7 +133,7 @@ def test_links_that_are_fixed_to_one_another_are_one_actor(tmp_path):
     actors = robot.actors(joints={"pan": 3.5}, name="Arm", tell=notes.append)
     assert [actor.name for actor in actors] == ["Arm/base", "Arm/upper", "Arm/rod", "Arm/tip"]
     assert [len(actor.mesh.faces) for actor in actors] == [24, 12, 12, 12]
-    assert notes == ["r: joint pan goes from 3.5 to 3.5, beyond its limits of -1 to 3"]
+    assert notes == ["r: joint pan has values from 3.5 to 3.5, which exceed its limits of -1 to 3."]
     (plate,) = robot.actors(without=["base", "upper", "rod", "tip"])
     corner = shift(0.1, 0.2, 0.3) @ turn("z", 0.6) @ turn("y", -0.5) @ turn("x", 0.4)
     cube = corner[:3, :3] @ (box("", (0.2, 0.2, 0.2)).vertices - [0, 0, 0.1]).T
@@ -217,22 +217,25 @@ def test_mesh_files_of_packages(tmp_path, packages):
         # In metres by its unit; with the axes of the file, as RViz takes it.
         robot = leg_of(package / "urdf", name)
         assert robot.meshes["leg"].bounds[1].tolist() == [1, 0, 3], name
-    outside = f"is outside the package, {package}: name a folder that contains it as assets"
-    missing = "with a package.xml: name the folder '{}', or one that contains it, as assets"
+    outside = f"is outside the package, {package}. Name a folder that contains the mesh as assets"
+    missing = "was not found. Name the folder '{}', or a folder that contains it, as assets"
     for name, words in (
         ("../../../secret.dae", outside),
         ("../meshes/link.dae", outside),
         ("package://my_robot/../../secret.dae", outside),
         (f"file://{tmp_path}/secret.dae", outside),
-        ("package://../secret.dae", "names no package: write package://NAME/FILE, or the path of"),
-        ("package:///leg.dae", "from the folder 'urdf' of the .urdf"),
-        ("package://", "from the folder 'urdf' of the .urdf"),
-        ("model:///other/meshes/leg.dae", "and name the folder 'other', or one that contains it"),
-        ("package:///other//leg.dae", "names no package: write package://other/leg.dae, and"),
+        ("package://../secret.dae", "names no package. Write package://NAME/FILE, or a path"),
+        ("package:///leg.dae", "relative to the folder 'urdf' of the .urdf"),
+        ("package://", "relative to the folder 'urdf' of the .urdf"),
+        (
+            "model:///other/meshes/leg.dae",
+            "and name the folder 'other', or a folder that contains it",
+        ),
+        ("package:///other//leg.dae", "names no package. Write package://other/leg.dae, and"),
         ("package://unknown/leg.dae", missing.format("unknown")),
         ("package://private/leg.dae", missing.format("private")),  # no package
         ("../meshes/arm.dae", "does not exist"),
-        ("http://example.org/leg.dae", "must be a file's name"),
+        ("http://example.org/leg.dae", "must be a path"),
     ):
         with pytest.raises(LidarError) as caught:
             leg_of(package / "urdf", name)
@@ -248,14 +251,15 @@ def test_without_a_package_mesh_files_are_in_the_folder_of_the_robot_or_in_asset
     for name in ("../leg.dae", "../../my_robot/meshes/leg.dae", f"file://{folder}/leg.dae"):
         with pytest.raises(LidarError) as caught:
             leg_of(urdf, name)
-        assert f"is outside the folder of the .urdf, {urdf}: name a folder that contains" in str(
-            caught.value
+        assert (
+            f"is outside the folder of the .urdf file, {urdf}. Name a folder that contains"
+            in str(caught.value)
         )
         assert leg_of(urdf, name, assets=packages).meshes
     for assets in (folder, packages):  # the package, and a folder of packages
         assert leg_of(urdf, "package://private/leg.dae", assets=assets).meshes
     assert leg_of(urdf, "../leg.dae", assets=folder).meshes
-    with pytest.raises(LidarError, match=r"outside the folder of the \.urdf"):
+    with pytest.raises(LidarError, match=r"outside the folder of the \.urdf file"):
         leg_of(urdf, "../../../secret.dae", assets=packages)
 
 
@@ -281,12 +285,12 @@ HINGE = joint("j", "revolute", "a", "b")
 BROKEN = {
     "it has no link": [],
     "not connected": [link("a"), link("b")],
-    "go round in a circle": [link("a"), link("b"), HINGE, joint("k", "fixed", "b", "a")],
-    "'b' go round in a circle": [
+    "form a cycle": [link("a"), link("b"), HINGE, joint("k", "fixed", "b", "a")],
+    "'b' form a cycle": [
         link("a"), link("b"), link("c"),
         joint("j", "fixed", "b", "c"), joint("k", "fixed", "c", "b"),
     ],
-    "two joints that hold it": [link("a"), link("b"), HINGE, joint("k", "fixed", "a", "b")],
+    "is the child of two joints": [link("a"), link("b"), HINGE, joint("k", "fixed", "a", "b")],
     "its type is 'ball'": [link("a"), link("b"), joint("j", "ball", "a", "b")],
     "mimics 'x', which does not move": [
         link("a"), link("b"), joint("j", "revolute", "a", "b", '<mimic joint="x"/>'),
@@ -294,11 +298,11 @@ BROKEN = {
     "xyz of <origin> is 'nan 0 0'": [
         link("a"), link("b"), joint("j", "fixed", "a", "b", '<origin xyz="nan 0 0"/>'),
     ],
-    "by xacro first": [link("a", visual('<box size="${w} 1 1"/>'))],
+    "with xacro first": [link("a", visual('<box size="${w} 1 1"/>'))],
     "must be 3 finite numbers": [link("a", visual('<box size="1 1e300 1"/>'))],
     "its shape is <cone>": [link("a", visual("<cone/>"))],
-    "nothing to see": [link("a", "")],
-    "at most 1,000 are read": [link(f"l{k}") for k in range(1001)],
+    "no link has a <visual>": [link("a", "")],
+    "the limit is 1,000": [link(f"l{k}") for k in range(1001)],
     "would unpack to": [link("a", visual('<sphere radius="1"/>') * 4000)],
 }  # fmt: skip
 
@@ -320,7 +324,7 @@ def test_xacro_other_files_and_garbled_copies(tmp_path):
             "xacro arm.urdf > arm.exp",
         ),
         ("<robot><xacro:arm/></robot>", "xacro arm.urdf > arm.expanded.urdf"),
-        ("<sdf version='1.7'/>", "the ending .sdf, as a scene"),
+        ("<sdf version='1.7'/>", "its extension to .sdf"),
         ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>", "XML entity"),
     ):
         path.write_text(text)
@@ -357,9 +361,11 @@ def test_what_is_left_out_is_told(tmp_path):
     )
     assert list(robot.meshes) == ["a"] and not robot.moving
     held, collide, flat = notes
-    assert held.endswith("joint j is floating: it stays at zero")
-    assert collide.endswith("collision shapes and no visual ones, and are left out: b")
-    assert flat.endswith("shapes of size zero, which are left out: a")
+    assert held.endswith(
+        "joint j has the type floating, which is not supported. Its value is always zero."
+    )
+    assert collide.endswith("collision shapes but no visual shapes and were skipped: b.")
+    assert flat.endswith("shapes of size zero and were skipped: a.")
 
 
 def test_tables_of_joints(tmp_path):
@@ -378,13 +384,13 @@ def test_tables_of_joints(tmp_path):
     for text, words in (
         ("", "it is empty"),
         ("time_s,stool\n0,1\n", "not known: stool. .*Known are time_s.*, pan.*, slide, tilt"),
-        ("time_s,seat\n0,1\n", "of no joint that moves: name its columns.*pan, slide, tilt"),
+        ("time_s,seat\n0,1\n", "no column for a movable joint. Name its columns.*pan, slide, tilt"),
         ("time_s,pan,pan\n0,1,2\n", "has the column 'pan' twice"),
         ("pan,slide\n0,1\n", "no column 'time_s'"),
         ("time,pan\n0,1\n", "call it time_s, in seconds; time_ms or time_us"),
         ("time_s,pan\n0,nan\n", "has 'nan' in line 2"),
         ("time_s,pan\n0,0\n50000000,1\n", "probably nanoseconds; give time_unit: ns"),
-        ("time_s,pan\n1,0\n0,0\n", "must be finite, and ascend"),
+        ("time_s,pan\n1,0\n0,0\n", "must be finite and strictly increasing"),
     ):
         table.write_text(text)
         with pytest.raises(LidarError, match=words):
@@ -393,11 +399,11 @@ def test_tables_of_joints(tmp_path):
     (*_, tip) = robot.actors(joints=table, time_unit="ns")
     assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
     assert robot.path("tip", joints=table, time_unit="ms").duration_ns == 1e15
-    with pytest.raises(LidarError, match="time_unit is of a file of joints"):
+    with pytest.raises(LidarError, match="time_unit applies only to a joint file"):
         robot.actors(joints={"pan": 1}, time_unit="ns")
     for given, words in (
-        ({"pam": 1}, "no joint 'pam' that moves. Did you mean 'pan'"),
-        ({"pan": [0, 1]}, "one for each time_s"),
+        ({"pam": 1}, "no movable joint 'pam'. Did you mean 'pan'"),
+        ({"pan": [0, 1]}, "one value for each time_s"),
         ({"time_s": [0, 1], "pan": [0, np.inf]}, "must be finite"),
     ):
         with pytest.raises(LidarError, match=words):
@@ -566,7 +572,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     notes = advice(built)
     assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
     assert built.findings.sources["rover.urdf"].startswith(
-        "14 links, 6,720 triangles; 9 of its joints move"
+        "14 links, 6,720 triangles; 9 movable joints"
     )
 
 
@@ -631,7 +637,9 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
     with pytest.raises(LidarError, match="is a robot, which is in metres and Z-up: leave out"):
         build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
-    with pytest.raises(LidarError, match="is not read: it is a robot, read it with load_robot"):
+    with pytest.raises(
+        LidarError, match=r"is not read: it describes a robot\. Read it with load_robot"
+    ):
         Scene.load(folder / "rover.urdf")
 
 

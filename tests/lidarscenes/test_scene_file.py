@@ -97,8 +97,8 @@ def test_colours_come_back_from_a_glb_file(tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("town.stl", "has the ending .stl; scenes are written as .ply, .glb, .obj"),
-        ("town", r"has the ending \(none\)"),
+        ("town.stl", "has the extension .stl. Scenes can be written as .ply, .glb, .obj"),
+        ("town", r"has the extension \(none\)"),
         ("nowhere/town.ply", "nowhere does not exist"),
     ],
 )

@@ -89,7 +89,10 @@ def test_colours_of_base_materials_and_colour_groups(tmp_path):
     expected = [[base] * 3, [last] * 3, [first, last, first], [[10, 20, 30]] * 3]
     grey = [[[188] * 3] * 3] * 2
     assert mesh.colours.corners.tolist() == expected + grey
-    assert notes == [f"{path} has textures or lacks colours, which leaves 2 triangles grey"]
+    assert notes == [
+        f"{path} contains textures, which are not supported, or lacks colors. As a result, "
+        "2 triangles became gray."
+    ]
     assert load_meshes(path)[0].colours is None
     (leaf,) = load(tmp_path)
     assert leaf.colours is None
@@ -145,9 +148,12 @@ def test_the_model_that_the_package_names_is_built(tmp_path):
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"more": 'requiredextensions="b"'}, "needs .*beamlattice/2017/02, which is not supported"),
-        ({"beams": "<b:beamlattice/>"}, "has a <beamlattice>"),
-        ({"items": '<item objectid="9"/>'}, "object '9' is placed, but missing"),
+        (
+            {"more": 'requiredextensions="b"'},
+            "extension .*beamlattice/2017/02, which is not supported",
+        ),
+        ({"beams": "<b:beamlattice/>"}, "contains <beamlattice>"),
+        ({"items": '<item objectid="9"/>'}, "object '9' is used but not defined"),
         ({"items": '<item objectid="1" transform="1 0 0"/>'}, "line .*: a transform has 3 numbers"),
         ({"unit": 'unit="parsec"'}, "parsec"),
         ({"x": "nan"}, "NaN"),
@@ -160,7 +166,7 @@ def test_the_model_that_the_package_names_is_built(tmp_path):
                 "objects": assembly(2, 1, 1, ' p:path="/../../etc/passwd"'),
                 "items": '<item objectid="2"/>',
             },
-            "archive has no file '../../etc/passwd'",
+            "archive does not contain '../../etc/passwd'",
         ),
         (
             {"doctype": f'<!DOCTYPE model [<!ENTITY a "0000000000">{NESTED}]>', "x": "&i;"},

@@ -94,8 +94,8 @@ def test_polygons_places_and_names(tmp_path):
     ("stage", "options", "size", "words"),
     [
         (METRES, {}, [2, 3, 0], []),
-        ('metersPerUnit = 1\nupAxis = "Y"', {}, [2, 0, 3], ["from Y-up to Z-up, as it states"]),
-        ("", {}, [0.02, 0, 0.03], ["taken in centimetres", "to Z-up, as OpenUSD asks"]),
+        ('metersPerUnit = 1\nupAxis = "Y"', {}, [2, 0, 3], ["to Z-up, as the file states"]),
+        ("", {}, [0.02, 0, 0.03], ["Centimeters, the default", "to Z-up, the default of OpenUSD"]),
         ("", {"unit": "m", "up_axis": "z"}, [2, 3, 0], []),
     ],
 )  # fmt: skip
@@ -142,8 +142,10 @@ def test_what_is_not_shown_is_left_out_and_counted(tmp_path):
     objects, lines = told(path)
     assert [one.name for one in objects] == ["Drawn", "Shown"]
     assert lines == [
-        "m.usda is read without 1 invisible, 1 BasisCurves, 1 of purpose proxy or guide",
-        "m.usda subdivides 1 mesh: taken as modelled, coarse",
+        "m.usda contains prims that were skipped: 1 invisible, 1 BasisCurves, "
+        "1 with the purpose proxy or guide.",
+        "m.usda contains 1 subdivision mesh. Subdivision is not supported, and the coarse mesh is "
+        "used.",
     ]
 
 
@@ -227,8 +229,8 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     path = write(tmp_path / "m.usda", prim("Ground"), prim("Balloon", text=QUAD + grows), camera)
     _, lines = told(path)
     assert lines == [
-        "m.usda moves 1 object otherwise than as a whole, or in copies: taken at the first time, "
-        "and still"
+        "m.usda contains 1 object whose motion is not supported because it is a deformation or a "
+        "motion of instances. The first frame is used."
     ]
     # Copies and actors of a scenario are of meshes that stand, and a scene of what moves only.
     path = write(tmp_path / "m.usda", prim("Car", text=QUAD + DRIVE), stage=STAGE)
@@ -408,7 +410,8 @@ def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
     objects, lines = told(path)
     np.testing.assert_allclose(objects[0].vertices, evaluated(path, 7.3), atol=1e-6)
     assert lines == [
-        "m.usda has skeletons that move: they stand still; actors move by animation: NAME"
+        "m.usda contains animated skeletons, which are static here. To animate an actor, set "
+        "animation: NAME."
     ]
     text = path.read_text()
     (tmp_path / "blocked.usda").write_text(text.replace("13: [", "6: None, 13: ["))
@@ -579,10 +582,10 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     ]
     _, lines = told(write(folder / "m.usda", prim("Quad"), *missing))
     assert lines == [
-        "m.usda refers to what is not there or cannot be read, and lacks it: 'bad.usda', "
-        "'https:/example.com/x.usd', 'no.usda'"
+        "m.usda refers to content that does not exist or cannot be read and was skipped: "
+        "'bad.usda', 'https:/example.com/x.usd', 'no.usda'."
     ]
-    with pytest.raises(LidarError, match=r"no triangles, and refers to .*: 'no\.usda'"):
+    with pytest.raises(LidarError, match=r"no triangles. It refers to .*: 'no\.usda'"):
         load_meshes(write(folder / "m.usda", missing[0]))
     with pytest.raises(
         LidarError, match=r"from '\.\./outside\.usda', but only files in its own folder"
@@ -606,11 +609,11 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     [
         ("#usda 1.0\ndef Mesh {", "m.usd cannot be read ("),
         ("PXR-USDC", "m.usd cannot be read ("),
-        (QUAD.replace("[4]", "[5]"), "'Quad' has polygons of 5 corners, 4 are there"),
+        (QUAD.replace("[4]", "[5]"), "'Quad' declares polygons with 5 corners but contains 4"),
         (QUAD.replace("3]", "9]"), "'Quad': faces refer to vertices 0 to 9"),
         (QUAD.replace("(2, 0, 0)", "(nan, 0, 0)"), "NaN or infinite"),
         ("", "holds no triangles"),
-        ('#usda 1.0\n(upAxis = "up")\n' + prim("Quad"), "its upAxis is 'up'"),
+        ('#usda 1.0\n(upAxis = "up")\n' + prim("Quad"), "upAxis is 'up'"),
         (MOVED.format("(1e300, 0, 0)") + QUAD, "farther than anything on Earth"),
     ],
 )  # fmt: skip
@@ -631,7 +634,7 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
     count = nodes.MAX_NODES + 1
     text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")
     text += f"point3f[] positions = [{'(0,0,0),' * count}]\n"
-    with pytest.raises(LidarError, match="more than 200,000 prims and copies"):
+    with pytest.raises(LidarError, match="more than 200,000 prims and instances"):
         load_meshes(write(tmp_path / "m.usda", prim("F", "PointInstancer", text)))
     levels = "".join(
         prim(f"L{i}", "Xform", "".join(
@@ -882,14 +885,14 @@ def test_packed_images_and_shapes(folder):
 @pytest.mark.parametrize(
     ("inputs", "image", "kind", "colour", "why"),
     [
-        (IMAGE, "asset inputs:file = @no.png@", "UsdPreviewSurface", GREY, "'no.png' is not there"),
+        (IMAGE, "asset inputs:file = @no.png@", "UsdPreviewSurface", GREY, "'no.png' does not"),
         (IMAGE, "asset inputs:file = @m.usda@", "UsdPreviewSurface", GREY, "is no PNG"),
         (IMAGE, "asset inputs:file = @no.png@\nfloat4 inputs:fallback = (1, 0, 0, 1)",
-         "UsdPreviewSurface", [255, 0, 0], "is not there"),
+         "UsdPreviewSurface", [255, 0, 0], "does not exist"),
         (IMAGE, "asset inputs:file = @../out.png@", "UsdPreviewSurface", GREY,
-         "is not in the scene's folder, name one that holds it as assets"),
-        (IMAGE, "asset inputs:file = @t.<UDIM>.png@", "UsdPreviewSurface", GREY, "several tiles"),
-        ("", "", "MyShader", GREY, "M (its shader is MyShader)"),
+         "outside the scene's folder; name the folder that"),
+        (IMAGE, "asset inputs:file = @t.<UDIM>.png@", "UsdPreviewSurface", GREY, "UDIM tiles"),
+        ("", "", "MyShader", GREY, "M (its shader MyShader is not supported)"),
         (IMAGE.replace("T.outputs:rgb", "X.outputs:result"), "", "UsdPreviewSurface", GREY,
          "computed by UsdTransform2d"),
     ],
@@ -919,5 +922,5 @@ def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, colour, why):
 def test_pipes_that_a_scene_names_are_not_waited_for(tmp_path, text):
     os.mkfifo(tmp_path / "f.usda")
     (tmp_path / "m.usda").write_text(text)
-    with pytest.raises(LidarError, match=r"it names 'f\.usda', which is no plain file"):
+    with pytest.raises(LidarError, match=r"it names 'f\.usda', which is not a regular file"):
         load_meshes(tmp_path / "m.usda")

@@ -198,7 +198,7 @@ def test_skins_are_bent_by_their_joints_as_they_stand(tmp_path):
     expected = [[0, 0, 5], [1, 0, 5], upper[0], (upper[1] + [1, 2, 5]) / 2]
     np.testing.assert_allclose(bar.vertices, expected, atol=1e-6)
     assert notes == [
-        f"{path} has 1 animation, of 1 bent mesh: all stands still; actors move by animation: NAME"
+        f"{path} has 1 animation, of 1 bent mesh: all stands still; actors move by animation: NAME."
     ]
     header["nodes"][3]["children"] = [2]
     with pytest.raises(LidarError, match="nodes contain each other"):
@@ -272,7 +272,7 @@ def test_hidden_nodes_are_left_out_with_all_below(tmp_path, where):
     meshes = load_meshes(path, up_axis="z", tell=notes.append)
     assert [mesh.name for mesh in meshes] == ["Sign", "Post"]
     assert notes == [
-        f"{path} has 2 hidden nodes (KHR_node_visibility), left out with all below: Hidden, node 7"
+        f"{path} has 2 hidden nodes (KHR_node_visibility), left out with all below: Hidden, node 7."
     ]
 
 
@@ -294,7 +294,7 @@ def test_extensions_that_are_used_and_not_read_are_noted_once(tmp_path):
     notes = []
     path = write(tmp_path / "m.glb", glb(header, CORNERS))
     assert len(load_meshes(path, up_axis="z", tell=notes.append)) == 1
-    assert notes == [f"{path} uses extensions that are not read: MSFT_lod, ACME_tilt"]
+    assert notes == [f"{path} uses extensions that are not read: MSFT_lod, ACME_tilt."]
     header["extensionsUsed"] = known
     load(tmp_path, header)
     header["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}, "mode": 0}]

@@ -202,7 +202,7 @@ def test_copies_of_a_node(tmp_path):
     notes = []
     found = load_meshes(path, up_axis="z", tell=notes.append)
     assert [one.name for one in found] == ["Tree", "Tree", "Leaf"]
-    assert notes == [f"{path} has objects without an area, which are left out: Tree"]
+    assert notes == [f"{path} has objects without an area, which are left out: Tree."]
     bounds = [one.flat().bounds for one in found]
     np.testing.assert_allclose(bounds[0], [[10, -4, 96], [10, 4, 104]], atol=1e-6)
     np.testing.assert_allclose(bounds[1], [[-10, 16, 96], [-10, 24, 104]], atol=1e-6)

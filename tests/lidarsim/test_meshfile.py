@@ -164,7 +164,7 @@ def test_objects_farther_than_anything_on_earth(tmp_path):
     assert near.name == "Ball" and np.abs(near.bounds).max() < 1e5
     assert [note.partition(" has objects ")[2] for note in notes] == [
         "farther than anything on Earth (2e+08 m from the origin), which are left out: Box; check "
-        "their units and placement"
+        "their units and placement."
     ]
     away = Transform.from_parts((2e8, 0, 0))
     with pytest.raises(LidarError, match=r"Object 'Box' reaches 2e\+08 m from the origin, farther"):
@@ -265,7 +265,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
                 f"m{suffix}",
                 content,
                 "cannot be read|cut short|no triangles|is not glTF|no valid JSON|pip install|"
-                "is not of AMAPVox",
+                "is not an AMAPVox",
             )
             for suffix in endings()
             for content in (np.random.default_rng(5).bytes(3000), b"no mesh\n" * 20, bytes(2000))

@@ -334,7 +334,7 @@ def test_omnilidar_has_attributes_of_the_schema_and_reads_back(model, frames, tm
     assert back.rays.range_m == pytest.approx(file.rays.range_m)
     wavelength = values[f"{CORE}waveLengthNm"]
     others = [] if wavelength == 905 else [f"waveLengthNm = {wavelength:g}"]  # 905 is the default
-    assert back.left_out == ["its channels: a list of rays has one", *others]
+    assert back.left_out == ["channels (a ray list has one channel)", *others]
 
 
 ROTARY = """#usda 1.0
@@ -365,7 +365,7 @@ def test_rotary_omnilidars_fire_in_each_tick(tmp_path):
     assert len(rays) == 720 and rays.cycle_ns == 1e8 and rays.range_m == (0, 60)
     assert rays.times_ns[:4].tolist() == [0, 500, 277_778, 278_278]
     assert np.allclose(rays.azimuths_deg[:4], [0, 1, -1, 0], atol=1e-5), "clockwise"
-    assert sensor.left_out[0] == "vertOffsetM of its emitters"
+    assert sensor.left_out[0] == "the emitter attributes vertOffsetM"
     path.write_text(ROTARY.format(f"float[] {CORE}emitterState:s002:azimuthDeg = [0, 1]"))
     with pytest.raises(LidarError, match="emitterState:s002 has no elevationDeg, fireTimeNs"):
         read_omnilidar(path)
@@ -394,7 +394,7 @@ def test_rotary_omnilidars_return_within_a_window(window, lowest_deg, highest_de
     azimuths_deg = np.where(azimuths_deg > 180, azimuths_deg - 360, azimuths_deg)
     assert (azimuths_deg.min(), azimuths_deg.max()) == (lowest_deg, highest_deg)
     assert len(sensor.rays) == rays and sensor.rays.cycle_ns == 1e8
-    assert sensor.left_out == ["its channels: a list of rays has one"]
+    assert sensor.left_out == ["channels (a ray list has one channel)"]
 
 
 def test_attributes_of_an_omnilidar_that_are_not_read_are_listed(tmp_path):
@@ -426,7 +426,7 @@ def test_attributes_of_an_omnilidar_that_are_not_read_are_listed(tmp_path):
     assert sorted(read_omnilidar(path).left_out[1:]) == sorted([*listed, *more])
     window = f"float {CORE}validStartAzimuthDeg = 0.2 \n float {CORE}validEndAzimuthDeg = 0.7"
     path.write_text(ROTARY.format(window))
-    with pytest.raises(LidarError, match=r"no ray is between azimuths 0\.2 and 0\.7 degrees"):
+    with pytest.raises(LidarError, match=r"no ray has an azimuth from 0\.2 to 0\.7 degrees"):
         read_omnilidar(path)
 
 
@@ -526,13 +526,14 @@ def test_a_scanner_of_many_is_named_and_has_its_highest_rates(tmp_path):
     path = tmp_path / "scanners.xml"
     path.write_text(SCANNERS)
     with pytest.raises(
-        LidarError, match=r"2 scanners: name one, scanners.xml#far. There are far, "
+        LidarError,
+        match=r"2 scanners. Name one, for example scanners.xml#far. Its scanners are far, ",
     ):
         sensor_of_scanner(path, tmp_path / "new")
-    with pytest.raises(LidarError, match=r"no <scanner> 'fur' in the file\. Did you mean 'far'"):
+    with pytest.raises(LidarError, match=r"the file has no <scanner> 'fur'\. Did you mean 'far'"):
         sensor_of_scanner(tmp_path / "scanners.xml#fur", tmp_path / "new")
     sensor, mount, [note] = sensor_of_scanner(tmp_path / "scanners.xml#far", tmp_path / "new")
-    assert note == "its rates: there are no <scannerSettings> for it, so they are the highest"
+    assert note == "missing <scannerSettings> (the highest rates are used)"
     assert sensor.times_ns(np.arange(2))[:, 0].tolist() == [0, 500_000] and sensor.min_range_m == 2
     assert np.allclose(np.degrees(np.arcsin(sensor.directions(np.arange(9))[:, 0, 2])), 70)
     assert mount.position == (0, 0, 0.1) and mount.rotation is not None
@@ -814,10 +815,11 @@ def test_import_reads_tables_of_other_programs(tmp_path):
     assert np.allclose(np.degrees(np.arcsin(z)), [10, -10, 90])
     path.write_text("azimuth_deg,elevation_deg\n0,0\n1,0\n")
     [line] = import_whole(import_sensor, path, tmp_path / "untimed", (), Scenario.load)
-    assert line == "times: it states none, so 2 rays take 0.1 s"
+    assert line == "missing firing times (2 rays are fired in 0.1 s)"
     path.write_text("azimuth_deg,speed\n0,0\n")
     with pytest.raises(
-        LidarError, match=r"mine\.csv cannot be converted to a scenario: it has no rays .*speed"
+        LidarError,
+        match=r"mine\.csv cannot be converted to a scenario: it cannot be read as a sensor.*speed",
     ):
         import_whole(import_sensor, path, tmp_path / "no", (), Scenario.load)
     assert not (tmp_path / "no").exists()

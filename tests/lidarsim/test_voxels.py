@@ -112,7 +112,10 @@ def test_variants_of_the_format(tmp_path):
     first.write_text(text.replace("\n", "\r\n").replace("i j k", " i j k"))
     told = []
     (one,) = load_meshes(first, tell=told.append)
-    assert told == [f"{first} has densities for Planophile leaves: give its object that leaf_angle"]
+    assert told == [
+        f"{first} states the leaf angle distribution 'Planophile'. Set the same leaf_angle for its "
+        "object."
+    ]
     assert one.voxels.density.tolist() == [[[1, 2]]]
     second = written(tmp_path / "b.vox", [[[1, 2]]], size=2.0)
     text = second.read_text().replace(NAMES, "i j k ground_distance pad_transmittance n")
@@ -127,26 +130,34 @@ def test_unknown_voxels_are_empty_and_told_of(tmp_path):
     told = []
     mesh = tree(tmp_path / "a.vox", [[[np.nan, 1.0, np.nan, 2.0]]], tell=told.append)
     assert mesh.voxels.density.tolist() == [[[1, 0, 2]]]
-    assert "knows nothing of 2 voxels (NaN), which stay empty" in told[0]
+    assert "contains 2 voxels without data (NaN). Voxels without" in told[0]
 
 
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
         ("VOXEL SPACE", "PIXELS", "does not begin with VOXEL SPACE"),
-        ("VOXEL SPACE", "VOX \x96", "is a model of MagicaVoxel"),
-        ("i j k", "x y z", "has no row of names that begins with i j k"),
-        ("PadBVTotal", "Leaves", "has no column PadBVTotal, nor one other"),
-        ("#min_corner: 0 0 0", "", "has no header #min_corner with three numbers"),
-        ("#max_corner: 2", "#max_corner: nan", "has no header #max_corner with three numbers"),
-        ("#split: 2 1 2", "#split: 2 1.5 2", "has #split 2 1.5 2; it must be whole numbers"),
-        ("#split: 2 1 2", "#split: 2 1 8", "contradicts itself: 2 1 2 voxels"),
-        ("#res: 1.0", "#res: 0.0", "has voxels without a size"),
-        ("1 0 1 0.4", "1 0 2 0.4", "has a voxel 1 0 2, but #split is 2 1 2"),
-        ("1 0 1 0.4", "1 0 -1 0.4", "has a voxel 1 0 -1, but"),
-        ("1 0 1 0.4", "1 0 0 0.4", "has 1 row of voxels that it had before"),
-        ("1 0 1 0.4", "1 0 1 -0.4", "has -0.4 m²/m³ in voxel 1 0 1; a density is 0 to 10000"),
-        ("1 0 1 0.4", "1 0 1 1e9", r"has 1e\+09 m²/m³ in voxel 1 0 1"),
+        ("VOXEL SPACE", "VOX \x96", "is a MagicaVoxel model"),
+        ("i j k", "x y z", "has no header row that begins with i j k"),
+        ("PadBVTotal", "Leaves", "has neither a column PadBVTotal nor exactly"),
+        ("#min_corner: 0 0 0", "", "has no header line #min_corner with three numbers"),
+        ("#max_corner: 2", "#max_corner: nan", "has no header line #max_corner with three numbers"),
+        ("#split: 2 1 2", "#split: 2 1.5 2", "has #split 2 1.5 2, but the values must be integers"),
+        ("#split: 2 1 2", "#split: 2 1 8", r"is inconsistent\. Its corners span 2 1 2 voxels"),
+        ("#res: 1.0", "#res: 0.0", "has voxels without a positive size"),
+        (
+            "1 0 1 0.4",
+            "1 0 2 0.4",
+            "contains the voxel 1 0 2, which is outside the grid with #split 2 1 2",
+        ),
+        ("1 0 1 0.4", "1 0 -1 0.4", "contains the voxel 1 0 -1, which"),
+        ("1 0 1 0.4", "1 0 0 0.4", "contains 1 duplicate row"),
+        (
+            "1 0 1 0.4",
+            "1 0 1 -0.4",
+            "has a density of -0.4 m²/m³ in voxel 1 0 1, but densities must be from 0 to 10000",
+        ),
+        ("1 0 1 0.4", "1 0 1 1e9", r"has a density of 1e\+09 m²/m³ in voxel 1 0 1"),
         ("1 0 1 0.4", "1 0 1 leaf", "line 10 has 'leaf' as PadBVTotal, and a number"),
         ("45.5 12\n1 0 1 0.4", "45.5\n1 0 1", "has 5 of 6 numbers"),
     ],
@@ -171,7 +182,7 @@ def test_cut_files_are_refused(tmp_path, cut):
 
 
 def test_empty_and_huge_grids_are_refused_in_little_memory(tmp_path):
-    with pytest.raises(LidarError, match="has no voxel whose PadBVTotal is above 0"):
+    with pytest.raises(LidarError, match="contains no voxel with PadBVTotal above 0"):
         tree(tmp_path / "a.vox", np.zeros((2, 2, 2)))
     path = tmp_path / "b.vox"
     path.write_text(
@@ -368,7 +379,7 @@ def test_what_voxels_cannot_do_is_refused(tmp_path):
     with pytest.raises(LidarError, match="'X' has voxels, and cannot be joined"):
         join_meshes("X", [mesh, mesh])
     assert join_meshes("X", [mesh]).voxels is not None
-    with pytest.raises(LidarError, match="'T' is of voxels, which cannot be written"):
+    with pytest.raises(LidarError, match="'T' consists of voxels, which cannot be written"):
         write_scene(tmp_path / "out.glb", Scene.from_meshes([mesh]))
     for density, matrix in [
         (np.zeros((1, 1, 1)), np.eye(3, 4)),

@@ -96,10 +96,13 @@ class Child(NamedTuple):
     def _end(self, code: int) -> str:
         """Return why the process ended before its last frame was read."""
         if code == -signal.SIGALRM:
-            return f"{self.library} takes too long for it"
+            return f"{self.library} exceeded its time limit"
         status = signal.Signals(-code).name if code < 0 else f"status {code}"
         limit = bytes_of(self.max_bytes)
-        return f"{self.library} ended with {status}, or needs more than {limit} of memory"
+        return (
+            f"{self.library} exited with {status}, possibly because it needs more than {limit} "
+            "of memory"
+        )
 
 
 def _next_frame(stream: IO[bytes], take: Callable[[dict[str, Any], int], None]) -> Frame | None:

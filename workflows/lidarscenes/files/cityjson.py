@@ -117,15 +117,15 @@ def read_cityjson(data: bytes, path: Path, options: ReadOptions) -> Content:
         if city is None:
             if kind != "CityJSON":
                 raise MeshFileError(
-                    'is JSON, but not CityJSON: it does not begin with "type": "CityJSON" (a '
-                    "scenario has the ending .yaml)"
+                    'is a JSON file, but its "type" is not "CityJSON". '
+                    "Scenarios must have the extension .yaml"
                 )
             city = _CityFile(document, allowance, options)
         elif kind != "CityJSONFeature":
-            raise ValueError(f"a line is of the type {str(kind)[:40]!r}, not CityJSONFeature")
+            raise ValueError(f"a line has the type {str(kind)[:40]!r} instead of 'CityJSONFeature'")
         city.add(document)
     if city is None:
-        raise ValueError("no line has anything")
+        raise ValueError("all lines are empty")
     return city.content()
 
 
@@ -152,8 +152,8 @@ class _CityFile:
         version = str(head.get("version"))
         if not re.match(r"1\.[01]|2\.0", version):
             raise MeshFileError(
-                f"is CityJSON {version[:20]}, and 1.0 to 2.0 are read: cjio FILE upgrade save NEW "
-                "makes it one of them"
+                f"uses CityJSON {version[:20]}, but only versions 1.0 to 2.0 are supported. "
+                "Upgrade it with `cjio FILE upgrade save NEW`"
             )
         transform = head.get("transform", {"scale": [1, 1, 1], "translate": [0, 0, 0]})
         self._scale = np.array(transform["scale"], np.float64).reshape(3)
@@ -337,17 +337,19 @@ class _CityFile:
         content.up_axis = "z"
         content.classes = CLASSES
         levels = [
-            f"{plural(n, 'object')} of LoD {f'{level:g}' if level >= 0 else 'unknown'}"
+            f"{plural(n, 'object')} with LoD {f'{level:g}' if level >= 0 else 'unknown'}"
             for level, n in sorted(self._levels.items(), reverse=True)
         ]
         if self._unscaled:
-            content.notes.append("lacks its transform: its coordinates are taken as metres")
+            content.notes.append("has no transform. Its coordinates are assumed to be in meters")
         content.notes += system.notes(unit_given=self._unit is not None)
         if len(levels) > 1:
-            content.notes.append(f"has {', '.join(levels)}, which is the highest of each")
+            content.notes.append(
+                f"contains {', '.join(levels)}. Each object is read at its highest level of detail"
+            )
         if self._unread:
             listed = ", ".join(f"{n} {kind}" for kind, n in self._unread.items())
-            content.notes.append(f"is read without {listed}")
+            content.notes.append(f"contains content that was skipped: {listed}")
         return content
 
 
@@ -387,27 +389,32 @@ class _System:
 
     def check(self, corners: Floats) -> None:
         """Raise MeshFileError if coordinates (n, 3) are angles, or lengths that are not true."""
-        reproject = "reproject it, for example by cjio FILE crs_reproject {} save NEW"
+        reproject = "Reproject it, for example with `cjio FILE crs_reproject {} save NEW`"
         if self.is_of_angles:
             raise MeshFileError(
-                f"has coordinates in degrees{f' ({self.name})' if self.name else ''}, and metres "
-                f"are needed: {reproject.format('EPSG')}"
+                f"has coordinates in degrees{f' ({self.name})' if self.name else ''}, but meters "
+                f"are required. {reproject.format('EPSG')}"
             )
         x, y = (corners[:, :2].min(axis=0) + corners[:, :2].max(axis=0)).tolist()
         problem = scale_problem(self.name, x / 2, y / 2, in_system=False) if self.name else ""
         if problem:
             code = None if self.crs is None else suggested_epsg(self.crs, x / 2, y / 2)
-            raise MeshFileError(f"is in {self.name}, {problem}: {reproject.format(code or 'EPSG')}")
+            raise MeshFileError(f"uses {self.name}, {problem}. {reproject.format(code or 'EPSG')}")
 
     def notes(self, *, unit_given: bool) -> list[str]:
         """Return notes on the system."""
         if self.unit_m != 1 and not unit_given:
             return [
-                f"is in {self.name}, of a unit of {self.unit_m:.9g} m, and was converted to metres"
+                f"uses {self.name}, whose unit is {self.unit_m:.9g} m. Its coordinates were "
+                "converted to meters"
             ]
         if self.epsg is None:
-            return [f"is in {self.name}, which is not used"] if self.name else []
-        return [f"is in EPSG:{self.epsg}: <world.epsg={self.epsg}> writes that to LAS"]
+            return (
+                [f"uses the coordinate system {self.name}, which was ignored"] if self.name else []
+            )
+        return [
+            f"uses EPSG:{self.epsg}. To write this code to LAS files, use <world.epsg={self.epsg}>"
+        ]
 
 
 def _looks_like_angles(corners: Floats) -> bool:
@@ -425,9 +432,9 @@ def _points(coordinates: Any) -> Floats:
     try:
         points = np.array(coordinates or np.zeros((0, 3)), np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError("its vertices are not rows of three numbers") from error
+        raise ValueError("the vertices are not rows of three numbers") from error
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"its vertices are of the shape {points.shape}, not (v, 3)")
+        raise ValueError(f"the vertices have the shape {points.shape}; expected (v, 3)")
     return points
 
 
@@ -435,7 +442,10 @@ def _integers(numbers: Sequence[int]) -> Ints:
     """Return whole numbers (n,), or raise ValueError."""
     array = np.array(numbers or np.zeros(0, np.int64))
     if array.ndim != 1 or array.dtype != np.int64:
-        raise ValueError("its boundaries are not nested as those of its type, or not whole numbers")
+        raise ValueError(
+            "the boundaries do not have the nesting of the geometry type, or contain values "
+            "that are not integers"
+        )
     return array
 
 
@@ -445,7 +455,9 @@ def _item(items: Any, number: Any) -> Any:
     Raises ValueError if no item has the number.
     """
     if type(number) is not int or not 0 <= number < len(items):
-        raise ValueError(f"{str(number)[:20]} is none of {len(items)} templates or vertices")
+        raise ValueError(
+            f"index {str(number)[:20]} is out of range for {len(items)} templates or vertices"
+        )
     return items[number]
 
 

@@ -59,7 +59,9 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
-        raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
+        raise MeshFileError(
+            f"is an XML file, but not COLLADA. Its root element is <{root.tag[:40]}>"
+        )
     allowance = Allowance(len(data), SMALLER)
     paint = _Effects(path, options, allowance) if options.colours else None
     document = _Document(root, allowance, paint, options)
@@ -70,9 +72,7 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
         meter = unit.attrib["meter"]
         content.unit_m = float(meter) if _is_number(meter, np.float64) else np.nan
         if not 0 < content.unit_m < np.inf:
-            raise ValueError(
-                f"its unit is {meter[:40]!r} metres, and a positive number was expected"
-            )
+            raise ValueError(f"the unit is {meter[:40]!r} meters, but it must be a positive number")
     axis = (root.findtext("asset/up_axis") or "").strip()
     content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # default
     return content
@@ -126,13 +126,16 @@ class _Document:
                 is_skinned = True
             elif child.tag == "instance_controller":
                 raise MeshFileError(
-                    "moves vertices by a skin (a skeleton) or a morph, which is not supported: "
-                    "apply it, then export"
+                    "deforms vertices with a skin (skeleton) or a morph, which is not "
+                    "supported. Apply the deformation before you export the file"
                 )
             elif child.tag in _STEPS:
                 matrix = matmul(matrix, _step(child))
             elif child.tag == "skew":
-                raise MeshFileError("shears objects by <skew>, which is not supported: apply it")
+                raise MeshFileError(
+                    "contains <skew>, which is not supported. Apply the transform before you "
+                    "export the file"
+                )
         name = element.get("name", "") if element.tag == "node" else ""
         return Node(name, matrix, meshes, children, skinned=is_skinned)
 
@@ -140,13 +143,16 @@ class _Document:
         """Return the meshes of a skin where its joints are at rest, in the file's coordinates."""
         skin = controller.find("skin")
         if skin is None:
-            raise MeshFileError("moves vertices by a morph, which is not supported: apply it")
+            raise MeshFileError(
+                "deforms vertices with a morph, which is not supported. Apply the morph before "
+                "you export the file"
+            )
         bound = self._bound_materials(instance) if self._paint or self._names_materials else ()
         shape = skin.find("bind_shape_matrix")
         matrix = np.eye(4) if shape is None else _numbers(shape)
         if matrix.size != 16:
             raise ValueError(
-                f"{_tag(skin)} has a bind_shape_matrix of {matrix.size} numbers, not 16"
+                f"{_tag(skin)} has a bind_shape_matrix with {matrix.size} numbers; expected 16"
             )
         matrix = matrix.reshape(4, 4)
         return [
@@ -160,7 +166,8 @@ class _Document:
         target = self._ids.get((kind, url[1:]), self._ids.get((kind, unquote(url[1:]))))
         if target is None or not url.startswith("#"):
             raise MeshFileError(
-                f"has an <{element.tag}> of {url[:80]!r}, which is not in the file: export it again"
+                f"contains <{element.tag}> with a reference to {url[:80]!r}, which is not in the "
+                "file. Export it again"
             )
         return target
 
@@ -174,7 +181,9 @@ class _Document:
         name = geometry.get("name") or geometry.get("id") or ""
         for kind in ("convex_mesh", "brep"):
             if geometry.find(kind) is not None:
-                raise MeshFileError(f"has a <{kind}>, which is not read: export it as triangles")
+                raise MeshFileError(
+                    f"contains <{kind}>, which is not supported. Export it as triangles"
+                )
         materials = dict(bound)
         pieces = (
             self._piece(primitive, materials.get(primitive.get("material", "")))._replace(
@@ -266,14 +275,14 @@ class _Document:
                 points = self._points(self._target(entry, "vertices"))
                 offset = entry_offset
         if points is None:
-            raise ValueError(f"{_tag(primitive)} has no <input> of VERTEX")
+            raise ValueError(f"{_tag(primitive)} has no <input> with the semantic VERTEX")
         return _Inputs(points, offset, stride)
 
     def _read_points(self, vertices: Element) -> Floats:
         """Return the positions (v, 3) of <vertices>."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
-            raise ValueError(f"{_tag(vertices)} has no <input> of POSITION")
+            raise ValueError(f"{_tag(vertices)} has no <input> with the semantic POSITION")
         source = self._target(entry, "source")
         rows = self._rows(source)
         accessor = source.findall("technique_common/accessor/param")
@@ -296,8 +305,8 @@ class _Document:
         offset = _whole_number(accessor, "offset")
         if min(count, offset, stride - 1) < 0 or offset + count * stride > len(numbers):
             raise ValueError(
-                f"{_tag(source)} announces {count:,} x {stride} numbers, and {len(numbers):,} are "
-                "there"
+                f"{_tag(source)} declares {count:,} x {stride} numbers but contains "
+                f"{len(numbers):,}"
             )
         return numbers[offset : offset + count * stride].reshape(count, stride)
 
@@ -345,7 +354,7 @@ class _Effects:
                 name = image_name.strip() if image_link is None else image_link.get("url", "")[1:]
         image = ids.get(("image", name))
         if image is None:
-            raise MaskError(f"its image {name[-80:]!r} is not in the file")
+            raise MaskError(f"its image {name[-80:]!r} is not defined in the file")
         file = image.findtext("init_from/ref") or image.findtext("init_from") or ""
         return self._texture((file.strip(), wrap_s, wrap_t))
 
@@ -381,8 +390,8 @@ def _triangles(
         joined_corners = np.concatenate(lists)
         if (sizes < 0).any() or sizes.sum() != len(joined_corners):
             raise ValueError(
-                f"{_tag(primitive)} announces polygons of {sizes.sum():,} corners, and "
-                f"{len(joined_corners):,} are there"
+                f"{_tag(primitive)} declares polygons with {sizes.sum():,} corners but contains "
+                f"{len(joined_corners):,}"
             )
         yield triangulated(points, joined_corners, sizes)
     elif primitive.tag == "polygons":
@@ -395,7 +404,7 @@ def _triangles(
 
 def _integers(element: Element) -> Ints:
     """Return the integers in the text of an element."""
-    return _words(element, np.int64, "whole numbers")
+    return _words(element, np.int64, "integers")
 
 
 def _numbers(element: Element) -> Floats:
@@ -414,7 +423,7 @@ def _words(element: Element, kind: type, expected: str) -> AnyArray:
     except (ValueError, OverflowError) as error:
         word = next(word for word in words if not _is_number(word, kind))
         raise ValueError(
-            f"{_tag(element)} has {word[:40]!r}, and {expected} were expected"
+            f"{_tag(element)} contains {word[:40]!r}, but {expected} were expected"
         ) from error
 
 
@@ -437,7 +446,7 @@ def _whole_number(element: Element, attribute: str, default: int = 0) -> int:
         return int(text)
     except ValueError as error:
         raise ValueError(
-            f"{_tag(element)} has {attribute}={text[:40]!r}, and a whole number was expected"
+            f"{_tag(element)} has {attribute}={text[:40]!r}; expected an integer"
         ) from error
 
 
@@ -455,7 +464,7 @@ def _step(element: Element) -> Floats:
     numbers = _numbers(element)
     count, matrix_of = _STEPS[element.tag]
     if len(numbers) != count:
-        raise ValueError(f"{_tag(element)} has {len(numbers)} numbers, and {count} were expected")
+        raise ValueError(f"{_tag(element)} has {len(numbers)} numbers; expected {count}")
     return matrix_of(numbers)
 
 

@@ -50,5 +50,7 @@ MESH_FORMATS = (
         (".ifc",), _IFC, from_path=True, options=_IFC_OPTIONS, signatures=(b"ISO-10303-21;",)
     ),
     MeshFormat((".ifczip",), _IFC, from_path=True, options=_IFC_OPTIONS, signatures=(_ZIP,)),
-    MeshFormat(ROBOTS, advice="it is a robot, read it with load_robot, or by a scenario"),
+    MeshFormat(
+        ROBOTS, advice="it describes a robot. Read it with load_robot, or name it in a scenario"
+    ),
 )

@@ -83,7 +83,7 @@ _MAP_NUMBERS = (
     "FactorZ",
 )
 _ADVICE = "export it in parts"
-_EMPTY = "holds no elements with a shape, such as walls and slabs, or none in these storeys"
+_EMPTY = "contains no elements with a shape, such as walls and slabs, in the selected storeys"
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class IfcOptions:
 
     storeys: Annotated[
         Annotated[Several[Text], Field(min_length=1)] | None,
-        about("of a building (.ifc): take only the elements of these storeys"),
+        about("names of the storeys whose elements are read, by default all (.ifc only)"),
     ] = None
 
 
@@ -103,12 +103,14 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
     storeys = own.storeys
     is_packed = path.suffix.lower() == ".ifczip"
     if not is_packed and b"ISO-10303-21" not in data:
-        raise ValueError("it does not begin with ISO-10303-21")
+        raise ValueError("it does not start with ISO-10303-21")
     if find_spec("ifcopenshell") is None:
         command = install_command("lidarpool[ifc]")
-        raise MeshFileError(f"is IFC, which ifcopenshell reads: {command}")
+        raise MeshFileError(
+            f"is an IFC file, which requires ifcopenshell. Install it with `{command}`"
+        )
     if sys.platform == "win32":  # where a process has no limits of memory
-        raise MeshFileError("is IFC, which is not read on Windows: export it as .glb")
+        raise MeshFileError("is an IFC file, which is not supported on Windows. Export it as .glb")
     if not is_packed:
         _check_end(path)
     size = path.stat().st_size
@@ -133,8 +135,9 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
             match frame["what"]:
                 case "schema":
                     raise MeshFileError(
-                        f"is of the schema {frame['schema']!r}, and {', '.join(frame['read'])} are "
-                        "read: export it in one of these"
+                        f"uses the IFC schema {frame['schema']!r}, but only "
+                        f"{', '.join(frame['read'])} are supported. Export it with one of these "
+                        "schemas"
                     )
                 case "building":
                     building = frame
@@ -143,7 +146,7 @@ def read_ifc(data: bytes, path: Path, options: ReadOptions) -> Content:
                     shapes.add(frame, arrays)
                 case "elements":
                     return _content(building, frame, arrays[0], shapes)
-    raise ValueError("ifcopenshell gave no elements")
+    raise ValueError("ifcopenshell returned no elements")
 
 
 def _check_end(path: Path) -> None:
@@ -162,8 +165,9 @@ def _check_storeys(wanted: Sequence[str] | None, storeys: list[str]) -> None:
     missing = [name for name in wanted or () if name not in storeys]
     if missing:
         names = ", ".join(repr(name[:80]) for name in dict.fromkeys(storeys[:50]))
-        has = f"has the storeys {names}" if names else "has no storeys: leave out storeys"
-        raise MeshFileError(f"has no storey {missing[0][:80]!r}; it {has}")
+        if not names:
+            raise MeshFileError("has no storeys. Remove the option `storeys`")
+        raise MeshFileError(f"has no storey {missing[0][:80]!r}. Its storeys are {names}")
 
 
 class _Shapes:
@@ -223,25 +227,24 @@ def _content(
     if count := frame["missing_count"]:
         names = ", ".join(map(repr, frame["missing"])) + ", …" * (count > len(frame["missing"]))
         missing = (
-            f"is read without {plural(count, 'element')} of which ifcopenshell makes no triangles: "
-            f"{names}"
+            f"{plural(count, 'element')} that ifcopenshell cannot convert to triangles: {names}"
         )
     if not placed:
-        raise MeshFileError(missing.replace("is read without", "holds only") or _EMPTY)
+        raise MeshFileError(f"contains only {missing}" if missing else _EMPTY)
     content = placed_content(placed)
     content.unit_m = 1.0
     content.up_axis = "z"
     content.classes = _classes({row[1] for row in frame["elements"]}, frame["ancestors"])
     content.notes = [*_reference_notes(building, middle_of(content.meshes)), *shapes.notes.lines()]
     if missing:
-        content.notes.append(missing)
+        content.notes.append(f"was read without {missing}")
     if building["errors"]:
         content.notes.append(
-            f"has {plural(building['errors'], 'error')}, without which ifcopenshell reads it, "
-            f"such as: {building['first_error']}"
+            f"contains {plural(building['errors'], 'error')} that ifcopenshell ignored. The "
+            f"first error is: {building['first_error']}"
         )
     if not building["unit_stated"]:
-        content.unit_note = "states no unit of length and is taken in metres, as ifcopenshell does"
+        content.unit_note = "states no length unit. Meters are assumed, as in ifcopenshell"
     return content
 
 
@@ -275,17 +278,21 @@ def _reference_notes(building: dict[str, Any], middle: Floats) -> list[str]:
             f"{abs(latitude):.6g}° {'S' if latitude < 0 else 'N'}, "
             f"{abs(longitude):.6g}° {'W' if longitude < 0 else 'E'}"
         )
-        return [f"states the position of its site, {position}, which is not used"]
+        return [f"contains a site position, {position}, which was ignored"]
     try:
         conversion = _MapConversion.from_file(stated)
     except ValueError as error:
-        return [f"has a map conversion that cannot be used: {error}"]
+        return [f"contains a map conversion that cannot be used because {error}"]
     epsg = re.search(r"(?i)\bepsg:{1,2}(\d{4,6})\b", conversion.system)
     system = f"EPSG:{epsg[1]}" if epsg else repr(conversion.system)
     if conversion.is_identity:
         if problem := scale_problem(system, *middle.tolist()) if epsg else "":
-            return [f"is in {system}, {problem}"]
-        return [f"is in EPSG:{epsg[1]}: <world.epsg={epsg[1]}> writes that to LAS"] if epsg else []
+            return [f"uses {system}, {problem}"]
+        return (
+            [f"uses EPSG:{epsg[1]}. To write this code to LAS files, use <world.epsg={epsg[1]}>"]
+            if epsg
+            else []
+        )
     return [_conversion_note(conversion, system, is_known=epsg is not None)]
 
 
@@ -301,23 +308,24 @@ def _conversion_note(conversion: _MapConversion, system: str, *, is_known: bool)
         if is_known
         else ""
     ):
-        where += f", {problem}, unlike that of the building"
+        where += f", {problem}, unlike the meter of the building"
     moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
     if conversion.heading_deg:
         moves.append(f"rotation_deg [0, 0, {conversion.heading_deg:.9g}]")
     if not conversion.is_true:
         scales = dict.fromkeys(f"{scale:.9g}" for scale in conversion.scales)
         moves.append(f"scale {next(iter(scales)) if len(scales) == 1 else _scale_list(conversion)}")
-    verb = "moves" if len(moves) == 1 else "move"
-    all_of_it = "" if moves[1:] else f"; {world_advice(x, y, z)}"
+    all_of_it = "" if moves[1:] else f". {world_advice(x, y, z)}"
     ignored = ""
     if conversion.ignores_scale:
-        ignored = ". Its Scale of 1 does not convert the unit of the project to that of the map: "
-        ignored += "it is ignored, and the units count"
+        ignored = (
+            ". Its Scale of 1 does not convert project units to map units. The scale was ignored, "
+            "and the units were used instead"
+        )
     in_unit = "" if conversion.unit_m == 1 else " in meters"
     return (
-        f"has a map conversion, which is not applied: {' and '.join(moves)} {verb} it into {where}"
-        f"{in_unit}{all_of_it}{ignored}"
+        "contains a map conversion, which was not applied. To move the building to "
+        f"{where}{in_unit}, use {' and '.join(moves)}{all_of_it}{ignored}"
     )
 
 
@@ -345,9 +353,11 @@ class _MapConversion:
         that of the project. A scale that is not stated converts units and nothing else.
         """
         if stated["count"] > 1:
-            raise ValueError(f"the file has {stated['count']} property sets of it that differ")
+            raise ValueError(
+                f"the file contains {stated['count']} property sets with different values for it"
+            )
         if stated.get("is_angle"):
-            raise ValueError("it states longitude and latitude, not meters")
+            raise ValueError("it is in longitude and latitude instead of meters")
         numbers = {name: _number(stated, name) for name in _MAP_NUMBERS}
         project_m = stated["unit_m"]
         scale = numbers["Scale"] or None
@@ -357,7 +367,7 @@ class _MapConversion:
         if ignores_scale:
             true_scale = 1.0
         elif not abs(true_scale - 1) < _MAX_SCALE_ERROR:
-            raise ValueError(f"its scale, {true_scale:g}, does not fit its units")
+            raise ValueError(f"its scale, {true_scale:g}, is not consistent with its units")
         x, y, z = (true_scale * (numbers[f"Factor{axis}"] or 1.0) for axis in "XYZ")
         east, north, height = (numbers[name] or 0.0 for name in _MAP_NUMBERS[:3])
         abscissa = numbers["XAxisAbscissa"] or 0.0
@@ -395,7 +405,7 @@ def _number(stated: dict[str, Any], name: str) -> float | None:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{name} is {str(value)[:40]!r}, not a number")
+        raise ValueError(f"{name} is {str(value)[:40]!r}, which is not a number")
     return number
 
 
@@ -404,7 +414,7 @@ def _map_unit_m(unit: float | str | None, project_m: float, scale: float | None)
     if isinstance(unit, str):
         unit_m = unit_by_name(unit)
         if unit_m is None:
-            raise ValueError(f"its map unit {unit[:40]!r} is not a known unit of length")
+            raise ValueError(f"its map unit {unit[:40]!r} is not a known length unit")
         return unit_m
     if unit is not None:
         return unit

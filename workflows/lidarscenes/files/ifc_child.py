@@ -141,7 +141,7 @@ class Building:
             if element.is_a("IfcBuildingStorey"):
                 return str(element.Name or element.GlobalId)
             element = _parent(element)
-        raise ValueError("its elements contain each other")
+        raise ValueError("the containment of its elements is circular")
 
     def _write_shapes(self, elements: dict[int, Any]) -> None:
         """Write shapes and elements."""
@@ -322,9 +322,9 @@ def _unpacked(path: str, max_bytes: int) -> bytes:
     with zipfile.ZipFile(path) as archive:
         entries = [e for e in archive.infolist() if e.filename.lower().endswith(".ifc")]
         if len(entries) != 1:
-            raise ValueError(f"it holds {len(entries)} files .ifc, not one")
+            raise ValueError(f"the archive contains {len(entries)} .ifc files; expected 1")
         if entries[0].file_size > max_bytes:
-            raise ValueError(f"it unpacks to more than {max_bytes:,} bytes")
+            raise ValueError(f"the archive unpacks to more than {max_bytes:,} bytes")
         with archive.open(entries[0]) as stream:
             data = stream.read(max_bytes)
     if b"END-ISO-10303-21" not in data[-200:]:

@@ -60,9 +60,9 @@ class _Parser:
             self._add_text(text[position:start])
             position = self._after_markup(start)
         if self._open:
-            raise CutShortError(f"its last element, <{self._open[-1].tag[:40]}>, has no end")
+            raise CutShortError(f"its last element, <{self._open[-1].tag[:40]}>, is not closed")
         if self._root is None:
-            raise ValueError("it has no elements")
+            raise ValueError("it contains no elements")
         return self._root
 
     def _after_markup(self, start: int) -> int:
@@ -81,8 +81,8 @@ class _Parser:
         tag = _TAG.match(text, start)
         if tag is None:
             if ">" not in text[start:]:
-                raise CutShortError(f"it ends within a tag, in line {self._line(start)}")
-            raise ValueError(f"line {self._line(start)} has a tag that is none of XML")
+                raise CutShortError(f"it ends inside a tag on line {self._line(start)}")
+            raise ValueError(f"line {self._line(start)} contains an invalid tag")
         if tag["end"]:
             self._end_element(tag["name"], start)
         else:
@@ -93,7 +93,9 @@ class _Parser:
         """Return the position after the next mark."""
         stop = self._text.find(mark, start)
         if stop < 0:
-            raise ValueError(f"what begins in line {self._line(start)} has no end, {mark}")
+            raise ValueError(
+                f"the section that starts on line {self._line(start)} is not closed with {mark}"
+            )
         return stop + len(mark)
 
     def _after_declaration(self, start: int) -> int:
@@ -104,34 +106,34 @@ class _Parser:
         stop = self._end_of(start, ">")
         declaration = self._text[start:stop]
         if "[" in declaration or not declaration.upper().startswith("<!DOCTYPE"):
-            raise ValueError("it declares XML entities, which may expand to any length")
+            raise ValueError("it declares XML entities, which are not supported")
         return stop
 
     def _start_element(self, tag: re.Match[str], start: int) -> None:
         """Open an element, which is closed if empty."""
         self._count += 1
         if self._count > MAX_ELEMENTS:
-            raise ValueError(f"it has more than {MAX_ELEMENTS:,} elements")
+            raise ValueError(f"it contains more than {MAX_ELEMENTS:,} elements")
         element = Element(tag["name"])
         for name, double, single in _ATTRIBUTE.findall(tag["attributes"]):
             element.attrib.setdefault(name, self._resolved(double or single))
         if self._open:
             self._open[-1].append(element)
         elif self._root is not None:
-            raise ValueError(f"line {self._line(start)} begins a second root")
+            raise ValueError(f"line {self._line(start)} starts a second root element")
         else:
             self._root = element
         if not tag["empty"]:
             self._open.append(element)
             self._texts.append([])
             if len(self._open) > _MAX_DEPTH:
-                raise ValueError(f"its elements are nested deeper than {_MAX_DEPTH}")
+                raise ValueError(f"its elements are nested more than {_MAX_DEPTH} levels deep")
 
     def _end_element(self, name: str, start: int) -> None:
         """Close the innermost element."""
         if not self._open or self._open[-1].tag != name:
             raise ValueError(
-                f"line {self._line(start)} has an end </{name[:40]}> without its start"
+                f"line {self._line(start)} contains </{name[:40]}> without a matching start tag"
             )
         element = self._open.pop()
         element.text = "".join(self._texts.pop()) or None
@@ -159,6 +161,8 @@ def _character(reference: re.Match[str]) -> str:
     if name in _CHARACTERS:
         return _CHARACTERS[name]
     if not name.startswith("#"):
-        raise ValueError(f"it names an XML entity, {name[:20]!r}, which may expand to any length")
+        raise ValueError(
+            f"it uses the XML entity {name[:20]!r}, but only predefined entities are supported"
+        )
     code = int(name[2:], 16) if name[1] == "x" else int(name[1:])
     return chr(code) if code < 0x110000 else "\ufffd"

@@ -91,11 +91,14 @@ class RasterOptions:
 
     step_m: Annotated[
         float | None,
-        about("of a raster: mean heights in a grid of this step, metres", gt=0, le=1e6),
+        about("grid step in meters to which heights are averaged (rasters only)", gt=0, le=1e6),
     ] = None
     window: Annotated[
         Rectangle | None,
-        about("of a raster: take this part of it, lowest and highest x and y: [x0, y0, x1, y1]"),
+        about(
+            "part of a raster to read, [x0, y0, x1, y1]: its lowest x and y, and its highest x "
+            "and y"
+        ),
     ] = None
     # Code of the mesh's coordinate system, `world.epsg` of scenarios; None chooses by the file.
     epsg: EpsgCode | None = None
@@ -110,10 +113,13 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     """
     if find_spec("rasterio") is None:
         raise MeshFileError(
-            f"is a raster, which rasterio reads: {install_command('lidarpool[geo]')}"
+            "is a raster, which requires rasterio. Install it with "
+            f"`{install_command('lidarpool[geo]')}`"
         )
     if options.up_axis is not None:
-        raise MeshFileError("is a raster, whose heights are z: leave out up_axis")
+        raise MeshFileError(
+            "is a raster, whose heights are always along z. Remove the option `up_axis`"
+        )
     request: RasterOptions = options.own
     with _open_raster(path) as file:
         source = _source(file, path)
@@ -187,15 +193,15 @@ def _height_notes(
     if DRIVERS[path.suffix.lower()] == "GTiff":
         command = f"rio edit-info --nodata {value!r} {path.name}"
     stated = pixels.file.nodata
-    state = "as its nodata" if stated is None else f"as its nodata, which is {float(stated)!r} now"
+    state = "as nodata" if stated is None else f"as nodata instead of {float(stated)!r}"
     if max(-lowest_m, highest_m) > MAX_COORDINATE_M:
         raise MeshFileError(
-            f"has the value {value!r}, which is no height: if it stands for no data, state it "
-            f"{state} ({command})"
+            f"contains the value {value!r}, which is not a valid height. If it marks missing "
+            f"data, declare it {state} with `{command}`"
         )
     return [
-        f"has heights from {lowest_m:,.6g} to {highest_m:,.6g} m: if {value!r} stands for no data, "
-        f"state it {state} ({command})"
+        f"has heights from {lowest_m:,.6g} to {highest_m:,.6g} m. If {value!r} marks missing "
+        f"data, declare it {state} with `{command}`"
     ]
 
 
@@ -238,7 +244,7 @@ class _LocalSystem:
         if self.unit_m == 1:
             return ""
         return (
-            f"is in the local coordinate system {self.name!r}, in the unit {self.unit}: its "
+            f"uses the local coordinate system {self.name!r} with the unit {self.unit}. Its "
             "coordinates were converted to meters"
         )
 
@@ -257,8 +263,8 @@ def _source(file: Any, path: Path) -> _Source:
     unit = linear_unit(crs) if is_local(crs) else None
     if unit is None:
         raise MeshFileError(
-            f"is in {crs_name(crs)}, which has no axes along the ground: project it to meters "
-            "first (gdalwarp -t_srs SYSTEM IN OUT)"
+            f"uses {crs_name(crs)}, which has no horizontal axes. Project it to meters first, "
+            "for example with `gdalwarp -t_srs SYSTEM IN OUT`"
         )
     name, unit_m = unit
     local = _LocalSystem(str(projjson(crs)["name"])[:80], name, unit_m)
@@ -277,8 +283,8 @@ def _stated_crs(file: Any, path: Path) -> Any:
     crs = crs_of_text(text) if text else None
     if text and crs is None:
         raise MeshFileError(
-            f"has a coordinate system in {path.stem}.prj that PROJ does not understand: correct "
-            "it, or delete the file to read the coordinates in meters"
+            f"has a coordinate system in {path.stem}.prj that PROJ cannot parse. Correct it, or "
+            "delete the file to read the coordinates in meters"
         )
     return crs
 
@@ -323,9 +329,11 @@ def _open_raster(path: Path) -> Iterator[Any]:
 def _failure(reason: str, driver: str) -> ValueError:
     """Return the error of a file that a driver of GDAL refused for a reason."""
     if "File short" in reason:
-        return CutShortError("it has fewer heights than its header announces")
+        return CutShortError("it contains fewer heights than its header declares")
     if "not recognized as being in a supported file format" in reason:
-        return ValueError(f"it does not begin as a raster of its ending does, by GDAL's {driver}")
+        return ValueError(
+            f"its content is not in the {driver} format that GDAL expects for its extension"
+        )
     return ValueError(reason)
 
 
@@ -340,18 +348,26 @@ def _read_beside(path: Path, suffix: str) -> bytes:
 def _check_kind(source: Any) -> None:
     """Raise MeshFileError for bands without heights, and blocks that exceed the memory."""
     if not source.dtypes[0].startswith(("int", "uint", "float")):
-        raise MeshFileError(f"has pixels of the type {source.dtypes[0]}, which are no heights")
+        raise MeshFileError(
+            f"has pixels of type {source.dtypes[0]}, which cannot be read as heights"
+        )
     if source.width < 2 or source.height < 2:
-        raise MeshFileError(f"has {source.width} x {source.height} pixels: no cell of four")
+        raise MeshFileError(
+            f"has {source.width} x {source.height} pixels, but at least 2 x 2 are required"
+        )
     if source.gcps[0] and source.transform.is_identity:
-        raise MeshFileError("is placed by control points: rectify it first (gdalwarp -tps)")
+        raise MeshFileError(
+            "is georeferenced by ground control points only. Rectify it first, for example with "
+            "`gdalwarp -tps`"
+        )
     rows, columns = source.block_shapes[0]
     interleaved = source.count if source.interleaving and source.interleaving.name == "pixel" else 1
     size = rows * columns * np.dtype(source.dtypes[0]).itemsize * interleaved
     if size > memory_share():
         raise MeshFileError(
-            f"has blocks of {columns:,} x {rows:,} pixels, each {bytes_of(size)}, of at most "
-            f"{bytes_of(memory_share())}: write it in tiles (gdal_translate -co TILED=YES)"
+            f"has blocks of {columns:,} x {rows:,} pixels, each {bytes_of(size)}. The limit is "
+            f"{bytes_of(memory_share())}. Rewrite it with tiles, for example with "
+            "`gdal_translate -co TILED=YES`"
         )
 
 
@@ -379,14 +395,15 @@ def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
                 )
             target = _zone_crs(source, middle)
             notes.append(
-                f"is in {crs_name(crs)}, whose metre is {scale} long on the ground here: brought "
-                f"to {crs_name(target)}"
+                f"uses {crs_name(crs)}, whose meter is {scale} long on the ground here. It was "
+                f"reprojected to {crs_name(target)}"
             )
     else:
         target = _zone_crs(source, middle)
     if error := _scale_error_at_edges(source, target):
         notes.append(
-            f"is so wide that lengths of {crs_name(target)} are wrong by {error:.1%} at its edges"
+            f"is so wide that lengths in {crs_name(target)} have an error of {error:.1%} at its "
+            "edges"
         )
     return target
 
@@ -402,7 +419,7 @@ def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
         with suppress(Exception):  # errors of GDAL have classes that rasterio keeps private
             place = transformed(crs, horizontal_part(target)[0], middle[None])[0]
     if problem := target_problem(epsg, *place.tolist()):
-        raise MeshFileError(f"cannot be brought to {problem} (world.epsg)")
+        raise MeshFileError(f"cannot be reprojected to world.epsg {problem}")
     return target
 
 
@@ -414,15 +431,16 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
     place = longitude_latitude(source.crs, *middle.tolist())
     if place is None:
         raise MeshFileError(
-            f"is in {crs_name(source.crs)}, and has no place on Earth by it: project it to metres "
-            "first (gdalwarp -t_srs SYSTEM IN OUT)"
+            f"uses {crs_name(source.crs)}, but its coordinates cannot be converted to longitude "
+            "and latitude. Project it to meters first, for example with `gdalwarp -t_srs SYSTEM "
+            "IN OUT`"
         )
     code = zone_in_metres(*place)
     width_deg = _width_deg(source)
     if width_deg > _WIDEST_DEG and code not in POLAR_EPSG:
         raise MeshFileError(
-            f"spans {width_deg:.4g} degrees, too wide for a UTM zone: give world.epsg, the code of "
-            "a projection in metres"
+            f"spans {width_deg:.4g} degrees, which is too wide for a UTM zone. Set world.epsg to "
+            "the code of a projection in meters"
         )
     return crs_of_code(code)
 
@@ -465,7 +483,7 @@ def _affine(file: Any, path: Path) -> Any:
             a, d, b, e, c, f = map(float, numbers)
             affine = Affine(a, b, c - (a + b) / 2, d, e, f - (d + e) / 2)
     if not np.isfinite(affine).all() or affine.determinant == 0:
-        raise MeshFileError(f"places its pixels by {[*affine][:6]}, which gives them no area")
+        raise MeshFileError(f"has the geotransform {[*affine][:6]}, which gives its pixels no area")
     return affine
 
 
@@ -540,7 +558,7 @@ class _RasterGrid:
         first = np.maximum(np.ceil(corners.min(axis=1) - 0.5 - 1e-6), 0)
         stop = np.minimum(np.floor(corners.max(axis=1) + 0.5 + 1e-6), size)
         if (stop - first < 2).any():
-            raise MeshFileError("has fewer than 2 x 2 pixels in the window: give a larger one")
+            raise MeshFileError("has fewer than 2 x 2 pixels in the window. Choose a larger window")
         first_column, first_row = first.astype(int).tolist()
         stop_column, stop_row = stop.astype(int).tolist()
         return (first_column, stop_column), (first_row, stop_row)
@@ -551,7 +569,7 @@ class _RasterGrid:
         if (np.maximum(lower, window[:2]) >= np.minimum(upper, window[2:])).any():
             (x_min, x_max), (y_min, y_max) = self.extent.T.tolist()
             raise MeshFileError(
-                f"has nothing in the window {[*window]}: it reaches from x {x_min:,.10g} to "
+                f"does not overlap the window {[*window]}. It extends from x {x_min:,.10g} to "
                 f"{x_max:,.10g} and from y {y_min:,.10g} to {y_max:,.10g}"
             )
 
@@ -565,7 +583,9 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
     from rasterio.vrt import WarpedVRT
 
     if step_m < grid.pixel_m * (1 - 1e-6):
-        raise MeshFileError(f"has pixels of {grid.pixel_m:.6g} m: step_m must not be less")
+        raise MeshFileError(
+            f"has a pixel size of {grid.pixel_m:.6g} m. The value of step_m must not be smaller"
+        )
     lower, upper = grid.extent
     if window is not None:
         grid.check_overlap(window)
@@ -573,12 +593,12 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
         upper = np.minimum(upper, window[2:])
     if (count := float(np.prod((upper - lower) / grid.pixel_m))) > _MAX_READ:
         raise MeshFileError(
-            f"would be made coarser from {count:,.0f} pixels, of at most {_MAX_READ:,}: give a "
-            "window too, or make it coarser first (gdal_translate -tr)"
+            f"has {count:,.0f} pixels to average, but the limit is {_MAX_READ:,}. Set a window "
+            "as well, or reduce the resolution first, for example with `gdal_translate -tr`"
         )
     columns, rows = np.ceil((upper - lower) / step_m - 1e-6).astype(int).tolist()
     if min(columns, rows) < 2:
-        raise MeshFileError("has fewer than 2 x 2 steps of step_m: give a smaller one")
+        raise MeshFileError("covers fewer than 2 x 2 steps of step_m. Choose a smaller value")
     # Whole cells have their middle at their mean.
     width_m, height_m = (upper - lower) / (columns, rows)
     affine = Affine(width_m, 0, lower[0], 0, -height_m, upper[1])
@@ -630,14 +650,16 @@ def _check_size(
     if count <= max_read:
         extent = [*np.floor(lower).tolist(), *np.ceil(upper).tolist()]
         raise MeshFileError(
-            f"has {sides[0]:,} x {sides[1]:,} pixels, {2 * count / 1e6:.0f} million triangles. In "
-            f"a scenario, scene: [{{file: {name}, step_m: {step:g}}}] takes means\nof them; not "
-            f"step_m but window: {window} takes the middle, and window: {extent} all"
+            f"has {sides[0]:,} x {sides[1]:,} pixels, which would make {2 * count / 1e6:.0f} "
+            f"million triangles. To average them, write\nscene: [{{file: {name}, step_m: "
+            f"{step:g}}}] in a scenario. Instead of step_m, window: {window} selects the center, "
+            f"and window: {extent} selects all pixels"
         )
     raise MeshFileError(
-        f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "
-        f"at most {bytes_of(memory_share())}, a quarter of the memory: give window: {window}"
-        f"{f' or step_m: {step:g}' * (count <= _MAX_READ)} in scene.files"
+        f"has {sides[0]:,} x {sides[1]:,} pixels, which would make a mesh of "
+        f"{bytes_of(count * _PIXEL_BYTES)}. The limit is {bytes_of(memory_share())}, a quarter "
+        f"of the memory. Set window: {window}{f' or step_m: {step:g}' * (count <= _MAX_READ)} in "
+        "scene.files"
     )
 
 
@@ -656,7 +678,7 @@ def _grid_mesh(
     """
     cells = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1] & valid[1:, 1:]
     if not cells.any():
-        raise MeshFileError("has no cell of four pixels with heights, only of those without")
+        raise MeshFileError("contains no 2 x 2 block of pixels with heights")
     used = np.zeros_like(valid)
     for part in (used[:-1, :-1], used[:-1, 1:], used[1:, :-1], used[1:, 1:]):
         part |= cells
@@ -682,7 +704,9 @@ def _height_unit_m(source: _Source, notes: list[str]) -> float:
     if stated:
         if (unit_m := unit_by_name(stated)) is not None:
             return unit_m
-        notes.append(f"has heights in {stated[:40]!r}, which is no known unit: taken in metres")
+        notes.append(
+            f"has heights in {stated[:40]!r}, which is not a known unit. Meters are assumed"
+        )
         return 1.0
     if source.up_m is not None:
         return source.up_m
@@ -695,8 +719,8 @@ def _height_unit_m(source: _Source, notes: list[str]) -> float:
         name, factor = source.crs.linear_units_factor
     if factor != 1:
         notes.append(
-            f"states no unit of heights: taken in {name}, as its coordinates are; "
-            '<file.unit="m"> takes them in metres'
+            f"states no height unit. The unit of its coordinates, {name}, is assumed. "
+            'To read heights in meters, use <file.unit="m">'
         )
     return float(factor)
 
@@ -707,21 +731,27 @@ def _notes(source: _Source, path: Path) -> list[str]:
     notes = []
     unit_m = 1.0 if source.local is None else source.local.unit_m
     if file.transform.is_identity and source.affine.f == file.height * unit_m:
-        notes.append(f"states no place: its pixels are taken as {unit_m:.6g} m, from x and y 0")
+        notes.append(
+            f"is not georeferenced. Pixels of {unit_m:.6g} m that start at x = 0 and y = 0 are "
+            "assumed"
+        )
     if source.local is not None:
         notes += [source.local.note] if source.local.note else []
     elif source.crs is None:
         notes.append(
-            "states no coordinate system: its coordinates are taken in metres (gdal_translate "
-            "-a_srs EPSG:CODE gives it one)"
+            "states no coordinate system. Coordinates in meters are assumed. To add a "
+            "coordinate system, use `gdal_translate -a_srs EPSG:CODE`"
         )
     if file.count > 1:
-        notes.append(f"has {file.count} bands: the first is taken for heights")
+        notes.append(f"has {file.count} bands. Heights are read from the first band")
     endings = (".msk", ".aux.xml") if source.crs is None else (".msk",)
     neglected = [path.name + ending for ending in endings if Path(f"{path}{ending}").is_file()]
     if neglected:
         listed = " and ".join(neglected)
-        notes.append(f"is read without {listed}: gdal_translate makes one file of it")
+        notes.append(
+            f"was read without {listed}. To include this content, convert the raster with "
+            "`gdal_translate`"
+        )
     return notes
 
 

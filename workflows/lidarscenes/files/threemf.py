@@ -123,7 +123,10 @@ def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.up_axis = "z"
     if grey_count := sum(model.grey_count for model in package.models.values()):
         words = plural(grey_count, "triangle")
-        content.notes.append(f"has textures or lacks colours, which leaves {words} grey")
+        content.notes.append(
+            f"contains textures, which are not supported, or lacks colors. As a result, {words} "
+            "became gray"
+        )
     return content
 
 
@@ -151,7 +154,7 @@ class _Package:
         for name in names:
             if name.lower() == "3d/3dmodel.model":
                 return name
-        raise ValueError("a ZIP archive without 3D/3dmodel.model")
+        raise ValueError("the archive does not contain 3D/3dmodel.model")
 
     def model(self, name: str) -> _Model:
         """Return an inner file, which is read on its first use."""
@@ -167,10 +170,13 @@ class _Package:
         The content is never longer than announced.
         """
         if name not in self._archive.namelist():
-            raise ValueError(f"its archive has no file {name[:80]!r}")
+            raise ValueError(f"the archive does not contain {name[:80]!r}")
         entry = self._archive.getinfo(name)
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise MeshFileError("is packed by a method other than Deflate: export it again")
+            raise MeshFileError(
+                "is compressed with a method other than Deflate, which is not supported. Export "
+                "it again with Deflate"
+            )
         self._allowance.take(entry.file_size)
         with self._archive.open(entry) as file:
             while piece := file.read(PIECE_BYTES):
@@ -183,7 +189,7 @@ class _Package:
         """
         objects = self.model(key[0]).objects
         if key[1] not in objects:
-            raise ValueError(f"object {key[1][:20]!r} is placed, but missing")
+            raise ValueError(f"object {key[1][:20]!r} is used but not defined")
         return objects[key[1]]
 
 
@@ -229,7 +235,7 @@ class _Model:
         except expat.ExpatError as error:
             if error.code not in AT_END:
                 raise
-            raise CutShortError(f"{name[:80]} ends within an element") from error
+            raise CutShortError(f"{name[:80]} ends inside an element") from error
         except (KeyError, OverflowError, ValueError) as error:
             raise ValueError(
                 f"line {parser.CurrentLineNumber} of {name[:80]}: {message_of(error).rstrip('.')}"
@@ -249,7 +255,7 @@ class _Model:
         elif tag in self._readers:
             self._readers[tag](attributes)
         elif tag in ("beamlattice", "booleanshape", "levelset"):
-            raise MeshFileError(f"has a <{tag}>, which is not supported: export it as triangles")
+            raise MeshFileError(f"contains <{tag}>, which is not supported. Export it as triangles")
 
     def _begin_group(self, attributes: dict[str, str]) -> None:
         """Begin a group of colours or materials."""
@@ -281,7 +287,10 @@ class _Model:
         for prefix in attributes.get("requiredextensions", "").split():
             extension = attributes.get(f"xmlns:{prefix}", prefix)
             if not _SUPPORTED.search(extension):
-                raise MeshFileError(f"needs {extension[:80]}, which is not supported")
+                raise MeshFileError(
+                    f"requires the extension {extension[:80]}, which is not supported. Export it "
+                    "without the extension"
+                )
 
     def _material(self, attributes: dict[str, str]) -> str:
         """Return the name of the material of a triangle's first corner, or an empty string."""
@@ -310,7 +319,7 @@ class _Model:
         if "transform" in attributes:
             numbers = np.array(attributes["transform"].split(), np.float64)
             if numbers.shape != (12,):
-                raise ValueError(f"a transform has {len(numbers)} numbers, and 12 were expected")
+                raise ValueError(f"a transform has {len(numbers)} numbers; expected 12")
             matrix[:3] = numbers.reshape(4, 3).T
         key = path.lstrip("/") or self._name, attributes["objectid"]
         return _Placement(key, attributes.get("partnumber", ""), matrix)

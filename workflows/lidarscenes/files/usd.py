@@ -55,8 +55,8 @@ from .child_process import Child, Frame
 from .usd_materials import MeshLook, UsdMaterials, material_pieces
 
 _LIMITS = {
-    "prims and copies": MAX_NODES,
-    "poses of what moves": 1_000_000,
+    "prims and instances": MAX_NODES,
+    "poses of moving objects": 1_000_000,
     "moving objects": 10_000,
 }
 USD_CORE_BYTES = 512 * 2**20  # bytes that usd-core takes for any file
@@ -68,9 +68,13 @@ def read_usd(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read all visible prims of a scene at its first time, and their motions or an animation."""
     if find_spec("pxr") is None:
         command = install_command("lidarpool[usd]")
-        raise MeshFileError(f"is OpenUSD, which usd-core reads: {command}")
+        raise MeshFileError(
+            f"is an OpenUSD file, which requires usd-core. Install it with `{command}`"
+        )
     if sys.platform == "win32":  # where a process has no limits of memory
-        raise MeshFileError("is OpenUSD, which is not read on Windows: export it as .glb")
+        raise MeshFileError(
+            "is an OpenUSD file, which is not supported on Windows. Export it as .glb"
+        )
     allowance = Allowance(0, SMALLER if options.animation is None else SHORTER)  # all files share
     with closing(_frames(path, options, allowance)) as frames:
         stage, _ = next(frames)
@@ -133,7 +137,7 @@ def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator
         for frame, arrays in frames:
             if frame["what"] == "too many":
                 limit = f"{_LIMITS[frame['of']]:,} {frame['of']}"
-                raise MeshFileError(f"has more than {limit}: export it in parts")
+                raise MeshFileError(f"has more than {limit}. Export it in parts")
             for file in map(Path, frame.get("files", ())):
                 if not (options.allows(file) or file.samefile(path)):
                     raise MeshFileError(outside(os.path.relpath(file, path.resolve().parent)))
@@ -152,7 +156,7 @@ def _polygon_mesh(
     corners = corners.astype(np.int64)
     if (sizes < 0).any() or sizes.sum() != len(corners):
         raise ValueError(
-            f"{name!r} has polygons of {sizes.sum():,} corners, {len(corners):,} are there"
+            f"{name!r} declares polygons with {sizes.sum():,} corners but contains {len(corners):,}"
         )
     solid = np.ones(len(sizes), bool)
     solid[holes[(holes >= 0) & (holes < len(sizes))]] = False
@@ -257,7 +261,7 @@ def _content(
             rotations = matmul(poses[:, :, :3], inverse(scale))
             times = (motion[:, 0] - frame["start"]) / frame["rate_hz"]
             if not (np.abs(times) < _LATEST_S).all():
-                raise ValueError("its times are not finite, or reach over 30 years")
+                raise ValueError("its times are not finite, or span more than 30 years")
             content.moving.append(
                 RigidPart(nodes[number][0], part.meshes, times, poses[:, :, 3], rotations)
             )
@@ -302,16 +306,16 @@ def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int])
     content.unit_m = stage["unit_m"]
     content.up_axis = stage["up_axis"]
     if not 0 < stage["unit_m"] < np.inf:
-        raise ValueError(f"its unit is {stage['unit_m']} metres")
+        raise ValueError(f"the unit is {stage['unit_m']} meters, but it must be a positive number")
     if stage["up_axis"] not in UP_AXES:
-        raise ValueError(f"its upAxis is {stage['up_axis'][:20]!r}")
-    content.turned = "as it states" if stage["up_stated"] else "as OpenUSD asks"
+        raise ValueError(f"the value of upAxis is {stage['up_axis'][:20]!r}, which is not an axis")
+    content.turned = "as the file states" if stage["up_stated"] else "the default of OpenUSD"
     if not stage["unit_stated"]:
-        content.unit_note = "states no unit and is taken in centimetres, as OpenUSD asks"
+        content.unit_note = "states no unit. Centimeters, the default of OpenUSD, are assumed"
     notes = content.notes
     notes += _notes(stage, counts)
     if notes and not (content.meshes or content.moving):
-        raise MeshFileError(f"holds no triangles, and {notes[0]}")
+        raise MeshFileError(f"contains no triangles. It {notes[0]}")
     return content
 
 
@@ -319,22 +323,34 @@ def _notes(stage: dict[str, Any], counts: dict[str, int]) -> Iterator[str]:
     """Yield notes on content that is not read, from a stage and counts of its prims."""
     moving, skinned, smooth = (counts.pop(k, 0) for k in ("moving", "skinned", "subdivided"))
     if stage["materialx"]:
-        yield "has materials in MaterialX files, which usd-core does not read: they are lacking"
+        yield (
+            "uses materials in MaterialX files, which usd-core does not support. These "
+            "materials were skipped"
+        )
     if names := [name[-80:] for name in stage["missing"]]:
         listed = ", ".join(map(repr, names[:3])) + ", …" * (len(names) > 3)
-        yield f"refers to what is not there or cannot be read, and lacks it: {listed}"
+        yield f"refers to content that does not exist or cannot be read and was skipped: {listed}"
     if counts:
         listed = ", ".join(f"{n} {kind}" for kind, n in counts.items())
-        yield f"is read without {listed}"
+        yield f"contains prims that were skipped: {listed}"
     if moving:
         yield (
-            f"moves {plural(moving, 'object')} otherwise than as a whole, or in copies: taken at "
-            "the first time, and still"
+            f"contains {plural(moving, 'object')} whose motion is not supported because it is a "
+            "deformation or a motion of instances. The first frame is used"
         )
     if stage["animations"] and len(stage["times_s"]) == 1:
-        yield "has skeletons that move: they stand still; actors move by animation: NAME"
+        yield (
+            "contains animated skeletons, which are static here. To animate an actor, set "
+            "animation: NAME"
+        )
     if skinned:
         bent = plural(skinned, "mesh", "meshes")
-        yield f"bends {bent} by skeletons in instances, which is not read: taken unbent"
+        yield (
+            f"contains {bent} deformed by skeletons in instances, which is not supported. The "
+            "undeformed shape is used"
+        )
     if smooth:
-        yield f"subdivides {plural(smooth, 'mesh', 'meshes')}: taken as modelled, coarse"
+        yield (
+            f"contains {plural(smooth, 'subdivision mesh', 'subdivision meshes')}. Subdivision "
+            "is not supported, and the coarse mesh is used"
+        )

@@ -109,7 +109,7 @@ class StageNodes:
             self._count(1)
         return self._numbers[key]
 
-    def _count(self, count: int, kind: str = "prims and copies") -> None:
+    def _count(self, count: int, kind: str = "prims and instances") -> None:
         """Count towards the limit of a kind.
 
         Raises TooManyError beyond the limit.
@@ -137,7 +137,7 @@ class StageNodes:
             return node
         if prim.IsA(UsdGeom.Gprim):
             if inherited.excluded:
-                self.counts["of purpose proxy or guide"] += 1
+                self.counts["with the purpose proxy or guide"] += 1
             else:
                 node[1] = self._mesh(prim)
         if prim.IsInstance():
@@ -207,7 +207,7 @@ class StageNodes:
             for start, stop in pairwise(poses):
                 added = _poses_up_to(prim, start, stop, max_offset, _MAX_HALVINGS)
                 sampled += added
-                self._count(len(added), "poses of what moves")
+                self._count(len(added), "poses of moving objects")
             return np.array([[pose.code, *pose.matrix[:3].ravel()] for pose in sampled])
         self.counts["moving"] += 1
         return None
@@ -229,8 +229,8 @@ class StageNodes:
         matrices = np.array(transforms, np.float64).reshape(-1, 4, 4).transpose(0, 2, 1)
         if len(matrices) != len(prototype_numbers):
             raise ValueError(
-                f"{instancer.GetPath()} has {len(prototype_numbers)} copies, and places for "
-                f"{len(matrices)}"
+                f"{instancer.GetPath()} has {len(prototype_numbers)} instances but transforms "
+                f"for {len(matrices)}"
             )
         mask = np.array(
             instancer.ComputeMaskAtTime(self._time) or np.ones(len(prototype_numbers)), bool
@@ -439,7 +439,7 @@ class Looks:
         properties: dict[str, Any] = {}
         if kind not in _SURFACES:
             if self._colours:
-                properties["colour"] = {"unread": f"its shader is {kind[:40]}"}
+                properties["colour"] = {"unread": f"its shader {kind[:40]} is not supported"}
         elif kind == "OmniPBR":
             if self._colours:
                 properties["colour"] = self._omniverse_colour(shader)
@@ -483,7 +483,7 @@ class Looks:
         if kind.startswith("UsdPrimvarReader_"):
             return {"values": str(_constant(shader.GetInput("varname")) or "")}
         if kind != "UsdUVTexture":
-            return {"unread": f"it is computed by {kind[:40]}"}
+            return {"unread": f"it is computed by {kind[:40]}, which is not supported"}
         names = ("file", "scale", "bias", "fallback", "sourceColorSpace", "wrapS", "wrapT")
         image, scale, bias, fallback, space, *wraps = (
             _constant(shader.GetInput(name)) for name in names
@@ -527,7 +527,7 @@ class Looks:
             step[2, :2] = offset or (0, 0)
             matrix = step @ matrix
             coordinate_input = shader.GetInput("in")
-        return {"unread": "its texture coordinates are computed in a way that is not read"}
+        return {"unread": "its texture coordinates are computed in an unsupported way"}
 
     def _image(self, asset: Any) -> int:
         """Write a new image, and return its number."""
@@ -539,11 +539,13 @@ class Looks:
         frame = {"what": "image", "number": number, "name": path[-80:], "unread": ""}
         data = b""
         if "<UDIM>" in path:
-            frame["unread"] = "is of several tiles"
+            frame["unread"] = "is a set of UDIM tiles, which is not supported"
         elif not os.path.isfile(outer):  # noqa: PTH113 - or a pipe, which would wait for ever
-            frame["unread"] = "is not there"
+            frame["unread"] = "does not exist"
         elif not outer.startswith(self._folders):
-            frame["unread"] = "is not in the scene's folder, name one that holds it as assets"
+            frame["unread"] = (
+                "is outside the scene's folder; name the folder that contains it as assets"
+            )
         elif asset := Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path)):
             data = asset.GetBuffer()
         self._write(frame, np.frombuffer(data, np.uint8))
@@ -670,7 +672,7 @@ def _reason(error: Exception, path: str) -> str:
     try:
         text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
     except UnicodeDecodeError:
-        return "its text is garbled"
+        return "its text is not valid UTF-8"
     text = text.replace(path, os.path.basename(path))  # noqa: PTH119
     return re.sub(r"pxrInternal\w+::", "", text)[:300]
 
@@ -694,7 +696,7 @@ def _checked_layers(path: str) -> list[Any]:
             outer = Ar.SplitPackageRelativePathOuter(full_name)[0]
             is_usual = os.path.isfile(outer) or os.path.isdir(outer)  # noqa: PTH112, PTH113
             if os.path.exists(outer) and not is_usual:  # noqa: PTH110
-                raise ValueError(f"it names {name[-80:]!r}, which is no plain file")
+                raise ValueError(f"it names {name[-80:]!r}, which is not a regular file")
             if name in layer.subLayerPaths and full_name not in names:
                 names.add(full_name)
                 layers.append(Sdf.Layer.FindOrOpen(full_name))

@@ -99,14 +99,17 @@ class MeshLook:
         if not name:  # a texture without coordinates has its value at zero everywhere
             return np.zeros((1, width)), np.zeros((len(face_indices), 3), np.int64)
         if name not in self._values:
-            raise MaskError(f"its mesh has no {name!r}")
+            raise MaskError(f"its mesh has no primvar {name!r}")
         interpolation, number = self._values[name]
         values = self._arrays[number]
         corners = self._value_indices.get(interpolation)
         if corners is None:
-            raise MaskError("its shape has no texture coordinates that are read")
+            raise MaskError("its shape has no supported texture coordinates")
         if values.shape[1] != width or not corners[face_indices].max(initial=-1) < len(values):
-            raise MaskError(f"{name!r} of its mesh has {len(values)} values of {values.shape[1]}")
+            raise MaskError(
+                f"the primvar {name!r} of its mesh has {len(values)} values with "
+                f"{values.shape[1]} components, which does not fit the mesh"
+            )
         return values.astype(np.float64), corners[face_indices]
 
 
@@ -149,7 +152,7 @@ class UsdMaterials:
         for colour_source in (source, source.get("instead", _DISPLAY)):
             with self.notes.without_colour(material["name"]):
                 if not self._allowance.fits(FACE_BYTES * len(face_indices)):
-                    raise MaskError("there are too many triangles")
+                    raise MaskError("the mesh has too many triangles")
                 if "unread" in colour_source:
                     raise MaskError(colour_source["unread"])
                 if "value" in colour_source:

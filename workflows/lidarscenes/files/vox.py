@@ -32,28 +32,35 @@ def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
     are not listed, or whose density is NaN, have no leaves.
     """
     if data.startswith(b"VOX "):
-        raise MeshFileError("is a model of MagicaVoxel: export it as .obj or .ply")
+        raise MeshFileError(
+            "is a MagicaVoxel model, which is not supported. Export it as .obj or .ply"
+        )
     if not data.lstrip().startswith(b"VOXEL SPACE"):
-        raise MeshFileError("is not of AMAPVox: it does not begin with VOXEL SPACE")
+        raise MeshFileError("is not an AMAPVox file, because it does not begin with VOXEL SPACE")
     table = _read_table(data)
     unknown = int(np.isnan(table.densities).sum())
     full = table.densities > 0
     if not full.any():
-        raise MeshFileError(f"has no voxel whose {table.density_name} is above 0")
+        raise MeshFileError(f"contains no voxel with {table.density_name} above 0")
     indices = table.indices[full].astype(np.int64)
     first = indices.min(axis=0)
     stop = indices.max(axis=0) + 1
-    Allowance(len(data), "take larger voxels, or a part").take(4 * int(np.prod(stop - first)))
+    Allowance(len(data), "use larger voxels or a smaller part").take(4 * int(np.prod(stop - first)))
     densities = np.zeros(stop - first, np.float32)
     densities[tuple((indices - first).T)] = table.densities[full]
     grid = table.grid
     mesh = _box_around(path.stem, densities, grid.min_corner + first * grid.edges_m, grid.edges_m)
     notes = []
     if unknown:
-        notes.append(f"knows nothing of {plural(unknown, 'voxel')} (NaN), which stay empty")
+        notes.append(
+            f"contains {plural(unknown, 'voxel')} without data (NaN). Voxels without data are "
+            "treated as empty"
+        )
     angles = table.header.get("lad_type", "").strip()
     if angles and angles.lower() != "spherical":
-        notes.append(f"has densities for {angles} leaves: give its object that leaf_angle")
+        notes.append(
+            f"states the leaf angle distribution {angles!r}. Set the same leaf_angle for its object"
+        )
     return Content([mesh], unit_m=1.0, up_axis="z", notes=notes)
 
 
@@ -82,7 +89,7 @@ def _read_table(data: bytes) -> _Table:
     """
     heading = re.search(rb"^[ \t]*i[ \t]+j[ \t]+k[ \t].*$", data, re.MULTILINE)
     if heading is None:
-        raise MeshFileError("has no row of names that begins with i j k")
+        raise MeshFileError("has no header row that begins with i j k")
     text = data[: heading.start()].decode("utf-8", "replace")
     header = {k.lower(): v for k, v in re.findall(r"#[ \t]*([\w-]+)[ \t]*[:=]([^#\n]*)", text)}
     columns = heading[0].decode("utf-8", "replace").split()
@@ -133,7 +140,7 @@ def _grid(header: dict[str, str]) -> _Grid:
         except (KeyError, ValueError):
             values = np.full(0, np.nan)
         if values.shape != (3,) or not np.isfinite(values).all():
-            raise MeshFileError(f"has no header #{name} with three numbers")
+            raise MeshFileError(f"has no header line #{name} with three numbers")
         return values
 
     min_corner = three("min_corner")
@@ -141,16 +148,16 @@ def _grid(header: dict[str, str]) -> _Grid:
     split = three("split")
     if (split != np.floor(split)).any() or (split < 1).any() or (split > MAX_VOXELS).any():
         raise MeshFileError(
-            f"has #split {_in_words(split)}; it must be whole numbers of 1 to {MAX_VOXELS:,}"
+            f"has #split {_spaced(split)}, but the values must be integers from 1 to {MAX_VOXELS:,}"
         )
     edges_m = three("res", 3) if "res" in header else (max_corner - min_corner) / split
     if not (edges_m > 0).all():
-        raise MeshFileError("has voxels without a size: #res, or #max_corner, is wrong")
+        raise MeshFileError("has voxels without a positive size. Correct #res or #max_corner")
     between = (max_corner - min_corner) / edges_m
     if not (np.abs(between - split) <= _MAX_COUNT_ERROR).all():
         raise MeshFileError(
-            f"contradicts itself: {_in_words(between)} voxels of #res are between its corners, and "
-            f" #split is {_in_words(split)}"
+            f"is inconsistent. Its corners span {_spaced(between)} voxels of #res, but #split is "
+            f"{_spaced(split)}"
         )
     return _Grid(split, min_corner, edges_m)
 
@@ -162,8 +169,8 @@ def _density_column(columns: list[str]) -> int:
     named = [row for row, name in enumerate(columns) if name.lower().startswith("pad")]
     if len(named) != 1:
         raise MeshFileError(
-            f"has no column {DENSITY}, nor one other whose name begins with pad: "
-            f"{' '.join(columns)[:200]}"
+            f"has neither a column {DENSITY} nor exactly one other column whose name begins with "
+            f"pad. Its columns are: {' '.join(columns)[:200]}"
         )
     return named[0]
 
@@ -173,22 +180,21 @@ def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
     is_bad = ~((indices == np.floor(indices)) & (indices >= 0) & (indices < shape)).all(axis=1)
     if is_bad.any():
         raise MeshFileError(
-            f"has a voxel {_in_words(indices[is_bad][0])}, but #split is {_in_words(shape)}"
+            f"contains the voxel {_spaced(indices[is_bad][0])}, which is outside the grid with "
+            f"#split {_spaced(shape)}"
         )
     _, ny, nz = shape
     repeated = np.diff(np.sort((indices[:, 0] * ny + indices[:, 1]) * nz + indices[:, 2])) == 0
     if repeated.any():
-        raise MeshFileError(
-            f"has {plural(int(repeated.sum()), 'row')} of voxels that it had before"
-        )
+        raise MeshFileError(f"contains {plural(int(repeated.sum()), 'duplicate row')}")
     is_bad = (density < 0) | (density > MAX_LEAF_DENSITY)
     if is_bad.any():
         raise MeshFileError(
-            f"has {density[is_bad][0]:g} m²/m³ in voxel {_in_words(indices[is_bad][0])}; a density "
-            f"is 0 to {MAX_LEAF_DENSITY:g}"
+            f"has a density of {density[is_bad][0]:g} m²/m³ in voxel "
+            f"{_spaced(indices[is_bad][0])}, but densities must be from 0 to {MAX_LEAF_DENSITY:g}"
         )
 
 
-def _in_words(numbers: Floats) -> str:
+def _spaced(numbers: Floats) -> str:
     """Return numbers with spaces between."""
     return " ".join(f"{number:g}" for number in numbers)

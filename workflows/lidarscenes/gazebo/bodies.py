@@ -108,7 +108,10 @@ class BodyReader:
         body = Body(Frames(WORLD_FRAME))
         self._fill(body, element, source)
         if body.size > MAX_NODES:
-            raise LidarError(f"it places more than {MAX_NODES:,} links and models: divide it.")
+            raise LidarError(
+                f"it contains more than {MAX_NODES:,} links and models. Divide it into several "
+                "files."
+            )
         return body
 
     def _fill(self, body: Body, element: Element, source: Source) -> None:
@@ -196,15 +199,18 @@ class BodyReader:
         """
         key = id(element)
         if key in self._open_elements:
-            raise LidarError("it includes itself, by its own files: remove an <include>.")
+            raise LidarError("it includes itself through its own files. Remove an <include>.")
         if len(self._open_elements) > _MAX_NESTED:
-            raise LidarError(f"more than {_MAX_NESTED} models are within each other.")
+            raise LidarError(f"models are nested more than {_MAX_NESTED} levels deep.")
         if key not in self._bodies:
             self._open_elements.append(key)
             body = Body(Frames(_MODEL_FRAME))
             self._fill(body, element, source)
             if body.size > MAX_NODES:
-                raise LidarError(f"it places more than {MAX_NODES:,} links and models: divide it.")
+                raise LidarError(
+                    f"it contains more than {MAX_NODES:,} links and models. Divide it into "
+                    "several files."
+                )
             self._bodies[key] = body
             self._open_elements.pop()
         return self._bodies[key]

@@ -98,7 +98,7 @@ def matrix_of(pose: Element) -> Floats:
     if is_quaternion:
         norm = length(values[3:])
         if not norm > _MIN_NORM:
-            raise LidarError(f"<pose> is {shown(text)}, whose quaternion has no length.")
+            raise LidarError(f"<pose> is {shown(text)}, whose quaternion has zero length.")
         x, y, z, w = values[3:] / norm
         return affine(matrices(np.array([[x, y, z, w]]))[0], values[:3])
     angles = values[3:] if pose.get("degrees") in ("true", "1") else np.degrees(values[3:])

@@ -47,16 +47,16 @@ def import_world(world: Path, folder: Path, assets: Sequence[Path]) -> list[str]
         If the world cannot be read, or has no lidar.
     """
     if len(assets) > 1:
-        raise LidarError("it is of Gazebo: give one folder, --assets DIR.")
+        raise LidarError("it is a Gazebo world, for which only one `--assets` folder is allowed.")
     loaded = _loaded(world, assets)
     lidars = [*lidars_of(loaded)]
     left_out = [*loaded.notes.remote_lines(), *unknown_sensors(loaded)]
     if not lidars:
-        reason = "".join(f" It {line}." for line in loaded.notes.remote_lines())
+        reason = "".join(f" It contains {line}." for line in loaded.notes.remote_lines())
         reason += "".join(f" {line}" for line in unknown_sensors(loaded))
         raise LidarError(
-            f"it has no lidar (gpu_lidar, gpu_ray, lidar, ray): lidarpool init --mesh "
-            f"{world.name} makes a scenario for a sensor of yours.{reason}"
+            "it contains no sensor of type gpu_lidar, gpu_ray, lidar or ray. To use another "
+            f"sensor, create a scenario with `lidarpool init --mesh {world.name}`.{reason}"
         )
     entry = {"file": world, **({"assets": assets[0]} if assets else {})}
     unseen = _unseen_objects(loaded, [lidar.mask for lidar in lidars], _folders(world, assets))

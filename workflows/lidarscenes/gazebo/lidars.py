@@ -32,11 +32,11 @@ _OTHER_SENSORS = (
 )
 _SCANS = ("horizontal", "vertical")
 _NOISE_LEFT_OUT = {
-    "mean": "a mean",
-    "bias_mean": "a bias",
-    "bias_stddev": "a random bias",
-    "dynamic_bias_stddev": "a bias that drifts",
-    "precision": "a step",
+    "mean": "the mean of the noise",
+    "bias_mean": "the bias of the noise",
+    "bias_stddev": "the random bias of the noise",
+    "dynamic_bias_stddev": "the drifting bias of the noise",
+    "precision": "the precision of the noise",
 }
 _MAX_NAMES = 12  # limit for the names that a line lists
 _RATE_HZ = 10.0  # default rate of sensors
@@ -73,7 +73,7 @@ def unknown_sensors(world: World) -> Iterator[str]:
             if kind not in (*LIDARS, *_OTHER_SENSORS):
                 name = scoped((*link.path, printable(element.get("name", ""))))
                 hint = did_you_mean(kind, LIDARS)
-                yield f"sensor {name!r} is of the unknown type {printable(kind)[:40]!r}.{hint}"
+                yield f"sensor {name!r} has the unknown type {printable(kind)[:40]!r}.{hint}"
 
 
 def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
@@ -83,7 +83,7 @@ def _unknown_elements(element: Element, figures: Element) -> Iterator[str]:
     parents += [child for scan in scans for name in _SCANS for child in scan.findall(name)]
     parents += [*figures.findall("range"), *figures.findall("noise"), *element.findall("noise")]
     if unknown := dict.fromkeys(tag for parent in parents for tag in unknown_children(parent)):
-        yield f"elements that are not read: {listed([*unknown], _MAX_NAMES)}"
+        yield f"elements that SDFormat does not define ({listed([*unknown], _MAX_NAMES)})"
 
 
 def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lidar:
@@ -100,7 +100,7 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
     rate_hz = numbers_of(element, "update_rate", 1, "0").item()
     if rate_hz <= 0:
         rate_hz = _RATE_HZ
-        left_out.append(f"no update_rate: it turns {_RATE_HZ:g} times a second")
+        left_out.append(f"a missing update_rate ({_RATE_HZ:g} Hz is used)")
     data: dict[str, Any] = {
         "name": f"{full_name} of Gazebo",
         "sources": {"all": "the world's <sensor>"},
@@ -113,7 +113,9 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
         data["optics"] = {"resolution_m": clean(resolution_m)}
     data |= _noise(element, figures, left_out)
     if element.get("type") in _COLLISION_LIDARS:
-        left_out.append("it meets collision shapes in Gazebo: geometry: collision of scene.files")
+        left_out.append(
+            "rays that hit collision shapes (to get them, set geometry: collision in scene.files)"
+        )
     return Lidar(
         name=full_name,
         sensor=name,
@@ -205,6 +207,6 @@ def _noise(element: Element, figures: Element, left_out: list[str]) -> dict[str,
     for name, words in _NOISE_LEFT_OUT.items():
         is_used = name != "precision" or kind == "gaussian_quantized"
         if is_used and numbers_of(noise, name, 1, "0").item():
-            left_out.append(f"{words} of its noise")
+            left_out.append(words)
     sigma_m = numbers_of(noise, "stddev", 1, "0", at_least=0).item()
     return {"performance": {"range_m": clean(sigma_m)}} if sigma_m and kind != "none" else {}

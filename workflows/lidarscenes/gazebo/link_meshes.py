@@ -204,7 +204,9 @@ class LinkMeshes:
         chosen = chosen or [mesh for mesh in meshes if mesh.name.lower() == name.lower()]
         if not chosen:
             names = listed([mesh.name for mesh in meshes], 4)
-            self.notes.unread_files[f"submesh {name!r} of {printable(uri)}"] = f"it has {names}"
+            self.notes.unread_files[f"submesh {name!r} of {printable(uri)}"] = (
+                f"the file contains {names}"
+            )
             return []
         if (part.findtext("center") or "").strip() in ("true", "1"):
             bounds = np.concatenate([mesh.bounds for mesh in chosen])
@@ -219,7 +221,7 @@ class LinkMeshes:
         if file is None:
             return []
         if file.path.suffix.lower() in (".tif", ".tiff", ".dem", ".hgt"):
-            self.notes.unread_files[printable(uri)] = "it is a raster: add it to scene.files"
+            self.notes.unread_files[printable(uri)] = "it is a raster. Add it to scene.files"
             return []
         self.allowance.add_file(file.path)
         try:
@@ -268,7 +270,7 @@ class LinkMeshes:
         Raises LidarError for an unusable file.
         """
         if file.path.suffix.lower() not in MESHES:
-            raise LidarError(f"Gazebo reads meshes of {' '.join(MESHES)}.")
+            raise LidarError(f"Gazebo supports only meshes in {', '.join(MESHES)} files.")
         # Gazebo ignores up-axes, of Collada and glTF, but not the unit of Collada.
         meshes = load_meshes(
             file.path,

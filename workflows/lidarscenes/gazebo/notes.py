@@ -85,45 +85,50 @@ class Notes:
         self.unknown |= dict.fromkeys(unknown_children(element))
 
     def remote_lines(self) -> Iterator[str]:
-        """Yield a clause on models that are too far away, if any."""
+        """Yield a phrase for the models that are too far away, if any."""
         if self.remote:
             names = listed([*self.remote], _MAX_NAMES)
-            yield f"has models that are 1,000 km and more away, or nowhere: left out are {names}"
+            yield (
+                f"models that are more than 1,000 km away or without a finite position ({names})"
+            )
 
     def lines(self) -> Iterator[str]:
         """Yield clauses that follow the file's name."""
-        yield from _line("lacks", "model", self.missing_models)
-        yield from _line("lacks", "file", self.missing_files)
+        yield from _line("model", self.missing_models)
+        yield from _line("file", self.missing_files)
         for name, reason in list(self.unread_files.items())[:_MAX_NAMES]:
-            yield f"names {name}, which is left out: {reason}"
+            yield f"refers to {name}, which was skipped: {reason.rstrip('.')}"
         if self.unknown:
-            yield f"has elements that are not read: {listed([*self.unknown], _MAX_NAMES)}"
+            yield (
+                "contains elements that are not supported and were skipped: "
+                f"{listed([*self.unknown], _MAX_NAMES)}"
+            )
         for links, reason in (
-            (self.without_visuals, "collision shapes and no visuals, and are left out"),
-            (self.hidden, "transparent visuals, which are left out"),
-            (self.invisible, "visuals with <visibility_flags> of 0, which are left out"),
-            (self.bright, "a <laser_retro> above 255, which counts as 255"),
+            (self.without_visuals, "without visuals, whose collision shapes were skipped"),
+            (self.hidden, "with fully transparent visuals, which were skipped"),
+            (self.invisible, "with visuals whose <visibility_flags> are 0, which were skipped"),
+            (self.bright, "with a <laser_retro> above 255, which was limited to 255"),
         ):
             if links:
-                yield f"has links that have {reason}: {listed([*links])}"
-        yield from self.remote_lines()
+                yield f"contains links {reason}: {listed([*links])}"
+        yield from (f"contains {line}, which were skipped" for line in self.remote_lines())
         yield from self.further
         yield from _first_lines([*self.of_meshes])
 
 
-def _line(verb: str, noun: str, names: Counter[str]) -> Iterator[str]:
+def _line(noun: str, names: Counter[str]) -> Iterator[str]:
     """Yield a clause on missing things, if any, with all names up to a limit."""
     if names:
-        count = plural(len(names), noun)
-        uses = f", in {sum(names.values()):,} places" if names.total() > len(names) else ""
-        pronoun = "which is" if len(names) == 1 else "which are"
-        yield f"{verb} {count}, {pronoun} left out{uses}: {listed([*names], _MAX_NAMES)}"
+        count = plural(len(names), f"missing {noun}")
+        uses = f" in {names.total():,} places" if names.total() > len(names) else ""
+        outcome = "It was skipped" if len(names) == 1 else "They were skipped"
+        yield f"refers to {count}{uses}: {listed([*names], _MAX_NAMES)}. {outcome}"
 
 
 def _first_lines(lines: Iterable[str], max_lines: int = 3) -> Iterator[str]:
     """Yield the first lines on meshes, and the number of further lines."""
     all_lines = [*lines]
-    yield from (f"names a mesh: {line}" for line in all_lines[:max_lines])
+    yield from (f"uses a mesh with a note: {line.rstrip('.')}" for line in all_lines[:max_lines])
     further = len(all_lines) - max_lines
     if further > 0:
-        yield f"names meshes with {plural(further, 'further note')}"
+        yield f"uses meshes with {plural(further, 'further note')}"

@@ -157,14 +157,14 @@ class Resources:
             roots = (root, *self.trusted)
             if not is_inside(resolved, roots):
                 raise LidarError(
-                    f"{printable(uri)!r} leads out of {root}: put the file there, or name its "
-                    "folder as assets."
+                    f"{printable(uri)!r} refers to a file outside {root}. Move the file there, "
+                    "or name its folder as assets."
                 )
             yield Source(path, next(f for f in roots if resolved.is_relative_to(f)))
         if refused is not None:
             raise LidarError(
-                f"{printable(uri)!r} is in {refused}, which has no {_CONFIGS[0]}: name the folder "
-                "that contains it as assets."
+                f"{printable(uri)!r} is in {refused}, which has no {_CONFIGS[0]}. Name the "
+                "folder that contains it as assets."
             )
 
     def _candidates(self, uri: str, source: Source) -> Iterator[Candidate]:

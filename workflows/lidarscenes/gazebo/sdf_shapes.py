@@ -83,7 +83,7 @@ def _plane(shape: Element) -> SceneMesh | None:
     normal = numbers_of(shape, "normal", 3, "0 0 1")
     size = length(normal)
     if not size > 0:
-        raise LidarError("<normal> of a <plane> has no direction.")
+        raise LidarError("<normal> of a <plane> has zero length.")
     x, y = (_sizes(shape, "size", 2, "1 1") / 2).tolist()
     if not x or not y:
         return None

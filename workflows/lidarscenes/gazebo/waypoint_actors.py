@@ -41,7 +41,7 @@ def actors_of(world: Element, source: Source, meshes: LinkMeshes, notes: Notes) 
             mesh = _skin(element, source, meshes)
             if mesh is None:
                 continue
-            notes.further["has actors, whose skins are at rest"] = None
+            notes.further["contains actors, whose skins are not animated"] = None
             times_s, poses = _waypoints(element, name, notes)
             if len(times_s) < 2:
                 actors.standing.append(PlacedNode(mesh, poses[0], name))
@@ -83,8 +83,8 @@ def _waypoints(actor: Element, name: str, notes: Notes) -> tuple[Floats, Floats]
         times_s, poses = _repeated(times_s, poses)
         if times_s[-1] < _LOOP_S:
             notes.further[
-                f"has an actor, {name}, with so many waypoints that it loops for "
-                f"{times_s[-1]:.4g} s alone"
+                f"contains the actor {name} with so many waypoints that its loop is repeated for "
+                f"only {times_s[-1]:.4g} s"
             ] = None
     return times_s + delay_s, poses
 

@@ -60,7 +60,7 @@ class GazeboOptions:
 
     geometry: Annotated[
         Literal["visual", "collision"],
-        about("of a world of Gazebo: its visual shapes, or those for collision", "collision"),
+        about("shapes that are read from a Gazebo world: visual or collision shapes", "collision"),
     ] = "visual"
 
 
@@ -159,11 +159,11 @@ def read_sdf(data: bytes, path: Path, options: ReadOptions) -> Content:
     content = content_of(world, options)[0]
     if not content.meshes and not content.moving:
         missing = [*world.notes.missing_models, *world.notes.missing_files]
-        reason = f": it lacks {listed(missing, 12)}" if missing else ""
+        reason = f". It refers to missing models or files: {listed(missing, 12)}" if missing else ""
         if world.notes.without_visuals:
-            reason += "; give geometry: collision, since links have collision shapes"
-        reason += "".join(f"; it {line}" for line in world.notes.remote_lines())
-        raise MeshFileError(f"has nothing that a lidar sees{reason}")
+            reason += ". Its links have collision shapes. To read them, set geometry: collision"
+        reason += "".join(f". It contains {line}" for line in world.notes.remote_lines())
+        raise MeshFileError(f"contains nothing that a lidar can detect{reason}")
     return content
 
 
@@ -209,9 +209,14 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
     """
     root = lenient_root(data)
     if root.tag == _OLD_ROOT:
-        raise MeshFileError("is of Gazebo before 1.9: convert it, gz sdf -k, with a Gazebo of then")
+        raise MeshFileError(
+            "has the format of Gazebo before version 1.9. Convert it with `gz sdf -k` of an old "
+            "Gazebo release"
+        )
     if root.tag not in ("sdf", "model", "world"):
-        raise MeshFileError(f"is XML, but no SDFormat: it begins with <{root.tag[:40]}>")
+        raise MeshFileError(
+            f"is an XML file, but not SDFormat. Its root element is <{root.tag[:40]}>"
+        )
     notes = Notes()
     allowance = Allowance(len(data), _ADVICE)
     resources = Resources.of_world(path, folders[1:])
@@ -240,7 +245,7 @@ def _world_element(root: Element, notes: Notes) -> Element:
         worlds = root.findall("world")
         if worlds:
             if len(worlds) > 1:
-                notes.further["has several worlds, of which the first is read"] = None
+                notes.further["contains several worlds. The first one was read"] = None
             return worlds[0]
     element = Element("world", {"name": "default"})
     element.extend([root] if root.tag == "model" else [*root])

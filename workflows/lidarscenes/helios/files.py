@@ -73,8 +73,8 @@ class Assets:
                 self.check(folder / name, name)
                 return folder / name
         raise LidarError(
-            f"there is no file {name!r} in the survey's folder or one above it: give the folder "
-            "that it starts from, --assets DIR."
+            f"the file {name!r} is neither in the folder of the survey nor in a folder above it. "
+            "Name the folder that its path starts from with --assets DIR."
         )
 
     def asset(self, reference: str, kind: str, home: Path) -> Asset:
@@ -83,9 +83,7 @@ class Assets:
         path = self.file(file) if file else home
         elements = {element.get("id", ""): element for element in self.root(path).findall(kind)}
         if name not in elements:
-            raise LidarError(
-                f"there is no <{kind}> {name!r} in {path}.{did_you_mean(name, elements)}"
-            )
+            raise LidarError(f"{path} has no <{kind}> {name!r}.{did_you_mean(name, elements)}")
         return Asset(elements[name], path)
 
     def settings(self, element: Element | None, home: Path, depth: int = 0) -> dict[str, str]:
@@ -96,7 +94,9 @@ class Assets:
         if (template := attributes.pop("template", None)) is None:
             return attributes
         if depth == _MAX_TEMPLATES:
-            raise LidarError(f"the template {template!r} names itself, or too many others.")
+            raise LidarError(
+                f"the template {template!r} refers to itself or to too many other templates."
+            )
         defaults = self.asset(template, element.tag, home)
         return self.settings(*defaults, depth + 1) | attributes
 
@@ -110,10 +110,11 @@ def _root(path: Path) -> Element:
         with explained(f"{path} cannot be read"):
             root = xml_root(read(path))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
-        raise LidarError(f"{path} is not readable XML: {error}.") from error
+        raise LidarError(f"{path} is not valid XML: {error}.") from error
     if root.tag != "document":
         raise LidarError(
-            f"{path} is XML, but not of HELIOS++: it begins with <{root.tag[:40]}>, not <document>."
+            f"{path} is an XML file, but not a HELIOS++ document. Its root element is "
+            f"<{root.tag[:40]}>."
         )
     return root
 

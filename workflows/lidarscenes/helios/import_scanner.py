@@ -84,16 +84,17 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
     lines = [line for scanner in scanners.values() for line in unsupported_features(scanner)]
     settings = _settings(files, reference.file, element)
     if settings is None:
-        lines.append("its rates: there are no <scannerSettings> for it, so they are the highest")
+        lines.append("missing <scannerSettings> (the highest rates are used)")
         settings = _highest_rates(first)
     devices = {name: device(scanner, settings) for name, scanner in scanners.items()}
     sensors = _merged(devices)
     if len(sensors) > MAX_SENSORS:
         raise LidarError(
-            f"its {len(sensors)} channels are a sensor each; a scenario has {MAX_SENSORS} at most."
+            f"its {len(sensors)} channels become separate sensors, but a scenario can have at "
+            f"most {MAX_SENSORS}."
         )
     if len(sensors) > 1:
-        lines.append(f"its {len(sensors)} channels are a sensor each")
+        lines.append(f"{len(sensors)} channels in one sensor (they become separate sensors)")
     _write(folder, survey.name, first, sensors, list(dict.fromkeys(lines)))
     return list(dict.fromkeys(lines))
 
@@ -108,13 +109,13 @@ def _element(files: Assets, reference: _Reference) -> Element:
     if reference.scanner:
         if reference.scanner not in by_id:
             hint = did_you_mean(reference.scanner, by_id)
-            raise LidarError(f"there is no <scanner> {reference.scanner!r} in the file.{hint}")
+            raise LidarError(f"the file has no <scanner> {reference.scanner!r}.{hint}")
         return by_id[reference.scanner]
     if len(elements) > 1:
         names = [*by_id]
         raise LidarError(
-            f"it has {len(elements)} scanners: name one, {reference.file.name}#{names[0]}. "
-            f"There are {listed(names, _MAX_NAMES)}."
+            f"it has {len(elements)} scanners. Name one, for example "
+            f"{reference.file.name}#{names[0]}. Its scanners are {listed(names, _MAX_NAMES)}."
         )
     return elements[0]
 
@@ -214,8 +215,8 @@ def _write(
             settings, first.number("maxNOR"), first.number("pulseLength_ns", 4)
         )
     head = [
-        f"From {program_file} of HELIOS++ by lidarpool import.",
-        *(f"Not as there: {line}." for line in lines),
+        f"Created from {program_file} (HELIOS++) by lidarpool import.",
+        *(f"Not supported: {line}." for line in lines),
     ]
     text = "".join(f"# {line}\n" for line in head) + yaml.safe_dump(content, sort_keys=False)
     (folder / SCENARIO_FILE).write_text(text, encoding="utf-8", newline="\n")

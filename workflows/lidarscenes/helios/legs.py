@@ -112,7 +112,7 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
             continue
         speed = number(leg.platform, "movePerSec_m", _SPEED)
         if speed <= 0:
-            raise LidarError(f"leg {leg.number}: movePerSec_m is {speed:g}; it never ends.")
+            raise LidarError(f"leg {leg.number}: movePerSec_m is {speed:g}; it must be above 0.")
         seconds = min(length / speed, leg.longest_s)
         if displacement[:2].any():
             yaw = float(np.degrees(np.arctan2(displacement[1], displacement[0])))
@@ -122,7 +122,7 @@ def moving_trajectory(legs: Sequence[Leg]) -> HeliosTrajectory:
         clock = clock + seconds + _BETWEEN_S
         position = target
     if not rows:
-        raise LidarError("its platform moves, and no two legs are at different places.")
+        raise LidarError("its platform moves, but all legs have the same position.")
     rows.append([clock + _AFTER_S, *position, yaw])
     return HeliosTrajectory(np.array(rows), stretches)
 
@@ -141,15 +141,15 @@ def standing_trajectory(legs: Sequence[Leg], heads: dict[int, float]) -> HeliosT
         seconds = min(heads[leg.number] or np.inf, leg.longest_s)
         if seconds == np.inf:
             raise LidarError(
-                f"leg {leg.number}: nothing moves, neither platform nor head, and there is no "
-                "maxDuration_s; it never ends."
+                f"leg {leg.number}: neither the platform nor the head moves, so the leg has no "
+                "end. Set maxDuration_s."
             )
         pose = [*leg.position, _FACING_Y_DEG]
         rows += [[clock, *pose], [clock + seconds, *pose]]
         stretches.append(Stretch(leg.number, True, clock, seconds))
         clock += seconds + _BETWEEN_S
     if not rows:
-        raise LidarError("no leg scans anything.")
+        raise LidarError("no leg has an active scanner.")
     rows.append([clock + _AFTER_S, *rows[-1][1:]])
     return HeliosTrajectory(np.array(rows), stretches)
 
@@ -161,7 +161,7 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
     """
     files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
-        raise LidarError("an interpolated platform needs one trajectory, the same in all legs.")
+        raise LidarError("all legs of an interpolated platform must name the same trajectory.")
     path = assets.file(files.pop())
     settings: dict[str, str] = {}
     for leg in reversed(legs):
@@ -170,10 +170,10 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
     try:
         columns["t"] = seconds_of(columns["t"], None, advice="HELIOS++ expects seconds")
     except ValueError as error:
-        raise LidarError(f"{path} is not a usable trajectory: {error}.") from error
+        raise LidarError(f"{path} cannot be used as a trajectory: {error}.") from error
     times, first = np.unique(columns["t"], return_index=True)
     if len(times) < 2:
-        raise LidarError(f"{path} is no trajectory: all its rows have one time.")
+        raise LidarError(f"{path} is not a trajectory, because all its rows have the same time.")
     columns = {name: column[first] for name, column in columns.items()}
     rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     if settings.get("interpolationDomain") != "position" and "yaw" in columns:
@@ -193,7 +193,9 @@ def _stretch_between(leg: Leg, first_s: float, last_s: float) -> Stretch:
     start = max(number(leg.platform, "tStart", first_s), first_s)
     stop = min(number(leg.platform, "tEnd", last_s), last_s, start + leg.longest_s)
     if stop <= start:
-        raise LidarError(f"leg {leg.number}: tStart and tEnd lie outside the trajectory.")
+        raise LidarError(
+            f"leg {leg.number}: tStart and tEnd are outside the time range of the trajectory."
+        )
     return Stretch(leg.number, leg.active, float(start - first_s), float(stop - start))
 
 
@@ -203,7 +205,7 @@ def _platform_rotation(kind: str, roll: float, pitch: float, yaw: float) -> Floa
         return rotation_about(_X, roll) @ rotation_about(_Y, pitch) @ rotation_about(_Z, yaw)
     if kind == "ARINC 705":
         return rotation_about(-_Z, yaw) @ rotation_about(_Y, roll) @ rotation_about(_X, pitch)
-    raise LidarError(f"rotationSpec is {kind!r}; there are ARINC 705 and CANONICAL.")
+    raise LidarError(f"rotationSpec is {kind!r}; it must be 'ARINC 705' or 'CANONICAL'.")
 
 
 def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
@@ -214,9 +216,9 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     try:
         rows = np.array([[float(word) for word in line.split(separator)] for line in lines])
     except ValueError as error:
-        raise LidarError(f"its trajectory has rows that are not alike: {error}.") from error
+        raise LidarError(f"its trajectory has invalid rows: {error}.") from error
     if rows.ndim != 2 or not np.isfinite(rows).all():
-        raise LidarError("its trajectory is not a table of numbers.")
+        raise LidarError("its trajectory is not a table of finite numbers.")
     width = rows.shape[1]
     header = re.search(r"^#\s*HEADER:(.*)$", text, re.MULTILINE)
     if any(f"{name}Index" in settings for name in default_names):
@@ -230,19 +232,20 @@ def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
         names = ["t", "x", "y", "z"] if width == 4 else default_names
     description = f"its trajectory has {width} columns, named {', '.join(names)}"
     if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
-        raise LidarError(f"{description}; it needs t, x, y and z.")
+        raise LidarError(f"{description}. It must have t, x, y and z.")
     used = [name for name in names if name]  # indices may leave columns out
     unknown = [name for name in used if name not in default_names]
     if unknown or len(set(used)) < len(used):
-        verb = "are" if unknown[1:] else "is"
-        fault = "a name is there twice"
+        fault = "A name occurs twice."
         if unknown:
-            fault = f"{', '.join(map(repr, unknown))} {verb} not known"
+            fault = f"Unknown names: {', '.join(map(repr, unknown))}."
         raise LidarError(
-            f"{description}, and {fault}: name those to read by their indices, such as tIndex and "
-            "xIndex, in platformSettings."
+            f"{description}. {fault} Select the columns by index with settings such as tIndex "
+            "and xIndex in platformSettings."
         )
     angles = {"roll", "pitch", "yaw"}.intersection(used)
     if angles and len(angles) < 3:
-        raise LidarError(f"{description}; it needs roll, pitch and yaw, or none of them.")
+        raise LidarError(
+            f"{description}. It must have all of roll, pitch and yaw, or none of them."
+        )
     return {name: column for name, column in zip(names, rows.T, strict=True) if name}

@@ -106,13 +106,13 @@ def unsupported_features(scanner: HeliosScanner) -> Iterator[str]:
     """Yield the features of a scanner that a scenario does not support, in words."""
     for tag in ("rangeError", "deflectionError", "headError"):
         if scanner.child(tag) is not None:
-            yield f"<{tag}> of {scanner.name}: errors by a formula"
+            yield f"<{tag}> of {scanner.name}"
     if "receivedEnergyMin_W" in scanner.values:
-        yield f"receivedEnergyMin_W of {scanner.name}: weak returns are kept"
+        yield f"receivedEnergyMin_W of {scanner.name} (weak returns are kept)"
     if (max_returns := int(scanner.number("maxNOR"))) > 1:
-        yield f"maxNOR={max_returns} of {scanner.name}: all returns of a pulse are kept"
+        yield f"maxNOR={max_returns} of {scanner.name} (all returns of a pulse are kept)"
     if scanner.values.get("optics") == "oscillating":
-        yield f"the slow turns of the mirror of {scanner.name}: it goes to and fro evenly"
+        yield f"turning points of the oscillating mirror of {scanner.name} (its speed is constant)"
 
 
 def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
@@ -130,7 +130,8 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     optics = scanner.values.get("optics", "")
     if optics not in ("rotating", *_OPTICS):
         raise LidarError(
-            f"{scanner.name} has the optics {optics!r}; there are rotating, {', '.join(_OPTICS)}."
+            f"{scanner.name} has the optics {optics!r}; it must be one of rotating, "
+            f"{', '.join(_OPTICS)}."
         )
     emitter = scanner.child("beamOrigin")
     line = _Line.from_settings(scanner, settings, pulse_hz) if optics == "rotating" else None
@@ -146,7 +147,7 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     return Device(
         data={
             "name": scanner.name,
-            "sources": {"all": "a HELIOS++ survey and what it names"},
+            "sources": {"all": "a HELIOS++ survey and the files that it refers to"},
             **data,
             "optics": {name: clean(value) for name, value in _light(scanner, settings).items()},
         },
@@ -206,13 +207,14 @@ def _turning_head(scanner: HeliosScanner, head: _Head, line: _Line | None) -> Sc
     vertical = abs(head.axis[2]) >= (1 - 1e-12) * np.linalg.norm(head.axis)
     if line is None or aim is None or not vertical:
         raise LidarError(
-            f"the head of {scanner.name} turns; only one with rotating optics may, whose lines "
-            "hold the axis z that it turns about."
+            f"the head of {scanner.name} rotates. This is supported only for rotating optics "
+            "whose scan lines contain the rotation axis z."
         )
     if head.range_deg * head.deg_per_s <= 0:
         raise LidarError(
-            f"the head of {scanner.name} turns at {head.deg_per_s:g} degrees a second from "
-            f"{head.start_deg:g}, never to {head.start_deg + head.range_deg:g}."
+            f"the head of {scanner.name} rotates from {head.start_deg:g} degrees at "
+            f"{head.deg_per_s:g} degrees per second, so it never reaches "
+            f"{head.start_deg + head.range_deg:g} degrees."
         )
     return line.turning(head.deg_per_s if head.axis[2] > 0 else -head.deg_per_s, aim), _HEAD
 
@@ -285,8 +287,8 @@ class _Line:
         last = min(floor((highest_deg + max_deg) / step_deg + _SLACK), pulses_per_line - 1)
         if last < first:
             raise LidarError(
-                f"lines of {scanner.name} from {lowest_deg:g} to {highest_deg:g} degrees hold no "
-                "pulse."
+                f"scan lines of {scanner.name} from {lowest_deg:g} to {highest_deg:g} degrees "
+                "contain no pulse."
             )
         return cls(
             first * step_deg - max_deg,
@@ -306,7 +308,7 @@ class _Line:
             If the mirror stands.
         """
         if not self.scan_hz:
-            raise LidarError("scanFreq_hz is 0, and no head turns.")
+            raise LidarError("scanFreq_hz is 0, and the head does not rotate.")
         width = self.count * self.step_deg
         mirror = {
             "motion": "sawtooth",
@@ -370,7 +372,10 @@ def _oscillating(
     half_deg = min(number(settings, "scanAngle_deg", 0), max_deg)
     firings = floor(pulse_hz / scan_hz + _SLACK)
     if half_deg <= 0 or not firings:
-        raise LidarError(f"{scanner.name} has no scanAngle_deg above 0, or no pulse in a line.")
+        raise LidarError(
+            f"{scanner.name} must have a scanAngle_deg above 0 and at least one pulse per scan "
+            "line."
+        )
     mirror = {"motion": "triangle", "width_deg": clean(2 * half_deg)}
     return _mirror(firings, pulse_hz / firings, mirror), _LINE
 
@@ -451,7 +456,7 @@ def _scan_hz(
     max_hz = scanner.number("scanFreqMax_Hz") or np.inf
     if not min_hz <= rate_hz <= max_hz or rate_hz <= 0:
         raise LidarError(
-            f"{scanner.name} cannot scan at scanFreq_hz {rate_hz:g}: {min_hz:g} to {max_hz:g}, "
-            "above 0."
+            f"{scanner.name} has a scanFreq_hz of {rate_hz:g}; it must be above 0 and from "
+            f"{min_hz:g} to {max_hz:g}."
         )
     return rate_hz

@@ -152,7 +152,8 @@ class HeliosScene:
                 self.parts += self._read(part, f"part {index}")
         if not self.parts:
             raise LidarError(
-                f"{name} has no part that can be read: only those of {' and '.join(_LOADERS)} are."
+                f"{name} has no part with a supported loader. Supported loaders are "
+                f"{' and '.join(_LOADERS)}."
             )
         for falling in self.parts:
             if falling.falls:
@@ -172,7 +173,7 @@ class HeliosScene:
             if kind == "detailedvoxels" and mode != "transmittive":
                 files_text = text.get("filepath") or text.get("efilepath", "")
                 self.unread.append(
-                    f"{name}, {kind} of {files_text}: intersectionMode {mode}, left out"
+                    f"{name}, {kind} of {files_text} with intersectionMode {mode} (skipped)"
                 )
                 return []
             if kind in _LOADERS:
@@ -196,7 +197,7 @@ class HeliosScene:
                 self._folder / f"{file.stem}-{number_of_part}.glb" for file in draft.files
             ]
         if "ladlut" in text:
-            self.unread.append(f"{name}, ladlut: leaf angles are spherical")
+            self.unread.append(f"ladlut in {name} (leaf angles are spherical)")
 
     @cached_property
     def _ground(self) -> Scene | None:
@@ -247,7 +248,7 @@ class HeliosScene:
                 if rows:  # micrometres and per cent
                     lengths, shares = np.array(sorted((float(x), float(y)) for x, y in rows)).T
                     return float(np.interp(wavelength_nm / 1000, lengths, shares) / 100)
-        self.unread.append(f"the spectrum {name!r}, which is not there: its reflectance is 0.5")
+        self.unread.append(f"the missing spectrum {name!r} (a reflectance of 0.5 is used)")
         return None
 
     def left_out(self) -> list[str]:
@@ -255,14 +256,14 @@ class HeliosScene:
         lines = []
         for tag, parts in self._moving.items():
             if len(parts) == 1:
-                lines.append(f"<{tag}> of {parts[0]}: it stands as it is at first")
+                lines.append(f"<{tag}> in {parts[0]} (the part is static)")
             elif parts:
                 several = f"{len(parts)} parts, {parts[0]} to {parts[-1]}"
-                lines.append(f"<{tag}> of {several}: they stand as they are at first")
+                lines.append(f"<{tag}> in {several} (the parts are static)")
         lines += self.unread
         if self._missing:
             positions = "; ".join(sorted(self._missing))
-            lines.append(f"onGround at {positions}: no ground there, so z is 0")
+            lines.append(f"onGround where there is no ground, at {positions} (z is 0)")
         return lines
 
 
@@ -292,8 +293,8 @@ class _PartDraft:
             self.falls = text.get("onGround", "0") != "0"
         else:
             raise LidarError(
-                f"the filter {kind!r} is not known; there are {', '.join(_LOADERS)}, rotate, "
-                "scale, translate."
+                f"the filter {kind!r} is unknown. Supported filters are {', '.join(_LOADERS)}, "
+                "rotate, scale and translate."
             )
 
     def parts(self, assets: Assets) -> list[HeliosPart]:
@@ -302,7 +303,7 @@ class _PartDraft:
         Raises LidarError without files.
         """
         if not self.files:
-            raise LidarError("no filter loads a file.")
+            raise LidarError("none of its filters loads a file.")
         return [
             HeliosPart(
                 assets=assets,
@@ -350,7 +351,9 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
     try:
         fits = re.compile(names)
     except re.error as error:
-        raise LidarError(f"efilepath is {text['efilepath']!r}: {error}.") from error
+        raise LidarError(
+            f"efilepath is {text['efilepath']!r}, which is not a valid regular expression: {error}."
+        ) from error
     for root in assets.folders:
         if (root / folder).is_dir():
             paths = sorted(p for p in (root / folder).iterdir() if fits.fullmatch(p.name))
@@ -358,7 +361,7 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
                 assets.check(path, text["efilepath"])
             if paths:
                 return paths
-    raise LidarError(f"no file fits the efilepath {text['efilepath']!r}.")
+    raise LidarError(f"no file matches the efilepath {text['efilepath']!r}.")
 
 
 def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
@@ -373,11 +376,13 @@ def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
     try:
         points = np.loadtxt(lines, comments="//", usecols=(0, 1, 2), ndmin=2)
     except ValueError as error:
-        raise LidarError(f"{path} has rows that are no points: {error}.") from error
+        raise LidarError(
+            f"{path} has rows that are not points: {str(error).rstrip('.')}."
+        ) from error
     if not (np.abs(points) <= MAX_COORDINATE_M).all():  # NaN is not either
         raise LidarError(
             f"{path} has points that are not finite, or more than {MAX_COORDINATE_M / 1000:,.0f} "
-            "km away: leave them out."
+            "km away. Remove these points."
         )
     return points, number(settings, "voxelSize", 1.0) or 1.0
 
@@ -400,5 +405,5 @@ def _numbers(text: str, count: int) -> Floats:
     except ValueError:
         values = np.full(0, np.nan)
     if values.shape != (count,) or not np.isfinite(values).all():
-        raise LidarError(f"{text!r} is not {count} number{'s' * (count > 1)}.")
+        raise LidarError(f"{text!r} must be {count} finite number{'s' * (count > 1)}.")
     return values

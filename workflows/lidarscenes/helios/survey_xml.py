@@ -87,7 +87,7 @@ def import_survey(
     survey = Path(survey)
     folder = Path(folder)
     if folder.exists():
-        raise LidarError(f"{folder} exists: name another folder, --out DIR.")
+        raise LidarError(f"{folder} already exists. Pass another folder with --out.")
     try:
         survey_import = _Import(survey, [Path(path) for path in assets], folder, surfels)
     except LidarError as error:
@@ -138,19 +138,19 @@ class _Import:
         self._sensors: dict[str, dict[str, Any]] = {}
         self._trajectory = self._read_legs()
         if not self._sensors:
-            raise LidarError("no leg scans anything.")
+            raise LidarError("no leg has an active scanner.")
         if len(self._sensors) > MAX_SENSORS:
             raise LidarError(
-                f"{len(self._sensors)} legs and channels scan; a scenario has {MAX_SENSORS} "
-                "sensors at most."
+                f"its active legs and channels make {len(self._sensors)} sensors, but a scenario "
+                f"can have at most {MAX_SENSORS}."
             )
         self._materials = self.scene.materials(self._first.number("wavelength_nm", 1064))
         if element.get("legRandomOffset", "false") in ("true", "1"):
-            self._notes.append("legRandomOffset: legs are where they say")
+            self._notes.append("legRandomOffset (legs have their stated positions)")
         if number(element, "numRuns", 1) > 1:
-            self._notes.append("numRuns: it is one run")
+            self._notes.append("numRuns (a single run is simulated)")
         if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
-            self._notes.append("maxFullwaveRange_ns: waveforms are as long as their echoes")
+            self._notes.append("maxFullwaveRange_ns (waveforms are as long as their echoes)")
         unsupported = (
             line for scanner in self._scanners.values() for line in unsupported_features(scanner)
         )
@@ -159,7 +159,7 @@ class _Import:
     def _asset(self, kind: str) -> Element:
         """Return the element that the survey names for a kind, such as «scanner»."""
         if not (reference := self._element.get(kind)):
-            raise LidarError(f"its <survey> names no {kind}.")
+            raise LidarError(f"its <survey> has no {kind}.")
         return self._assets.asset(reference, kind, self._home).element
 
     def _read_legs(self) -> HeliosTrajectory:
@@ -201,13 +201,14 @@ class _Import:
         kind = platform.get("type", "").lower()
         if kind in ("groundvehicle", "multicopter"):
             self._notes.append(
-                f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
+                f"driving dynamics of a {kind} (it moves straight from leg to leg at constant "
+                "speed)"
             )
         noise_tags = [
             e.tag for parent in (platform, self._element) for e in parent if "Noise" in e.tag
         ]
         if noise_tags:
-            self._notes.append(f"noise of the platform: {', '.join(noise_tags)}")
+            self._notes.append(f"platform noise ({', '.join(noise_tags)})")
         return kind in ("linearpath", "groundvehicle", "multicopter")
 
     def _devices(self, legs: Sequence[Leg]) -> dict[int, dict[str, Device]]:
@@ -237,7 +238,9 @@ class _Import:
             for mounted in by_channel.values()
         }
         if len(positions) > 1:
-            self._notes.append("places of channels beside each other: all leave from the first's")
+            self._notes.append(
+                "different positions of channels (all channels have the same position)"
+            )
         trajectory.rows[:, 1:4] += min(positions, default=(0, 0, 0))
         for stretch in trajectory.stretches:
             if not stretch.active:
@@ -296,7 +299,7 @@ class _Import:
             },
         }
         head = [
-            f"From the HELIOS++ survey {self._name!r} by lidarpool import.",
+            f"Created from the HELIOS++ survey {self._name!r} by lidarpool import.",
             *(f"Not supported: {line}." for line in self.left_out),
         ]
         text = "".join(f"# {line}\n" for line in head) + _dumped(data)

@@ -68,16 +68,16 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
         If the model cannot be read, or has no rangefinder.
     """
     if len(assets) > 1:
-        raise LidarError("it is of MuJoCo: give one folder, --assets DIR.")
+        raise LidarError("it is a MuJoCo model, for which only one `--assets` folder is allowed.")
     model = _loaded(path, assets)
     groups = _groups(model)
     left_out = _differences(model, groups)
     groups = {group: sites for group, sites in groups.items() if not _unusable(model, group.camera)}
     if not groups:
-        reason = "".join(f" {line}." for line in left_out)
+        reason = "".join(f" Not supported: {line}." for line in left_out)
         raise LidarError(
-            f"it has no rangefinder that becomes a sensor: lidarpool init --mesh {path.name} makes "
-            f"a scenario for a sensor of yours.{reason}"
+            "it has no rangefinder that can become a sensor. To use another sensor, create a "
+            f"scenario with `lidarpool init --mesh {path.name}`.{reason}"
         )
     names = unique_names([_name(model, group) for group in groups])
     lidars = [
@@ -242,13 +242,13 @@ def _unusable(model: Any, camera: int | None) -> str:
     if projections is not None and int(projections[camera]) == _ORTHOGRAPHIC:
         return "its rays are parallel"
     rays = math.prod(model.cam_resolution[camera].tolist())
-    return f"it has {rays:,} rays, of at most {_MAX_RAYS:,}" if rays > _MAX_RAYS else ""
+    return f"it has {rays:,} rays, and the limit is {_MAX_RAYS:,}" if rays > _MAX_RAYS else ""
 
 
 def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
     """Return what is not as in MuJoCo, a clause each."""
     lines = [
-        f"the rangefinder of {_name(model, group)!r}: {reason}"
+        f"the rangefinder of {_name(model, group)!r} ({reason})"
         for group in groups
         if (reason := _unusable(model, group.camera))
     ]
@@ -257,7 +257,7 @@ def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
     if further and seen_geoms(model, Choice(further, (), (), "body")):
         numbers = ", ".join(map(str, further))
         lines.append(
-            f"rangefinders also meet geoms of {'groups' if len(further) > 1 else 'group'} "
-            f"{numbers}: groups of scene.files"
+            f"rangefinder hits on geoms of {'groups' if len(further) > 1 else 'group'} {numbers} "
+            "(to get them, set groups in scene.files)"
         )
     return lines

@@ -51,7 +51,7 @@ from ..files.child_process import Child
 from .model_sources import check_sources
 
 MUJOCO_BYTES = 512 * 2**20  # bytes that MuJoCo takes for any file
-_ADVICE = "simplify its meshes, or give it in parts"
+_ADVICE = "simplify its meshes, or divide the model"
 # Half of the side of planes without a size: at least metres, and as a multiple of the model's size.
 _MIN_PLANE_M = 200.0
 _PLANE_SIZES = 5.0
@@ -66,14 +66,14 @@ class MujocoOptions:
 
     keyframe: Annotated[
         Text | None,
-        about("of a model of MuJoCo: the keyframe at which its bodies are", "home"),
+        about("keyframe that determines the poses of the bodies (MuJoCo models only)", "home"),
     ] = None
     groups: Annotated[
         Several[Annotated[int, Field(ge=0, le=5)]],
-        about("of a model of MuJoCo: groups of the geoms that are seen"),
+        about("groups of the geoms that are read (MuJoCo models only)"),
     ] = (0, 1, 2)
     exclude: Annotated[
-        Several[Text], about("of a model of MuJoCo: bodies and geoms that are left out")
+        Several[Text], about("bodies and geoms that are not read (MuJoCo models only)")
     ] = ()
 
 
@@ -89,7 +89,9 @@ def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.notes = _notes(model, options)
     if not content.meshes and not content.skipped:
         groups = tuple(options.own.groups)
-        raise MeshFileError(f"has nothing that a lidar sees in the groups {groups}: give groups")
+        raise MeshFileError(
+            f"contains nothing that a lidar can detect in the groups {groups}. Set groups"
+        )
     return content
 
 
@@ -107,9 +109,11 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
     check_sources(data, path, options, allowance)
     if find_spec("mujoco") is None:
         command = install_command("mujoco")
-        raise MeshFileError(f"is a model of MuJoCo, which MuJoCo reads: {command}")
+        raise MeshFileError(
+            f"is a MuJoCo model, which requires the package mujoco. Install it with `{command}`"
+        )
     if sys.platform == "win32":  # where a process has no limits of memory
-        raise MeshFileError("is a model of MuJoCo, which is not read on Windows")
+        raise MeshFileError("is a MuJoCo model, which is not supported on Windows")
     request = {"keyframe": options.own.keyframe, "colours": options.colours}
     with TemporaryDirectory() as folder:
         child = Child(
@@ -183,7 +187,9 @@ def _choice(model: Any, options: MujocoOptions, bodies: list[int], geoms: list[i
     choice = Choice(options.groups, bodies, geoms, "body", plane_m=plane_m)
     seen = np.array(seen_geoms(model, choice), np.int64)
     if len(seen) > MAX_NODES:
-        raise MeshFileError(f"has {len(seen):,} geoms, of at most {MAX_NODES:,}: give it in parts")
+        raise MeshFileError(
+            f"has {len(seen):,} geoms, and the limit is {MAX_NODES:,}. Divide the model"
+        )
     return choice._replace(sag_m=_sag_m(model, seen))
 
 
@@ -240,9 +246,15 @@ def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:
 
 def _notes(model: Any, options: ReadOptions) -> list[str]:
     """Return notes on what is not in the scene, as clauses that follow the file's name."""
-    notes = [f"has {soft}, which are left out"] if (soft := soft_bodies(model)) else []
+    notes = (
+        [f"contains soft bodies, which were skipped: {soft}"]
+        if (soft := soft_bodies(model))
+        else []
+    )
     if model.warnings:
-        notes.append(f"makes MuJoCo warn: {listed([text.strip() for text in model.warnings], 3)}")
+        notes.append(
+            f"causes warnings in MuJoCo: {listed([text.strip() for text in model.warnings], 3)}"
+        )
     if not options.masks:
         return notes
     transparent = MaskNotes()

@@ -23,12 +23,12 @@ _OF_XML = ("include", "model")  # elements that name further files of MJCF
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
 _MAX_FILES = 20_000
 _OTHER_ROOTS = {  # {root element of other XML files: advice}
-    "robot": "is a robot in URDF: give it the ending .urdf",
-    "sdf": "is a world of Gazebo: give it the ending .sdf",
-    "document": "is no model of MuJoCo, and perhaps a survey of HELIOS++: lidarpool import reads "
-    "these",
-    "fcd-export": "is no model of MuJoCo but floating car data of SUMO: name it in traffic.file of "
-    "a scenario",
+    "robot": "is a URDF robot. Change its extension to .urdf",
+    "sdf": "is a Gazebo world. Change its extension to .sdf",
+    "document": "is not a MuJoCo model but may be a HELIOS++ survey. Convert it with "
+    "`lidarpool import`",
+    "fcd-export": "is not a MuJoCo model but SUMO floating car data. Name it in traffic.file of a "
+    "scenario",
 }
 
 
@@ -46,7 +46,7 @@ def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allo
     """
     root = lenient_root(data)
     if root.tag != ROOT:
-        advice = "is XML, but no model of MuJoCo: it begins with <{}>"
+        advice = "is an XML file, but not a MuJoCo model. Its root element is <{}>"
         raise MeshFileError(_OTHER_ROOTS.get(root.tag, advice.format(root.tag[:40])))
     home = path.resolve().parent
     roots = {path.resolve(): root}  # {file: its root element}
@@ -76,7 +76,7 @@ def check_sources(data: bytes, path: Path, options: ReadOptions, allowance: Allo
 def _count(count: int) -> None:
     """Raise MeshFileError if a model names too many files."""
     if count > _MAX_FILES:
-        raise MeshFileError(f"names more than {_MAX_FILES:,} files: give it in parts")
+        raise MeshFileError(f"refers to more than {_MAX_FILES:,} files. Divide the model")
 
 
 def _names_of(root: Element, tags: tuple[str, ...] = ()) -> Iterator[str]:
@@ -118,5 +118,7 @@ def _included_root(file: Path) -> Element:
     except ValueError as error:
         raise ValueError(f"{file.name}: {error}") from error
     if root.tag not in _INCLUDED_ROOTS:
-        raise ValueError(f"{file.name} begins with <{root.tag[:40]}>, which is not MuJoCo's")
+        raise ValueError(
+            f"{file.name} has the root element <{root.tag[:40]}>, which MuJoCo does not define"
+        )
     return root

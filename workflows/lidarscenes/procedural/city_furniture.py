@@ -137,8 +137,9 @@ def _choose(weights: Floats, count: int, plural: str, rng: np.random.Generator) 
     """
     if len(weights) < count:
         raise LidarError(
-            f"The city has room for {len(weights):,} {plural}, not {count:,}: give it more "
-            f"triangles, which make it larger, or take fewer {plural}."
+            f"The city has room for {len(weights):,} {plural}, but {count:,} were requested. "
+            "Increase the number of triangles, which enlarges the city, or request fewer "
+            f"{plural}."
         )
     return rng.choice(len(weights), count, replace=False, p=weights / weights.sum())
 

@@ -98,8 +98,8 @@ def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[SceneI
     fits &= np.abs(positions[:, :2]).max(axis=1) < side_m / 2 - _EDGE_M
     if fits.sum() < count:
         raise LidarError(
-            f"The terrain has room for {fits.sum():,} trees, not {count:,}: make it larger, or "
-            "take fewer trees."
+            f"The terrain has room for {fits.sum():,} trees, but {count:,} were requested. Make "
+            "the terrain larger, or request fewer trees."
         )
     line = np.linspace(0, 1, cells) * min(side_m / _WOODS_M, cells / _WOOD_CELLS)
     density = np.exp(_DENSER * _noise(line, line, rng)).reshape(-1) * fits

@@ -25,7 +25,9 @@ def number(element: Element, name: str, default: float | None = None) -> float:
     text = element.get(name)
     if not text:
         if default is None:
-            raise MeshFileError(f"has a <{element.tag}> without {name}: correct it")
+            raise MeshFileError(
+                f"contains <{element.tag}> without the attribute {name}. Add the attribute"
+            )
         return default
     try:
         value = float(text)
@@ -33,7 +35,8 @@ def number(element: Element, name: str, default: float | None = None) -> float:
         value = float("nan")
     if not isfinite(value):
         raise MeshFileError(
-            f"has a <{element.tag}> with {name} {text[:MAX_SHOWN]!r}, not a number: correct it"
+            f"contains <{element.tag}> with {name} {text[:MAX_SHOWN]!r}, which is not a number. "
+            "Correct the value"
         )
     return value
 
@@ -46,7 +49,8 @@ def positive(element: Element, name: str, default: float | None = None) -> float
     value = number(element, name, default)
     if value < 0:
         raise MeshFileError(
-            f"has a <{element.tag}> with {name} {value:g}, which is negative: correct it"
+            f"contains <{element.tag}> with {name} {value:g}, which must not be negative. "
+            "Correct the value"
         )
     return value
 

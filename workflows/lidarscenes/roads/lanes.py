@@ -127,7 +127,9 @@ class LaneSection:
         ]
         numbers = [lane.number for lane in lanes]
         if len(set(numbers)) < len(numbers):
-            raise MeshFileError("has a <laneSection> with two lanes of the same id: correct it")
+            raise MeshFileError(
+                "contains <laneSection> with two lanes of the same id. Correct the ids"
+            )
         lanes.sort(key=lambda lane: abs(lane.number))
         self.lanes = {side: [lane for lane in lanes if lane.side == side] for side in (1, -1)}
         self.middle = next((lane for lane in lanes if not lane.number), None)

@@ -44,7 +44,7 @@ from .signals import SignalBuilder
 # vehicles drive are hit.
 _SINK_OF_NONE_M = 0.005
 _SINK_M = 0.002
-_SMALLER = "give a larger sag_m, or divide the file"
+_SMALLER = "use a larger sag_m, or divide the file"
 _KNOWN = ("header", "road", "junction", "junctionGroup", "controller", "station")
 _KNOWN_OF_JUNCTIONS = ("connection", "priority", "controller", "surface", "crossPath")
 _UTM = re.compile(r"\+proj=utm\b.*\+zone=(\d{1,2})\b")
@@ -60,7 +60,9 @@ class RoadOptions:
 
     sag_m: Annotated[
         float,
-        about("of roads (.xodr): largest distance of triangles from curves, metres", gt=0, le=1),
+        about(
+            "maximum distance in meters between curves and their triangles (.xodr only)", gt=0, le=1
+        ),
     ] = 0.01
 
 
@@ -71,10 +73,14 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "OpenDRIVE":
-        raise MeshFileError(f"is XML, but not OpenDRIVE: it begins with <{root.tag[:40]}>")
+        raise MeshFileError(
+            f"is an XML file, but not OpenDRIVE. Its root element is <{root.tag[:40]}>"
+        )
     header = root.find("header")
     if header is not None and number(header, "revMajor", 1.0) > 1:
-        raise MeshFileError(f"is OpenDRIVE {header.get('revMajor')}, and 1.4 to 1.8 are read")
+        raise MeshFileError(
+            f"uses OpenDRIVE {header.get('revMajor')}, but only versions 1.4 to 1.8 are supported"
+        )
     unread = UnreadElements()
     unread.check(root, _KNOWN)
     for junction in root.iterfind("junction"):
@@ -198,7 +204,7 @@ def _notes(
         notes = _reference_notes(header, middle_of(meshes))
     listed = str(unread)
     if listed:
-        notes.append(f"is read without {listed}")
+        notes.append(f"contains elements that were skipped: {listed}")
     return notes
 
 
@@ -223,19 +229,18 @@ def _reference_notes(header: Element, middle: Floats) -> list[str]:
         moves = [f"translation [{x:.12g}, {y:.12g}, {z:.9g}]"]
         if heading:
             moves.append(f"rotation_deg [0, 0, {np.degrees(heading):.9g}]")
-        verb = "move" if heading else "moves"
         where = system if text else "its coordinate system"
-        all_of_it = "" if heading else f"; {world_advice(x, y, z)}"
+        all_of_it = "" if heading else f". {world_advice(x, y, z)}"
         return [
-            f"has an offset, which is not applied: {' and '.join(moves)} {verb} it into {where}"
-            f"{all_of_it}"
+            f"contains an offset, which was not applied. To move the roads to {where}, use "
+            f"{' and '.join(moves)}{all_of_it}"
         ]
     if problem:
-        return [f"is in {system}"]
+        return [f"uses {system}"]
     if epsg:
-        return [f"is in EPSG:{epsg}: <world.epsg={epsg}> writes that to LAS"]
+        return [f"uses EPSG:{epsg}. To write this code to LAS files, use <world.epsg={epsg}>"]
     if text:
-        return [f"is in {system}, which is not used"]
+        return [f"uses {system}, which was ignored"]
     return []
 
 

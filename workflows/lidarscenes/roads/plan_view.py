@@ -161,8 +161,8 @@ class PlanTable:
         if shape is None:
             tags = ", ".join(child.tag for child in geometry) or "nothing"
             raise MeshFileError(
-                f"has a <geometry> of {tags[:40]}, not line, arc, spiral, poly3 or paramPoly3: "
-                "correct it"
+                f"contains <geometry> with {tags[:40]}; expected line, arc, spiral, poly3 or "
+                "paramPoly3"
             )
         stated_length = positive(geometry, "length")
         if shape.tag in ("poly3", "paramPoly3"):
@@ -204,7 +204,10 @@ class PlanTable:
         lengths = np.diff(parameters) * (speeds[1:] + speeds[:-1]) / 2
         distances = np.append(0, np.add.accumulate(lengths))
         if not (0 < distances[-1] < np.inf and speeds.min() > _MIN_SPEED * speeds.max()):
-            raise MeshFileError(f"has a <{shape.tag}> that has no length or stops: correct it")
+            raise MeshFileError(
+                f"contains <{shape.tag}> with zero length or with a point where its speed is "
+                "zero. Correct its parameters"
+            )
         if is_normalized:  # the end of the parameters is the end of the length
             distances = distances * (length / distances[-1])
         x, y, heading = _origin(geometry)

@@ -67,7 +67,8 @@ class Road:
         self.length = positive(element, "length")
         if self.length > MAX_ROAD_M:
             raise MeshFileError(
-                f"has a road {self.name!r} of {self.length:g} m: correct its length"
+                f"contains the road {self.name!r} with a length of {self.length:g} m, which "
+                f"exceeds {MAX_ROAD_M:,.0f} m. Correct its length"
             )
         self.in_junction = (element.get("junction") or "-1") != "-1"
         self.offset = 0.0  # offset of the road in the table of reference lines, m
@@ -98,19 +99,19 @@ class Road:
         """
         geometries = self.element.findall("planView/geometry")
         if not geometries:
-            raise MeshFileError(f"has a road {self.name!r} without geometry: correct it")
+            raise MeshFileError(f"contains the road {self.name!r} without geometry. Add geometry")
         geometries.sort(key=lambda geometry: number(geometry, "s"))
         last = geometries[-1]
         end = positive(last, "s") + positive(last, "length")
         if self.length - end > _MAX_MISSING * self.length:
             raise MeshFileError(
-                f"has a road {self.name!r} of {self.length:,.9g} m, whose geometry ends at "
-                f"{end:,.9g} m: correct its length, or add geometry"
+                f"contains the road {self.name!r} with a length of {self.length:,.9g} m, but its "
+                f"geometry ends at {end:,.9g} m. Correct its length or add geometry"
             )
         self.offset = offset
         self.geometry_starts = table.add(geometries, offset, self.length)
         if not len(self.geometry_starts) and self.length > 0:
-            raise MeshFileError(f"has a road {self.name!r} without geometry: correct it")
+            raise MeshFileError(f"contains the road {self.name!r} without geometry. Add geometry")
         return offset + self.length + _GAP_M
 
     @cached_property

@@ -116,10 +116,11 @@ class Robot:
     def summary(self) -> str:
         """Numbers of links, moving joints and triangles, in words."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
-        verb = "moves" if len(self.moving) == 1 else "move"
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
         return f"{plural(len(self.links), 'link')}, {plural(triangles, 'triangle')}; " + (
-            f"{len(self.moving):,} of its joints {verb}: {moving}" if moving else "no joint moves"
+            f"{plural(len(self.moving), 'movable joint')}: {moving}"
+            if moving
+            else "no movable joints"
         )
 
     @cached_property
@@ -279,7 +280,7 @@ class Robot:
         if isinstance(joints, (str, Path)):
             table = self._read_values(Path(joints), ignore, time_unit)
         elif time_unit is not None:
-            raise LidarError("time_unit is of a file of joints: give time_s in seconds.")
+            raise LidarError("time_unit applies only to a joint file. Give time_s in seconds.")
         elif joints is not None:
             table = {name: as_array(name, value).reshape(-1) for name, value in joints.items()}
         times = table.pop("time_s", np.zeros(1))
@@ -296,15 +297,15 @@ class Robot:
         for name, value in table.items():
             if name not in self.moving:
                 raise LidarError(
-                    f"{self.name} has no joint {name!r} that moves.{name_hint(name, self.moving)}"
+                    f"{self.name} has no movable joint {name!r}.{name_hint(name, self.moving)}"
                 )
             if value.shape != times.shape or not np.isfinite(value).all():
                 raise LidarError(
-                    f"The values of joint {name!r} must be finite, one for each time_s "
-                    f"({len(times)}), or one without time_s; there are {value.size}."
+                    f"The values of joint {name!r} must be finite, with one value for each time_s "
+                    f"({len(times)}), or a single value without time_s. It has {value.size}."
                 )
         if not (len(times) and np.isfinite(times).all() and (np.diff(times) > 0).all()):
-            raise LidarError("time_s of joints must be finite, and ascend.")
+            raise LidarError("The values of time_s must be finite and strictly increasing.")
 
     def _moving_joints(self) -> dict[str, Joint]:
         """Return the joints that move, {name: joint}."""
@@ -334,8 +335,8 @@ class Robot:
             max_value = table[name].max()
             if min_value < lower - 1e-6 or max_value > upper + 1e-6:
                 tell(
-                    f"{self.name}: joint {name} goes from {min_value:.4g} to {max_value:.4g}, "
-                    f"beyond its limits of {lower:.4g} to {upper:.4g}"
+                    f"{self.name}: joint {name} has values from {min_value:.4g} to "
+                    f"{max_value:.4g}, which exceed its limits of {lower:.4g} to {upper:.4g}."
                 )
 
     def _read_values(
@@ -367,12 +368,12 @@ class Robot:
             )
         except (OSError, ValueError, LidarError) as error:
             raise LidarError(
-                f"{path} is not a usable table of joints: {message_of(error)}"
+                f"{path} cannot be used as a joint table: {message_of(error)}"
             ) from error
         if len(table) < 2:
             raise LidarError(
-                f"{path} has values of no joint that moves: name its columns as the joints of "
-                f"{self.name} are, such as {', '.join(self.moving[:3])}."
+                f"{path} has no column for a movable joint. Name its columns like the joints of "
+                f"{self.name}, for example {', '.join(self.moving[:3])}."
             )
         return table
 
@@ -499,8 +500,8 @@ class LinkPath:
         start_s, stop_s = self.times_s[[0, -1]]
         if self.hinges and max(start_s - first_s, last_s - stop_s) > _LATE_S:
             raise LidarError(
-                f"The joints have values from {start_s:.9g} to {stop_s:.9g} s; poses are asked for "
-                f"from {first_s:.9g} to {last_s:.9g} s."
+                f"The joints have values from {start_s:.9g} to {stop_s:.9g} s, but poses from "
+                f"{first_s:.9g} to {last_s:.9g} s were requested."
             )
         return moments_s
 

@@ -111,7 +111,7 @@ def load_robot(
                     meshes[link] = join_meshes(link, parts)
         reader.tell_left_out()
         if not meshes:
-            raise LidarError("no link has a <visual> with triangles: there is nothing to see.")
+            raise LidarError("no link has a <visual> with triangles.")
     return Robot(name, tuple(order), {link: joints[link] for link in order[1:]}, meshes)
 
 
@@ -124,7 +124,7 @@ def _read_root(path: Path) -> tuple[Element, int]:
         raise LidarError(f"{path} cannot be read: {reason}.") from error
     target = path.name.removesuffix(".xacro").removesuffix(".urdf")
     target += ".expanded" * (path.suffix != ".xacro")  # so that the file is not overwritten
-    expand = f"{path} is xacro: expand it first: xacro {path.name} > {target}.urdf"
+    expand = f"{path} is a xacro file. Expand it first with `xacro {path.name} > {target}.urdf`."
     if path.suffix.lower() == ".xacro":
         raise LidarError(expand)
     try:
@@ -132,12 +132,16 @@ def _read_root(path: Path) -> tuple[Element, int]:
     except (ParseError, ValueError, LookupError) as error:  # an unknown encoding
         if b"<xacro:" in data:
             raise LidarError(expand) from error
-        raise LidarError(f"{path} is no URDF that can be read: {error}.") from error
+        raise LidarError(f"{path} cannot be read as URDF: {error}.") from error
     if any("xacro" in element.tag for element in root.iter()):
         raise LidarError(expand)
     if root.tag != "robot":
-        advice = "; give a file of Gazebo the ending .sdf, as a scene" * (root.tag == "sdf")
-        raise LidarError(f"{path} is no URDF: it begins with <{root.tag[:40]}>{advice}.")
+        advice = " If it is a Gazebo file, change its extension to .sdf and use it as a scene." * (
+            root.tag == "sdf"
+        )
+        raise LidarError(
+            f"{path} is not a URDF file. Its root element is <{root.tag[:40]}>.{advice}"
+        )
     return root, len(data)
 
 
@@ -148,9 +152,12 @@ def _joints(root: Element, links: Collection[str], tell: Callable[[str], None]) 
         with prefixed(f"joint {_name(element)!r}"):
             child, joint = _joint(element, links)
             if child in joints:
-                raise LidarError(f"link {child!r} has two joints that hold it.")
+                raise LidarError(f"link {child!r} is the child of two joints.")
             if joint.kind in HELD[1:]:
-                tell(f"joint {joint.name} is {joint.kind}: it stays at zero")
+                tell(
+                    f"joint {joint.name} has the type {joint.kind}, which is not supported. Its "
+                    "value is always zero."
+                )
             joints[child] = joint
     return joints
 
@@ -173,10 +180,10 @@ def _named(root: Element, kind: str) -> list[Element]:
     """
     elements = root.findall(kind)
     if len(elements) > _MAX_LINKS:
-        raise LidarError(f"it has {len(elements):,} {kind}s; at most {_MAX_LINKS:,} are read.")
+        raise LidarError(f"it has {len(elements):,} {kind}s, and the limit is {_MAX_LINKS:,}.")
     names = [_name(element) for element in elements]
     if duplicate := next((name for name in names if name and names.count(name) > 1), None):
-        raise LidarError(f"two {kind}s have the name {duplicate!r}: give each its own.")
+        raise LidarError(f"two {kind}s have the name {duplicate!r}. Names must be unique.")
     if "" in names:
         raise LidarError(f"a {kind} has no name.")
     return elements
@@ -192,7 +199,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
     if len(values) != count or not (np.abs(values) <= _MAX_NUMBER).all():  # nor NaN
         tag = "" if element is None else element.tag
         expected = "a finite number" if count == 1 else f"{count} finite numbers"
-        hint = " Expand the file by xacro first." * ("$" in text)
+        hint = " Expand the file with xacro first." * ("$" in text)
         raise LidarError(f"{name} of <{tag}> is {shown(text)}; it must be {expected}.{hint}")
     return values
 
@@ -216,7 +223,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
         link_element = element.find(end)
         link = printable("" if link_element is None else link_element.get("link", ""))
         if link not in links:
-            raise LidarError(f"its {end} {link!r} is no link of the file.")
+            raise LidarError(f"its {end} {link!r} is not a link in the file.")
         end_links.append(link)
     axis = np.array([1.0, 0.0, 0.0])
     limits = None
@@ -224,7 +231,7 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
     if kind in MOVING:
         axis = _numbers(element.find("axis"), "xyz", 3, "1 0 0")
         if not (size := length(axis)) > 1e-9:
-            raise LidarError("its axis has no direction.")
+            raise LidarError("its axis has zero length.")
         axis = axis / size
         limit = element.find("limit")
         if kind != "continuous" and limit is not None:
@@ -258,15 +265,14 @@ def _in_order(links: list[str], joints: Mapping[str, Joint]) -> list[str]:
         raise LidarError("it has no link.")
     if len(roots) > 1:
         raise LidarError(
-            f"links {roots[0]!r} and {roots[1]!r} are not connected: one root must hold all links."
+            f"links {roots[0]!r} and {roots[1]!r} are not connected. All links must descend from "
+            "one root."
         )
     parents = {link: [joints[link].parent] if link in joints else [] for link in links}
     try:
         return [*TopologicalSorter(parents).static_order()]
     except CycleError as error:
-        raise LidarError(
-            f"the joints of link {error.args[1][0]!r} go round in a circle."
-        ) from error
+        raise LidarError(f"the joints of link {error.args[1][0]!r} form a cycle.") from error
 
 
 def _check_mimics(joints: Mapping[str, Joint]) -> None:
@@ -279,7 +285,9 @@ def _check_mimics(joints: Mapping[str, Joint]) -> None:
     try:
         TopologicalSorter(mimicked_joints).prepare()
     except CycleError as error:
-        raise LidarError(f"joint {error.args[1][0]!r} mimics itself, in a circle.") from error
+        raise LidarError(
+            f"joint {error.args[1][0]!r} mimics itself through other joints."
+        ) from error
 
 
 @dataclass(eq=False)
@@ -333,12 +341,12 @@ class _LinkMeshes:
     def tell_left_out(self) -> None:
         """Tell of the links that were left out."""
         for links, reason in (
-            (self._collide, "have collision shapes and no visual ones, and are left out"),
-            (self._flat, "have shapes of size zero, which are left out"),
+            (self._collide, "have collision shapes but no visual shapes"),
+            (self._flat, "have shapes of size zero"),
         ):
             if links:
                 names = ", ".join(dict.fromkeys(links[:3])) + ", …" * (len(links) > 3)
-                self.tell(f"{self.path}: links that {reason}: {names}")
+                self.tell(f"{self.path} contains links that {reason} and were skipped: {names}.")
 
     def _colour(self, visual: Element) -> Bytes | None:
         """Return the colour (1, 1, 3) of a visual, or of its material in the robot, or None."""
@@ -363,7 +371,8 @@ class _LinkMeshes:
             return size, [UNIT_BOX]
         if shape.tag not in ("cylinder", "sphere", "capsule"):
             raise LidarError(
-                f"its shape is <{shape.tag[:40]}>; there are mesh, box, cylinder, sphere, capsule."
+                f"its shape is <{shape.tag[:40]}>; it must be one of mesh, box, cylinder, "
+                "sphere, capsule."
             )
         (radius,) = self._sizes(_numbers(shape, "radius", 1, ""))
         if shape.tag == "sphere":
@@ -388,10 +397,10 @@ class _LinkMeshes:
         """Return the meshes of a file, in the axes of the file."""
         path, package = self._find(name)
         if not is_inside(path, (package, *self.assets)):
-            kind = "package" if _is_package(package) else "folder of the .urdf"
+            kind = "package" if _is_package(package) else "folder of the .urdf file"
             raise LidarError(
-                f"its mesh {name[:200]!r} is outside the {kind}, {package}: name a folder that "
-                "contains it as assets."
+                f"its mesh {name[:200]!r} is outside the {kind}, {package}. Name a folder that "
+                "contains the mesh as assets."
             )
         if path not in self._files:
             # Like RViz, which lets assimp ignore Collada's up_axis
@@ -421,7 +430,7 @@ class _LinkMeshes:
             return Path(location), self._package
         if scheme not in ("package", "model"):
             raise LidarError(
-                f"its mesh {name[:200]!r} must be a file's name, package://NAME/FILE or file://."
+                f"its mesh {name[:200]!r} must be a path, or start with package://NAME/ or file://."
             )
         package, _, file = location.partition("/")
         if package in _NO_FOLDERS:
@@ -434,24 +443,25 @@ class _LinkMeshes:
             if inner.is_dir() and (folder in self.assets or _is_package(inner)):
                 return inner / file, inner.resolve()
         raise LidarError(
-            f"its mesh {name[:200]!r} is of a package that is not beside the .urdf nor above it, "
-            f"with a package.xml: name the folder {package[:80]!r}, or one that contains it, as "
-            "assets."
+            f"its mesh {name[:200]!r} is in a package that was not found. Name the folder "
+            f"{package[:80]!r}, or a folder that contains it, as assets. Packages beside or "
+            "above the .urdf file are found if they contain a package.xml."
         )
 
     def _without_package(self, name: str, scheme: str, location: str) -> str:
         """Return the error of a URI without the name of a package: package:///my_robot/leg.dae."""
         parts = [part for part in location.split("/") if part not in _NO_FOLDERS]
-        start = f"its mesh {name[:200]!r} names no package: write"
+        start = f"its mesh {name[:200]!r} names no package. Write"
         if len(parts) < 2:
             folder = self.path.resolve().parent.name
             return (
-                f"{start} {scheme}://NAME/FILE, or the path of the file from the folder "
-                f"{folder[:80]!r} of the .urdf."
+                f"{start} {scheme}://NAME/FILE, or a path relative to the folder {folder[:80]!r} "
+                "of the .urdf file."
             )
         return (
             f"{start} {scheme}://{'/'.join(parts)[:200]}, and name the folder {parts[0][:80]!r}, "
-            "or one that contains it, as assets, unless it is a package beside the .urdf or above."
+            "or a folder that contains it, as assets. This is not necessary for packages beside "
+            "or above the .urdf file."
         )
 
 

@@ -46,14 +46,19 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
         If the file cannot be read, or is not of a sensor.
     """
     if assets:
-        raise LidarError("it is of a sensor: leave --assets out.")
+        raise LidarError("it is a sensor file, for which `--assets` is not allowed.")
     sensor = _read(path)
     lines = list(sensor.left_out)
     rays = sensor.rays
     if rays.times_ns is None:
-        lines.append(f"times: it states none, so {len(rays):,} rays take {1 / rays.rate_hz:g} s")
+        lines.append(
+            f"missing firing times ({len(rays):,} rays are fired in {1 / rays.rate_hz:g} s)"
+        )
     ray_npz.write(folder / _RAYS_FILE, rays.timed(), lines)
-    head = [f"From {path.name} by lidarpool import.", *(f"Not as there: {line}." for line in lines)]
+    head = [
+        f"Created from {path.name} by lidarpool import.",
+        *(f"Not supported: {line}." for line in lines),
+    ]
     text = "".join(f"# {line}\n" for line in head)
     text += yaml.safe_dump({"scene": "seed", "sensor": _section(rays)}, sort_keys=False)
     (folder / SCENARIO_FILE).write_text(text, encoding="utf-8", newline="\n")
@@ -78,10 +83,10 @@ def _read(path: Path) -> ReadSensor:
     """
     if path.suffix.lower() in USD_ENDINGS:
         return read_omnilidar(path)
-    with converted("it has no rays of a sensor"):
+    with converted("it cannot be read as a sensor file"):
         rays = read_rays(path)
     if rays is None:
-        raise LidarError("it has no rays of a sensor, with azimuths and elevations or directions.")
+        raise LidarError("it contains no rays with azimuths and elevations, or with directions.")
     channels = int(rays.channels.max()) + 1
-    lost = [f"its {channels} channels: a list of rays has one"] if channels > 1 else []
+    lost = [f"{channels} channels (a ray list has one channel)"] if channels > 1 else []
     return ReadSensor(rays, lost)

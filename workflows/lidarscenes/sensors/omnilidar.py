@@ -84,10 +84,12 @@ def read_omnilidar(path: Path) -> ReadSensor:
     """
     if find_spec("pxr") is None:
         command = install_command("lidarpool[usd]")
-        raise LidarError(f"{path} is OpenUSD, which usd-core reads: {command}.")
+        raise LidarError(
+            f"{path} is an OpenUSD file, which requires usd-core. Install it with `{command}`."
+        )
     if sys.platform == "win32":  # where a process has no limits of memory
-        raise LidarError(f"{path} is OpenUSD, which is not read on Windows.")
-    with converted(f"{path} is not a usable OmniLidar"):
+        raise LidarError(f"{path} is an OpenUSD file, which is not supported on Windows.")
+    with converted(f"{path} cannot be used as an OmniLidar"):
         return _sensor(_read_prim(path))
 
 
@@ -108,7 +110,7 @@ def _read_prim(path: Path) -> _Prim:
 
     Raises ValueError if the file has no such prim.
     """
-    allowance = Allowance(check_input(path), "write it again with fewer rays")
+    allowance = Allowance(check_input(path), "export it with fewer rays")
     child = Child(
         Path(__file__).with_name("omnilidar_child.py"),
         "usd-core",
@@ -132,11 +134,11 @@ def _sensor(prim: _Prim) -> ReadSensor:
     states = _states(prim)
     rate_hz = prim.number("scanRateBaseHz", 10)
     if not rate_hz > 0:
-        raise ValueError(f"scanRateBaseHz is {rate_hz:g}")
+        raise ValueError(f"scanRateBaseHz is {rate_hz:g}, but it must be above 0")
     kind = str(prim.values.get(f"{CORE}scanType", "ROTARY"))
     fires = {"SOLID_STATE": _solid_state, "ROTARY": _rotary}
     if kind not in fires:
-        raise ValueError(f"scanType is {kind!r}; SOLID_STATE and ROTARY are read")
+        raise ValueError(f"scanType is {kind!r}, but only SOLID_STATE and ROTARY are supported")
     pattern = fires[kind](prim, states, rate_hz)
     order = np.argsort(pattern.times_ns, kind="stable")
     rays = FiredRays(
@@ -176,9 +178,7 @@ def _states(prim: _Prim) -> list[_State]:
         {name[len(_STATE) :].partition(":")[0] for name in prim.arrays if name.startswith(_STATE)}
     )
     if not names:
-        raise ValueError(
-            "it has no emitter states of its own, such as emitterState:s001:azimuthDeg"
-        )
+        raise ValueError("it defines no emitter states such as emitterState:s001:azimuthDeg")
     states = []
     for name in names:
         fields = {field: prim.arrays.get(f"{_STATE}{name}:{field}") for field in _READ}
@@ -186,9 +186,11 @@ def _states(prim: _Prim) -> list[_State]:
             raise ValueError(f"emitterState:{name} has no {listed(missing)}")
         columns = [np.asarray(values, np.float64) for values in fields.values()]
         if len({column.shape for column in columns}) > 1 or not len(columns[0]):
-            raise ValueError(f"the arrays of emitterState:{name} have different lengths, or none")
+            raise ValueError(
+                f"the arrays of emitterState:{name} are empty or have different lengths"
+            )
         if not all(np.isfinite(column).all() for column in columns):
-            raise ValueError(f"emitterState:{name} has numbers that are not finite")
+            raise ValueError(f"emitterState:{name} has values that are not finite")
         states.append(_State(columns[0], columns[1], np.rint(columns[2]).astype(np.int64)))
     return states
 
@@ -214,7 +216,7 @@ def _rotary(prim: _Prim, states: list[_State], rate_hz: float) -> _Pattern:
     """
     tick_hz = prim.number("patternFiringRateHz", 0) or prim.number("reportRateBaseHz", 0)
     if not tick_hz > 0:
-        raise ValueError("it has neither patternFiringRateHz nor reportRateBaseHz")
+        raise ValueError("it has neither a patternFiringRateHz nor a reportRateBaseHz above 0")
     ticks = max(round(tick_hz / rate_hz), 1)
     if ticks * max(len(state.azimuths_deg) for state in states) > _MAX_RAYS:
         raise ValueError(f"a scan has more than {_MAX_RAYS:,} rays")
@@ -254,7 +256,7 @@ def _within_window(prim: _Prim, pattern: _Pattern) -> _Pattern:
     past_start_deg = (pattern.azimuths_deg - start_deg + _AZIMUTH_TOLERANCE_DEG) % 360
     inside = past_start_deg <= width_deg + 2 * _AZIMUTH_TOLERANCE_DEG
     if not inside.any():
-        raise ValueError(f"no ray is between azimuths {start_deg:g} and {end_deg:g} degrees")
+        raise ValueError(f"no ray has an azimuth from {start_deg:g} to {end_deg:g} degrees")
     return _Pattern(
         pattern.azimuths_deg[inside],
         pattern.elevations_deg[inside],
@@ -267,12 +269,12 @@ def _left_out(prim: _Prim, states: list[_State], kind: str) -> list[str]:
     """Return what is not as in the other program, a clause each."""
     clauses = []
     if prim.paths[1:]:
-        clauses.append(f"{len(prim.paths) - 1} further OmniLidar prims: {prim.paths[0]} is read")
+        clauses.append(f"several OmniLidar prims (only {prim.paths[0]} is read)")
     fields = {name.rpartition(":")[2] for name in _used_arrays(prim.arrays)}
     if others := sorted(fields - {*_READ, *_OF_NO_RAY}):
-        clauses.append(f"{listed(others)} of its emitters")
+        clauses.append(f"the emitter attributes {listed(others)}")
     if len(states[0].azimuths_deg) > 1:
-        clauses.append("its channels: a list of rays has one")
+        clauses.append("channels (a ray list has one channel)")
     clauses += [f"{name} = {value}" for name, value in _unread(prim, kind)]
     return clauses
 

@@ -58,7 +58,7 @@ def _reason(error: Exception, path: str) -> str:
     try:
         text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
     except UnicodeDecodeError:
-        return "its text is garbled"
+        return "its text is not valid UTF-8"
     return " ".join(text.replace(path, Path(path).name).split())[:300]
 
 
@@ -67,7 +67,7 @@ def _check_layers(stage: Usd.Stage, path: str) -> None:
     folder = Path(path).resolve().parent
     for layer in stage.GetUsedLayers():
         if layer.realPath and not Path(layer.realPath).resolve().is_relative_to(folder):
-            raise ValueError(f"it refers to {layer.realPath}, outside its folder")
+            raise ValueError(f"it refers to {layer.realPath}, which is outside its folder")
 
 
 def _is_lidar(prim: Usd.Prim) -> bool:

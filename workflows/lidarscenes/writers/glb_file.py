@@ -237,6 +237,8 @@ class _Writer:
         text += b" " * (-len(text) % 4)
         total = 28 + len(text) + self._size
         if total > _MAX_BYTES:
-            raise LidarError("it would have more than 4 GiB, the most of .glb: write a .ply.")
+            raise LidarError(
+                "it would exceed 4 GiB, the limit of .glb files. Write a .ply file instead."
+            )
         head = struct.pack("<4sIII4s", b"glTF", 2, total, len(text), b"JSON")
         return b"".join([head, text, struct.pack("<I4s", self._size, b"BIN\0"), *self._pieces])

@@ -92,7 +92,9 @@ def write_scenario(
         If there are too many lidars.
     """
     if len(lidars) > MAX_SENSORS:
-        raise LidarError(f"it has {len(lidars)} lidars; at most {MAX_SENSORS} are allowed.")
+        raise LidarError(
+            f"it has {len(lidars)} lidars, but a scenario can have at most {MAX_SENSORS} sensors."
+        )
     lines = [*left_out, *(f"{lidar.name}: {line}" for lidar in lidars for line in lidar.left_out)]
     files = _Files()
     data = {
@@ -101,8 +103,8 @@ def write_scenario(
         **sections,
         "cloud": {"columns": ["time", "range", "intensity", "object"]},
     }
-    head = [f"From {Path(entry['file']).name} of {program} by lidarpool import."]
-    head += [f"Not as in {program}: {line}." for line in lines]
+    head = [f"Created from {Path(entry['file']).name} ({program}) by lidarpool import."]
+    head += [f"Not supported: {line}." for line in lines]
     text = "".join(f"# {line}\n" for line in head) + _dumped(data)
     for name, content in {**files.texts(), SCENARIO_FILE: text}.items():
         (folder / name).write_text(content, encoding="utf-8", newline="\n")

@@ -59,27 +59,29 @@ def check_target(path: Path) -> None:
     """
     if path.suffix.lower() not in SUFFIXES:
         raise LidarError(
-            f"{path} has the ending {path.suffix or '(none)'}; "
-            f"scenes are written as {', '.join(SUFFIXES)}."
+            f"{path} has the extension {path.suffix or '(none)'}. Scenes can be written as "
+            f"{', '.join(SUFFIXES)}."
         )
     if not path.parent.is_dir():
-        raise MissingFileError(f"The folder {path.parent} does not exist: make it first.")
+        raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
     if path.is_dir() or not os.access(path.parent, os.W_OK):
-        raise LidarError(f"{path} cannot be written: choose another place.")
+        raise LidarError(f"{path} cannot be written. Choose another path.")
 
 
 def _encoded(suffix: str, scene: Scene) -> bytes:
     """Return the content of a file with a suffix of `SUFFIXES`."""
     if scene.has_voxels.any():
         name = scene.object_names[scene.has_voxels.argmax()]
-        raise LidarError(f"{name!r} is of voxels, which cannot be written: name its .vox file.")
+        raise LidarError(
+            f"{name!r} consists of voxels, which cannot be written. Use its .vox file instead."
+        )
     if suffix == ".ply":
         if scene.origin.any():
             step = np.spacing(np.float32(np.abs(scene.origin).max()))
             x, y, _ = scene.origin
             raise LidarError(
-                f"A .ply would have coordinates in steps of {step:.2g} m around x {x:.0f}, "
-                f"y {y:.0f}, because they are in single precision: write a .glb or .obj."
+                "A .ply file stores coordinates in single precision, which gives steps of "
+                f"{step:.2g} m at x {x:.0f}, y {y:.0f}. Write a .glb or .obj file instead."
             )
         drawn = SimplifiedScene.from_scene(scene, scene.triangles).scene
         joined = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)

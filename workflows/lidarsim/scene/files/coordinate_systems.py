@@ -507,10 +507,10 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
 
 
 def world_advice(x: float, y: float, z: float) -> str:
-    """Return advice, as a clause, on a mesh whose file states an offset to a coordinate system."""
+    """Return advice, a sentence without a period, on a file that states a map offset."""
     return (
-        f"with world.origin [{x:.12g}, {y:.12g}, {z:.9g}] in its place, scene and poses of a "
-        "scenario stay as they are, and what is written is there"
+        f"Alternatively, world.origin [{x:.12g}, {y:.12g}, {z:.9g}] leaves the scene and the "
+        "poses of a scenario unchanged and writes output files in this system"
     )
 
 

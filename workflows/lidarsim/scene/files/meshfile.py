@@ -214,11 +214,11 @@ def _tell_notes(
     """Call `tell` with a line on objects that were left out, and with the notes of the reader."""
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
-        tell(f"{path} has objects without an area, which are left out: {names}")
+        tell(f"{path} has objects without an area, which are left out: {names}.")
     for note in content.notes:
-        tell(f"{path} {note}")
+        tell(f"{path} {note}.")
     if content.unit_note and not unit_given:
-        tell(f"{path} {content.unit_note}")
+        tell(f"{path} {content.unit_note}.")
 
 
 def load_meshes(
