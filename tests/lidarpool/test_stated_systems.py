@@ -1,5 +1,6 @@
 """Coordinate systems that clouds state: true metres, a refusal that helps, or another system."""
 
+import contextlib
 import struct
 from importlib.util import find_spec
 
@@ -10,8 +11,11 @@ from click.testing import CliRunner
 from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.recordings.opening import open_recording
+from lidarpool.scenario.build import build
 from lidarpool.scenario.point_scene import scene_of_points
+from lidarpool.scenario.scenario import Scenario
 from lidarpool.showing.pages.opened import growing_view, open_view
+from lidarscenes.writers.scene_file import write_scene
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.scene import Scene
@@ -269,6 +273,49 @@ def test_a_comment_may_state_a_local_system(tmp_path, system):
     assert lower[2] == pytest.approx(3 * 1200 / 3937, abs=1e-3)
 
 
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_a_scene_keeps_the_system_of_its_cloud(tmp_path, suffix):
+    """In the file, and from there into what a scenario writes."""
+    cloud = written(tmp_path / "a.laz", ground("EPSG:25832"), wkt("EPSG:25832"))
+    file = tmp_path / f"place{suffix}"
+    arguments = ["points", str(cloud), str(file), "--voxel-m", "0.3"]
+    noted = CliRunner().invoke(command, arguments, catch_exceptions=False).stderr
+    assert f"{file} keeps the coordinate system of {cloud}, EPSG:25832" in noted
+    scene = Scene.load(file)
+    assert scene.epsg == 25832
+    assert Scene.load(write_scene(tmp_path / "again.glb", scene)).epsg == 25832
+
+    def built(entry=file.name, **world):
+        pose = [*(scene.bounds.mean(axis=0) + scene.origin + (0, 0, 2)).tolist()]
+        data = {"scene": {"files": [entry]}, "poses": [pose], "world": world}
+        return build(Scenario.from_data(data, folder=tmp_path), plans=False)
+
+    assert built().survey.epsg == 25832
+    with pytest.raises(LidarError, match=rf"world.origin would be added to {file.name} as well"):
+        built(origin=[500_000, 5_200_000])
+    other = built(epsg=32632)
+    assert other.survey.epsg == 32632
+    assert [note for note in other.findings.notes if "is in EPSG:25832, and EPSG:32632" in note]
+    moved = {"file": file.name, "translation": [-500_000, -5_200_000, 0]}
+    assert built(moved, origin=[500_000, 5_200_000]).survey.epsg is None
+    assert Scene.load(file, unit="ft").epsg is None
+
+
+def test_scenes_keep_the_chosen_system_and_none_of_converted_coordinates(tmp_path):
+    degrees = written(tmp_path / "a.las", ground("EPSG:4326"), wkt("EPSG:4326"))
+    assert scene_of_points(degrees, epsg=32632, voxel_m=0.3).epsg == 32632
+    utm = written(tmp_path / "b.las", ground("EPSG:25832"), wkt("EPSG:25832"))
+    assert scene_of_points(utm, unit="m", voxel_m=0.3).epsg is None
+    feet = written(tmp_path / "c.las", ground("EPSG:2263"), wkt("EPSG:2263"))
+    with contextlib.suppress(LidarError):
+        assert scene_of_points(feet, voxel_m=0.3).epsg is None
+    stated = with_comment(tmp_path / "d.ply", "comment crs: EPSG:25832", ground("EPSG:25832"))
+    assert scene_of_points(stated, voxel_m=0.3).epsg == 25832
+    foreign = tmp_path / "e.obj"
+    foreign.write_text("# made by hand\n# crs: EPSG:25832\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert Scene.load(foreign).epsg is None
+
+
 def e57_with(monkeypatch, path, metadata, points):
     pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
     text = pye57.libe57.StringNode
@@ -292,6 +339,7 @@ def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
     true_one = e57_with(monkeypatch, tmp_path / "b.e57", "EPSG:32632", ground("EPSG:32632"))
     assert bounds_of(true_one)[1] == [] and open_recording(true_one).notes == ()
     assert open_view(true_one).epsg == 32632
+    assert scene_of_points(true_one, voxel_m=0.3).epsg == 32632
     definition = "+proj=merc +datum=WGS84"
     by_proj = e57_with(monkeypatch, tmp_path / "d.e57", definition, ground("EPSG:3395"))
     with pytest.raises(LidarError, match=r"whose metre is 0\.67.*--epsg 32632"):

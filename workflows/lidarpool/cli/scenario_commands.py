@@ -392,13 +392,18 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
       lidarpool scene points tile.laz place.glb --epsg 32618
       lidarpool scene points stations.e57 place.glb --colour intensity
     """  # noqa: D301 - click wants the character, not its name
-    from ..scenario.point_scene import scene_of_points
+    from ..scenario.point_scene import points_to_scene
 
     def tell(note: str) -> None:
         click.echo(f"note: {note}", err=True)
 
     def make() -> Scene:
-        place = scene_of_points(cloud, tell=tell, **settings)
+        made = points_to_scene(cloud, tell=tell, **settings)
+        place = made.scene
+        if made.gap_note:
+            tell(f"{cloud}: {made.gap_note}")
+        if place.epsg is not None:
+            tell(f"{out} keeps the coordinate system of {cloud}, EPSG:{place.epsg}")
         if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
             tell(
                 f"{out} cannot store the colors and classes of {cloud}. Write a .glb file to "

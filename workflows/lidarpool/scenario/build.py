@@ -352,27 +352,37 @@ def _build_traffic(
 
 
 def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
-    """Return the EPSG code of the rasters whose placement keeps x and y, or None.
+    """Return the EPSG code that the files of a scene state, or None.
 
-    LidarError if the coordinate systems of these rasters differ, or `world.origin` would move them.
+    LidarError if the coordinate systems of these files differ, or `world.origin` would move them.
+    A file that states another system than `world.epsg` gets a note, unless it is transformed.
     """
-    unmoved = [(e.file, raster) for e, raster in findings.rasters if e.transform().keeps_xy]
-    systems = {raster.crs: file for file, raster in unmoved if raster.crs}
+    systems = {system.crs: system for system in findings.systems}
     x, y, _ = scenario.world.origin
     if systems and (x or y):
-        crs, file = next(iter(systems.items()))
+        first = next(iter(systems.values()))
         raise LidarError(
-            f"{scenario.source}: world.origin would be added to {file} as well, whose coordinates "
-            f"are those of {crs[:60]} already: give the file translation: [{-x:.12g}, {-y:.12g}, "
-            "0], or leave out world.origin."
+            f"{scenario.source}: world.origin would be added to {first.file} as well, whose "
+            f"coordinates are those of {first.crs[:60]} already: give the file translation: "
+            f"[{-x:.12g}, {-y:.12g}, 0], or leave out world.origin."
         )
+    if scenario.world.epsg is not None:
+        world = f"EPSG:{scenario.world.epsg}"
+        findings.notes += [
+            f"{system.file} is in {crs}, and {world} is written, because world.epsg states that: "
+            "leave out world.epsg if the file is right"
+            for crs, system in systems.items()
+            if crs != world and not system.is_raster
+        ]
+        return None
     if len(systems) > 1:
-        listed = ", ".join(f"{file} in {crs[:60]}" for crs, file in systems.items())
+        listed = ", ".join(f"{system.file} in {crs[:60]}" for crs, system in systems.items())
         raise LidarError(
-            f"{scenario.source}: rasters of one scene have several coordinate systems: "
-            f"{listed}. Give world.epsg, the code of the one that all of them are brought to."
+            f"{scenario.source}: files of one scene have several coordinate systems: {listed}. "
+            "Give world.epsg, the code of the one that all rasters are brought to, and bring other "
+            "files to it."
         )
-    return next((raster.epsg for _, raster in unmoved if raster.crs), None)
+    return next((system.epsg for system in systems.values()), None)
 
 
 def _mounted_sensors(shapes: Shapes) -> list[Mounted]:

@@ -62,6 +62,10 @@ class ScannedPoints:
         float64 (n,), from 0, in the scale of the file; NaN for points without an intensity.
     colours
         float32 (n, 3), sRGB from 0 to 255; NaN for points without a color.
+    scanners
+        float64 (n, 3): position of the scanner of each point, metres; NaN where unknown.
+    epsg
+        EPSG code of the coordinate system of the positions, or None if it is not known.
     """
 
     positions: Floats
@@ -69,6 +73,8 @@ class ScannedPoints:
     classes: Ints | None = None
     intensities: Floats | None = None
     colours: Floats32 | None = None
+    scanners: Floats | None = None
+    epsg: int | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -81,6 +87,8 @@ class ScannedPoints:
             None if self.classes is None else self.classes[row_indices],
             None if self.intensities is None else self.intensities[row_indices],
             None if self.colours is None else self.colours[row_indices],
+            None if self.scanners is None else self.scanners[row_indices],
+            self.epsg,
         )
 
 
@@ -128,8 +136,9 @@ def read_points(
             content = reader(path)
             if not keep_noise:
                 content = _without_noise(path, content, tell)
-            to_metres = _to_metres(path, content, unit, epsg, tell)
+            to_metres, placed_epsg = _to_metres(path, content, unit, epsg, tell)
             points, notes = _scanned_points(content, to_metres)
+            points = replace(points, epsg=placed_epsg)
     except LidarError:
         raise
     except Exception as error:  # readers raise whatever they stumble over
@@ -186,10 +195,11 @@ def _to_metres(
     unit: str | None,
     epsg: int | None,
     tell: Callable[[str], None],
-) -> Callable[[Floats], Floats]:
-    """Return a function from positions (n, 3) of a file to true metres.
+) -> tuple[Callable[[Floats], Floats], int | None]:
+    """Return a function from positions (n, 3) of a file to true metres, and their EPSG code.
 
-    `tell` gets a message that says how positions are converted.
+    The code is None if the coordinates are in no known system afterwards. `tell` gets a message
+    that says how positions are converted.
     """
     finite = content.positions[np.isfinite(content.positions).all(axis=1)]
     if epsg is not None:
@@ -199,6 +209,7 @@ def _to_metres(
         reprojection.check(finite[:: len(finite) // _SAMPLE + 1])
         notes = reprojection.notes
         convert = reprojection.apply
+        placed_epsg = epsg
     else:
         if content.in_metres and unit is None:
             notes = check_metric_format(content.system, finite)
@@ -210,9 +221,12 @@ def _to_metres(
         else:
             metres, notes = stated_metres(content.system, finite, unit)
         convert = partial(np.multiply, metres)
+        placed_epsg = None
+        if content.system is not None and unit is None and metres == (1.0, 1.0, 1.0):
+            placed_epsg = content.system.epsg_in_metres
     for note in notes:
         tell(f"{path} {note}")
-    return convert
+    return convert, placed_epsg
 
 
 def _scanned_points(
@@ -232,9 +246,10 @@ def _scanned_points(
         scanners = _first_vectors(columns, ORIGINS)
     if scanners is not None:
         try:
-            outward = to_metres(scanners) - positions
+            scanners = to_metres(scanners.astype(np.float64))
+            outward = scanners - positions
         except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
-            outward = None
+            scanners = outward = None
             content.ignored.append("positions of scanners without a place in that system")
     classes = _first(columns, CLASSES)
     intensities = _first(columns, INTENSITIES)
@@ -248,6 +263,7 @@ def _scanned_points(
         None if classes is None else _as_integers(classes),
         intensities,
         None if colours is None else _as_srgb(colours),
+        scanners,
     )
     # Depth cameras write NaN for pixels without a return.
     finite = np.isfinite(positions).all(axis=1)

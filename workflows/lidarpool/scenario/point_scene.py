@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -30,6 +30,7 @@ from lidarsim.scene.scene_mesh import SceneMesh
 from ..base.open3d_module import load_open3d
 from ..clouds.file_points import MIN_POINTS, POINT_BYTES
 from .point_files import NO_CLASS, ScannedPoints, read_points
+from .surfel_gaps import expected_loss
 
 # Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.
@@ -42,6 +43,9 @@ _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _MAX_VOXELS = 1 << 62  # voxels of the box around the points: 64 bits number voxels
 CLASS_MATERIAL = "class "  # and the number: name of the material of surfels with a class
 _GRAY = "take the mean color of their neighbors, or are gray"  # in notes
+_LEAST_LOSS = 0.02  # share of returns lost in gaps that a note tells
+# docs/how-to/point-clouds.md has the scans
+_MEASURED_LOSS = "4 to 40 % in scenes of one to three scans of a city"
 _WHITE_QUANTILE = 0.99  # share of intensities up to white: mirrors return more
 
 
@@ -105,18 +109,91 @@ def scene_of_points(
         coordinate system without lengths or with lengths that are not true, as Web Mercator, cannot
         be brought to `epsg`, or needs too much memory.
     """
-    path = Path(path)
+    return points_to_scene(
+        Path(path),
+        voxel_m=voxel_m,
+        size=size,
+        unit=unit,
+        epsg=epsg,
+        keep_noise=keep_noise,
+        colour=colour,
+        tell=tell,
+    ).scene
+
+
+class PointScene(NamedTuple):
+    """A scene that was made of a point cloud.
+
+    Attributes
+    ----------
+    scene
+        The scene, with the coordinate system of the cloud.
+    voxel_m
+        Edge of the cubes whose points became a surfel, metres.
+    loss
+        Share of returns that are expected to be lost in gaps between points (`expected_loss`), or
+        None if it cannot be estimated.
+    """
+
+    scene: Scene
+    voxel_m: float
+    loss: float | None
+
+    @property
+    def gap_note(self) -> str:
+        """A note on returns that are lost in gaps between points, or ""."""
+        advice = (
+            f"A larger --voxel-m (in Python voxel_m=), such as {2 * self.voxel_m:.2g}, closes gaps"
+        )
+        if self.loss is None:
+            return (
+                "returns are lost in gaps between points. The share cannot be estimated, because "
+                f"the scanner's positions are not known; it was {_MEASURED_LOSS}. {advice}"
+            )
+        if self.loss < _LEAST_LOSS:
+            return ""
+        return (
+            f"about {self.loss:.0%} of the returns would be lost in gaps between points, such as "
+            f"those between rings, in scans from the same positions. {advice}"
+        )
+
+
+def points_to_scene(
+    path: Path,
+    *,
+    voxel_m: float | None,
+    size: float,
+    unit: str | None,
+    epsg: int | None,
+    keep_noise: bool,
+    colour: str | None,
+    tell: Callable[[str], None],
+) -> PointScene:
+    """Make a scene of a point cloud as `scene_of_points`, and estimate what it loses."""
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} is {value}; it must be a positive number.")
     points = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
     points = _coloured(path, points, colour, tell)
-    return Scene.from_meshes([_surfels_of(path, points, voxel_m, size)])
+    surfels = _surfels_of(path, points, voxel_m, size)
+    loss = None
+    if points.scanners is not None:
+        corners = surfels.mesh.vertices.reshape(-1, 4, 3)
+        loss = expected_loss(points.positions, points.scanners, corners)
+    scene = replace(Scene.from_meshes([surfels.mesh]), epsg=points.epsg)
+    return PointScene(scene, surfels.voxel_m, loss)
 
 
 def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
     """Return the surfels of the points (n, 3) of a file."""
-    return _surfels_of(path, ScannedPoints(points), voxel_m, size)
+    return _surfels_of(path, ScannedPoints(points), voxel_m, size).mesh
+
+
+class _Surfels(NamedTuple):
+    """Surfels of points."""
+
+    mesh: SceneMesh
+    voxel_m: float  # edge of the cubes whose points became a surfel, metres
 
 
 def _coloured(
@@ -157,7 +234,7 @@ def _note_unknown(
         )
 
 
-def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: float) -> SceneMesh:
+def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: float) -> _Surfels:
     """Return the surfels of the points of a file, with their colours and classes."""
     # Covariances of Open3D lose the digits of points far from zero.
     positions = points.positions
@@ -186,13 +263,14 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
     corners = _surfel_corners(
         np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size, outward
     )
-    return SceneMesh(
+    mesh = SceneMesh(
         path.stem,
         corners.reshape(-1, 3) + origin,
         surfel_faces(count),
         colours=_surfel_colours(o3d, points, voxels, np.asarray(cloud.points)),
         materials=surfel_materials(points, voxels),
     )
+    return _Surfels(mesh, voxel_m)
 
 
 def surfel_faces(count: int) -> Ints:

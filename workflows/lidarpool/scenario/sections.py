@@ -430,7 +430,7 @@ class WorldSection(Section):
         EpsgCode | None,
         about(
             "EPSG code of the coordinate system, which files of clouds state and rasters are "
-            "converted to; by default the rasters'",
+            "converted to; by default that of the scene's files",
             25832,
         ),
     ] = None

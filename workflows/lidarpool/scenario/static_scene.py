@@ -22,7 +22,7 @@ from lidarsim.motion.rotations import rotations_of
 from lidarsim.scene.actors import Actor, box, join_meshes
 from lidarsim.scene.files.mesh_formats import format_of, option_names
 from lidarsim.scene.files.meshfile import Objects, load_objects
-from lidarsim.scene.files.scene_graph import ObjectClass, Raster
+from lidarsim.scene.files.scene_graph import ObjectClass
 from lidarsim.scene.object_names import resolve_same_names
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
@@ -52,6 +52,15 @@ _ROBOT_FIELDS = {"file", "opacity", "assets", "translation", "rotation_deg", "sc
 Kept = TypeVar("Kept")
 
 
+class FileSystem(NamedTuple):
+    """The coordinate system of a file, whose placement keeps x and y."""
+
+    file: str
+    crs: str  # as "EPSG:25832" or WKT
+    epsg: int | None
+    is_raster: bool  # whether `world.epsg` transforms the file
+
+
 @dataclass
 class Findings:
     """Notes about a scene, collected while its files are read."""
@@ -59,7 +68,7 @@ class Findings:
     notes: list[str] = field(default_factory=list)  # about objects left out of the scene
     remarks: list[str] = field(default_factory=list)  # about the up-axes of files
     sources: dict[str, str] = field(default_factory=dict)  # {file: its content in words}
-    rasters: list[tuple[MeshFile, Raster]] = field(default_factory=list)  # entry, description
+    systems: list[FileSystem] = field(default_factory=list)  # of files of the scene
     landscapes: list[str] = field(default_factory=list)  # files of land, never of single objects
     # {file of the scene: {number: class}} of files whose format gives classes to objects
     classes: dict[str, Mapping[int, ObjectClass]] = field(default_factory=dict)
@@ -207,6 +216,8 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
             moving += objects.actors
             if objects.classes:
                 findings.classes[entry.file] = objects.classes
+            if system := _system_of(entry, objects):
+                findings.systems.append(system)
     mistakes.tell()
     meshes = resolve_same_names(meshes, section.same_names, findings.notes.append)
     if section.copies:
@@ -216,6 +227,18 @@ def _read_objects(scenario: Scenario) -> _StaticObjects:
     if section.ground is not None and (meshes or moving):
         corners = _corners(Scene.from_meshes(meshes or objects.at_start(lambda _: None)))
     return _StaticObjects(objects, findings, corners)
+
+
+def _system_of(entry: MeshFile, objects: Objects) -> FileSystem | None:
+    """Return the coordinate system that a file states for its x and y, or None."""
+    if not entry.transform().keeps_xy:
+        return None
+    if objects.raster is not None:
+        raster = objects.raster
+        return FileSystem(entry.file, raster.crs, raster.epsg, True) if raster.crs else None
+    if objects.epsg is None:
+        return None
+    return FileSystem(entry.file, f"EPSG:{objects.epsg}", objects.epsg, False)
 
 
 def _check_not_empty(scenario: Scenario) -> None:
@@ -335,8 +358,6 @@ class Shapes:
         findings.sources.setdefault(entry.file, objects.summary)
         if objects.is_landscape:
             findings.landscapes.append(entry.file)
-        if objects.raster is not None:
-            findings.rasters.append((entry, objects.raster))
         return objects
 
     def _still_robot(self, entry: MeshFile, transform: Transform) -> Objects:

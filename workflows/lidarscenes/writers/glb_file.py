@@ -18,7 +18,7 @@ from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vectors import applied, matmul, turned
 from lidarsim.scene.colours import LINEAR
-from lidarsim.scene.files.meshfile import GENERATOR
+from lidarsim.scene.files.scene_graph import GENERATOR
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import SceneMesh
@@ -39,7 +39,7 @@ def glb_of(scene: Scene) -> bytes:
     LidarError
         If the file would have more than 4 GiB.
     """
-    writer = _Writer(scene.origin)
+    writer = _Writer(scene.origin, scene.epsg)
     for name, parts in groupby(scene.meshes(), lambda mesh: mesh.name):
         instances: dict[bytes, list[SceneMesh | SceneInstance]] = {}
         for part in parts:
@@ -53,8 +53,9 @@ def glb_of(scene: Scene) -> bytes:
 class _Writer:
     """The JSON object of a file, and its buffer."""
 
-    def __init__(self, origin: Floats) -> None:
+    def __init__(self, origin: Floats, epsg: int | None) -> None:
         self._origin = origin
+        extras = {} if epsg is None else {"extras": {"epsg": epsg}}
         self._pieces: list[bytes] = []
         self._size = 0
         self._meshes: dict[tuple[int, ...], int] = {}  # {ids of parts: number of the mesh}
@@ -62,7 +63,7 @@ class _Writer:
         self._materials: dict[tuple[int, str], int] = {}
         self._referenced: list[Any] = []  # parts and images, so that their ids are not reused
         self._tree: dict[str, Any] = {
-            "asset": {"version": "2.0", "generator": GENERATOR},
+            "asset": {"version": "2.0", "generator": GENERATOR, **extras},
             "scene": 0,
             "scenes": [{"nodes": []}],
             **{name: [] for name in ("nodes", "meshes", "accessors", "bufferViews")},

@@ -31,7 +31,8 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
     are kept in .glb only: in .ply and .obj, triangles are solid and grey. Where a triangle has both
     a mask and a texture, its colour is the texture's mean. All formats store metres; .glb is Y-up,
     by its standard, .ply and .obj are Z-up. Coordinates are world coordinates; .ply and .glb have
-    single precision, .glb from the scene's origin. A comment, or the generator of .glb, tells
+    single precision, .glb from the scene's origin. The coordinate system, `Scene.epsg`, is kept. A
+    comment, or the generator of .glb, tells
     `load_meshes` that this package wrote the file. An existing file is replaced only by a complete
     file.
 
@@ -87,7 +88,8 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         joined = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
         data = bytes(export_ply(joined, vertex_normal=False))
         head, _, tail = data.partition(b"\ncomment ")
-        return head + f"\ncomment {FORMAT_COMMENT}\n".encode() + tail.partition(b"\n")[2]
+        comments = "".join(f"\ncomment {line}" for line in _comments(scene))
+        return head + f"{comments}\n".encode() + tail.partition(b"\n")[2]
     if suffix == ".glb":
         return glb_of(scene)
     objects = trimesh.Scene()
@@ -96,4 +98,10 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
         objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
     text = export_obj(objects, include_normals=False, include_texture=False)
-    return f"# {FORMAT_COMMENT}\n{text}".encode()
+    comments = "".join(f"# {line}\n" for line in _comments(scene))
+    return f"{comments}{text}".encode()
+
+
+def _comments(scene: Scene) -> list[str]:
+    """Return the comments that begin a file: units and axes, and a coordinate system."""
+    return [FORMAT_COMMENT, *([] if scene.epsg is None else [f"crs: EPSG:{scene.epsg}"])]

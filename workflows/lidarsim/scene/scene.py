@@ -76,6 +76,9 @@ class Scene:
         Colours of `faces`, or None; parts of instances and meshes of actors have their own.
     materials
         Names of the materials of the static objects' faces in the scene's files, or None.
+    epsg
+        EPSG code of the coordinate system of the world coordinates, if the scene's file states it.
+        Pass it to `Survey` to have it written.
 
     Raises
     ------
@@ -93,6 +96,7 @@ class Scene:
     colours: Colours | None = None
     materials: ObjectMaterials | None = None
     world_origin: Floats = field(default_factory=lambda: np.zeros(3))
+    epsg: int | None = None
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
@@ -236,6 +240,7 @@ class Scene:
             note_start = "nothing stands in the scene, and without that nothing moves: "
             return cls.from_meshes(objects.at_start(lambda line: tell(note_start + line)))
         scene = cls.from_meshes(objects.static)
+        object.__setattr__(scene, "epsg", objects.epsg)
         actors = []
         for actor in objects.actors:
             track = actor.trajectory

@@ -40,6 +40,7 @@ from .gltf_file import (
 from .gltf_materials import GltfMaterials
 from .polygons import fanned, unrolled
 from .scene_graph import (
+    GENERATOR,
     MAX_NODES,
     SHORTER,
     SMALLER,
@@ -77,7 +78,12 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
     if notes and not content.meshes:
         raise MeshFileError(f"holds no triangles that can be read: it {'; it '.join(notes)}")
     content.notes = [*notes, *materials.notes.lines(), *reader.motion_notes()]
-    content.generator = str(header.get("asset", {}).get("generator", ""))
+    asset = header.get("asset", {})
+    content.generator = str(asset.get("generator", ""))
+    extras = asset.get("extras")
+    if content.generator == GENERATOR and isinstance(extras, dict):
+        epsg = extras.get("epsg")
+        content.epsg = epsg if type(epsg) is int else None
     return content
 
 

@@ -41,6 +41,7 @@ from .mesh_formats import (
     plugin_endings,
 )
 from .scene_graph import (
+    GENERATOR,
     Content,
     MeshFileError,
     ObjectClass,
@@ -50,8 +51,6 @@ from .scene_graph import (
 )
 from .text_cloud import is_text_raster
 
-# Generator that files written by lidarpool name: .glb is Y-up, others are Z-up.
-GENERATOR = "lidarpool"
 # Comment at the start of files written by lidarpool in formats without a generator.
 FORMAT_COMMENT = "lidarpool: metres, Z-up"
 
@@ -77,6 +76,7 @@ class Objects(NamedTuple):
     raster: Raster | None = None  # description, if the file is a raster
     classes: Mapping[int, ObjectClass] = {}  # {number of ASPRS LAS: class}, of formats with types
     is_landscape: bool = False  # whether the file is of land, never of a single object
+    epsg: int | None = None  # code of the coordinate system of x and y, if the file states it
 
     def at_start(self, tell: Callable[[str], None]) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return the static objects, and the actors as static objects at their first pose.
@@ -161,7 +161,16 @@ def load_objects(
         and FORMAT_COMMENT.encode() not in data[:_HEAD_BYTES]
     ):
         _tell_axes(path, content, meshes, axes)
-    objects = objects._replace(classes=content.classes, is_landscape=content.is_landscape)
+    epsg = content.epsg or _stated_epsg(data[:_HEAD_BYTES])
+    if content.raster is not None:
+        epsg = content.raster.epsg
+    if unit_m != (content.unit_m or 1.0) or axis != (content.up_axis or "z"):
+        epsg = None
+    if shared.transform is not None and not shared.transform.keeps_xy:
+        epsg = None
+    objects = objects._replace(
+        classes=content.classes, is_landscape=content.is_landscape, epsg=epsg
+    )
     if content.raster is not None:
         return objects._replace(summary=content.raster.summary, raster=content.raster)
     return objects._replace(summary=_summary(meshes, unit_m, axis, wanted))
@@ -263,6 +272,12 @@ def written_by_lidarpool(path: Path) -> bool:
     """Return True if lidarpool wrote a file of a format without a unit, which is in metres then."""
     with open_input(path) as file:
         return FORMAT_COMMENT.encode() in file.read(_HEAD_BYTES)
+
+
+def _stated_epsg(head: bytes) -> int | None:
+    """Return the EPSG code in the comments at the start of a file that lidarpool wrote, or None."""
+    match = re.search(re.escape(FORMAT_COMMENT.encode()) + rb"\n\S+ crs: EPSG:(\d+)", head)
+    return int(match[1]) if match else None
 
 
 def _tell_axes(

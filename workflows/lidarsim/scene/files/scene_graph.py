@@ -85,6 +85,10 @@ class RigidPart(NamedTuple):
     rotations: Floats  # (k, 3, 3), perhaps rounded or scaled
 
 
+# Generator that files written by lidarpool name: .glb is Y-up, others are Z-up.
+GENERATOR = "lidarpool"
+
+
 @dataclass
 class Content:
     """Content of a mesh file.
@@ -102,6 +106,7 @@ class Content:
     skipped: list[str] = field(default_factory=list)  # names of objects without an area
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
     raster: Raster | None = None
+    epsg: int | None = None  # code of the coordinate system in metres, if the file states it
     is_landscape: bool = False  # whether the file is of land, never of a single object
     # {number of ASPRS LAS: class} of formats whose objects have types
     classes: Mapping[int, ObjectClass] = field(default_factory=dict)

@@ -143,6 +143,14 @@ class StatedSystem:
         """EPSG code of the system, or None if the file states none."""
         return self._code
 
+    @property
+    def epsg_in_metres(self) -> int | None:
+        """EPSG code of a projected system in metres, or None if none is known."""
+        if self.crs is None:
+            return self._code if self._stated_m == 1.0 else None
+        code = self._code or crs_key(self.crs)[1]
+        return code if self.horizontal_m == 1.0 else None
+
     def units(self) -> CoordinateUnits | None:
         """Return the units of the coordinates, or None if the file says nothing of a projection.
 
