@@ -542,7 +542,7 @@ def test_a_scanner_of_many_is_named_and_has_its_highest_rates(tmp_path):
     notes = import_whole(
         import_scanner, tmp_path / "scanners.xml#two", tmp_path / "two", (), Scenario.load
     )
-    assert notes[-1] == "its 2 channels are a sensor each"
+    assert notes[-1] == "2 channels in one sensor (they become separate sensors)"
     assert [*Scenario.load(tmp_path / "two/scenario.yaml").sensors] == ["low", "high"]
 
 
