@@ -109,7 +109,8 @@ def test_without_names_sweeps_have_the_bytes_that_they_had(scene, sweeps):
 
 def test_las_looks_them_up(saved):
     path = saved("las")
-    assert laspy.open(path).header.vlrs.get("ClassificationLookupVlr")[0][3] == "road"
+    with laspy.open(path) as file:
+        assert file.header.vlrs.get("ClassificationLookupVlr")[0][3] == "road"
     # laspy leaves out signs that are neither letters nor digits.
     _, _, found = path.read_bytes().partition(b"LASF_Spec".ljust(16, b"\0") + b"\0\0")
     assert int.from_bytes(found[:2], "little") == 256 * 16

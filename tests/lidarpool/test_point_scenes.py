@@ -181,7 +181,7 @@ def test_far_clouds_keep_their_digits(tmp_path):
         again = Scene.load(write_scene(tmp_path / name, scene))
         difference = again.vertices + again.origin - (scene.vertices + scene.origin)
         assert np.abs(difference).max() < 1e-6
-    with pytest.raises(LidarError, match=r"steps of 0.5 m .* write a .glb or .obj"):
+    with pytest.raises(LidarError, match=r"steps of 0.5 m .* Write a .glb or .obj"):
         write_scene(tmp_path / "b.ply", scene)
 
 

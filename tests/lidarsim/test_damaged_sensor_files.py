@@ -89,7 +89,7 @@ NPZ = {
     "empty": (b"", "no .npz"),
     "text": (b"dear reader", "no .npz"),
     "cut": (npz()[:-30], "no .npz"),
-    "no arrays": (b"PK\5\6" + bytes(18), "usable|rays of a sensor"),
+    "no arrays": (b"PK\5\6" + bytes(18), "usable|contains no rays"),
     "encrypted": (encrypted(), "it is encrypted. Write it again without a password"),
     "unknown method": (with_method(97), "compression method"),
     "damaged lzma": (flipped(npz(zipfile.ZIP_LZMA), 70), "."),
