@@ -313,8 +313,53 @@ def test_sweeps_of_each_format_are_those_of_the_result(written, name):
     assert image["residual"]["rmse_m"] < 1e-4
     assert found["intensity"]["rank_correlation"] == pytest.approx(1, abs=1e-6)
     assert found["distances"]["a_to_b"]["max_m"] < 3e-4
-    one = compare(folder / name, folder, sweeps=[1]).figures
-    assert one["pairs"] == 1 and one["a"]["points"] == len(made) // 3
+    one = compare(folder / name, folder, sweeps=[1])
+    assert one.figures["pairs"] == 1 and one.figures["a"]["points"] == len(made) // 3
+    assert one.figures["a"]["compared_sweeps"] == one.figures["b"]["compared_sweeps"] == [1]
+    assert repr(one).count(f"{len(made) // 3:,} points, sweep 1 of 3") == 2
+    two = repr(compare(folder / name, folder, sweeps=[0, 2]))
+    assert two.count("points, 2 of 3 sweeps") == 2 and "A has" not in two
+
+
+def test_sweeps_left_over_are_noted_unless_sweeps_are_chosen(written, tmp_path):
+    folder, _, _ = written
+    for name in ("000000.pcd", "000001.pcd"):
+        (tmp_path / name).write_bytes((folder / "pcd" / name).read_bytes())
+    found = compare(tmp_path, folder / "pcd")
+    assert found.figures["notes"] == ["A has 2 sweeps, B 3: 2 pairs by order"]
+    head_a, head_b = repr(found).splitlines()[:2]
+    assert head_a.endswith(" points, 2 sweeps")
+    assert head_b.endswith(" points, 2 of 3 sweeps (the reference)")
+    one = compare(tmp_path, folder / "pcd", sweeps=[1])
+    assert one.figures["notes"] == []
+    assert "sweep 1 of 2\n" in repr(one) and "sweep 1 of 3 (the reference)" in repr(one)
+
+
+def test_intensities_have_one_scale_only_if_both_are_energies(written):
+    folder, made, sweeps = written
+    strong, weak = (
+        Cloud(
+            made.positions,
+            {**made.columns, "intensity": made["intensity"] / factor},
+            sweeps=lambda: sweeps,
+        )
+        for factor in (1, 100)
+    )
+    energies = compare(weak, strong)
+    assert energies.figures["intensity"]["same_scale"]
+    axes = comparison.draw_distances(energies).figure.axes[1]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == (
+        "intensity in B, energy",
+        "intensity in A, energy",
+    )
+    assert axes.get_xlim() == axes.get_ylim()
+    recorded = compare(folder / "cloud.mcap", folder)
+    assert not recorded.figures["intensity"]["same_scale"]
+    axes = comparison.draw_distances(recorded).figure.axes[1]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == (
+        "intensity in B, scale of B",
+        "intensity in A, scale of A",
+    )
 
 
 @pytest.mark.parametrize("name", ["cloud.las", "cloud.laz", "text/text.ply", "pcd/000000.pcd"])

@@ -10,6 +10,7 @@ from lidarpool.plan import Planning
 from lidarpool.run.job_source import fields_of
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.base.words import rounded
 
 POSES = [[x, 0, 1] for x in range(30)]
 
@@ -57,3 +58,23 @@ def test_a_plan_is_of_the_fields():
     plans = [Planning((0, 0), (10, 0), centres=[(5, 0)], radii=r) for r in (1, 2)]
     fields = [dict(fields_in_words(plan, "planning")) for plan in plans]
     assert differences(*fields) == "planning.radii is [2.0], was [1.0]"
+
+
+@pytest.mark.parametrize(
+    ("number", "digits", "text"),
+    [
+        (99.96, 2, "100"),
+        (99.96, 3, "100"),
+        (99.94, 3, "99.9"),
+        (-99.96, 2, "-100"),
+        (5.0, 3, "5"),
+        (1234.5, 3, "1,230"),
+        (12_345_678.0, 4, "12,350,000"),
+        (0.00123456, 3, "0.00123"),
+        (0.0, 2, "0"),
+        (float("inf"), 3, "inf"),
+        (1e30, 3, "1e+30"),
+    ],
+)
+def test_large_numbers_in_messages_have_no_exponent(number, digits, text):
+    assert rounded(number, digits) == text

@@ -291,6 +291,9 @@ BAD = [
         r"must be a list\. Write \[ply\]\.\n.*format is not a field\. Write output: {write: "
         r"\[kitti\]}\.$",
     ),
+    ("cloud: {formats: [laz]}", r"formats is not a field\. Write output: {write: \[laz\]}\.$"),
+    ("formats: las", r"formats is not a field\. Write output: {write: \[las\]}\.$"),
+    ("output: {formats: [laz]}", r"output\.formats is not a field\. Did you mean 'write'\?$"),
     ("layout: ouster", r"Write output: {write: \[{format: …, layout: ouster}\]}\.$"),
     (
         "sensor: {model: vlp16, mount: [0, 0, 1]}",

@@ -55,6 +55,13 @@ def check(tmp_path, lidarpool) -> Callable[..., Any]:
 
 
 @pytest.mark.extended
+def test_clear_air_leaves_all_of_the_light(tmp_path, lidarpool):
+    (tmp_path / "clear.yaml").write_text("scene: seed\nweather: {visibility_km: 1000}\n")
+    shown = lidarpool("check", tmp_path / "clear.yaml").out
+    assert "air         takes 0.00135/km: 100 % of the light from 50 m is left\n" in shown
+
+
+@pytest.mark.extended
 def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
     job = build(Scenario.from_data(SHORT), plans=False).job()
     with Client(cluster, set_as_default=False) as client:

@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarsim.base.archives import open_archive, packed
 from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints32
-from lidarsim.base.words import plural
+from lidarsim.base.words import plural, rounded
 from lidarsim.columns.table import CAUSES, TABLE, Column, value_names
 from lidarsim.media.materials import MaterialTable
 from lidarsim.motion.trajectory import ALWAYS, Beyond, Track, presence_ns
@@ -168,7 +168,8 @@ class PictureContent:
             if not actors:
                 return words
         words += f" and {plural(actors, 'actor')}" if actors else ""
-        return f"{words}, at {self.duration_ns / 2e9:.3g} s of {self.duration_ns / 1e9:.3g} s"
+        duration_s = self.duration_ns / 1e9
+        return f"{words}, at {rounded(duration_s / 2)} s of {rounded(duration_s)} s"
 
     @property
     def models(self) -> str:

@@ -15,7 +15,7 @@ from distributed import Client
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import listed, plural, scans_in_words
+from lidarsim.base.words import listed, plural, rounded, scans_in_words
 
 from ..base.job_errors import lines_of_errors
 from ..report.output import SurveyOutput
@@ -281,8 +281,8 @@ def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
         rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
         yield f"returns     {returns.mode} of each pulse{rays}"
     if extinction := survey.extinction(survey.sensor):
-        light = f"{100 * math.exp(-100 * extinction):.2g} % of the light from 50 m is left"
-        yield f"air         takes {1000 * extinction:.3g}/km: {light}"
+        light = f"{rounded(100 * math.exp(-100 * extinction))} % of the light from 50 m is left"
+        yield f"air         takes {rounded(1000 * extinction)}/km: {light}"
     if estimate := figures["estimate"]:
         without = survey.faults and 2 * estimate["rays"] < survey.ray_count
         yield (

@@ -56,7 +56,9 @@ def run_scenario(
     of the error say what was kept.
     """
     options = options.with_pool(scenario.pool, {"backend": backend})
-    if options.starts_workers:  # before reading the scene, which may take long
+    for output_format in scenario.output.write:  # before reading the scene, which may take long
+        output_format.check_installed()
+    if options.starts_workers:
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
         built = build(scenario)
@@ -120,6 +122,7 @@ def run_campaign(
         raise click.UsageError("--pace applies to a survey only. Remove it to run the campaign.")
     options = options.with_pool(campaign.pool, {"backend": backend})
     assert options.out is not None, "commands write"
+    campaign.keep.of_jobs.check_installed()
     for warning in _first_job_warnings(campaign, terminal):
         terminal.warn(warning)
     with page_of(campaign, options.live) as page:

@@ -162,6 +162,11 @@ class Recording:
     fired: Callable[[int], FiredPoints] | None = None
 
     @property
+    def intensity_name(self) -> str:
+        """Name of the column that was chosen as intensity, by default «intensity»."""
+        return self.intensity_column or _INTENSITY_COLUMNS[0]
+
+    @property
     def left_out_notes(self) -> list[str]:
         """Notes on points that were left out of what has been read."""
         note = "" if self.noise_filter is None else self.noise_filter.note()

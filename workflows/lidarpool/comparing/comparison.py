@@ -314,9 +314,16 @@ def _draw_intensities(page: Page, comparison: Comparison) -> None:
     """Draw the histogram of pairs of intensities, on the right."""
     figures = comparison.figures["intensity"]
     frame = (LEFT + 0.5, 0.13, 0.4, 0.64)
-    axes = page.chart(frame, xlabel="intensity in B", ylabel="intensity in A")
+    name_a, name_b = figures["columns"]["a"], figures["columns"]["b"]
+    scales = ("energy",) * 2 if figures["same_scale"] else ("scale of B", "scale of A")
+    axes = page.chart(
+        frame, xlabel=f"{name_b} in B, {scales[0]}", ylabel=f"{name_a} in A, {scales[1]}"
+    )
     intensity_a, intensity_b = comparison.intensities
     bins = _intensity_bins(intensity_b), _intensity_bins(intensity_a)
+    if figures["same_scale"]:
+        both = max(bins, key=lambda edges: edges[-1])
+        bins = both, both
     axes.hist2d(intensity_b, intensity_a, bins, norm=LogNorm(), cmap="viridis", rasterized=True)
     axes.locator_params(nbins=6)  # labels of small numbers are long
     axes.grid(False)

@@ -101,13 +101,19 @@ def compare(
     )
     comparing = _Comparing((first, second), tuple(sorted(distances_m)), azimuth_deg)
     if not first.is_cloud and not second.is_cloud:
-        pairs = _pair_sweeps(first, second, match, comparing.notes)
+        pairs = _pair_sweeps(first, second, match)
         if sweeps:
             pairs = _choose_pairs(pairs, sweeps)
+        elif len(pairs) < max(first.count, second.count):
+            comparing.note(
+                f"A has {plural(first.count, 'sweep')}, B {second.count:,}: "
+                f"{plural(len(pairs), 'pair')} by {match}"
+            )
+        comparing.pairs = pairs
         budget = MAX_VALUES // len(pairs)
         for number_a, number_b in pairs:
             comparing.add_sweeps(first.read_points(number_a), second.read_points(number_b), budget)
-        return comparing.result(len(pairs))
+        return comparing.result()
     cloud = first if first.is_cloud else second
     if sweeps or match == "time":
         raise LidarError(f"{cloud.name} has no sweeps: leave out --sweep and --match.")
@@ -120,7 +126,7 @@ def compare(
     if max(len(points_a), len(points_b)) > MAX_VALUES:
         comparing.note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
     comparing.add_points(points_a, points_b, MAX_VALUES)
-    return comparing.result(0)
+    return comparing.result()
 
 
 def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[tuple[int, int]]:
@@ -136,10 +142,10 @@ def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[t
     return [pairs[number] for number in sorted({*sweeps})]
 
 
-def _pair_sweeps(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tuple[int, int]]:
+def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]]:
     """Return the numbers of sweeps of A and B that belong together.
 
-    Appends a note if sweeps are left over. LidarError if no sweeps belong together.
+    LidarError if no sweeps belong together.
     """
     pairs = [(number, number) for number in range(min(a.count, b.count))]
     if match == "time":
@@ -157,11 +163,6 @@ def _pair_sweeps(a: Recording, b: Recording, match: str, notes: list[str]) -> li
         raise LidarError(
             f"{a.name} with {plural(a.count, 'sweep')} and {b.name} with {b.count:,} have none of "
             f"the same {match}."
-        )
-    if len(pairs) < max(a.count, b.count):
-        notes.append(
-            f"A has {plural(a.count, 'sweep')}, B {b.count:,}: "
-            f"{plural(len(pairs), 'pair')} by {match}"
         )
     return pairs
 
@@ -203,6 +204,7 @@ class _Comparing:
 
     def __post_init__(self) -> None:
         self.notes = [note for recording in self.recordings for note in recording.notes]
+        self.pairs: list[tuple[int, int]] = []  # numbers of sweeps; empty for whole clouds
         self.point_counts = np.zeros(2, np.int64)
         self.images: RangeImages | None = None
         self.measured_points: list[MeasuredPoints] = []
@@ -306,8 +308,8 @@ class _Comparing:
             _, total = self.rings.get(ring, (0.0, np.zeros(4, np.int64)))
             self.rings[ring] = elevation, total + count
 
-    def result(self, pair_count: int) -> Comparison:
-        """Return all figures of a number of pairs of sweeps, 0 for clouds without sweeps."""
+    def result(self) -> Comparison:
+        """Return all figures."""
         counts = self.point_counts.tolist()
         for recording, count in zip(self.recordings, counts, strict=True):
             if not count:
@@ -338,10 +340,10 @@ class _Comparing:
         figures: dict[str, Any] = {
             "versions": {"lidarpool": __version__},
             **self._source_figures(),
-            "pairs": pair_count,
+            "pairs": len(self.pairs),
             "notes": self.notes + [note for r in self.recordings for note in r.left_out_notes],
             "range_image": image_figures,
-            "intensity": _intensity_figures(*intensities, paired_by),
+            "intensity": self._intensity_figures(*intensities, paired_by),
             "distances": self._distance_figures(from_a.distance, from_b.distance),
         }
         distances = from_a.distance, from_b.distance
@@ -350,15 +352,32 @@ class _Comparing:
         )
 
     def _source_figures(self) -> dict[str, Any]:
-        """Return the name and the sizes of A and B."""
+        """Return the name and the sizes of A and B, and the sweeps that were compared."""
         counts = self.point_counts.tolist()
         return {
             key: {
                 "name": recording.name,
                 "sweeps": None if recording.is_cloud else recording.count,
+                "compared_sweeps": sorted({pair[number] for pair in self.pairs}),
                 "points": count,
             }
-            for key, recording, count in zip("ab", self.recordings, counts, strict=True)
+            for number, (key, recording, count) in enumerate(
+                zip("ab", self.recordings, counts, strict=True)
+            )
+        }
+
+    def _intensity_figures(self, a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
+        """Return figures of pairs of intensities (n,), or None without a rank correlation."""
+        correlation = rank_correlation(a, b)
+        if correlation is None:
+            return None
+        first, second = self.recordings
+        return {
+            "rank_correlation": correlation,
+            "pairs": len(a),
+            "of": paired_by,
+            "columns": {"a": first.intensity_name, "b": second.intensity_name},
+            "same_scale": first.energies and second.energies,
         }
 
     def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
@@ -398,14 +417,6 @@ class _Comparing:
                 for ring, (elevation, count) in rings
             ],
         }
-
-
-def _intensity_figures(a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
-    """Return figures of pairs of intensities (n,), or None without a rank correlation."""
-    correlation = rank_correlation(a, b)
-    if correlation is None:
-        return None
-    return {"rank_correlation": correlation, "pairs": len(a), "of": paired_by}
 
 
 def _residual_figures(values: Floats) -> dict[str, Any]:

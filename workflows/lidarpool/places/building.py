@@ -240,6 +240,7 @@ def twin(
         `model`; an extra is missing; or the folder holds the steps of another twin.
     """
     need("scipy", "twin", "Places are rebuilt")
+    base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.of_choice(RecordingChoice(Path(recording), sensor, intensity))
     else:
@@ -252,7 +253,6 @@ def twin(
             recording = open_recording(recording, sensor, intensity, name="the recording")
         recorded = RecordedSweeps.of_recording(recording)
     _check(recorded)
-    base = None if model is None else read_model(model)
     if base is None and not len(recorded.elevation_rad):
         reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
         raise LidarError(f"{reason} Name its sensor, for example --model livox/mid360.")

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lidarsim.base.arrays import Bools, Floats, Indices
 from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import plural, shortened
+from lidarsim.base.words import plural, rounded, shortened
 from lidarsim.columns.table import TABLE, Z, value_names
 from lidarview.render import theme
 from lidarview.render.colouring import colours_of
@@ -387,7 +387,7 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     points = sweep.points[rows]
     classes = None if sweep.classes is None else sweep.classes[rows]
     values = [
-        f"{name} {f'{value:.4g}' if isinstance(value, float) else shortened(str(value))}"
+        f"{name} {rounded(value, 4) if isinstance(value, float) else shortened(str(value))}"
         for name, value in list(sweep.values.items())[:MAX_VALUES]
     ]
     page.title(

@@ -18,6 +18,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError
+from lidarsim.base.words import rounded
 from lidarsim.simulator.memory import MB, scans_that_fit
 
 from ..base import timeline
@@ -257,7 +258,7 @@ class RunLoop:
         self._store.name_sensors(
             (
                 carried.name or "lidar",
-                f"{sensor.model}, {1e9 / sensor.revolution_start_ns(1):.3g} Hz",
+                f"{sensor.model}, {rounded(1e9 / sensor.revolution_start_ns(1))} Hz",
             )
             for row, job in ended
             if row.done

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.base.words import as_scenario, listed, plural
+from lidarsim.base.words import as_scenario, listed, plural, rounded
 from lidarsim.columns.table import VELOCITY
 from lidarsim.media.materials import MaterialTable
 from lidarsim.media.weather import FOG_LIDAR_RATIO_SR
@@ -111,8 +111,8 @@ def _size_note(built: Built, side: float) -> str:
     unit = "mm" if side > max_m else "km"
     stated = "states no unit" if unitless else "is in metres by its format"
     return (
-        f"{(unitless or files)[0]} {stated}, and in metres the scene is {side:,.5g} m long. If "
-        f"that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
+        f"{(unitless or files)[0]} {stated}, and in metres the scene is {rounded(side, 5)} m long. "
+        f"If that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
         "mesh file"
     )
 
@@ -276,6 +276,6 @@ def _timing_notes(built: Built) -> Iterator[str]:
         animation = actor.mesh.animation
         if animation and not animation.repeat and actor.seconds(end)[0][0] > animation.duration_s:
             yield (
-                f"{actor.name}: its animation of {animation.duration_s:.3g} s ends before the "
+                f"{actor.name}: its animation of {rounded(animation.duration_s)} s ends before the "
                 "survey does, and its last pose remains: give repeat: true"
             )

@@ -196,6 +196,7 @@ def _build(
     scenario: Scenario, plans: bool, cache: SceneCache | None, columns: Sequence[str]
 ) -> Built:
     """Build as `build`."""
+    _check_sensors(scenario)
     static = read_static_scene(scenario) if cache is None else cache.find(scenario)
     findings = static.findings.copy()
     scene = static.scene
@@ -383,6 +384,17 @@ def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
             "files to it."
         )
     return next((system.epsg for system in systems.values()), None)
+
+
+def _check_sensors(scenario: Scenario) -> None:
+    """Check that the models and calibrations of sensors can be read, before the scene is.
+
+    The scene may take minutes. Sensors are read once.
+    """
+    sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
+    with prefixed(scenario.source):
+        for name, section in sections.items():
+            section.mounted(scenario.path, CENTRE, scenario.noise, scenario.returns, name)
 
 
 def _mounted_sensors(shapes: Shapes) -> list[Mounted]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from lidarsim.base.arrays import Floats
-from lidarsim.base.words import plural
+from lidarsim.base.words import plural, rounded
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.sampling import sample_ranges
 from lidarsim.survey.survey import Survey
@@ -100,7 +100,7 @@ def _effects(survey: Survey) -> Iterator[str]:
 
 def _span(ranges: Floats) -> str:
     """Return the smallest and largest range in words."""
-    return f"{np.min(ranges):,.4g} to {np.max(ranges):,.4g} m"
+    return f"{rounded(np.min(ranges), 4)} to {rounded(np.max(ranges), 4)} m"
 
 
 def _start(scene: Scene, survey: Survey) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from lidarscenes.procedural.surroundings import Surroundings
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.even_samples import even_indices
-from lidarsim.base.words import as_scenario, printable
+from lidarsim.base.words import as_scenario, printable, rounded
 from lidarsim.motion.rotations import matrices, quaternions_of
 from lidarsim.motion.trajectory import Track, full_poses, velocities
 from lidarsim.scene.actors import Actor
@@ -192,7 +192,7 @@ def _bad_positions(
     share = f" at {is_bad.sum()} of {len(is_bad)} positions that were tried, first" * (
         not is_bad.all()
     )
-    time = f", {first.time_ns / 1e9:,.4g} s after the start" * moves
+    time = f", {rounded(first.time_ns / 1e9, 4)} s after the start" * moves
     return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f}){time}"
 
 
@@ -234,8 +234,8 @@ def _noise_warnings(survey: Survey, sight_m: float) -> Iterator[str]:
             value = float(np.max(np.abs(getattr(noise, field))))
             if value > NOISE_SHARE * range_m:
                 yield (
-                    f"noise.{field}{name} is {value:,.4g} m, more than a tenth of the range, "
-                    f"{range_m:,.4g} m: give it in metres"
+                    f"noise.{field}{name} is {rounded(value, 4)} m, more than a tenth of the "
+                    f"range, {rounded(range_m, 4)} m: give it in metres"
                 )
         if noise.range_per_m > NOISE_SHARE:
             yield (
@@ -286,14 +286,14 @@ def _speed_warnings(motion: _Motion, *, flies: bool) -> Iterator[str]:
     if (speeds > limit_m_s).any():
         fastest = int(speeds.argmax())
         yield (
-            f"the carrier moves at {speeds[fastest]:,.4g} m/s at {_time(motion, fastest)}, and "
-            f"carriers {medium} stay below {limit_m_s:g} m/s: check the units of positions and "
+            f"the carrier moves at {rounded(speeds[fastest], 4)} m/s at {_time(motion, fastest)}, "
+            f"and carriers {medium} stay below {limit_m_s:g} m/s: check the units of positions and "
             "times"
         )
     if (rates > MAX_RATE_DEG_S).any():
         fastest = int(rates.argmax())
         yield (
-            f"the carrier turns at {rates[fastest]:,.4g} degrees a second at "
+            f"the carrier turns at {rounded(rates[fastest], 4)} degrees a second at "
             f"{_time(motion, fastest)}, and carriers stay below {MAX_RATE_DEG_S:g}: check times, "
             "and the units and the order of angles or quaternions"
         )
@@ -301,7 +301,7 @@ def _speed_warnings(motion: _Motion, *, flies: bool) -> Iterator[str]:
 
 def _time(motion: _Motion, row: int) -> str:
     """Return the time of a row in words."""
-    return f"{motion.times_ns[row] / 1e9:,.4g} s"
+    return f"{rounded(motion.times_ns[row] / 1e9, 4)} s"
 
 
 def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
@@ -321,9 +321,9 @@ def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
         and extent_m[flat_axis] < _FLAT * extent_m[2]
     ):
         yield (
-            f"the trajectory rises and falls by {extent_m[2]:,.4g} m, and stays within "
-            f"{extent_m[flat_axis]:,.3g} m along {'xy'[flat_axis]}: give positions with z up, in "
-            f"metres (is {'xy'[flat_axis]} the up axis of its file?)"
+            f"the trajectory rises and falls by {rounded(extent_m[2], 4)} m, and stays within "
+            f"{rounded(extent_m[flat_axis])} m along {'xy'[flat_axis]}: give positions with z up, "
+            f"in metres (is {'xy'[flat_axis]} the up axis of its file?)"
         )
 
 

@@ -20,7 +20,7 @@ from lidarsim.base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
-from lidarsim.base.words import plural
+from lidarsim.base.words import plural, rounded
 from lidarsim.scene.colours import GREY, LINEAR, Colours, as_srgb
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import warn
@@ -142,9 +142,8 @@ class PointScene(NamedTuple):
     @property
     def gap_note(self) -> str:
         """A note on returns that are lost in gaps between points, or ""."""
-        advice = (
-            f"A larger --voxel-m (in Python voxel_m=), such as {2 * self.voxel_m:.2g}, closes gaps"
-        )
+        larger_m = rounded(2 * self.voxel_m, 2)
+        advice = f"A larger --voxel-m (in Python voxel_m=), such as {larger_m}, closes gaps"
         if self.loss is None:
             return (
                 "returns are lost in gaps between points. The share cannot be estimated, because "

@@ -24,7 +24,10 @@ Contradictory = Callable[[Any], bool]
 _SYNONYMS = {
     "position": "translation",
     "translation": "position",
+    "formats": "write",
 }  # too different for `did_you_mean`
+# {name that is tried anywhere: the section and the field, a list, that are meant}
+_OTHER_PLACES = {"formats": ("output", "write")}
 _MAX_DEPTH = 4  # sections within sections
 _SUGGESTION = re.compile(r"Did you mean '([^']*)'\?")
 
@@ -92,8 +95,8 @@ def place_advice(
     `content` its content, or None.
     """
     name = str(path[-1])
-    if (synonym := _SYNONYMS.get(name)) in field_names:
-        return f" Did you mean {synonym!r}?"
+    if known := _known_place(name, value, field_names, file):
+        return known
     content = dict(content) if isinstance(content, Mapping) else {}
     starts = [owner_of_file(file)]
     if path[1:]:  # first in the section at fault
@@ -124,6 +127,18 @@ def place_advice(
     suggestion = _similar_name(name, value, field_names)
     words = _in_words(path, suggestion, direct, examples)
     return words or _other_unit_elsewhere(name, value, file)
+
+
+def _known_place(name: str, value: Any, field_names: Collection[str], file: Any) -> str:
+    """Return advice on a name that is often tried for a field of another name, or ""."""
+    if (synonym := _SYNONYMS.get(name)) in field_names:
+        return f" Did you mean {synonym!r}?"
+    section, field = _OTHER_PLACES.get(name, ("", ""))
+    if section not in fields_by_name(file):
+        return ""
+    values = value if isinstance(value, list) else [value]
+    listed = ", ".join(values) if all(isinstance(entry, str) for entry in values) else "…"
+    return f" Write {section}: {{{field}: [{listed}]}}."
 
 
 def _similar_name(name: str, value: Any, field_names: Collection[str]) -> str:

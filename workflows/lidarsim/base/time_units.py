@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from .arrays import Floats
+from .words import rounded
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 # {unit: number of these units in a second}
@@ -56,7 +57,7 @@ def seconds_of(
     span_s = last_s - first_s
     fault = f"its times go from {first_s:.9g} to {last_s:.9g} s"
     if span_s > _YEAR_S:
-        fault += f", which are {span_s / _YEAR_S:,.3g} years"
+        fault += f", which are {rounded(span_s / _YEAR_S)} years"
     unit = _probable_unit(times[np.isfinite(times)], stated)
     if unit == stated:
         advice = advice or f"correct those that are far from the others, or give time_unit: {unit}"

@@ -112,9 +112,24 @@ def as_scenario(note: str) -> str:
     return _SETTING.sub(lambda m: form.get(m[1], f"{{}}: {{}} in {m[1]}").format(m[2], m[4]), note)
 
 
+_EXPONENT_FROM = 1e15  # numbers this large are mistakes, and have an exponent
+
+
 def plural(number: float, noun: str, plural_noun: str = "") -> str:
     """Return number and noun: «1 worker», «1,200 workers»."""
     return f"{number:,} {noun if number == 1 else plural_noun or noun + 's'}"
+
+
+def rounded(number: float, digits: int = 3) -> str:
+    """Return a number with some significant digits, large ones without an exponent.
+
+    Examples
+    --------
+    >>> rounded(99.96), rounded(99.96, 2), rounded(1234.5), rounded(0.00123456)
+    ('100', '100', '1,230', '0.00123')
+    """
+    text = f"{number:,.{digits}g}"
+    return f"{float(text):,.0f}" if "e+" in text and abs(number) < _EXPONENT_FROM else text
 
 
 def scans_in_words(scans: int, sweeps: int) -> str:

@@ -11,6 +11,7 @@ from pydantic import Field
 from ..base.arrays import Ints
 from ..base.errors import LidarError, MissingFileError
 from ..base.validation import checked
+from ..base.words import rounded
 from ..sensor_files.fired_rays import FRAME_HZ, FiredRays, Light
 from ..sensor_files.format_table import PROPERTIES, SensorFormat, format_of
 from .optics import Optics
@@ -102,7 +103,9 @@ def export_sensor(
         lost = _left_out(sensor, row)
         if not rays.repeats:
             assert rays.cycle_ns is not None  # of a sensor
-            lost.append(f"rays after {rays.cycle_ns / 1e9:.4g} s, which do not repeat these")
+            lost.append(
+                f"rays after {rounded(rays.cycle_ns / 1e9, 4)} s, which do not repeat these"
+            )
         left_out = write(path, rays, lost)
     return SensorFile(path, row.name, rays, tuple(left_out))
 
@@ -180,8 +183,8 @@ def _firings_before(sensor: Sensor, duration_ns: float) -> int:
 
     if starts_before(limit):
         raise LidarError(
-            f"{sensor.model} fires more than {MAX_RAYS:,} rays in {duration_ns / 1e9:.4g} s: give "
-            "fewer seconds or revolutions."
+            f"{sensor.model} fires more than {MAX_RAYS:,} rays in {rounded(duration_ns / 1e9, 4)} "
+            "s: give fewer seconds or revolutions."
         )
     lower = 0
     while limit - lower > 1:

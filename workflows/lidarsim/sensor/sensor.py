@@ -19,6 +19,7 @@ from ..base.errors import LidarError
 from ..base.notebook import picture_of, table_of
 from ..base.validation import checked, checked_fields
 from ..base.vectors import turned
+from ..base.words import rounded
 from .beams import MAX_CHANNELS, Beams, Head, Mirror, Rate, Spin, Step
 from .noise import Noise
 from .optics import LIGHT_M_NS, Optics, Returns
@@ -132,7 +133,7 @@ class Sensor:
         first, stop = self._revolution_firings()
         seconds = (self.revolution_start_ns(1) - self.revolution_start_ns(0)) / 1e9
         rays = (stop - first) * self.channels / seconds
-        return f"{1 / seconds:.4g} Hz, {rays:,.0f} rays/s"
+        return f"{rounded(1 / seconds, 4)} Hz, {rays:,.0f} rays/s"
 
     def with_packets(
         self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]

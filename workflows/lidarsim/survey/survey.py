@@ -22,7 +22,7 @@ from ..base.signatures import ReadableSignature
 from ..base.validation import checked_fields
 from ..base.value_texts import shown
 from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
-from ..base.words import listed, plural, scans_in_words
+from ..base.words import listed, plural, rounded, scans_in_words
 from ..columns.table import (
     COORDINATES,
     OPTIONAL,
@@ -468,7 +468,7 @@ class Survey(CloudOptions, Weather):
         duration_ns = firing_start_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
         if not duration_ns < MAX_DURATION_NS:
             raise LidarError(
-                f"The survey would last {duration_ns / 1e9:.3g} s, and times are counted in "
+                f"The survey would last {rounded(duration_ns / 1e9)} s, and times are counted in "
                 "nanoseconds for 292 years: make rate_hz larger, or start_s or steps smaller."
             )
 
@@ -705,8 +705,8 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
         )
     if noise.false_alarm_hz and (mean := noise.false_alarm_hz * sensor.gate_s) > MAX_ALARMS:
         raise LidarError(
-            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which are {mean:.3g} false alarms "
-            f"of each pulse; {MAX_ALARMS} are possible: make it or max_range_m smaller."
+            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which are {rounded(mean)} false "
+            f"alarms of each pulse; {MAX_ALARMS} are possible: make it or max_range_m smaller."
         )
 
 

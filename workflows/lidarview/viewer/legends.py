@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidarsim.base.arrays import Floats
+from lidarsim.base.words import rounded
 from lidarsim.scene.colours import as_bytes
 
 from ..render.colouring import (
@@ -37,7 +38,7 @@ def legend_of(colouring: Colouring) -> Legend:
     title = f"{colouring.name}, {colouring.unit}" if colouring.unit else colouring.name
     title += f": {colouring.meaning}" if colouring.meaning else ""
     if colouring.logarithmic:
-        marks = [f"{number:.2g}" for number in (lower, (lower * upper) ** 0.5, upper)]
+        marks = [rounded(number, 2) for number in (lower, (lower * upper) ** 0.5, upper)]
     else:  # the digits suit a bar of this span, without -0
         digits = int(np.clip(np.ceil(1 - np.log10(upper - lower)), 0, 6)) if upper > lower else 2
         marks = [

@@ -118,6 +118,7 @@ def fit(
         sensor moves, and the scene or the poses are unknown; or scipy is missing.
     """
     need("scipy", "fit", "Figures are fitted")
+    named = None if model is None else read_model(model)  # before the recording, which takes long
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
     check_sweeps(recording)
@@ -130,7 +131,7 @@ def fit(
         raise LidarError(moving_message(recording.name, speed, "the --scene of its poses"))
     else:
         measured = measure_moving(recording, white, loaded, poses)
-    base = read_model(model) if model else recorded_sensor(measured.stack)
+    base = recorded_sensor(measured.stack) if named is None else named
     return _fit_of(recording, measured, base)
 
 

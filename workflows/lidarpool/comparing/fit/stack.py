@@ -17,6 +17,7 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.even_samples import even_indices
+from lidarsim.base.words import rounded
 
 from ...clouds.recording import RecordedPoints, Recording
 from ..range_image import RangeImages, range_images
@@ -80,8 +81,8 @@ class SweepStack:
         has_return = np.isfinite(values[0]).any(axis=0)
         if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
             notes.append(
-                f"{100 * gaps:.2g} % of the sweeps are gaps, of lost packets or sweeps cut short, "
-                "and count as no lost pulses"
+                f"{rounded(100 * gaps, 2)} % of the sweeps are gaps, of lost packets or sweeps cut "
+                "short, and count as no lost pulses"
             )
         directions, azimuth_offsets = _mean_directions(values, elevation_deg, cells.step_deg)
         return cls(

@@ -9,6 +9,7 @@ import numpy as np
 from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
+from lidarsim.base.words import rounded
 
 from ...clouds.recording import Recording
 from .planes import fit_creep, range_scatter
@@ -50,9 +51,9 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
     changes = np.abs(np.diff(stack.ranges, axis=0))
     if (change := finite_median(changes, (0, 1, 2))) > _MAX_CHANGE_M:
         raise LidarError(
-            f"{name} has ranges that change by {change:.2g} m from sweep to sweep, in the median, "
-            "and no motion of the sensor explains that: give points in metres, of a place that "
-            "stands still."
+            f"{name} has ranges that change by {rounded(change, 2)} m from sweep to sweep, in the "
+            "median, and no motion of the sensor explains that: give points in metres, of a place "
+            "that stands still."
         )
     return stack
 
@@ -74,10 +75,10 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
     if speed.shift_m > 0:
         by_time = ""
         if speed.period_ns:
-            by_time = f" ({1e9 * speed.shift_m / speed.period_ns:.2g} m/s)"
-        amounts.append(f"{speed.shift_m:.2g} m{by_time}")
+            by_time = f" ({rounded(1e9 * speed.shift_m / speed.period_ns, 2)} m/s)"
+        amounts.append(f"{rounded(speed.shift_m, 2)} m{by_time}")
     if speed.turn_deg > 0:
-        amounts.append(f"{speed.turn_deg:.2g}°")
+        amounts.append(f"{rounded(speed.turn_deg, 2)}°")
     return (
         f"{name} is of a sensor that moves, by {' and '.join(amounts)} from sweep to sweep: give "
         f"{advice}, sweeps of a sensor that stands, or one sweep for the bias of its rings."
@@ -132,7 +133,7 @@ def _check_drift(stack: SweepStack, name: str) -> None:
     drift_m = range_scatter(stack, lag)
     if drift_m > _DRIFT_FACTOR * step_m + _DRIFT_M:
         raise LidarError(
-            f"{name} has ranges that drift: smooth surfaces change by {step_m:.2g} m from sweep to "
-            f"sweep, but by {drift_m:.2g} m in {lag} sweeps, so the sensor or the place moves, "
-            "or the sensor warms up: give sweeps of a warm sensor that stands."
+            f"{name} has ranges that drift: smooth surfaces change by {rounded(step_m, 2)} m from "
+            f"sweep to sweep, but by {rounded(drift_m, 2)} m in {lag} sweeps, so the sensor or the "
+            "place moves, or the sensor warms up: give sweeps of a warm sensor that stands."
         )

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import plural
+from lidarsim.base.words import plural, rounded
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.viewer.point_selection import OrderedPoints
@@ -152,4 +152,4 @@ def _in_words(value: Value) -> str:
     """Return a value of a job in words."""
     if isinstance(value, bool):
         return str(value).lower()
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return rounded(value, 4) if isinstance(value, float) else str(value)

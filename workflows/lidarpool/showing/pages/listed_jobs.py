@@ -7,6 +7,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any
 
+from lidarsim.base.words import rounded
+
 from ...datasets.job_table import JobRow, Value
 
 LIST_EVERY_S = 0.5  # jobs under way
@@ -76,5 +78,5 @@ class ListedJobs:
     def _words(self, values: Mapping[str, Value]) -> list[str]:
         """Return values in the order of the table's columns, "" for a missing value."""
         shown = (values.get(name, "") for name in self._names)
-        words = (f"{value:.4g}" if isinstance(value, float) else value for value in shown)
+        words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]

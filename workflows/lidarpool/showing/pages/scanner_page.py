@@ -23,6 +23,7 @@ from lidarsim.base.arrays import AnyArray, AnyFloats, Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.base.notebook import cell_display
 from lidarsim.base.validation import checked
+from lidarsim.base.words import rounded
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.motion.rotations import quaternions_of
@@ -255,7 +256,7 @@ class SweepFeed:
             moments = [*self._moments]
             now_s = self._sensors[0].trail[-1][0] if self._sensors[0].trail else 0.0
         if len(moments) > 1:
-            rate = f"{(len(moments) - 1) / max(moments[-1] - moments[0], 1e-9):.3g} sweeps/s"
+            rate = f"{rounded((len(moments) - 1) / max(moments[-1] - moments[0], 1e-9))} sweeps/s"
         return {
             "state": f"sweep {self._count:,}" if self._count else "waiting for the first sweep",
             "over": False,

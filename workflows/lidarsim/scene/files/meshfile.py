@@ -22,7 +22,7 @@ from ...base.input_files import not_found, open_input, read_input
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
-from ...base.words import as_python, listed, plural, printable
+from ...base.words import as_python, listed, plural, printable, rounded
 from ...motion.rotations import quaternions_of
 from ...motion.trajectory import Track
 from ..actors import Actor, join_meshes
@@ -316,7 +316,7 @@ def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance])
     lower = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
     x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - lower
     if 2 * y < min(x, z):
-        return f", and is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
+        return f", and is {rounded(x)} m wide, {rounded(z)} m high and {rounded(y)} m thick now"
     return ""
 
 
