@@ -225,7 +225,7 @@ def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
         (["hall.glb", "--of", "scan.npy"], "it has no poses: give stations.yaml"),
         (["hall.glb", "--of", "scan.npy", "--count", "2"], "--count: not with --of"),
         (["hall.glb", "--of", "scan.npy", "--within", "0"], "--within is 0; it must be greater"),
-        (["hall.glb"], "--sensor says which instrument"),
+        (["hall.glb"], "--sensor is required, because hall.glb names no sensor model"),
     ],
 )
 def test_a_scan_that_cannot_be_compared(tmp_path, monkeypatch, options, says):

@@ -87,6 +87,10 @@ def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lid
     assert "of 100 stations already see all that can be seen" in outcome.out
     written = Scenario.load(hall / "a/b/stations.yaml")
     assert [entry.file for entry in written.scene.files] == ["../../hall.glb"]
+    # The sensor of a scenario is the default.
+    again = lidarpool("stations", "a/b/stations.yaml", "--count", "1", "--spacing", "4")
+    assert again.code == 0, again.err
+    assert Scenario.load(hall / "stations-stations/stations.yaml").sensor.model == "velodyne/vlp16"
 
 
 @pytest.mark.extended

@@ -53,8 +53,8 @@ def _share(text: str) -> float:
     "model",
     metavar="MODEL|FILE.yaml",
     shell_complete=completion.sensors,
-    help="The instrument: a model of lidarpool sensors, with or without its maker.  [default: the "
-    "scenario's]",
+    help="Sensor model, as listed by lidarpool sensors, with or without its manufacturer, or a "
+    "sensor file (default: the model in the scenario).",
 )
 @click.option(
     "--target",
@@ -143,16 +143,18 @@ def stations(
         scenario = Scenario.load(scene, of_mesh)
         sight = {key: settings[key] for key in ("slant_deg", "targets")}
         _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
-    elif model is None:
-        raise click.UsageError("--sensor says which instrument stands there: give its model.")
     else:
+        scenario = Scenario.load(scene, of_mesh)
+        model = model or scenario.sensor.model
+        if not model:
+            raise click.UsageError(f"--sensor is required, because {scene} names no sensor model.")
         out = settings.pop("out")
         overwrites = settings.pop("overwrite")
         folder = Path(f"{scene.stem}-stations") if out is None else out
         existing = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
         if existing and not overwrites:
             raise LidarError(f"{existing[0]} exists: give another folder, --out, or --overwrite.")
-        _plan(Scenario.load(scene, of_mesh), model, folder, **settings)
+        _plan(scenario, model, folder, **settings)
 
 
 def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **settings: Any) -> None:
