@@ -418,7 +418,10 @@ def test_rotation_is_yaw_then_pitch_then_roll():
         ({"poses": [(0, 0, float("nan"))]}, r"position\[2\] is nan"),
         ({"sensor": Sensor.grid(10_000_000, 65_535, 60.0)}, "18,204,181,230 rays, more than"),
         ({"sensor": Sensor.grid(rate_hz=1e-10)}, "would last .* for 292 years"),
-        ({"poses": [(0, 0, 0)] * 99, "sensor": Sensor.grid(rate_hz=1e-8)}, "would last 9.9e.09 s"),
+        (
+            {"poses": [(0, 0, 0)] * 99, "sensor": Sensor.grid(rate_hz=1e-8)},
+            "would last 9,900,000,000 s",
+        ),
         ({"keep_every": 0}, "keep_every"),
         ({"precision_m": 0}, "precision_m"),
         ({"trajectory": Cart()}, "either poses or a trajectory"),
