@@ -755,11 +755,7 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         (7415, [84_600, 447_000, 0], ""),
         (3857, [0, 0, 0], r"Pseudo-Mercator\), for maps of the world"),
         (3395, [1_000_000, 6_000_000, 0], "for maps of the world"),
-        (
-            2056,
-            [0, 0, 0],
-            r"metre is 0\.983 m long at x 0, y 0, where the scene is \(world\.origin",
-        ),
+        (2056, [0, 0, 0], r"The scene is at x 0, y 0, outside the area of use of EPSG:2056"),
         (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*EPSG:32617 has true metres"),
         (2263, [0, 0, 0], "which is not in metres"),
         (4326, [8, 47, 0], "which is not in metres"),
@@ -773,10 +769,9 @@ def test_the_coordinate_system_has_true_metres(tmp_path, epsg, place, words):
     if not words:
         assert build(scenario).survey.epsg == epsg
         return
-    with pytest.raises(
-        LidarError, match=rf"world\.epsg \(in Python epsg=\) is EPSG:{epsg}.*{words}"
-    ):
+    with pytest.raises(LidarError, match=rf"EPSG:{epsg}") as refused:
         build(scenario)
+    assert re.search(words, str(refused.value))
     if epsg == 2056:
         with pytest.raises(LidarError, match="EPSG:2056"):
             Job(Scene.seed(), Survey(poses=[(0, 0, 1)], epsg=epsg))

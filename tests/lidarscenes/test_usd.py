@@ -612,7 +612,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
         (QUAD.replace("[4]", "[5]"), "'Quad' declares polygons with 5 corners but contains 4"),
         (QUAD.replace("3]", "9]"), "'Quad': faces refer to vertices 0 to 9"),
         (QUAD.replace("(2, 0, 0)", "(nan, 0, 0)"), "NaN or infinite"),
-        ("", "holds no triangles"),
+        ("", "contains no triangles"),
         ('#usda 1.0\n(upAxis = "up")\n' + prim("Quad"), "upAxis is 'up'"),
         (MOVED.format("(1e300, 0, 0)") + QUAD, "farther than anything on Earth"),
     ],

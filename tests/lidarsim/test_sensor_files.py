@@ -478,7 +478,7 @@ def test_scanners_of_helios_come_back_as_the_same_sensor(name, tmp_path):
     assert is_scanner(tmp_path / "lidar.xml")
     back, mount, notes = sensor_of_scanner(tmp_path / "lidar.xml", tmp_path / "new")
     swings = name == "swing"
-    assert [note.partition(" of ")[0] for note in notes] == ["the slow turns"] * swings
+    assert [note.partition(" of ")[0] for note in notes] == ["turning points"] * swings
     firings = np.arange(0, 5000, 7)
     directions = back.directions(firings) @ mount.rotation_matrix.T
     assert angle_deg(directions.reshape(-1, 3), sensor.directions(firings).reshape(-1, 3)) < 1e-5
