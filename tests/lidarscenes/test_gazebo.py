@@ -751,7 +751,7 @@ def test_what_fell_for_a_long_time_is_left_out_and_named(tmp_path, name):
     objects, _, notes = load(tmp_path, world(model("kept", link()), element, state))
     assert list(objects) == ["kept/link"]
     notes = [note for note in notes if "skins" not in note]
-    assert len(notes) == 1 and "1,000 km away or without a finite position (fallen" in notes[0]
+    assert len(notes) == 1 and "1,000 km away or whose position is not a number (fallen" in notes[0]
     scene = Scene.load(tmp_path / "w.sdf")
     assert np.abs(scene.bounds).max() <= 0.5 and not scene.origin.any()
 
@@ -760,10 +760,10 @@ def test_lidars_of_models_that_fell_are_listed(tmp_path):
     fallen = ROBOT.replace("'robot'", "'fallen'").replace("2 1 0", "2 1 -7.5e8")
     output, data, scenario = imported(tmp_path, world(ROBOT, fallen))
     assert list(data["sensors"]) == ["scan"]
-    assert "1,000 km away or without a finite position (fallen" in output
+    assert "1,000 km away or whose position is not a number (fallen" in output
     assert build(scenario).scene.names == ("robot/base",)
     with pytest.raises(
-        LidarError, match=r"it contains no sensor of type gpu_lidar.*finite position \(fallen"
+        LidarError, match=r"it contains no sensor of type gpu_lidar.*not a number \(fallen"
     ):
         imported(tmp_path / "x", world(fallen))
 

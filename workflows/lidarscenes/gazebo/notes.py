@@ -89,7 +89,8 @@ class Notes:
         if self.remote:
             names = listed([*self.remote], _MAX_NAMES)
             yield (
-                f"models that are more than 1,000 km away or without a finite position ({names})"
+                "models that are more than 1,000 km away or whose position is not a number "
+                f"({names})"
             )
 
     def lines(self) -> Iterator[str]:
