@@ -39,10 +39,18 @@ class Forks:
         )
 
     def failure(self, fault: Fault | None, tests: list[str], limit_s: float) -> str | None:
-        """Return which test failed first, "hangs", or "" if all passed; None if not planted.
+        """Run tests with a fault, or without a fault if it is None.
 
-        Without a fault, the tests run on the sources as they are. Raises RuntimeError if pytest
-        could not run the tests.
+        Returns
+        -------
+        str or None
+            "by " and the name of the first test that failed, "hangs", or "" if all tests passed.
+            None if the fault could not be planted, because no function in memory contains it.
+
+        Raises
+        ------
+        RuntimeError
+            If pytest could not run the tests.
         """
         assert self._process.stdin is not None and self._process.stdout is not None
         request = {"fault": fault and vars(fault), "tests": tests, "limit_s": limit_s}
