@@ -3,7 +3,8 @@
     python examples/live_figure.py                 # a window, at a tenth of the scanner's rate
     python examples/live_figure.py figure.png      # the last state of the figure, as a picture
 
-`frame.hit_counts()` returns the number of hits per triangle, which the MATLAB example calls numHits.
+`frame.hit_counts()` returns the number of hits per triangle, which the MATLAB example calls
+numHits.
 It requires that the survey keeps every hit, so this script thins out the points that it draws.
 """
 
