@@ -758,8 +758,8 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     for told, path, more in (
         (r"has no format: use .ply, .las, .*, or give a format", "x.xyz", {}),
-        ("'xyz' is not a format of clouds. There are ply, las, ", "x", {"format": "xyz"}),
-        ("layout is 'sick'; .* 'velodyne'", "x.mcap", {"layout": "sick"}),
+        ("Unknown cloud format 'xyz'. The available names are ply, las, ", "x", {"format": "xyz"}),
+        ("layout must be 'velodyne', .* but is 'sick'", "x.mcap", {"layout": "sick"}),
         ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
         ("is a folder", "result", {"format": "laz"}),
         ("precision_m is -1; it must be a length in metres", "x.las", {"precision_m": -1}),

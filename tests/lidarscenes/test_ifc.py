@@ -250,7 +250,7 @@ def test_styles_are_colours_and_materials(house, forked):
     assert wall.colours.images[0].tolist() == [[[153, 51, 51]]]
     assert meshes["IfcSlab Floor"].colours is None
     [note] = notes
-    assert "has transparent materials without holes, taken as solid: Glass" in note
+    assert "has transparent materials without holes, which are treated as opaque: Glass" in note
 
 
 @pytest.mark.parametrize(("schema", "prefix", "unit_m"), [
@@ -678,7 +678,7 @@ def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
 @needs_ifcopenshell
 def test_a_process_that_wants_too_much_ends_itself_only(house, monkeypatch):
     monkeypatch.setattr(reader, "MIN_MEMORY_BYTES", 60 * 2**20)
-    with pytest.raises(LidarError, match=r"\(ifcopenshell ended with .*, or needs more than"):
+    with pytest.raises(LidarError, match=r"ifcopenshell ended with .*, or needs more than"):
         load_meshes(house)
 
 

@@ -98,7 +98,7 @@ def test_a_table_states_its_conventions_and_what_it_lacks(tmp_path):
     header = {name: json.loads(value) for name, _, value in remarks}
     assert header["axes"] == "x forward, y left, z up"
     assert "counter-clockwise" in header["azimuth_deg"] and not header["repeats"]
-    assert "rays after 0.1 s, which do not repeat these" in header["not_in_this_file"]
+    assert "rays after 0.1 s, where the pattern does not repeat" in header["not_in_this_file"]
     rows = [*csv.DictReader(line for line in lines if not line.startswith("#"))]
     assert len(rows) == 10_000 and rows[1]["time_offset_ns"] == "10000"
     azimuth, elevation = np.radians([float(rows[77][f"{n}_deg"]) for n in ("azimuth", "elevation")])
@@ -448,19 +448,19 @@ def sensor_of_scanner(path, folder):
     return load_sensor(**entry), pose, notes
 
 
-STRETCHED = "18,084.49 pulses a second: they are a whole number, 18,084, at the same angles"
-AT_ONCE = "times of the rays within a firing: all channels fire at once"
+STRETCHED = "the exact pulse rate of 18,084.49 Hz (rounded to 18,084 Hz, with the same angles)"
+AT_ONCE = "time offsets of the rays in a firing (all channels fire at once)"
 SWING = Mirror(500, rate_hz=20, motion="triangle", width_deg=50, clockwise=True, zero_deg=12)
 HELIOS_SENSORS = {
     "channels": ("velodyne/vlp16", (AT_ONCE, STRETCHED)),
-    "beside": ("ouster/os1-64", ("starts of the rays beside the axis of the head",)),
+    "beside": ("ouster/os1-64", ("ray origins outside the rotation axis of the head",)),
     "prisms": ("livox/mid40", ()),  # which start at the same angle, half a turn from zero
     "several": ("livox/avia", ()),
     "polygon": ("airborne/riegl-vq780i", ()),
     "line": (Sensor(Beams(np.radians(np.linspace(-20, 50, 70)), time_ns=np.arange(70) * 1e4),
                     Spin(400, rate_hz=1, zero_deg=33)), ()),
     "swing": (LineSensor(Beams(np.zeros(1)), SWING),
-              ("even turns of the mirror: HELIOS++ slows it at the ends of lines",)),
+              ("the constant speed of the mirror (HELIOS++ slows it down at the ends of lines)",)),
     "grid": (Sensor.grid(360, 8, 40, max_range_m=50, min_range_m=0.5, rate_hz=20), ()),
 }  # fmt: skip
 
@@ -495,18 +495,20 @@ def test_scanners_of_helios_come_back_as_the_same_sensor(name, tmp_path):
 @pytest.mark.parametrize(
     ("sensor", "reason"),
     [
-        ("livox/mid360", "a mirror turns behind its prisms"),
-        ("airborne/leica-als50-ii", "its mirror swings as a sine"),
-        (ListedSensor(), "it is a list of rays"),
+        ("livox/mid360", "a mirror behind its prisms"),
+        ("airborne/leica-als50-ii", "its mirror oscillates sinusoidally"),
+        (ListedSensor(), "the sensor is a list of rays"),
         (
             Sensor(Beams(np.zeros(1)), Spin(1, rate_hz=0.1, step_deg=360)),
-            "fires 0.1 times a second",
+            "fires 0.1 times per second",
         ),
     ],
 )
 def test_what_is_no_scanner_is_refused_for_helios(sensor, reason, tmp_path):
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    with pytest.raises(LidarError, match=f"is no scanner of HELIOS.*: .*{reason}.*npz and csv"):
+    with pytest.raises(
+        LidarError, match=f"cannot be written as a HELIOS.*: .*{reason}.*npz and csv"
+    ):
         export_sensor(sensor, tmp_path / "lidar.xml", format="helios")
     assert list(tmp_path.iterdir()) == []
 
@@ -742,9 +744,12 @@ def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):
         ({"path": "rays.npz", "format": "csv"}, "rays.npz does not end in .csv"),
         ({"path": "no/rays.npz"}, "folder .*no does not exist"),
         ({"path": "rays.npz", "seconds": 1e5}, "more than 20,000,000 rays in 1e[+]05 s"),
-        ({"path": "rays.npz", "seconds": 1, "revolutions": 1}, "give one"),
+        ({"path": "rays.npz", "seconds": 1, "revolutions": 1}, "cannot be combined"),
         ({"path": "rays.npz", "seconds": -1}, "seconds"),
-        ({"path": "rays.npz", "sensor": "vlp16"}, "str is no Sensor: load_sensor"),
+        (
+            {"path": "rays.npz", "sensor": "vlp16"},
+            "sensor must be a Sensor, but is a str. Load one with load_sensor",
+        ),
     ],
 )
 def test_what_cannot_be_written_is_refused(arguments, message, tmp_path):
@@ -774,7 +779,9 @@ def test_arrays_that_are_no_rays_are_refused(changes, message, tmp_path):
     with pytest.raises(LidarError, match=message):
         load_sensor(calibration=tmp_path / "rays.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "rays.npz").read_bytes()[:200])
-    with pytest.raises(LidarError, match=r"cut\.npz is not a usable calibration: it is no \.npz"):
+    with pytest.raises(
+        LidarError, match=r"cut\.npz is not a valid calibration file: it is no \.npz"
+    ):
         load_sensor(calibration=tmp_path / "cut.npz")
 
 

@@ -88,7 +88,13 @@ def test_random_numbers_belong_to_one_step():
 
 
 def test_a_number_of_random_numbers_is_declared_once():
-    with pytest.raises(ValueError, match=r"^random numbers 2 are of .* 'again' needs others$"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"^random number stream 2 is already used for .* 'again' requires a different "
+            r"number$"
+        ),
+    ):
         Purpose(2, "again")
 
 

@@ -66,7 +66,7 @@ def test_exact_names_are_not_spelled_otherwise():
     [
         (
             "0,1\n1,2\n",
-            "it has no header: name its columns in its first line, as in time_s,range_m",
+            "it has no header. Name its columns in the first line, for example time_s,range_m",
         ),
         ("", "it has no header"),
         ("time_s,range\n", "it has no rows of numbers"),
@@ -78,9 +78,9 @@ def test_exact_names_are_not_spelled_otherwise():
         ("time_s,\n0,car\n", "column 2 has no name, and holds 'car'"),
         ("time_s,range\n0,1\n1,2,3\n", "line 3 has 3 cells, and the header 2"),
         ("time_s,range\n0,1\n\n1\n", "line 4 has 1 cells"),
-        ("time_s,range\n0,1\n1,x\n", "column 'range' has 'x' in line 3: give a number in every"),
+        ("time_s,range\n0,1\n1,x\n", "column 'range' contains 'x' in line 3"),
         ("time_s,range\n0,1\n1,inf\n", "column 'range' has 'inf' in line 3"),
-        ("range\n1\n", "it has no column 'time_s'; it has range"),
+        ("range\n1\n", "it has no column 'time_s'. Its columns are range"),
     ],
 )
 def test_what_is_not_understood_is_refused(text, words):

@@ -170,7 +170,7 @@ def read_trajectory(survey: Element, legs: Sequence[Leg], assets: Assets) -> Hel
     try:
         columns["t"] = seconds_of(columns["t"], None, advice="HELIOS++ expects seconds")
     except ValueError as error:
-        raise LidarError(f"{path} is not a usable trajectory: {error}.") from error
+        raise LidarError(f"{path} is not a valid trajectory: {error}.") from error
     times, first = np.unique(columns["t"], return_index=True)
     if len(times) < 2:
         raise LidarError(f"{path} is no trajectory: all its rows have one time.")

@@ -303,7 +303,7 @@ def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
     return encoder
 
 
-_TABLE: PluginTable[Any] = PluginTable(GROUP, "a format of packets", ENCODERS, _encoder_of_plugin)
+_TABLE: PluginTable[Any] = PluginTable(GROUP, "packet format", ENCODERS, _encoder_of_plugin)
 
 
 def encoder_class(name: str) -> type[PacketEncoder]:

@@ -89,9 +89,12 @@ def export_sensor(
     path = Path(path)
     row = format_of(path, format)
     if not isinstance(sensor, Sensor):
-        raise LidarError(f"{type(sensor).__name__} is no Sensor: load_sensor(MODEL) returns one.")
+        raise LidarError(
+            f"sensor must be a Sensor, but is a {type(sensor).__name__}. Load one with "
+            "load_sensor(MODEL)."
+        )
     if not path.parent.is_dir():
-        raise MissingFileError(f"The folder {path.parent} does not exist: make it first.")
+        raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
     write = row.function("write")
     if row.describes:
         rays = FiredRays(np.zeros((0, 3)))
@@ -102,7 +105,9 @@ def export_sensor(
         lost = _left_out(sensor, row)
         if not rays.repeats:
             assert rays.cycle_ns is not None  # of a sensor
-            lost.append(f"rays after {rays.cycle_ns / 1e9:.4g} s, which do not repeat these")
+            lost.append(
+                f"rays after {rays.cycle_ns / 1e9:.4g} s, where the pattern does not repeat"
+            )
         left_out = write(path, rays, lost)
     return SensorFile(path, row.name, rays, tuple(left_out))
 
@@ -148,7 +153,7 @@ def _duration_ns(sensor: Sensor, seconds: float | None, revolutions: int | None)
     Raises LidarError if both figures are given.
     """
     if seconds is not None and revolutions is not None:
-        raise LidarError("seconds and revolutions both say how long the pattern is: give one.")
+        raise LidarError("seconds and revolutions cannot be combined.")
     if seconds is not None:
         return 1e9 * seconds
     return sensor.revolution_start_ns(revolutions or 1)
@@ -180,8 +185,8 @@ def _firings_before(sensor: Sensor, duration_ns: float) -> int:
 
     if starts_before(limit):
         raise LidarError(
-            f"{sensor.model} fires more than {MAX_RAYS:,} rays in {duration_ns / 1e9:.4g} s: give "
-            "fewer seconds or revolutions."
+            f"{sensor.model} fires more than {MAX_RAYS:,} rays in {duration_ns / 1e9:.4g} s. "
+            "Reduce seconds or revolutions."
         )
     lower = 0
     while limit - lower > 1:
