@@ -220,13 +220,13 @@ WRONG = {
     ),
     "some heights": (
         TREE | {"table": "some.csv"},
-        ("its column 'z' contains '' in line 5. Each row must have a number in this column, "
-"or ignore the column."),
+        ("its column 'z' contains '' in line 5. Each row must have a number in this column. "
+         "Otherwise, ignore the column."),
     ),
     "angle": (
         TREE | {"table": "yaw.csv"},
         ("column 'yaw' has no unit. Rename it to yaw_deg (degrees) or yaw_rad, or set "
-"`columns: {yaw_deg: yaw}`"),
+         "`columns: {yaw_deg: yaw}`"),
     ),
     "mesh": ({"name": "A", "file": "b.stl", "at": [[0, 0]]}, "b.stl"),
 }  # fmt: skip

@@ -402,7 +402,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         ("empty", "is not read: give a result, data set, cloud, recording, scenario or mesh"),
         ("run.rrd", "is not read: it is a recording of Rerun, open it with the command rerun, or"),
         ("gt.osi", "is not read: it is a trace of OSI, name it as the traffic of a scenario, or"),
-        ("osi.mcap", "osi.mcap: it has no messages of ROS 2: record PointCloud2, or, if it is a "),
+        ("osi.mcap", "osi.mcap: it has no ROS 2 messages. Record PointCloud2, or set an OSI trace"),
         ("none.ply", "none.ply has no points"),
         ("robot.xacro", "expand it first"),
         ("lost", r"lost cannot be read: No such file or directory, .*lost/samples/.*bin"),

@@ -293,7 +293,7 @@ def test_a_result_without_rays_is_refused_in_a_line(played, tmp_path):
     sweeps = Sweeps.load(played / "out" / SWEEPS_FILE)
     replace(sweeps, fired=None).save(tmp_path / SWEEPS_FILE)
     outcome = command("play", tmp_path, "--as", "packets")
-    assert "Packets hold every ray and return of a survey" in str(outcome.exception)
+    assert "Packets contain all rays and returns of a survey" in str(outcome.exception)
 
 
 def test_a_port_of_the_interface_that_is_in_use_is_refused(tmp_path):

@@ -366,7 +366,7 @@ def test_textures_are_the_reflectance(caplog):
     grey, found = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity",
                         materials=[Material("*", "texture")])  # fmt: skip
     usual, _ = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity")
-    assert (found == 188).all() and "nothing in the scene has colours" in caplog.text
+    assert (found == 188).all() and "the scene has no colors" in caplog.text
     np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
 
 
@@ -468,11 +468,11 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
         ),
         ({"reflectance": "texture", "transparent": "pass"}, "set reflectance to a number"),
         ({"scale": 2.0}, "requires reflectance: texture"),
-        ({"reflectance": "textures"}, "it must be 0 to 1, or texture"),
+        ({"reflectance": "textures"}, "must be from 0 to 1, or texture"),
     ):
         with pytest.raises(LidarError, match=why):
             Material("*", **arguments)
-    with pytest.raises(LidarError, match=r"\[0\].reflectance is 'white'; it must"):
+    with pytest.raises(LidarError, match=r"\[0\].reflectance must .* but is 'white'"):
         Scenario.from_data({"materials": [{"objects": "*", "reflectance": "white"}]})
     wrong = {"objects": "*", "spectrum": "asphalt, dry", "reflectance": 0.2}
     with pytest.raises(

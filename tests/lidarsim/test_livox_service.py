@@ -280,7 +280,7 @@ def test_addresses_that_cannot_be_had_are_refused():
             pass
     assert len(str(taken.value).splitlines()) == 1
     service = sensor.encoder.service(f"{SENSOR}:8080", Destination("127.0.0.1"), print)
-    with pytest.raises(LidarError, match="ports are fixed"), service:
+    with pytest.raises(LidarError, match="an address without a port"), service:
         pass
 
 

@@ -257,7 +257,7 @@ GLASS = (
         (lambda h: h["images"].__setitem__(0, {"uri": "a\0b.png"}), "is not there"),
         (lambda h: h["textures"][0].pop("source"), "in a format that cannot be read"),
         (lambda h: h["meshes"][0]["primitives"][0].update(material=9), ("material 9 (it is "
-"invalid)")),
+            "invalid)")),
         (lambda h: h["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"),
          "Leaf (texture coordinates are missing)"),
         (lambda h: h["accessors"][1].update(count=3), "coordinates are missing"),

@@ -513,7 +513,7 @@ class Mirrored:
 FAR = Scene.seed().with_actors([Actor(box("Car", (9, 9, 9)), Track([0, 1], [[3000, 0, 0]] * 2))])
 WRONG = {
     "number": (lambda s: s.sweep((0, 0, 1), number=-1), "number must … but is -1"),
-    "large": (lambda s: s.sweep((0, 0, 1), number=10**9), "counted up to"),
+    "large": (lambda s: s.sweep((0, 0, 1), number=10**9), "number must be at most"),
     "larger": (
         lambda s: s.ranges((0, 0, 1), number=2**63),
         ("number must … but is 9223372036854775808"),
@@ -523,15 +523,24 @@ WRONG = {
     "lost": (lambda s: s.sweep((0, float("nan"), 1)), "pose must … but is (0, nan, 1)"),
     "start": (lambda s: s.ranges((0, 0, 1), start_s=float("nan")), "start_s must … but is nan"),
     "late": (lambda s: s.sweep(DRIVE, start_s=0.45), "from 0.45 to 0.549167 s"),
-    "actor": (lambda s: s.move("Cart", (0, 0, 1)), "no actor or instance 'Cart'. Did you mean"),
-    "object": (lambda s: s.move("Bowl", (0, 0, 1)), "'Bowl'. It is part of the standing scene"),
-    "some name": (lambda s: s.move(["Car", "Cat"], [(0, 0, 1)] * 2), "no actor or instance 'Cat'"),
-    "twice": (lambda s: s.move(["Car", "Car"], [(0, 0, 1)] * 2), "'Car' is among the names twice"),
-    "count": (lambda s: s.move(["Car"], [(0, 0, 1)] * 2), "There are 1 names and 2 poses"),
+    "actor": (
+        lambda s: s.move("Cart", (0, 0, 1)),
+        "Unknown actor or instance 'Cart'. Did you mean",
+    ),
+    "object": (lambda s: s.move("Bowl", (0, 0, 1)), "'Bowl'. It is part of the static scene"),
+    "some name": (
+        lambda s: s.move(["Car", "Cat"], [(0, 0, 1)] * 2),
+        "Unknown actor or instance 'Cat'",
+    ),
+    "twice": (lambda s: s.move(["Car", "Car"], [(0, 0, 1)] * 2), "names contains 'Car' twice"),
+    "count": (lambda s: s.move(["Car"], [(0, 0, 1)] * 2), "There are 1 names, but 2 poses"),
     "deformed": (lambda s: s.move("Car", np.diag([1, 2, 1, 1])), "Matrix 0 of a pose deforms"),
     "no matrix": (lambda s: s.move(["Car"], np.ones((1, 4, 4))), "last row of each matrix"),
     "no pose": (lambda s: s.move(["Car"], np.ones((1, 2))), "of the shape (1, 2)"),
-    "not finite": (lambda s: s.move(["Car"], [(0, np.inf, 1)]), "Pose 0 is not finite"),
+    "not finite": (
+        lambda s: s.move(["Car"], [(0, np.inf, 1)]),
+        ("Pose 0 (counted from 0) is not finite"),
+    ),
     "no times": (
         lambda s: s.move("Car", np.eye(4), times_s=[0, 1]),
         "must be matrices (k, samples, 4, 4)",
@@ -544,7 +553,7 @@ WRONG = {
         lambda s: with_bodies(Scene.seed(), backend="numpy").move(
             ["Car", "Crate"], np.tile(np.eye(4), (2, 2, 1, 1)), times_s=[0, 1]
         ),
-        "'Crate' is a SceneInstance, which stands still during a sweep",
+        "'Crate' is a SceneInstance, which is stationary during a sweep",
     ),
     "pose": (lambda s: s.sweep("here"), "pose must … but is 'here'"),
     "poses": (lambda s: s.ranges([[0, 0]]), "of the shape (1, 2)"),
@@ -562,12 +571,12 @@ WRONG = {
     "backend": (lambda s: Scanner(Scene.seed(), GRID, backend="tile"), "'tile'. Did you mean"),
     "fine": (
         lambda s: Scanner(FAR, GRID, precision_m=1e-6).sweep((2990, 0, 1)),
-        "precision_m 1e-06 is too fine for points 2",
+        "precision_m is 1e-06, which is too fine for points 2",
     ),
     "threads": (lambda s: Scanner(Scene.seed(), GRID, threads=0), "threads is 0"),
     "names": (
         lambda s: Scanner(Scene.seed(), Mounted(GRID, name="left"), name="right"),
-        "name is 'right', and a Mounted sensor has a name of its own: give it there",
+        "name is 'right'. Use Mounted(sensor, name=",
     ),
 }
 

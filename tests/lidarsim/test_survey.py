@@ -428,7 +428,7 @@ def test_rotation_is_yaw_then_pitch_then_roll():
         ({"keep_every": 0}, "keep_every"),
         ({"precision_m": 0}, "precision_m"),
         ({"trajectory": Cart()}, "poses and a trajectory cannot be combined"),
-        ({"columns": ["tiem"]}, "There is no column 'tiem'.*'time'"),
+        ({"columns": ["tiem"]}, "Unknown column 'tiem'.*'time'"),
     ],
 )
 def test_values_out_of_range_say_which(arguments, message):

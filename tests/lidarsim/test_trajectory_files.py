@@ -103,7 +103,7 @@ def test_without_an_orientation_the_carrier_faces_its_direction_of_travel(load):
         ("yaw", "40", r"or yaw_rad, or set `columns: \{yaw_deg: yaw\}`"),
         ("heading", "0.5", "'heading' is ambiguous, because its values do not exceed 0.5"),
         ("yaw [mrad]", "40", (r"has the unit 'mrad', which is not supported. Convert it to deg "
-r"or rad")),
+                              r"or rad")),
         ("omega,phi,kappa", "0,0,40", "'omega' is a photogrammetric angle"),
         ("Kappa [deg]", "40", "Convert the angles to yaw_deg"),
         ("yaw_deg,yaw_deg", "40,50", "its column 'yaw_deg' occurs twice"),
@@ -116,7 +116,7 @@ r"or rad")),
         ("qz,qw", "0,1", "no columns 'qx' and 'qy'. Its columns are "),
         ("yaw_dge", "40", r"unknown column 'yaw_dge'\. Did you mean 'yaw_deg'\?"),
         ("speed", "40", (r"unknown column 'speed'\. .*ignore it with `\{file: …, ignore: "
-r"\[speed\]\}")),
+                         r"\[speed\]\}")),
         ("speed,course", "40,1", r"'speed', 'course'\. .*ignore them with .*\[speed, course\]"),
         ("q0,q1,q2,q3", "1,0,0,0", "unknown columns 'q0', 'q1', 'q2', 'q3'"),
         ("latitude", "48", "'latitude' is a geodetic coordinate"),

@@ -368,7 +368,7 @@ def test_what_voxels_cannot_do_is_refused(tmp_path):
     with pytest.raises(LidarError, match="'X' contains voxels and cannot be joined"):
         join_meshes("X", [mesh, mesh])
     assert join_meshes("X", [mesh]).voxels is not None
-    with pytest.raises(LidarError, match="'T' contains voxels, which cannot be written"):
+    with pytest.raises(LidarError, match="'T' is of voxels, which cannot be written"):
         write_scene(tmp_path / "out.glb", Scene.from_meshes([mesh]))
     for density, matrix in [
         (np.zeros((1, 1, 1)), np.eye(3, 4)),

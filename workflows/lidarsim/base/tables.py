@@ -466,10 +466,12 @@ class _ColumnReader:
         stem = quantity.name.removesuffix(f"_{first}")
         choice = f", or set `columns: {{{quantity.name}: {printable(cell)}}}`" * self.can_choose
         unit_option = ", or set time_unit" * (quantity.units is SECONDS)
-        names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
+        names = [f"{quantity.name} ({_UNIT_WORDS[first]})"]
+        names += [f"{stem}_{other_unit}" for other_unit in other_units]
+        alternatives = f"{', '.join(names[:-1])} or {names[-1]}" if names[1:] else names[0]
         return _UnitMissingError(
-            f"its column {printable(cell)!r} has no unit. Rename it to {quantity.name} "
-            f"({_UNIT_WORDS[first]}) or {names}{choice}{unit_option}"
+            f"its column {printable(cell)!r} has no unit. Rename it to "
+            f"{alternatives}{choice}{unit_option}"
         )
 
     def _unit(
@@ -591,7 +593,7 @@ def _numbers(
         for number, cells in _rows_of(lines, header):
             for name, index in names.items():
                 if not _is_finite(cells[index]):
-                    alternative = "" if name in required_names else ", or ignore the column"
+                    alternative = "" if name in required_names else ". Otherwise, ignore the column"
                     raise ValueError(
                         f"its column {printable(header.cells[index])!r} contains "
                         f"{printable(cells[index])!r} in line {number}. Each row must have a "
