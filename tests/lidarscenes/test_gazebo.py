@@ -488,7 +488,7 @@ BROKEN = {
     ),
     "it declares XML entities": "<!DOCTYPE s [<!ENTITY a 'b'>]>" + world(model("a", link())),
     "names an XML entity, 'a'": world(model("&a;", link())),
-    "is cut short (its last element, <world>, has no end)": sdf("<world name='w'>").replace(
+    "is cut short: its last element, <world>, has no end": sdf("<world name='w'>").replace(
         "</sdf>", ""
     ),
     "line 1 has an end </sdf> without its start": sdf("<world name='w'>"),

@@ -50,7 +50,7 @@ RETURNS = {
     "returns: {subrays: 19}": (
         "beam divergence of the sensor is unknown. Set returns.divergence_mrad"
     ),
-    "noise: {range_m: -0.01}": "noise.range_m is -0.01",
+    "noise: {range_m: -0.01}": "noise.range_m must be from 0 to 1000, but is -0.01",
     "cloud: {columns: [intensities]}": "Did you mean 'intensity'?",
 }
 FILES |= {text: ("s.yaml", f"scene: seed\n{text}".encode(), says) for text, says in RETURNS.items()}

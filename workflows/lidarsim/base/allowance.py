@@ -36,8 +36,8 @@ class Allowance:
     --------
     >>> Allowance(1_500_000, "export it again").take(2_900_000_000)
     Traceback (most recent call last):
-    lidarsim.base.errors.LidarError: it has 1.43 MiB and would unpack to \
-2.70 GiB or more, of at most 256.00 MiB: export it again.
+    lidarsim.base.errors.LidarError: it has 1.43 MiB but would unpack to at \
+least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
     """
 
     def __init__(self, size: int, advice: str, *, in_parts: bool = False) -> None:
