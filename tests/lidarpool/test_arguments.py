@@ -152,7 +152,7 @@ WRONG = {
     SCANNER.ranges: [(None, "a list of Pose"), ([AT], "(k, 4, 4)")],
     SCANNER.move: [
         (3, AT[0], "name must … but is 3"),
-        ("Car", AT[0], "no actor or instance 'Car'"),
+        ("Car", AT[0], "Unknown actor or instance 'Car'"),
     ],
     fit: [
         (3, "recording must … but is 3"),

@@ -458,7 +458,7 @@ def test_what_cannot_be_organized_is_one_line(tmp_path):
     unknown = Cloud(
         cloud.positions, cloud.columns, sweeps=lambda: replace(cloud.sweeps(), fired=None)
     )
-    with pytest.raises(LidarError, match=r"organized clouds need every return"):
+    with pytest.raises(LidarError, match=r"organized clouds require all returns"):
         save_cloud(unknown, tmp_path / "c.mcap", organized=True)
 
 

@@ -56,7 +56,7 @@ def _upright(value: Any, handler: Callable[[Any], Any]) -> Any:
     """Validate a rectangle, whose lowest x and y come first."""
     sides = handler(value)
     if sides[0] >= sides[2] or sides[1] >= sides[3]:
-        raise must_be("[x0, y0, x1, y1], the lowest x and y first")
+        raise must_be("[x0, y0, x1, y1] with the lower corner first")
     return sides
 
 

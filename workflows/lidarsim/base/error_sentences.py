@@ -13,7 +13,7 @@ from .errors import Mistakes
 from .field_advice import Contradictory, list_advice, name_advice, place_advice
 from .section_fields import FieldPath, Fields, classes_in, dotted, fields_by_name, limits_of
 from .value_texts import shown, with_article
-from .words import did_you_mean, listed, plural
+from .words import alternatives, did_you_mean, listed, plural
 
 # {class: an example}
 _EXAMPLES = {
@@ -155,8 +155,7 @@ def _sentence(
         return f"{location} is required."
     requirements = [*dict.fromkeys(_requirement(detail, hint) for detail in details)]
     if all(words.startswith("be ") for words in requirements):
-        *others, last = (words.removeprefix("be ") for words in requirements)
-        allowed = f"must be {', '.join(others)} or {last}" if others else f"must be {last}"
+        allowed = f"must be {alternatives([words.removeprefix('be ') for words in requirements])}"
     else:
         allowed = f"must {' or '.join(requirements)}"
     if kind == "literal_error" and isinstance(value, str):

@@ -19,7 +19,7 @@ import numpy as np
 
 from .arrays import Floats
 from .time_units import SECONDS, TimeUnit, seconds_of
-from .words import did_you_mean_each, fits, in_yaml, joined, printable
+from .words import alternatives, did_you_mean_each, fits, in_yaml, joined, printable
 
 # {unit: number of these units in the first unit}
 METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
@@ -468,10 +468,9 @@ class _ColumnReader:
         unit_option = ", or set time_unit" * (quantity.units is SECONDS)
         names = [f"{quantity.name} ({_UNIT_WORDS[first]})"]
         names += [f"{stem}_{other_unit}" for other_unit in other_units]
-        alternatives = f"{', '.join(names[:-1])} or {names[-1]}" if names[1:] else names[0]
         return _UnitMissingError(
             f"its column {printable(cell)!r} has no unit. Rename it to "
-            f"{alternatives}{choice}{unit_option}"
+            f"{alternatives(names)}{choice}{unit_option}"
         )
 
     def _unit(
@@ -482,7 +481,7 @@ class _ColumnReader:
             return self.time_unit
         if unit is not None:
             if unit not in quantity.units:
-                units_read = " or ".join(name or "none" for name in quantity.units)
+                units_read = alternatives([name or "none" for name in quantity.units])
                 raise ValueError(
                     f"its column {printable(cell)!r} has the unit {printable(unit)!r}, "
                     f"which is not supported. Convert it to {units_read}"

@@ -229,6 +229,19 @@ def joined(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
+def alternatives(names: Sequence[str]) -> str:
+    """Return alternatives as an enumeration. A quoted alternative may be an enumeration itself.
+
+    Examples
+    --------
+    >>> alternatives(["'even' or 'gaussian'", "a number", "None"])
+    "'even', 'gaussian', a number or None"
+    """
+    *others, last = names
+    flat = (name.replace("' or '", "', '") for name in others)
+    return " or ".join(filter(None, [", ".join(flat), last]))
+
+
 def listed(names: Sequence[str], max_names: int = 3) -> str:
     """Return the first names, and the number of further names.
 
