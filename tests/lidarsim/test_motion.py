@@ -193,8 +193,8 @@ def test_a_station_may_end_a_rounding_beyond_the_last_pose():
     for options, gap in (
         ({"start_s": -0.9e-6}, None),
         ({"duration_s": 1 + 0.9e-6}, None),
-        ({"start_s": -1.1e-6}, "start_s is -1.1e-06 s, 1.1e-06 s outside"),
-        ({"duration_s": 1 + 1.1e-6}, r"duration_s is 1\.0000011 s, 1.1e-06 s outside"),
+        ({"start_s": -1.1e-6}, "start_s is -1.1e-06 s, which is 1.1e-06 s outside"),
+        ({"duration_s": 1 + 1.1e-6}, r"duration_s is 1\.0000011 s, which is 1.1e-06 s outside"),
         ({"start_s": 1.0}, "must be above 0, but it covers 1 to 1 s"),
         ({"start_s": np.nan}, "start_s is nan"),
     ):
@@ -215,11 +215,11 @@ def test_a_station_may_end_a_rounding_beyond_the_last_pose():
     ("arguments", "message"),
     [
         (([0.0], [[0, 0, 0]]), "at least two poses"),
-        (([0.0, 1], [[0, 0], [1, 0]]), r"positions of \(2, 2\)"),
+        (([0.0, 1], [[0, 0], [1, 0]]), r"positions of the shape \(2, 2\)"),
         (([0.0, 1, 1], np.zeros((3, 3))), "the time of pose 2 is not after"),
-        (([0.0, np.inf], np.zeros((2, 3))), "the time of pose 1 is not finite"),
+        (([0.0, np.inf], np.zeros((2, 3))), "The time of pose 1 is not finite"),
         (([0.0, 1], [[0, 0, 0], [0, np.nan, 0]]), "The position of pose 1 is not finite"),
-        (([0.0, 1], np.zeros((2, 3)), np.ones((2, 3))), r"not \(2, 3\)"),
+        (([0.0, 1], np.zeros((2, 3)), np.ones((2, 3))), r"has the shape \(2, 3\)"),
         (([0.0, 1], np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, 1.0011]]), "quaternion of pose 1"),
         (([0.0, 1], np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, np.nan]]), "quaternion of pose 1"),
     ],

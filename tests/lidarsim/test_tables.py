@@ -57,7 +57,7 @@ def test_exact_names_are_not_spelled_otherwise():
     assert columns["Arm_1"].tolist() == [2]
     radians = read_table("time_s,arm_1 [rad]\n0,1\n", (TIME, JOINT))["Arm_1"]
     assert np.isclose(radians[0], np.degrees(1))
-    with pytest.raises(ValueError, match="not known: Arm1"):
+    with pytest.raises(ValueError, match="unknown column 'Arm1'"):
         read_table("time_s,Arm1\n0,2\n", (TIME, JOINT))
 
 
