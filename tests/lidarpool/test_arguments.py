@@ -77,131 +77,148 @@ CAMPAIGN = Campaign(lambda number, rng: Job(Scene.seed(), Survey(poses=AT)), 2)
 # Of everything public that takes arguments, calls that cannot be meant, and what is answered.
 WRONG = {
     Actor: [
-        ("Car", "a SceneMesh, such as SceneMesh("),
-        (SceneMesh("Car", POINTS, FACES), "drive.tum", "trajectory is 'drive.tum'"),
+        ("Car", "a SceneMesh, but is … For example, pass SceneMesh("),
+        (SceneMesh("Car", POINTS, FACES), "drive.tum", "trajectory must … but is 'drive.tum'"),
     ],
     Beams: [("x", "array of numbers"), ([[1], [2, 3]], "[[1")],
-    Beams.even: [("4", 60, "layers is '4'"), (4.5, 60, "whole")],
+    Beams.even: [("4", 60, "layers must … but is '4'"), (4.5, 60, "whole")],
     box: [
-        (3, (1, 1, 1), "name is 3"),
+        (3, (1, 1, 1), "name must … but is 3"),
         ("Car", 4, "list of numbers"),
-        ("Car", (4, 2), "size_m[2] is missing"),
+        ("Car", (4, 2), "size_m[2] is required"),
     ],
     Campaign: [
-        (3, 4, "make is 3; it must be a function"),
-        (print, "4", "count is '4'; it must be a whole number"),
+        (3, 4, "make must be a function, but is 3"),
+        (print, "4", "count must be a whole number, but is '4'"),
     ],
-    Campaign.load: [(3, "path is 3"), ("a.yaml", "not exist")],
+    Campaign.load: [(3, "path must … but is 3"), ("a.yaml", "not exist")],
     Campaign.of_scenarios: [
-        ("a.yaml", "paths is 'a.yaml'; it must be a list of text"),
+        ("a.yaml", "paths must be a list of text, but is 'a.yaml'"),
         ([], "name one"),
     ],
     Job: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
-        (SCENE, Survey(poses=AT), ["fog"], "planning is ['fog']; it must be a Planning"),
+        (SCENE, Survey(poses=AT), ["fog"], "planning must be a Planning or None, but is ['fog']"),
     ],
     Cloud: [("x", {}, "positions"), ([["a", 0, 0]], {}, "numbers")],
-    Column: [(1, "u1", "", "", "name"), ("a", "u1", "", "", 3, "source is 3")],
+    Column: [(1, "u1", "", "", "name"), ("a", "u1", "", "", 3, "source must … but is 3")],
     SceneInstance: [
-        ("Tree", Pose((0, 0, 0)), "a SceneMesh, such as SceneMesh("),
-        (SceneMesh("Tree", POINTS, FACES), "here", "transform is 'here'"),
+        ("Tree", Pose((0, 0, 0)), "a SceneMesh, but is … For example, pass SceneMesh("),
+        (SceneMesh("Tree", POINTS, FACES), "here", "transform must … but is 'here'"),
         (SceneMesh("Tree", POINTS, FACES), np.diag([1, 1, 0, 1]), "flattens the mesh"),
     ],
     Material: [(3, "list of text"), ("a", None, "tree", "whole number")],
-    SceneMesh: [(3, POINTS, FACES, "name is 3"), ("a", POINTS, "x", "integers")],
-    Mounted: [(GRID, "rear", "a Pose, such as Pose(("), (GRID, (0, 0, 1), "mount")],
-    Fault: [("dust", "kind is 'dust'"), ("frozen", -1, "from_s is -1")],
-    Foxglove: [("lidar", "scanner is 'lidar'"), (SCANNER, 8765, "to is 8765; it must be text")],
-    Gnss: [(0, "rate_hz is 0"), (10, Pose((0, 0, 2)), -1, "horizontal")],
+    SceneMesh: [(3, POINTS, FACES, "name must … but is 3"), ("a", POINTS, "x", "integers")],
+    Mounted: [(GRID, "rear", "For example, pass Pose(("), (GRID, (0, 0, 1), "mount")],
+    Fault: [("dust", "kind must … but is 'dust'"), ("frozen", -1, "from_s must … but is -1")],
+    Foxglove: [
+        ("lidar", "scanner must … but is 'lidar'"),
+        (SCANNER, 8765, "to must be text or None, but is 8765"),
+    ],
+    Gnss: [(0, "rate_hz must … but is 0"), (10, Pose((0, 0, 2)), -1, "horizontal")],
     Imu: [("fast", "rate_hz"), (200, Pose((0, 0, 1)), -1, "gyroscope")],
     Navigation: [("imu", "imu"), (None, None, "down", "gravity_m_s2")],
-    Noise: [("0.1", "range_m is '0.1'"), ([1], "a number"), (0, 0, 0, 0, None, 1.5, "seed is 1.5")],
+    Noise: [
+        ("0.1", "range_m must … but is '0.1'"),
+        ([1], "a number"),
+        (0, 0, 0, 0, None, 1.5, "seed must … but is 1.5"),
+    ],
     Optics: [("red", "wavelength_nm"), (905, None, None, "pulse_ns")],
-    Packets: [(3, "sensor is 3; it must be a Sensor"), (GRID, "has no packets")],
-    Planning: [("a", "start is 'a'"), ((0, 0), 5, "target is 5")],
-    Pose: [(1, "list of numbers"), ((0, 0, 1), "90", "yaw_deg is '90'")],
-    Rerun: [("lidar", "scanner is 'lidar'"), (SCANNER, 9876, "to is 9876; it must be text")],
-    Returns: [("strong", "'strongest', 'first'"), ("all", 7, "wide", "divergence_mrad is 'wide'")],
+    Packets: [(3, "sensor must be a Sensor … but is 3"), (GRID, "has no packets")],
+    Planning: [("a", "start must … but is 'a'"), ((0, 0), 5, "target must … but is 5")],
+    Pose: [(1, "list of numbers"), ((0, 0, 1), "90", "yaw_deg must … but is '90'")],
+    Rerun: [
+        ("lidar", "scanner must … but is 'lidar'"),
+        (SCANNER, 9876, "to must be text or None, but is 9876"),
+    ],
+    Returns: [
+        ("strong", "'strongest', 'first'"),
+        ("all", 7, "wide", "divergence_mrad must … but is 'wide'"),
+    ],
     Scene: [
         (POINTS, FACES, ["x"], ("a",), POINTS[0], "face_object"),
-        (POINTS, FACES, OWNERS, ("a",), "o", "origin is 'o'"),
+        (POINTS, FACES, OWNERS, ("a",), "o", "origin must … but is 'o'"),
     ],
     Scene.from_meshes: [("a.glb", "[SceneMesh('"), (GRID, "a Sensor")],
     Scanner: [
         ("hall.glb", GRID, "Scene.load('hall.glb')"),
-        (SCENE, Survey(poses=AT), "sensor is a Survey; it must be a Sensor"),
+        (SCENE, Survey(poses=AT), "sensor must be a Sensor … but is a Survey"),
     ],
     Follower: [
-        (3, GRID, "bodies is 3; it must be a list"),
-        (["car"], GRID, "bodies[0] is 'car'; it must be a SceneMesh"),
-        ([], 3, "sensor is 3; it must be a Sensor"),
+        (3, GRID, "bodies must be a list, but is 3"),
+        (["car"], GRID, "bodies[0] must be a SceneMesh, but is 'car'"),
+        ([], 3, "sensor must be a Sensor … but is 3"),
         ([], GRID, "at least one object"),
     ],
     MujocoScanner: [
         (None, GRID, "body=NAME or site=NAME"),
         (None, "velodyne/vlp16", "body=NAME or site=NAME"),
     ],
-    SCANNER.sweep: [(None, "pose is None"), ((0, 1), "position[2] is missing")],
+    SCANNER.sweep: [(None, "pose must … but is None"), ((0, 1), "position[2] is required")],
     SCANNER.ranges: [(None, "a list of Pose"), ([AT], "(k, 4, 4)")],
     SCANNER.move: [
-        (3, AT[0], "name is 3"),
-        ("Car", AT[0], "no actor or instance 'Car'"),
+        (3, AT[0], "name must … but is 3"),
+        ("Car", AT[0], "Unknown actor or instance 'Car'"),
     ],
     fit: [
-        (3, "recording is 3"),
+        (3, "recording must … but is 3"),
         ("nowhere", "nowhere does not exist"),
     ],
     twin: [
-        (3, "recording is 3"),
+        (3, "recording must … but is 3"),
         ("nowhere", "nowhere does not exist"),
     ],
     compare: [
-        (3, "a.ply", "a is 3"),
+        (3, "a.ply", "a must … but is 3"),
         ("a.ply", "b.ply", "a.ply does not exist: give the folder of a result"),
     ],
-    load_robot: [(3, "path is 3"), (None, "None; it must")],
-    Scene.load: [(3, "path is 3"), (None, "None; it must")],
+    load_robot: [(3, "path must … but is 3"), (None, "path must … but is None")],
+    Scene.load: [(3, "path must … but is 3"), (None, "path must … but is None")],
     Sensor: [("vlp16", "beams"), (Beams([0]), Spin(), "1", "min")],
-    Sensor.grid: [("1000", "whole"), (1000, 40, 60, None, "step_deg is None")],
+    Sensor.grid: [("1000", "whole"), (1000, 40, 60, None, "step_deg must … but is None")],
     Spin: [("1000", "a number"), (1000, 10, 10, "no", "true or false")],
     Survey: [
         (GRID, [1, 2, 3], "such as (0, 0, 1)"),
         ("velodyne/vlp16", AT, "load_sensor('velodyne/vlp16')"),
         (GRID, AT, 36, None, (), ["glass"], "Material("),
     ],
-    Track: [("a", "b", "times_s is 'a'"), ([0, 1], POINTS[:2], [[1]], "(1, 1)")],
+    Track: [("a", "b", "times_s must … but is 'a'"), ([0, 1], POINTS[:2], [[1]], "(1, 1)")],
     play: [
-        (3, AT[0], "scanner is 3; it must be a Scanner"),
+        (3, AT[0], "scanner must be a Scanner, but is 3"),
         (SCANNER, AT[0], "has no packets"),
-        (SCANNER, 3, "trajectory is 3"),
+        (SCANNER, 3, "trajectory must … but is 3"),
     ],
-    load_sensor: [(3, "model is 3"), ([1], "text or a path")],
-    load_trajectory: [(3, "path is 3"), ([AT], "text or a path")],
-    read_cloud: [(3, "path is 3"), (["a.ply"], "text or a path")],
+    load_sensor: [(3, "model must … but is 3"), ([1], "text, a path or None")],
+    load_trajectory: [(3, "path must … but is 3"), ([AT], "text or a path")],
+    read_cloud: [(3, "path must … but is 3"), (["a.ply"], "text or a path")],
     merge: [
-        ("part-1", "ds", "shards is 'part-1'"),
-        (["a"], 3, "out is 3"),
+        ("part-1", "ds", "shards must … but is 'part-1'"),
+        (["a"], 3, "out must … but is 3"),
         ([], "ds", "nothing to"),
     ],
-    remove_run: [(3, "folder is 3"), ([], "text or a path")],
+    remove_run: [(3, "folder must … but is 3"), ([], "text, a path or a Storage")],
     save_cloud: [
-        (Cloud(POINTS, {}), 3, "path is 3"),
+        (Cloud(POINTS, {}), 3, "path must … but is 3"),
         (Cloud(POINTS, {}), ["a.ply"], "text or a path"),
     ],
-    show: [("vlp16", "scanner is 'vlp16'"), ([], "different names"), ([3], "it must be a Scanner")],
+    show: [
+        ("vlp16", "scanner must … but is 'vlp16'"),
+        ([], "different names"),
+        ([3], "must be a Scanner"),
+    ],
     simulate: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
         (SCENE, Survey(poses=AT), (25, 25), "Planning(("),
     ],
     sweeps: [
-        (3, "location is 3"),
+        (3, "location must … but is 3"),
         ("nowhere", "nowhere does not exist: give the folder of a data set"),
     ],
     to_dask: [
-        (3, "points is 3"),
-        (Cloud(POINTS, {}), "it must be a StoredCloud"),
+        (3, "points must … but is 3"),
+        (Cloud(POINTS, {}), "must be a StoredCloud"),
     ],
-    to_open3d: [(3, "cloud is 3"), ("a.ply", "it must be a Cloud")],
+    to_open3d: [(3, "cloud must … but is 3"), ("a.ply", "must be a Cloud")],
 }
 
 
@@ -213,22 +230,22 @@ WRONG = {
 def test_it_is_told_what_is_expected(call, arguments, says):
     with pytest.raises(LidarError) as raised:
         call(*arguments)
-    assert says in str(raised.value)
+    assert all(words in str(raised.value) for words in says.split(" … "))
     assert len(str(raised.value).splitlines()) <= 2 and len(str(raised.value)) < 320
 
 
 def test_options_of_a_survey_are_checked_too():
     for options, says in (
-        ({"columns": "time"}, "columns is 'time'; it must be a list of text"),
-        ({"keep_every": 0}, "keep_every is 0; it must be 1 to 1000000"),
-        ({"precision_m": "fine"}, "precision_m is 'fine'; it must be a number"),
-        ({"visibility_km": float("nan")}, "visibility_km is nan"),
-        ({"epsg": 25832.5}, "epsg is 25832.5; it must be a whole number"),
-        ({"coordinates": "map"}, "coordinates is 'map'; it must be 'world' or 'sensor'"),
+        ({"columns": "time"}, "columns must be a list of text, but is 'time'"),
+        ({"keep_every": 0}, "keep_every must be from 1 to 1000000, but is 0"),
+        ({"precision_m": "fine"}, "precision_m must be a number, but is 'fine'"),
+        ({"visibility_km": float("nan")}, "visibility_km must … but is nan"),
+        ({"epsg": 25832.5}, "epsg must be a whole number or None, but is 25832.5"),
+        ({"coordinates": "map"}, "coordinates must be 'world' or 'sensor', but is 'map'"),
     ):
         with pytest.raises(LidarError) as raised:
             Survey(poses=AT, **options)
-        assert says in str(raised.value)
+        assert all(words in str(raised.value) for words in says.split(" … "))
 
 
 def test_a_scenario_says_how_it_is_run_unless_python_does():
@@ -263,7 +280,7 @@ def test_options_that_a_call_does_not_take_are_refused(call, keyword, says):
     with pytest.raises(TypeError) as raised:
         call(**{keyword: True})
     assert f"unexpected keyword argument {keyword!r}" in str(raised.value)
-    assert says in str(raised.value)
+    assert all(words in str(raised.value) for words in says.split(" … "))
 
 
 @pytest.mark.parametrize(
@@ -292,17 +309,17 @@ def test_unknown_arguments_are_refused_with_a_hint(call, keyword, says):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"backend": "opencl"}, "backend is 'opencl'; it must be"),
-        ({"batch_mb": 0}, "batch_mb is 0; it must be 1 to 1000000"),
-        ({"client": "tcp://x"}, "client is 'tcp://x'; it must be a Client"),
-        ({"wait_s": -1}, "wait_s is -1; it must be at least 0"),
+        ({"backend": "opencl"}, "backend must be … but is 'opencl'"),
+        ({"batch_mb": 0}, "batch_mb must be from 1 to 1000000, but is 0"),
+        ({"client": "tcp://x"}, "client must be a Client or None, but is 'tcp://x'"),
+        ({"wait_s": -1}, "wait_s must be at least 0, but is -1"),
     ],
 )
 def test_options_of_runs_are_checked(options, says):
     for call in (partial(simulate, Scene.seed(), Survey(poses=AT)), CAMPAIGN.stream):
         with pytest.raises(LidarError) as raised:
             call(**options)
-        assert says in str(raised.value)
+        assert all(words in str(raised.value) for words in says.split(" … "))
 
 
 def test_nothing_public_is_left_out():

@@ -62,7 +62,7 @@ WRONG = {
     "a list": ("[1]", "holds a list; a cluster file has"),
     "a misspelt field": (
         GOOD.replace("arguments", "argument"),
-        "argument is not a field. Did you mean 'arguments'?",
+        "Unknown field 'argument'. Did you mean 'arguments'?",
     ),
     "no partitions": ("cluster: distributed.SSHCluster", "partitions is missing"),
     "a partition of others": (

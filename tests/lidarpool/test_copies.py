@@ -197,9 +197,9 @@ def test_a_file_is_read_once_for_all_entries(made, monkeypatch):
 
 
 WRONG = {
-    "neither": ({"name": "A", "at": [[0, 0]]}, "give either file or box."),
-    "no place": (TREE, "give one of at, table and scatter."),
-    "two": (TREE | {"at": [[0, 0]], "table": "a.csv"}, "give one of at, table and scatter."),
+    "neither": ({"name": "A", "at": [[0, 0]]}, "Set exactly one of file and box."),
+    "no place": (TREE, "Set exactly one of at, table and scatter."),
+    "two": (TREE | {"at": [[0, 0]], "table": "a.csv"}, "Set exactly one of at, table and scatter."),
     "short": (TREE | {"at": [[0]]}, "at least 2 items"),
     "outside": (
         TREE | {"at": [[0, 0], [99, 1], [99, 2]]},
@@ -212,19 +212,21 @@ WRONG = {
         TREE | {"scatter": {"count": 9, "spacing_m": 25}},
         "of 9 found room on * within x -20 to 20, y -10 to 10: take fewer",
     ),
-    "no file": (TREE | {"table": "none.csv"}, "none.csv does not exist: check the name"),
-    "no column": (TREE | {"table": "a.csv"}, "it has no column 'y'; it has x, z"),
+    "no file": (TREE | {"table": "none.csv"}, "none.csv does not exist."),
+    "no column": (TREE | {"table": "a.csv"}, "it has no column 'y'. Its columns are x, z"),
     "nan": (
         TREE | {"table": {"file": "a.csv", "columns": {"y": "z"}}},
-        "its column 'z' has 'nan' in line 2: give a number in every line.",
+        "its column 'z' contains 'nan' in line 2. Each row must have a number in this column.",
     ),
     "some heights": (
         TREE | {"table": "some.csv"},
-        "its column 'z' has '' in line 5: give a number in every line, or ignore the column.",
+        ("its column 'z' contains '' in line 5. Each row must have a number in this column. "
+         "Otherwise, ignore the column."),
     ),
     "angle": (
         TREE | {"table": "yaw.csv"},
-        "column 'yaw' has no unit: call it yaw_deg, in degrees, or give columns: {yaw_deg: yaw}",
+        ("column 'yaw' has no unit. Rename it to yaw_deg (degrees) or yaw_rad, or set "
+         "`columns: {yaw_deg: yaw}`"),
     ),
     "mesh": ({"name": "A", "file": "b.stl", "at": [[0, 0]]}, "b.stl"),
 }  # fmt: skip

@@ -66,7 +66,7 @@ def test_a_port_that_is_in_use(monkeypatch):
 
 def test_extras_are_added_in_the_checkout(monkeypatch):
     monkeypatch.setattr(installation, "find_spec", lambda name: "a spec")
-    at = "in lidarpool's checkout (docs/install.md#extras)"
+    at = "in a checkout of lidarpool (docs/install.md#extras)"
     assert install_command("lidarpool[las]") == f'pip install -e ".[las]" {at}'
     assert install_command("lidarpool") == f"pip install -e . {at}"
     assert install_command("torch") == "pip install torch"

@@ -42,12 +42,18 @@ def test_options_are_named_with_the_formats_that_have_them():
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"file": "a.tif", "step_mm": 2}, "step_mm is not a field. Write step_m: 0.002."),
-        ({"file": "a.tif", "step_m": -2}, "step_m is -2; it must be above 0, at most 1000000."),
-        ({"file": "a.tif", "epsg": 25832}, "It is a field of world: write it there."),
-        ({"file": "a.glb", "animation": "Walk"}, "animation is not a field."),
-        ({"file": "a.xml", "groups": [7]}, "scene.files[0].groups[0] is 7; it must be 0 to 5."),
-        ({"step_m": 2}, "scene.files[0].file is missing; it must be given."),
+        (
+            {"file": "a.tif", "step_mm": 2},
+            "Unknown field 'scene.files[0].step_mm'. Write step_m: 0.002.",
+        ),
+        ({"file": "a.tif", "step_m": -2}, "step_m must be above 0 and at most 1000000, but is -2."),
+        ({"file": "a.tif", "epsg": 25832}, "It is a field of world. Move it there."),
+        ({"file": "a.glb", "animation": "Walk"}, "Unknown field 'scene.files[0].animation'."),
+        (
+            {"file": "a.xml", "groups": [7]},
+            "scene.files[0].groups[0] must be from 0 to 5, but is 7.",
+        ),
+        ({"step_m": 2}, "scene.files[0].file is required."),
     ],
 )
 def test_faults_of_options(entry, message):
@@ -58,9 +64,9 @@ def test_a_misspelt_option_in_python(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(LidarError, match=r"no opactiy: leave out opactiy. Did you mean 'opacity'"):
         Scene.load(tmp_path / "a.obj", opactiy="mask")
-    with pytest.raises(LidarError, match="unit is 'mile'"):
+    with pytest.raises(LidarError, match="unit cannot be 'mile'"):
         Scene.load(tmp_path / "a.obj", unit="mile")
-    with pytest.raises(LidarError, match="a scene plays no animation: leave out animation"):
+    with pytest.raises(LidarError, match="animation cannot be used in a scene"):
         Scene.load(tmp_path / "a.glb", animation="Walk")
     of_scenes = {*signature(MeshOptions).parameters} - {"animation"}
     assert of_scenes < {*signature(Scene.load).parameters}

@@ -241,7 +241,7 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
     sweeps = Sweeps.from_survey(own, SCENE)
     Format("images").write(tmp_path / "own", cloud, sweeps)
     sweeps.save(tmp_path / "sweeps.npz")
-    with pytest.raises(LidarError, match="of your own they are written with the run only"):
+    with pytest.raises(LidarError, match="they can only be written during the run"):
         Format("images").write(tmp_path / "i", cloud, Sweeps.load(tmp_path / "sweeps.npz"))
     with pytest.raises(LidarError, match="needs ray, range, which the cloud lacks"):
         Cloud = type(cloud)  # noqa: N806

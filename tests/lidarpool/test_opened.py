@@ -357,12 +357,12 @@ def test_tables_of_nuscenes_name_files_of_the_data_set_only(nuscenes, name, tabl
         open_recording(root, "LIDAR_TOP").read_points(0)
     key = "token" if table == "sample_data" else "sample_data_token"
     assert str(told.value) == (
-        f"{root}: v1.0-lidarpool/{table}.json, {key} {first['token']}, names {name!r}, which leads "
-        "outside of the folder of the data. Only files in that folder are read: copy the file "
-        "there, and correct the name."
+        f"{root}: v1.0-lidarpool/{table}.json, {key} {first['token']}, refers to {name!r}, which "
+        "is outside the data folder. Only files in that folder are read. Copy the file there and "
+        "correct the reference."
     )
     if "link" not in name:  # refused before any sweep is read
-        with pytest.raises(LidarError, match="leads outside"):
+        with pytest.raises(LidarError, match="is outside the data folder"):
             open_recording(root, "LIDAR_TOP")
 
 
@@ -440,10 +440,10 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     shutil.copytree(folder / "nuscenes", tmp_path / "lost")
     next((tmp_path / "lost" / "samples").rglob("*.bin")).unlink()
     for name, words in (
-        ("cut", "poses.txt has no row for frames 1 to 2: it has 1 row, and row k"),
+        ("cut", "poses.txt has no row for frames 1 to 2. It has 1 row, and row k"),
         ("bad", r"poses.txt: line 1 has 11 cells, and 12 were expected \(m00, m01"),
         ("uncalibrated", "calib.txt: line 1 has 'x' as m00, and a number was expected"),
-        ("long", "they are probably nanoseconds; write seconds into times.txt"),
+        ("long", "They are probably nanoseconds. Write seconds into times.txt"),
         ("cut.bin", "cut.bin"),
         ("cut.tar", "cut.tar"),
         ("cut.parquet", "cut.parquet"),
@@ -453,7 +453,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         ("empty", "is not read: give a result, data set, cloud, recording, scenario or mesh"),
         ("run.rrd", "is not read: it is a recording of Rerun, open it with the command rerun, or"),
         ("gt.osi", "is not read: it is a trace of OSI, name it as the traffic of a scenario, or"),
-        ("osi.mcap", "osi.mcap: it has no messages of ROS 2: record PointCloud2, or, if it is a "),
+        ("osi.mcap", "osi.mcap: it has no ROS 2 messages. Record PointCloud2, or set an OSI trace"),
         ("none.ply", "none.ply has no points"),
         ("robot.xacro", "Expand it first"),
         ("lost", r"lost cannot be read: No such file or directory, .*lost/samples/.*bin"),

@@ -223,7 +223,7 @@ def test_timestamps_that_cannot_be_seconds_need_their_unit(tmp_path):
     for second, truth in enumerate(messages):
         truth.timestamp.seconds = 1_790_000_000_000 + 1000 * second
     written(tmp_path / "town.osi", messages)
-    with pytest.raises(LidarError, match="they are probably milliseconds; give time_unit: ms"):
+    with pytest.raises(LidarError, match=r"They are probably milliseconds. Set `time_unit: ms`"):
         build(scenario(tmp_path, "town.osi"))
     timed = {"time_unit": "ms", "offset_s": -1_790_000_000}
     built = build(scenario(tmp_path, "town.osi", **timed))
@@ -321,12 +321,20 @@ def test_the_host_vehicle_carries_the_sensors(tmp_path, vehicle, host):
     on_bus = carried(tmp_path, "town_gt.osi", 7, host=host)
     names = ["car (0)"] if host else []
     assert [actor.name for actor in on_bus.scene.actors] == [*names, "pedestrian (9)"]
-    with pytest.raises(LidarError, match=r"vehicle is '8', which .* There are 0, 7, 9, host\."):
+    with pytest.raises(
+        LidarError, match=r"vehicle is '8', which .* Available names: 0, 7, 9, host\."
+    ):
         carried(tmp_path, "town_gt.osi", 8)
     for truth in (nobody := list(truths())):
         truth.host_vehicle_id = None
     written(tmp_path / "nobody_gt.osi", nobody)
-    with pytest.raises(LidarError, match=r"may not name its host .*identity\. There are 0, 7, 9\."):
+    with pytest.raises(
+        LidarError,
+        match=(
+            r"may not name its host .*identity\. Available "
+            r"names: 0, 7, 9\."
+        ),
+    ):
         carried(tmp_path, "nobody_gt.osi", "host")
 
 

@@ -179,14 +179,17 @@ BAD = {
     "start within": ({"centres": [(25, 24)], "radii": 2}, r"start \(25, 25\) lies within disc 0"),
     "target within": ({"centres": [(0, 0), (-30, -21)], "radii": 2}, "target .* within disc 1"),
     "no way to go": ({"start": (1, 2), "target": (1, 2)}, "nothing to plan"),
-    "start not finite": ({"start": (np.nan, 0)}, "start\\[0\\] is nan; it must be a finite number"),
-    "target in space": ({"target": (0, 0, 0)}, "target is .* at most 2 items"),
+    "start not finite": (
+        {"start": (np.nan, 0)},
+        "start\\[0\\] must be a finite number, but is nan",
+    ),
+    "target in space": ({"target": (0, 0, 0)}, "target must have at most 2 items"),
     "centres not finite": ({"centres": [(0, np.inf)], "radii": 1}, "centres is .*inf"),
     "centres in space": ({"centres": [(0, 0, 0)], "radii": 1}, r"centres is .*\(m, 2\)"),
     "radii too many": ({"centres": [(0, 0)], "radii": [1, 2]}, "one for each disc or one for all"),
     "radius below 0": ({"centres": [(0, 0)], "radii": -1}, "above 0"),
     "radius not finite": ({"centres": [(0, 0)], "radii": np.inf}, "radii is inf; it must be fin"),
-    "no trials": ({"trials": 0}, "trials is 0; it must be 1 to"),
+    "no trials": ({"trials": 0}, "trials must be from 1 to"),
 }
 
 

@@ -141,7 +141,7 @@ def test_stations_are_in_world_coordinates_and_stand_on_pavements():
     ("given", "says"),
     [
         ({"count": 2, "coverage": 0.9}, "give one of them"),
-        ({"coverage": 95.0}, "coverage is 95.0"),
+        ({"coverage": 95.0}, "coverage must be .* but is 95.0"),
         ({"spacing_m": 0.001}, "larger spacing"),
         ({"sensor": Sensor.grid(max_range_m=0.5)}, "Nothing is visible"),
         ({"scene": Scene.from_meshes(POLES), "spacing_m": 3.0}, "The scene has no floor"),

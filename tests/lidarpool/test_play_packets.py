@@ -177,7 +177,8 @@ def test_a_loop_goes_on_in_time_until_ctrl_c_and_leaves_no_process(receiver, tmp
     assert (steps > 1000).all()
     assert np.abs(steps - 1327).max() < 1500  # at the start of a lap, a packet is not full
     assert re.fullmatch(
-        r"lidarpool: interrupted; everything was stopped\. [\d,]+ packets sent, [\d.]+ % of them "
+        r"lidarpool: Interrupted. All processes were stopped\. [\d,]+ packets sent, [\d.]+ % "
+        r"of them "
         r"within 5 ms of their time, the latest after [\d.]+ ms\.\n",
         output[1].splitlines(keepends=True)[-1],
     )
@@ -292,7 +293,7 @@ def test_a_result_without_rays_is_refused_in_a_line(played, tmp_path):
     sweeps = Sweeps.load(played / "out" / SWEEPS_FILE)
     replace(sweeps, fired=None).save(tmp_path / SWEEPS_FILE)
     outcome = command("play", tmp_path, "--as", "packets")
-    assert "Packets hold every ray and return of a survey" in str(outcome.exception)
+    assert "Packets contain all rays and returns of a survey" in str(outcome.exception)
 
 
 def test_a_port_of_the_interface_that_is_in_use_is_refused(tmp_path):

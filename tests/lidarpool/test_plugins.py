@@ -103,7 +103,7 @@ def test_a_scenario_takes_options_of_a_plugin(tmp_path, distribution):
 
     assert scene({"file": "a.sized", "size_m": 3.0}).vertices.max() == 3
     told = refused(scene, {"file": "a.sized", "size_m": 0})
-    assert told == "scenario: scene.files[0].size_m is 0; it must be above 0, at most 100."
+    assert told == "scenario: scene.files[0].size_m must be above 0 and at most 100, but is 0."
     told = refused(scene, {"file": "a.obj", "size_m": 3})
     assert "scene.files[0]: a.obj has no size_m, an option of .sized: leave out size_m." in told
     assert scenario_schema()["$defs"]["MeshFile"]["properties"]["size_m"]["maximum"] == 100
@@ -115,7 +115,7 @@ def test_an_option_of_two_formats_has_the_limits_of_the_file(distribution):
     assert [entry["maximum"] for entry in schema["anyOf"]] == [1, 100]
     Scenario.from_data({"scene": [{"file": "a.sized", "sag_m": 90}]})
     told = refused(Scenario.from_data, {"scene": [{"file": "a.xodr", "sag_m": 90}]})
-    assert "sag_m is 90; it must be at most 1." in told
+    assert "sag_m must be at most 1, but is 90." in told
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_two_plugins_of_one_name_are_an_error(tmp_path, distribution):
     for name in ("twice-a", "twice-b"):
         mesh(distribution, name, "twice", TRIANGLE.format(ending="twice"))
     told = refused(load_meshes, write(tmp_path / "a.twice", "anything"))
-    assert "twice-a 0.1 and twice-b 0.1 each provide '.twice' for lidarsim.meshes" in told
+    assert "twice-a 0.1 and twice-b 0.1 both provide '.twice' for lidarsim.meshes" in told
 
 
 def test_names_without_a_plugin(distribution):
@@ -182,7 +182,7 @@ def refused(function, *arguments, **options):
         ("lost-library", "import no_such_library", None, "No module named 'no_such_library'"),
         ("lost-name", "", None, "has no attribute 'FORMAT'"),
         ("lost-module", "", "no_such_module:FORMAT", "No module named 'no_such_module'"),
-        ("wrong-kind", "FORMAT = {}", None, "is a dict, and lidarsim.meshes takes a MeshFormat"),
+        ("wrong-kind", "FORMAT = {}", None, "is a dict, but lidarsim.meshes requires a MeshFormat"),
         (
             "lost-field",
             "from lidarsim.plugins import MeshFormat\nFORMAT = MeshFormat()",
@@ -193,7 +193,7 @@ def refused(function, *arguments, **options):
             "lost-reader",
             "from lidarsim.plugins import MeshFormat\nFORMAT = MeshFormat(('.lost-reader',))",
             None,
-            "lacks read, which lidarsim.meshes needs",
+            "lacks read, which lidarsim.meshes requires",
         ),
         (
             "lost-function",
@@ -207,7 +207,7 @@ def refused(function, *arguments, **options):
             "late-library",
             TRIANGLE.format(ending="late-library").replace("mesh =", "import no_such; mesh ="),
             None,
-            "cannot be imported (No module named 'no_such')",
+            "cannot be imported: No module named 'no_such'",
         ),
         (
             "no-content",
@@ -239,7 +239,7 @@ def test_formats_of_clouds_that_cannot_be_used(distribution):
     assert "has data sets" in refused(row_of, "set")
     assert "writes 'cloud.ply'" in refused(row_of, "taken")
     told = refused(Format, "quarter")
-    assert "'quarter' is not a format of clouds" in told and "half" in told
+    assert "Unknown cloud format 'quarter'" in told and "half" in told
 
 
 def test_sensors_that_cannot_be_used(distribution):
@@ -252,7 +252,7 @@ def test_sensors_that_cannot_be_used(distribution):
         {"one_model/maker/x1.yaml": "firing_us: 1"},
     )
     assert "Did you mean 'maker/x1'?" in refused(load_sensor, "maker/x2")
-    assert "x1.yaml is not a usable model" in refused(load_sensor, "maker/x1")
+    assert "x1.yaml is not a valid sensor model" in refused(load_sensor, "maker/x1")
 
 
 def test_commands_that_cannot_be_used(distribution, capsys):

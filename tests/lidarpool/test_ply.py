@@ -186,7 +186,7 @@ def test_columns_of_every_type_come_back(tmp_path):
 
 def test_a_number_that_a_file_cannot_hold_is_refused(tmp_path):
     cloud = Cloud(np.zeros((1, 3)), {"time": np.array([2**53 + 1])})
-    with pytest.raises(LidarError, match="'time' holds 9007199254740993, and a PLY file holds"):
+    with pytest.raises(LidarError, match="'time' contains 9007199254740993, but PLY files store"):
         save_cloud(cloud, tmp_path / "c.ply")
     assert list(tmp_path.iterdir()) == []
 
@@ -258,11 +258,14 @@ def test_reading_what_is_not_a_cloud(tmp_path):
     save_cloud(sample(20), good)
     data = good.read_bytes()
     cases = {
-        "cut": (data[:-1], "bytes there"),
-        "empty": (b"", "no header"),
-        "ascii": (data.replace(b"binary_little_endian", b"ascii"), "no header"),
+        "cut": (data[:-1], "but there are"),
+        "empty": (b"", "no binary"),
+        "ascii": (data.replace(b"binary_little_endian", b"ascii"), "no binary"),
         "no z": (data.replace(b"float z", b"float w"), "lacks z"),
-        "mesh": (data.replace(b"end_header", b"element face 0\nend_header"), "more than points"),
+        "mesh": (
+            data.replace(b"end_header", b"element face 0\nend_header"),
+            "elements other than points",
+        ),
         "5000 digits": (data.replace(b"vertex 20", b"vertex " + b"9" * 5000), "bytes|Exceeds"),
         "below 0": (data.replace(b"vertex 20", b"vertex -1"), "no points"),
         "list": (data.replace(b"uint16 ring", b"list uchar int ring"), "list properties"),

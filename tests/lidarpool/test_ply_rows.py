@@ -86,5 +86,5 @@ def test_a_number_that_a_file_cannot_hold_is_refused():
     columns = memory.columns(5)
     columns["time"][3] = 2**53 + 1
     maker = RowMaker(row_type(np.dtype(np.float32), table), table, memory, 0.01, np.zeros(3))
-    with pytest.raises(LidarError, match="'time' holds 9007199254740993"):
+    with pytest.raises(LidarError, match="'time' contains 9007199254740993"):
         maker.make(columns)

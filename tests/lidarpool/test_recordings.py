@@ -99,10 +99,10 @@ def test_rows_of_kitti_belong_to_the_frames_with_their_numbers(tmp_path):
 @pytest.mark.parametrize(
     ("frames", "rows", "words"),
     [
-        ([0, 1, 2, 3, 7], (5, 8), "poses.txt has no row for frame 7: it has 5 rows, and row k"),
-        ([0, 1, 2, 3, 7], (8, 3), "times.txt has no row for frames 3, 7: it has 3 rows"),
+        ([0, 1, 2, 3, 7], (5, 8), "poses.txt has no row for frame 7. It has 5 rows, and row k"),
+        ([0, 1, 2, 3, 7], (8, 3), "times.txt has no row for frames 3, 7. It has 3 rows"),
         ([10, 11], (2, 20), "poses.txt has no row for frames 10 to 11"),
-        ([0, 1, 2], (3, 5), "times.txt has rows for frames 3 to 4, which have no file"),
+        ([0, 1, 2], (3, 5), "times.txt has rows for frames 3 to 4, but the"),
     ],
 )
 def test_rows_of_kitti_that_fit_no_frames_are_refused(tmp_path, frames, rows, words):
@@ -118,7 +118,7 @@ def test_files_that_are_not_numbered_have_a_row_each(tmp_path):
     assert first_x(recording) == [49, 50]
     np.testing.assert_allclose(recording.poses(range(2))[:, 0, 3], [0, 1], atol=1e-9)
     write_scan(folder / "velodyne" / "1623456789.75.bin", 51)
-    with pytest.raises(LidarError, match="has 2 rows for 3 files of points, whose names are not"):
+    with pytest.raises(LidarError, match="has 2 rows for 3 files of points whose names are not"):
         open_recording(folder)
 
 

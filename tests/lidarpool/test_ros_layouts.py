@@ -287,7 +287,7 @@ def test_a_custom_message_without_points_or_in_pieces(tmp_path):
     with AnyReader([tmp_path / "c.mcap"]) as bag:
         (data, _) = (data for found, _, data in bag.messages() if found.topic == "/roof/livox")
     assert not len(livox_columns(data)["x"])
-    with pytest.raises(ValueError, match=r"5 points announced"):
+    with pytest.raises(ValueError, match=r"5 points were expected"):
         livox_columns(data[:-4] + b"\5\0\0\0")
 
 
@@ -458,7 +458,7 @@ def test_what_cannot_be_organized_is_one_line(tmp_path):
     unknown = Cloud(
         cloud.positions, cloud.columns, sweeps=lambda: replace(cloud.sweeps(), fired=None)
     )
-    with pytest.raises(LidarError, match=r"organized clouds need every return"):
+    with pytest.raises(LidarError, match=r"organized clouds require all returns"):
         save_cloud(unknown, tmp_path / "c.mcap", organized=True)
 
 

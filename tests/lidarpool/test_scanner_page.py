@@ -114,7 +114,7 @@ def test_faults_are_one_line(hall):
     assert "iframe" not in view._repr_html_()
     with pytest.raises(LidarError, match=r"different names, such as .* given: '', ''\."):
         show([scanner, scanner])
-    with pytest.raises(LidarError, match=r"scanner is 'vlp16'; it must be a Scanner"):
+    with pytest.raises(LidarError, match=r"scanner must be a Scanner or a list, but is 'vlp16'"):
         show("vlp16")
 
 

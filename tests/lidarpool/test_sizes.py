@@ -53,7 +53,7 @@ def test_cells_of_any_length_are_refused_in_a_line(tmp_path, cell):
         path.write_text(f"{header}\n{row}")
         refused(load_trajectory, path)
     path.write_text(f"time_s,x,y,z\n0,0,0,{'1' * 140_000}\n1,1,1,1\n")
-    assert "a cell has more than 131,072 letters" in refused(load_trajectory, path)
+    assert "a cell has more than 131,072 characters" in refused(load_trajectory, path)
 
 
 @pytest.mark.extended

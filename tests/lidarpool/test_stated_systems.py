@@ -176,7 +176,7 @@ def test_true_metres_stay_as_they_are(tmp_path, system):
 def test_what_cannot_be_brought_is_refused(tmp_path):
     path = written(tmp_path / "a.las", ground("EPSG:3857"), wkt("EPSG:3857"))
     for epsg, message in (
-        (3857, r"cannot be brought to EPSG:3857 \(.*, for maps of the world"),
+        (3857, r"cannot be brought to EPSG:3857 \(.*, a world map projection"),
         (2263, r"cannot be brought to EPSG:2263 \(.*, which is not in metres"),
         (32640, r"cannot be brought to EPSG:32640 .*EPSG:32632 has true metres"),
         (1025, "EPSG:1025 is not known to PROJ"),

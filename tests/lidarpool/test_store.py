@@ -290,7 +290,7 @@ def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
 
 
 def test_places_that_cannot_be(tmp_path):
-    with pytest.raises(LidarError, match="make the one that it lies in first"):
+    with pytest.raises(LidarError, match="Make the one that it lies in first"):
         opened(tmp_path / "none" / "run")
     with pytest.raises(LidarError, match="give a folder for the run as well"):
         opened(None, tmp_path / "parts")

@@ -154,10 +154,10 @@ def test_sweeps_are_chosen_by_split_job_and_sensor(written):
         ({"sensors": ["roof"]}, r"no sensor 'roof'\. It has front, rear/left"),
         ({"jobs": [3]}, r"no job 3 that is done: jobs.csv lists all"),
         ({"jobs": [4], "split": "train"}, "no job 4 in split 'train'"),
-        ({"jobs": "04"}, "jobs is '04'; it must be a list"),
-        ({"shuffle": True}, "shuffle is True; it must be a whole number or None"),
-        ({"shuffle": -1}, "shuffle is -1; it must be at least 0"),
-        ({"sensors": "front"}, "sensors is 'front'; it must be a list of text"),
+        ({"jobs": "04"}, "jobs must be a list of whole numbers or None, but is '04'"),
+        ({"shuffle": True}, "shuffle must be a whole number or None, but is True"),
+        ({"shuffle": -1}, "shuffle must be at least 0 or None, but is -1"),
+        ({"sensors": "front"}, "sensors must be a list of text or None, but is 'front'"),
     ):
         with pytest.raises(LidarError, match=words) as told:
             lidarpool.sweeps(place, **options)

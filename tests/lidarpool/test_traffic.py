@@ -73,7 +73,7 @@ def test_an_actor_is_refused_held_or_absent_beyond_its_trajectory():
     for beyond in ("hold", "absent"):
         places, _ = passing(beyond).trajectory.poses(0, times)
         assert places[:, 0].tolist() == pytest.approx([-2, -2, 2])
-    with pytest.raises(LidarError, match="start_s is nan; it must be a finite number"):
+    with pytest.raises(LidarError, match="start_s must be a finite number or None, but is nan"):
         Track([0, 1], [[0, 0, 0], [1, 0, 0]], start_s=np.nan, beyond="absent")
 
 
@@ -212,7 +212,7 @@ def test_times_of_traffic_that_cannot_be_seconds_need_their_unit(
     tmp_path, unit, name, count, start_s
 ):
     text = in_unit(count, start_s * count)
-    with pytest.raises(LidarError, match=f"they are probably {name}; give time_unit: {unit}"):
+    with pytest.raises(LidarError, match=f"They are probably {name}. Set `time_unit: {unit}"):
         build(scenario(tmp_path, text))
     timed = {"time_unit": unit, "offset_s": -start_s}
     expected = [actor.trajectory for actor in build(scenario(tmp_path)).scene.actors]
@@ -346,7 +346,7 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         (FCD.replace('x="40"', 'x="east"'), "vehicle 'a.1' has the x 'east'; give a number"),
         (FCD.replace('time="3.00"', 'time="3:00"'), "a timestep has the time '3:00'; give a num"),
         (FCD.replace('angle="45"', ""), "'angle' is missing"),
-        (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares an XML entity"),
+        (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares the XML entity"),
     ],
 )
 def test_unusable_data_is_refused(tmp_path, text, told):
@@ -361,14 +361,14 @@ def test_unusable_data_is_refused(tmp_path, text, told):
         (
             '<vehicle id="' + "1" * 20_000_000 + '"/>',
             2**25,
-            "it has a tag or remark of more than 16.00 MiB",
+            "it has a tag or comment of more than 16.00 MiB",
         ),
         (
             "".join(f"<vehicle id='{i}' x='0' y='0' angle='0'/>" for i in range(2_000)),
             3 * 2**19,
-            "of at most 1.50 MiB: simulate a shorter time, or fewer vehicles.",
+            "the limit is 1.50 MiB. Simulate a shorter time, or fewer vehicles.",
         ),
-        ("<x/>" * 1_000_000, 2**20, "of at most 1.00 MiB: unpack it with gunzip first."),
+        ("<x/>" * 1_000_000, 2**20, "the limit is 1.00 MiB. Unpack it with gunzip first."),
     ],
 )
 def test_packed_data_that_unpacks_to_far_more_is_refused(
@@ -430,7 +430,7 @@ def test_what_is_wrong_with_traffic_is_told(tmp_path):
         scenario(tmp_path, traffic={"surfaces": []})
     with pytest.raises(LidarError, match=r"type 'car', but no entry .* add one, such as"):
         build(scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}))
-    with pytest.raises(LidarError, match="give either file or box"):
+    with pytest.raises(LidarError, match="Set exactly one of file and box"):
         scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
     with pytest.raises(LidarError, match=r"traffic\.file: .*no\.xml does not exist"):
         build(scenario(tmp_path, traffic={"file": "no.xml"}))
@@ -474,12 +474,12 @@ def test_a_vehicle_of_the_traffic_carries_the_sensors(tmp_path):
 def test_what_is_wrong_with_a_carrier_of_the_traffic_is_told(tmp_path):
     for trajectory, message in (
         ({"vehicle": "a.2"}, r"vehicle is 'a\.2', which fcd\.xml does not have .*'a\.1'"),
-        ({"vehicle": 7}, r"vehicle is '7', which .* There are a\.1, bus, p\."),
+        ({"vehicle": 7}, r"vehicle is '7', which .* Available names: a\.1, bus, p\."),
         ({"vehicle": "bus"}, "vehicle is 'bus', which fcd.xml does not have for two time steps"),
         ({"vehicle": "a.1"}, "from 0 to 1, 3 to 4 s: give trajectory.start_s"),
         ({"vehicle": "a.1", "start_s": 2}, "from 0 to 1, 3 to 4 s: give trajectory.start_s"),
         ({"vehicle": "p", "offset_s": 1}, r"leave out trajectory\.offset_s"),
-        ({"vehicle": "p", "file": "a.tum"}, "give one of file, points and vehicle"),
+        ({"vehicle": "p", "file": "a.tum"}, "Set exactly one of file, points and vehicle"),
         ({"vehicle": ""}, "vehicle"),
     ):
         with pytest.raises(LidarError, match=message) as caught:

@@ -161,9 +161,9 @@ CONTROLLER = (
             for metres in ("0,01", "0", "nan")
         ],
         ({"doctype": '<!DOCTYPE C [<!ENTITY i SYSTEM "file:///etc/passwd">]>', "numbers": "&i;"},
-         "declares an XML entity"),
+         "declares the XML entity"),
         ({"doctype": f'<!DOCTYPE C [<!ENTITY a "0 0 0 0 0 0 0 0 0 0">{NESTED}]>', "numbers": "&i;"},
-         "declares an XML entity, 'a'"),
+         "declares the XML entity 'a'"),
     ],
     ids=str,
 )  # fmt: skip

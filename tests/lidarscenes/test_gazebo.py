@@ -498,7 +498,7 @@ BROKEN = {
     ),
     "it declares XML entities": "<!DOCTYPE s [<!ENTITY a 'b'>]>" + world(model("a", link())),
     "uses the XML entity 'a'": world(model("&a;", link())),
-    "is cut short (its last element, <world>, is not closed)": sdf("<world name='w'>").replace(
+    "is cut short: its last element, <world>, is not closed": sdf("<world name='w'>").replace(
         "</sdf>", ""
     ),
     "line 1 contains </sdf> without a matching start tag": sdf("<world name='w'>"),

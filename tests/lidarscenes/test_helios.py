@@ -419,7 +419,7 @@ def test_times_of_a_trajectory_must_be_seconds(imported):
         '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20"/></leg>'
     )
     rows = "".join(f"{1403636580 + t}000000000,0,0,90,{t},2,30\n" for t in range(3))
-    words = r"way\.trj cannot be used .* probably nanoseconds; HELIOS\+\+ expects seconds"
+    words = r"way\.trj cannot be used .* probably nanoseconds[.] HELIOS\+\+ expects seconds"
     with pytest.raises(LidarError, match=words):
         imported(
             scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10),
@@ -602,7 +602,7 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
     ("change", "message"),
     [
         (("<survey", "<survey <"), "fly.xml is not valid XML"),
-        (("<document", '<!DOCTYPE a [<!ENTITY e "">]><document'), "declares an XML entity"),
+        (("<document", '<!DOCTYPE a [<!ENTITY e "">]><document'), "declares the XML entity 'e'"),
         (("devices.xml#s", "devices.xml#t"), "devices.xml has no <scanner> 't'"),
         (("devices.xml#s", "lasers.xml#s"), "the file 'lasers.xml' is neither.*--assets"),
         (('scanner="devices.xml#s"', ""), "<survey> has no scanner"),

@@ -250,7 +250,7 @@ def test_styles_are_colours_and_materials(house, forked):
     assert wall.colours.images[0].tolist() == [[[153, 51, 51]]]
     assert meshes["IfcSlab Floor"].colours is None
     [note] = notes
-    assert "has transparent materials without holes, taken as solid: Glass" in note
+    assert "has transparent materials without holes, which are treated as opaque: Glass" in note
 
 
 @pytest.mark.parametrize(("schema", "prefix", "unit_m"), [

@@ -636,12 +636,12 @@ ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
         # Its samples are more than its triangles, which would fit.
         (
             document(road(LANES, shape='<arc curvature="0.01"/>', offset=BENDS)),
-            "would unpack to 2[67].* MiB",
+            "would unpack to at least 2[67].* MiB",
         ),
         (document(road(section(right=lane(-1, width(4)) * 2))), "two lanes of the same id"),
         (document(road(section(right=lane(-1)))), "no triangles"),
-        (ENTITY + "<OpenDRIVE/>", "declares an XML entity"),
-        (document(road())[:-30], "is cut short .its XML ends within an element, in line"),
+        (ENTITY + "<OpenDRIVE/>", "declares the XML entity"),
+        (document(road())[:-30], "is cut short: its XML ends inside an element in line"),
     ],
 )  # fmt: skip
 def test_broken_files(tmp_path, text, message):

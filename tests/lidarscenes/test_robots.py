@@ -383,13 +383,16 @@ def test_tables_of_joints(tmp_path):
         tip.check(0, 2e9)
     for text, words in (
         ("", "it is empty"),
-        ("time_s,stool\n0,1\n", "not known: stool. .*Known are time_s.*, pan.*, slide, tilt"),
+        (
+            "time_s,stool\n0,1\n",
+            "unknown column 'stool'. .*The known columns are time_s.*, pan.*, slide, tilt",
+        ),
         ("time_s,seat\n0,1\n", "no column for a movable joint. Name its columns.*pan, slide, tilt"),
-        ("time_s,pan,pan\n0,1,2\n", "has the column 'pan' twice"),
+        ("time_s,pan,pan\n0,1,2\n", "its column 'pan' occurs twice"),
         ("pan,slide\n0,1\n", "no column 'time_s'"),
-        ("time,pan\n0,1\n", "call it time_s, in seconds; time_ms or time_us"),
-        ("time_s,pan\n0,nan\n", "has 'nan' in line 2"),
-        ("time_s,pan\n0,0\n50000000,1\n", "probably nanoseconds; give time_unit: ns"),
+        ("time,pan\n0,1\n", "Rename it to time_s .seconds., time_ms, time_us"),
+        ("time_s,pan\n0,nan\n", "contains 'nan' in line 2"),
+        ("time_s,pan\n0,0\n50000000,1\n", "probably nanoseconds. Set `time_unit: ns`"),
         ("time_s,pan\n1,0\n0,0\n", "must be finite and strictly increasing"),
     ):
         table.write_text(text)

@@ -170,7 +170,7 @@ def test_the_model_that_the_package_names_is_built(tmp_path):
         ),
         (
             {"doctype": f'<!DOCTYPE model [<!ENTITY a "0000000000">{NESTED}]>', "x": "&i;"},
-            "declares an XML entity",
+            "declares the XML entity",
         ),
     ],
     ids=str,

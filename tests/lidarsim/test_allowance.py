@@ -91,8 +91,8 @@ BOMBS = {
     "objects.3mf": (model(b"<object id='2'/>" * 300_000), "would unpack to 256"),
     "lzma.3mf": (model(b" " * 10_000_000, method=zipfile.ZIP_LZMA), "a method other than Deflate"),
     "colours.3mf": (model(b"<base/>" * 3_000_000), "would unpack to 256"),
-    "attribute.3mf": (model(b"<a b='%s'/>" % (b"1" * 20_000_000)), "a tag or remark of more"),
-    "entities.3mf": (None, "declares an XML entity"),
+    "attribute.3mf": (model(b"<a b='%s'/>" % (b"1" * 20_000_000)), "a tag or comment of more"),
+    "entities.3mf": (None, "declares the XML entity"),
     "count.gltf": (gltf({"bufferView": 0, "count": 60_000_000}), "would unpack to 457.76 MiB"),
     "sparse.gltf": (
         gltf({"count": 2_000_000_000, "sparse": {"count": 0}}),
@@ -108,7 +108,7 @@ BOMBS = {
         "places 14,641 objects of 7,320,500,000 triangles",
     ),
     "draco.gltf": (draco(), "would unpack to 46.35 GiB"),
-    "entities.dae": (entities("COLLADA"), "declares an XML entity"),
+    "entities.dae": (entities("COLLADA"), "declares the XML entity"),
     "long.ply": (PLY.format(10**9, "face", 1, "uchar int").encode() + bytes(10**6), "fewer"),
     "rows.ply": (
         PLY.format(3, "face", 10**5, "uchar uchar").encode()
@@ -123,11 +123,11 @@ BOMBS = {
                     .replace(b"]\n", b"]}\n"), "would unpack to"),
     "sensor.yaml": (
         b"name: x\nfiring_us: 1\nbeams: {elevation_deg: {first: 0, last: 1, count: 300000000}}\n",
-        "1,000,000 beams at most",
+        "count must be at most 1,000,000",
     ),
     "lasers.yaml": (
         b"num_lasers: 300000000\nlasers: [{laser_id: 0, vert_correction: 0, rot_correction: 0}]\n",
-        "it must have lasers 0 to 299999999",
+        "it must list each of the lasers 0 to 299999999",
     ),
 }  # fmt: skip
 READ = """
@@ -204,7 +204,7 @@ def test_a_large_mesh_is_read_though_memory_is_short(tmp_path, monkeypatch):
     monkeypatch.setattr(allowance, "memory", lambda: 1 + path.stat().st_size)
     assert len(load_meshes(path)[0].faces) == 81920
     monkeypatch.setattr(input_files, "memory", lambda: path.stat().st_size - 1)
-    with pytest.raises(LidarError, match=r"ball\.ply: it has .* more than the memory"):
+    with pytest.raises(LidarError, match=r"ball\.ply: it has .* exceeds the memory"):
         load_meshes(path)
 
 

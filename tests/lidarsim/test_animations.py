@@ -232,7 +232,7 @@ def test_unusable_animations_are_refused_in_a_line(tmp_path, edit, name, message
 
 @pytest.mark.parametrize(
     ("keys", "way", "message"),
-    [([0, 1e9], 1, "would unpack to .*: shorten its animation"),
+    [([0, 1e9], 1, "would unpack to .*[.] Shorten its animation"),
      ([0, 1], 1e30, "farther than anything on Earth")],
 )  # fmt: skip
 def test_endless_animations_and_ways_are_refused(tmp_path, keys, way, message):
@@ -540,7 +540,7 @@ def test_damaged_poses_in_a_file_of_pictures_are_told(walker, tmp_path):
         arrays = dict(archive)
     for name, value in (("mesh0_steps", arrays["mesh0_steps"][:, 1:]), ("mesh0_played", [0])):
         np.savez_compressed(path, **(arrays | {name: value}))
-        with pytest.raises(LidarError, match=r"p\.npz.*(its animation moves|run the survey)"):
+        with pytest.raises(LidarError, match=r"p\.npz.*(its animation moves|Run the survey)"):
             PictureContent.load(path)
 
 
@@ -583,16 +583,21 @@ def test_wheels_turn_by_speed_over_radius():
         np.testing.assert_allclose(velocity[:, wheel][..., [0, 2]] - [5, 0], expected, atol=0.3)
     flat = replace(parts[1], name="wheel_flat", vertices=parts[1].vertices * [1, 1, 0.5])
     rolling([*parts, flat], ["wheel*"], notes.append)
-    assert notes == [
-        "wheel_flat has no axle, and does not turn: it is 0.6 m long and 0.3 m high, not round "
-        "about y"
-    ]
+    assert notes == ["wheel_flat is not round about y (0.6 m long, 0.3 m high) and does not rotate"]
     nut = ring("wheel_nut", 0.01, [1.2, 0.9, 0.3])
     rolling([*parts, nut], ["wheel*"], notes.append)
-    assert notes[1:] == ["wheel_nut is 60 times smaller than the largest, and does not turn"]
-    with pytest.raises(LidarError, match=r"'axle', but no object has that name\. There are Bo"):
+    assert notes[1:] == ["wheel_nut is 60 times smaller than the largest wheel and does not rotate"]
+    with pytest.raises(
+        LidarError, match=r"'axle', but no object has that name\. Available names: Bo"
+    ):
         rolling(parts, ["wheel*", "axle"], notes.append)
-    with pytest.raises(LidarError, match=r"can turn: wheel_flat has no axle, .* about y\.$"):
+    with pytest.raises(
+        LidarError,
+        match=(
+            r"can rotate: wheel_flat is not round about y .* "
+            r"rotate\.$"
+        ),
+    ):
         rolling([*parts, flat], ["wheel_flat"], notes.append)
 
 
@@ -669,13 +674,15 @@ def test_bad_animations_are_refused():
     mesh = box("Box", (1, 1, 1))
     poses = np.stack([mesh.vertices] * 2)
     assert np.array_equal(Animation(poses.astype("f").tolist(), 1).vertices, poses)
-    with pytest.raises(LidarError, match="step_s is inf; it must be a finite number"):
+    with pytest.raises(LidarError, match="step_s must be a finite number, but is inf"):
         Animation(poses, np.inf)
-    with pytest.raises(LidarError, match=r"vertices of an animation is 'abc'; it must be an a"):
+    with pytest.raises(
+        LidarError, match=r"vertices of an animation must be an array of numbers, but is 'abc'"
+    ):
         Animation("abc", 1)
-    with pytest.raises(LidarError, match=r"of two poses at least.*given: \(1, 8, 3\), 0.1 s"):
+    with pytest.raises(LidarError, match=r"at least two poses.*but has \(1, 8, 3\), 0.1 s"):
         Animation(mesh.vertices[None], 0.1)
-    with pytest.raises(LidarError, match=r"above 0; given.* 0 s, None"):
+    with pytest.raises(LidarError, match=r"above 0, but has .* 0 s and None"):
         Animation(np.stack([mesh.vertices] * 2), 0)
-    with pytest.raises(LidarError, match="has 8 vertices, and its animation moves 7"):
+    with pytest.raises(LidarError, match="has 8 vertices, but its animation moves 7"):
         replace(mesh, animation=Animation(np.stack([mesh.vertices[1:]] * 2), 0.1))

@@ -149,7 +149,7 @@ def test_stamps_of_several_clocks_are_refused(bag):
     messages = [pose_stamped(row) for row in ROWS]
     messages[3].header.stamp.sec = 12  # since the start of a program
     path = bag(state=messages)
-    words = r"go from 12\.3 to 1\.7e\+09 s, which are 53\.8 years: correct those that are far from"
+    words = r"range from 12\.3 to 1\.7e\+09 s, a span of 53\.8 years. Correct the outliers"
     with pytest.raises(LidarError, match=words):
         load_trajectory(path)
     assert load_trajectory(path, time_unit="s").times_s[0] == 12.3
@@ -162,10 +162,10 @@ def test_several_topics_have_to_be_chosen(bag):
         tf=[carrier(row) for row in ROWS],
     )
     with pytest.raises(
-        LidarError, match="the poses /odom, /slam, /tf:base_link: choose one with topic"
+        LidarError, match=r"poses are /odom, /slam and /tf:base_link. Set topic to one"
     ):
         load_trajectory(path)
-    with pytest.raises(LidarError, match=r"has no poses '/odmo'\. Did you mean '/odom'"):
+    with pytest.raises(LidarError, match=r"has no topic '/odmo' with poses\. Did you mean '/odom'"):
         load_trajectory(path, topic="/odmo")
     track = load_trajectory(path, topic="/slam")
     assert len(track.times_s) == 16
@@ -188,7 +188,7 @@ def test_frames_above_each_other(bag):
         ],
         tf_static=[frames(transform(0, "base_link", "lidar", mount.position, turn))],
     )
-    with pytest.raises(LidarError, match="/tf:base_link, /tf:odom: choose one"):
+    with pytest.raises(LidarError, match=r"/tf:base_link and /tf:odom. Set topic to one"):
         load_trajectory(path)
     track = load_trajectory(path, topic="/tf:lidar")
     assert np.isclose(track.times_s[0] - START_NS / 1e9, 0.1)
@@ -223,7 +223,13 @@ def test_gnss_without_orientations_faces_its_direction_of_travel(bag):
 
 def test_bags_without_poses(bag):
     path = bag(imu=[imu(0), imu(1)])
-    with pytest.raises(LidarError, match="it has no poses: topics of nav_msgs/msg/Odometry"):
+    with pytest.raises(
+        LidarError,
+        match=(
+            r"it has no poses. Supported topics are "
+            r"nav_msgs/msg/Odometry"
+        ),
+    ):
         load_trajectory(path)
     with pytest.raises(LidarError, match="no poses"):
         load_trajectory(path, ignore=["x"])
@@ -233,6 +239,6 @@ def test_a_cut_bag_and_a_zero_quaternion(bag, tmp_path):
     path = bag(state=[pose_stamped(row) for row in ROWS])
     file = path if path.is_file() else next(path.glob("*.mcap"))
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 3])
-    with pytest.raises(LidarError, match="not a usable trajectory") as raised:
+    with pytest.raises(LidarError, match="not a valid trajectory") as raised:
         load_trajectory(path)
     assert len(str(raised.value).splitlines()) == 1

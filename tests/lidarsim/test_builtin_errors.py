@@ -16,7 +16,9 @@ def test_a_file_that_does_not_exist(load, name, tmp_path):
 
 
 def test_an_argument_that_does_not_fit():
-    with pytest.raises(ValueError, match="position is 'a'") as raised:
+    with pytest.raises(
+        ValueError, match="position must be a list of numbers, but is 'a'"
+    ) as raised:
         Pose("a")
     assert isinstance(raised.value, LidarError)
 

@@ -51,7 +51,7 @@ def test_what_a_capture_lacks_is_noted(tmp_path):
     assert [datagram.payload for datagram in capture.datagrams()] == [b"whole"]
     ends, cut = capture.notes
     assert ends.startswith("ends inside a frame")
-    assert cut.startswith("has 1 datagrams that were not captured as a whole")
+    assert cut.startswith("has 1 truncated datagrams")
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_what_a_capture_lacks_is_noted(tmp_path):
         (pcap([]), "has no UDP datagrams over IPv4"),
         (pcap([(0, ARP)]), "has no UDP datagrams over IPv4"),
         (pcap([(0, b"\x80" * 60)], link=105), "link type 105, which is not supported"),
-        (pcap([(0, (MACS + IPV4 + ip_packet(b"x" * 99))[:60])]), "only the beginnings of its"),
+        (pcap([(0, (MACS + IPV4 + ip_packet(b"x" * 99))[:60])]), "only truncated datagrams"),
         (pcap([]) + struct.pack("<IIII", 0, 0, 2**31, 60), "damaged before byte 40"),
         (pcapng([])[:8] + b"\xff" * 60, "is damaged before byte 12"),
         (pcapng([]) + struct.pack("<III", 6, 2**32 - 4, 0), "is damaged before byte"),
@@ -82,10 +82,10 @@ def test_a_file_without_datagrams_is_refused_in_a_line(content, says, tmp_path):
 @pytest.mark.parametrize(
     ("payload", "says"),
     [
-        (b"\xee\xff" + b"\0" * 600, "packets of a Hesai, which are not read. Write"),
+        (b"\xee\xff" + b"\0" * 600, "Hesai packets, which are not supported. Convert"),
         (b"\x55\xaa\x05\x5a" + b"\0" * 1244, "packets of a RoboSense, which are not read. Write"),
-        (b"\0\x54\5" + b"\0" * 1361, "packets of a Livox, which are not read. Record"),
-        (b"\0" * 512, "has no packets of a known sensor. Sweeps are read from"),
+        (b"\0\x54\5" + b"\0" * 1361, "Livox packets, which are not supported. Record"),
+        (b"\0" * 512, "contains no packets of a supported sensor. Sweeps can be read from"),
     ],
 )
 def test_the_first_known_packet_decides_whose_they_are(payload, says, tmp_path):

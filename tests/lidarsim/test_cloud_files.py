@@ -370,5 +370,5 @@ def test_bin_has_four_floats_and_of_nuscenes_five(tmp_path):
 @pytest.mark.parametrize("ending", SCAN_READERS)
 def test_a_file_that_is_larger_than_the_memory_is_refused(tmp_path, monkeypatch, ending):
     monkeypatch.setattr("lidarsim.base.input_files.memory", lambda: 10)
-    with pytest.raises(LidarError, match="more than the memory of this machine"):
+    with pytest.raises(LidarError, match="exceeds the memory of this machine"):
         read(tmp_path, f"a{ending}", "1 2 3\n" * 20)

@@ -124,7 +124,7 @@ def test_colours_of_vertices_are_interpolated_in_linear_light(tmp_path, name):
     else:
         mesh.export(path, **({"encoding": "ascii"} if name == "text.ply" else {}))
     scene = Scene.load(path, up_axis="z", colours=True)
-    assert colours_summary([scene.colours]) == "colours of vertices"
+    assert colours_summary([scene.colours]) == "vertex colors"
     cloud, found = sweep(scene)
     light = LINEAR[colours[faces[cloud["triangle"]]]]
     want = as_srgb((weights(cloud, vertices, faces)[:, :, None] * light).sum(axis=1))
@@ -266,21 +266,21 @@ def test_factors_and_colours_of_vertices_multiply_light(tmp_path):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"texture": b"junk"}, "its image is no PNG"),
+        ({"texture": b"junk"}, "its image is not a PNG"),
         ({"texture": png()[:300]}, "its image cannot be decoded"),
         ({"uv": np.full((4, 2), np.nan, "<f4")}, "infinite or too large"),
         ({"info": {"texCoord": 3}}, "texture coordinates are missing"),
-        ({"info": {"index": 7}}, "it is broken"),
-        ({"pbrMetallicRoughness": {"baseColorFactor": "red"}}, "it is broken"),
+        ({"info": {"index": 7}}, "it is invalid"),
+        ({"pbrMetallicRoughness": {"baseColorFactor": "red"}}, "it is invalid"),
         ({"pbrMetallicRoughness": {"baseColorFactor": [1, 0]}}, "its factor is not red"),
-        ({"pbrMetallicRoughness": 3}, "it is broken"),
+        ({"pbrMetallicRoughness": 3}, "it is invalid"),
     ],
 )
 def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
     header, body = opaque(**change)
     with caplog.at_level(logging.WARNING):
         found, _, _ = on_card(tmp_path, header, body)
-    assert why in caplog.text and "lack them: Leaf" in caplog.text
+    assert why in caplog.text and "have no color: Leaf" in caplog.text
     assert (found == GREY[0, 0]).all()
 
 
@@ -308,7 +308,9 @@ def test_large_images_are_made_smaller(tmp_path, monkeypatch, caplog):
     write(tmp_path / "m.glb", glb(header, body))
     (picture,) = Scene.load(tmp_path / "m.glb", colours=True).colours.images
     assert picture.shape == (24, 36, 3)
-    assert "has images of 288 x 192 pixels, taken at 36 at most on a side" in caplog.text
+    assert (
+        "has images of 288 x 192 pixels, which are reduced to at most 36 pixels per side"
+    ) in caplog.text
 
 
 def textured():
@@ -364,7 +366,7 @@ def test_textures_are_the_reflectance(caplog):
     grey, found = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity",
                         materials=[Material("*", "texture")])  # fmt: skip
     usual, _ = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity")
-    assert (found == 188).all() and "nothing in the scene has colours" in caplog.text
+    assert (found == 188).all() and "the scene has no colors" in caplog.text
     np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
 
 
@@ -399,7 +401,7 @@ def test_colours_that_do_not_fit_are_refused():
         Colours((PICTURE,), np.zeros(128, np.int32), np.full((128, 3, 2), np.nan, np.float32)),
         Colours((GREY.astype(float),), np.zeros(128, np.int32)),
     ):
-        with pytest.raises(LidarError, match="do not fit its 128 faces"):
+        with pytest.raises(LidarError, match="do not match its 128 faces"):
             SceneMesh("Hills", vertices, faces, colours=colours)
 
 
@@ -453,21 +455,33 @@ def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
 def test_names_of_materials_are_looked_up_and_contradictions_refused():
     for arguments, why in (
         ({"spectrum": "asfalt, dry"}, "Did you mean 'asphalt, dry'"),
-        ({"spectrum": "Asphalt"}, "There are: asphalt shingle, red; asphalt, dry; asphaltic"),
+        (
+            {"spectrum": "Asphalt"},
+            ("Available spectra: asphalt shingle, red; asphalt, dry; asphaltic"),
+        ),
         ({"spectrum": "limestone rock"}, "Did you mean 'limestone'"),
-        ({"spectrum": "muddy"}, "There are: water, muddy.$"),
-        ({"spectrum": "tar"}, "There are: aluminium, weathered; asphalt"),
-        ({"spectrum": "asphalt, dry", "reflectance": 0.2}, "either spectrum or reflectance"),
-        ({"reflectance": "texture", "transparent": "pass"}, "give a number"),
-        ({"scale": 2.0}, "give reflectance texture"),
-        ({"reflectance": "textures"}, "it must be 0 to 1, or texture"),
+        ({"spectrum": "muddy"}, "Available spectra: water, muddy.$"),
+        ({"spectrum": "tar"}, "Available spectra: aluminium, weathered; asphalt"),
+        (
+            {"spectrum": "asphalt, dry", "reflectance": 0.2},
+            ("spectrum and reflectance cannot be combined"),
+        ),
+        ({"reflectance": "texture", "transparent": "pass"}, "set reflectance to a number"),
+        ({"scale": 2.0}, "requires reflectance: texture"),
+        ({"reflectance": "textures"}, "must be from 0 to 1, or texture"),
     ):
         with pytest.raises(LidarError, match=why):
             Material("*", **arguments)
-    with pytest.raises(LidarError, match=r"\[0\].reflectance is 'white'; it must"):
+    with pytest.raises(LidarError, match=r"\[0\].reflectance must .* but is 'white'"):
         Scenario.from_data({"materials": [{"objects": "*", "reflectance": "white"}]})
     wrong = {"objects": "*", "spectrum": "asphalt, dry", "reflectance": 0.2}
-    with pytest.raises(LidarError, match=r"^scenario: materials\[1\]: give either spectrum or"):
+    with pytest.raises(
+        LidarError,
+        match=(
+            r"^scenario: materials\[1\]: spectrum and "
+            r"reflectance cannot"
+        ),
+    ):
         Scenario.from_data({"materials": [{"objects": "*"}, wrong]})
     table = reflectances()
     assert len(table) >= 30

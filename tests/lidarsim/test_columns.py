@@ -57,9 +57,9 @@ def test_columns_are_chosen_by_name_once_and_in_order():
 @pytest.mark.parametrize(
     ("columns", "message"),
     [
-        (["intensty"], r"no column 'intensty'.*'intensity'"),
-        (["reflectance of the surface"], r"There are\n  scan, x, y, .*intensity.*"),
-        ([Column("time", "u4", "s", "another")], "Two columns have the name 'time': rename one"),
+        (["intensty"], r"Unknown column 'intensty'.*'intensity'"),
+        (["reflectance of the surface"], r"Available columns:\n  scan, x, y, .*intensity.*"),
+        ([Column("time", "u4", "s", "another")], "Two columns have the name 'time'. Rename one"),
         ([Column("a", "u1", "", ""), Column("a", "u2", "", "")], "Two columns have the name 'a'"),
         ([Column("ring", "u1", "", "")], "Two columns have the name 'ring'"),
         ([Column("a", "u1", "", "", file_name="x")], "Two columns have the name 'x'"),
@@ -72,23 +72,23 @@ def test_columns_that_cannot_be_chosen(columns, message):
 
 @pytest.mark.parametrize("name", ["", "a b", "1st", "a-b", "../x"])
 def test_a_column_is_called_by_an_identifier(name):
-    with pytest.raises(LidarError, match=f"cannot have the name '{name}': use an identifier"):
+    with pytest.raises(LidarError, match=f"must be an identifier, but is '{name}'"):
         Column(name, "u1", "", "")
 
 
 @pytest.mark.parametrize("name", ["a b", "a\nb", "höhe", "positions", "normals", "colors", "x"])
 def test_a_column_that_files_cannot_hold_is_neither_chosen_nor_written(name, tmp_path):
     column = Column("a", "u1", "", "", file_name=name)
-    with pytest.raises(LidarError, match=r"name .* in files.*: (use|rename)"):
+    with pytest.raises(LidarError, match=r"in files.*(ASCII letters|Use|Rename)"):
         optional_columns([column])
-    with pytest.raises(LidarError, match=r"name .* in files.*: (use|rename)"):
+    with pytest.raises(LidarError, match=r"in files.*(ASCII letters|Use|Rename)"):
         save_cloud(Cloud(np.zeros((1, 3)), {"a": [1]}, (column,)), tmp_path / "c.ply")
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("dtype", ["float23", "U5", "O", "bool", "M8[s]", "complex64", "3f4"])
 def test_a_column_holds_numbers(dtype):
-    with pytest.raises(LidarError, match="give a type of whole or real numbers"):
+    with pytest.raises(LidarError, match="must be integer or floating point"):
         Column("a", dtype, "", "")
 
 
@@ -112,13 +112,17 @@ def test_a_column_is_made_of_an_attribute_or_by_a_function(dtype, values):
 @pytest.mark.parametrize(
     ("dtype", "values", "message"),
     [
-        ("u1", [0, 1], r"shape \(2,\); it needs one value for each of the 3 points"),
+        ("u1", [0, 1], r"one value for each of the 3 points, but has the shape \(2,\)"),
         ("u1", 5, r"shape \(\)"),
         ("f4", np.zeros((3, 1)), r"shape \(3, 1\)"),
-        ("u1", [0, 1, 256], "holds 0 to 256, and uint8 holds 0 to 255: give it a wider type"),
-        ("u4", [-1, 0, 1], "holds -1 to 1"),
-        ("i4", [0, 1, np.nan], "holds NaN or infinity as int32"),
-        ("i8", [0, 1, np.inf], "holds NaN or infinity"),
+        (
+            "u1",
+            [0, 1, 256],
+            ("contains 0 to 256, but uint8 is limited to 0 to 255. Use a wider type"),
+        ),
+        ("u4", [-1, 0, 1], "contains -1 to 1"),
+        ("i4", [0, 1, np.nan], "contains NaN or infinity, which int32"),
+        ("i8", [0, 1, np.inf], "contains NaN or infinity"),
     ],
 )
 def test_values_that_do_not_fit_their_column(dtype, values, message):
@@ -151,7 +155,13 @@ def test_a_cloud_gives_its_columns_in_their_types():
 
 
 def test_a_column_that_is_not_there():
-    with pytest.raises(KeyError, match=r"no column 'time'; it has \['scan', 'object', 'mine'\]"):
+    with pytest.raises(
+        KeyError,
+        match=(
+            r"column 'time'. The columns are \['scan', 'object', "
+            r"'mine'\]"
+        ),
+    ):
         cloud_of()["time"]
     with pytest.raises(AttributeError, match="no attribute or column 'time'"):
         _ = cloud_of().time
@@ -179,7 +189,7 @@ def test_points_are_selected_as_rows_of_an_array():
 
 @pytest.mark.parametrize("key", [2, [9], 0.5, [0.5], None, np.ones((5, 3), bool), [True], True])
 def test_what_selects_no_points(key):
-    with pytest.raises(LidarError, match=r"cloud of 5 are a slice, as cloud\[:100\], a mask"):
+    with pytest.raises(LidarError, match=r"selected by a slice such as cloud\[:100\], a mask"):
         cloud_of()[key]
 
 
@@ -195,7 +205,7 @@ def test_a_column_of_ones_own_is_held_to_its_description():
     cloud = Cloud(np.zeros((2, 3)), {"mine": [1, 2]}, own)
     assert cloud.mine.dtype == np.uint8 and cloud.table == own
     assert cloud[1:2].table == own
-    with pytest.raises(LidarError, match="mine holds 1 to 256"):
+    with pytest.raises(LidarError, match=r"'mine' must .* but contains 1 to 256"):
         Cloud(np.zeros((2, 3)), {"mine": [1, 256]}, own)
 
 
@@ -203,16 +213,24 @@ def test_a_column_of_ones_own_is_held_to_its_description():
 @pytest.mark.parametrize(
     ("positions", "columns", "message"),
     [
-        (np.zeros((5, 2)), {}, r"positions of \(n, 3\), not \(5, 2\)"),
-        (np.zeros(3), {}, r"not \(3,\)"),
+        (np.zeros((5, 2)), {}, r"must have the shape \(n, 3\), but have \(5, 2\)"),
+        (np.zeros(3), {}, r"have \(3,\)"),
         ([[np.nan, 0, 0]], {}, "NaN or infinite"),
         (np.full((1, 3), np.inf, np.float32), {}, "NaN or infinite"),
-        (np.zeros((2, 3)), {"scan": [1]}, r"'scan' has the shape \(1,\), but there are 2 points"),
+        (
+            np.zeros((2, 3)),
+            {"scan": [1]},
+            r"'scan' must have one value for each of the 2 points, but has the shape \(1,\)",
+        ),
         (np.zeros((2, 3)), {"scan": [[1, 2]]}, r"shape \(1, 2\)"),
-        (np.zeros((1, 3)), {"channel": [65_536]}, "channel holds 65536 to 65536.* 0 to 65535"),
-        (np.zeros((1, 3)), {"scan": [2**31]}, "scan holds 2147483648"),
-        (np.zeros((1, 3)), {"object": [0.5]}, "object holds 0.5 to 0.5; it must be whole"),
-        (np.zeros((1, 3)), {"time": [np.nan]}, "time holds nan"),
+        (
+            np.zeros((1, 3)),
+            {"channel": [65_536]},
+            "'channel' must .* 0 to 65535, but contains 65536",
+        ),
+        (np.zeros((1, 3)), {"scan": [2**31]}, "'scan' must .* contains 2147483648"),
+        (np.zeros((1, 3)), {"object": [0.5]}, "'object' must contain whole"),
+        (np.zeros((1, 3)), {"time": [np.nan]}, "'time' must .* contains nan"),
     ],
 )
 def test_arrays_that_are_no_cloud(positions, columns, message):
@@ -355,6 +373,6 @@ def test_a_ghost_has_no_normal_and_a_frozen_sensor_takes_normals_along(cluster_c
 
 
 def test_a_vector_is_chosen_as_a_whole():
-    with pytest.raises(LidarError, match="normal_x, normal_y, normal_z are one vector"):
+    with pytest.raises(LidarError, match="normal_x, normal_y, normal_z form a vector"):
         optional_columns(["normal_z"])
     assert len(optional_columns(SURFACE)) == 7

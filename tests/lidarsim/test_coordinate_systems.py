@@ -116,8 +116,8 @@ def test_scales_are_those_of_the_system_s_own_body():
         (25832, 5e6, 0, r"whose metre is 0\.793 m long at x 5000000, y 0: EPSG:32638 has"),
         (2056, 2.6e6, 1.2e6, ""),
         (7415, 84600, 447000, ""),
-        (3857, 0, 0, r"EPSG:3857 \(WGS 84 / Pseudo-Mercator\), for maps of the world"),
-        (3395, 1e6, 6e6, "for maps of the world"),
+        (3857, 0, 0, r"EPSG:3857 \(WGS 84 / Pseudo-Mercator\), a world map projection"),
+        (3395, 1e6, 6e6, "a world map projection"),
         (3994, 0, 0, r"\(WGS 84 / Mercator 41\), whose metre is"),
         (2263, 0, 0, "which is not in metres"),
         (4326, 8, 47, "which is not in metres"),
@@ -131,10 +131,10 @@ def test_chosen_systems_have_true_metres(epsg, x, y, message):
 
 def test_without_the_registry_systems_of_the_world_are_known(monkeypatch):
     monkeypatch.setattr(coordinate_systems, "find_spec", lambda name: None)
-    assert "for maps of the world" in target_problem(3857, 0, 0)
+    assert "a world map projection" in target_problem(3857, 0, 0)
     assert target_problem(25832, 5e6, 0) == target_problem(2056, 0, 0) == ""
     assert scale_problem("EPSG:3395", 0, 0) and not scale_problem("EPSG:25832", 0, 0)
-    with pytest.raises(LidarError, match="epsg is 3857, for maps of the world"):
+    with pytest.raises(LidarError, match="epsg is 3857, a world map projection"):
         Survey(poses=[(0, 0, 1)], epsg=3857)
 
 

@@ -47,7 +47,7 @@ def test_each_model_says_where_its_figures_are_from_or_that_none_were_found(name
     model = read_model(name)
     if model.performance is None:
         assert model.sources["performance"].startswith("none that could be read")
-        with pytest.raises(LidarError, match="give noise yourself"):
+        with pytest.raises(LidarError, match="Set noise instead"):
             model.datasheet()
         return
     sheet = model.datasheet()
@@ -167,16 +167,16 @@ def test_figures_that_a_data_sheet_lacks_are_told_only_on_request(model):
 @pytest.mark.parametrize(
     ("sensor", "lacks", "proposed"),
     [
-        ({"performance": "datasheet"}, "its data sheet does not state", 65),
-        ({}, "is not given", 65),
-        ({"max_range_m": 40}, "is not given", 20),
+        ({"performance": "datasheet"}, "is not in its data sheet", 65),
+        ({}, "is not set", 65),
+        ({"max_range_m": 40}, "is not set", 20),
     ],
 )
 def test_rain_without_a_detection_range_proposes_one_that_can_be_written(sensor, lacks, proposed):
     rain = {"sensor": {"model": "velodyne/vlp16", **sensor}, "weather": {"rain_mm_h": 10}}
     with pytest.raises(LidarError, match=lacks) as told:
         carried(**rain)
-    (entry,) = re.findall(r"write .*, (noise: {.*})", str(told.value))
+    (entry,) = re.findall(r"`(noise: {.*})`", str(told.value))
     assert yaml.safe_load(entry) == {"noise": {"detection_range_m": proposed}}
     carried(**rain, **yaml.safe_load(entry))
 
@@ -185,7 +185,7 @@ def test_rain_without_a_detection_range_proposes_one_that_can_be_written(sensor,
     ("sensor", "says"),
     [
         ({"performance": "datasheet"}, "needs a model"),
-        ({"model": "velodyne/hdl32e", "performance": "datasheet"}, "give noise yourself"),
+        ({"model": "velodyne/hdl32e", "performance": "datasheet"}, "Set noise instead"),
         ({"model": "velodyne/vlp16", "performance": "typical"}, "datasheet"),
     ],
 )

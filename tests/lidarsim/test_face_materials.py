@@ -158,12 +158,21 @@ def test_the_first_entry_that_fits_a_face_counts(house):
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
-        ([Material("*"), Material("House")], r"none after number 1, .* put it last"),
+        ([Material("*"), Material("House")], r"entries after number 1, .* Move it to the end"),
         ([Material(material="Gras"), Material("*")], "'Gras', but no face .* mean 'Grass'"),
         ([Material("Ground", material="Glass"), Material("*")], "no face of 'Ground' has the mat"),
-        ([Material(material="Glass")], r"no entry names the object 'House', material 'Brick' and"),
+        (
+            [Material(material="Glass")],
+            (
+                r"no entry matches the object 'House', material "
+                r"'Brick' and"
+            ),
+        ),
         ([Material("Hause"), Material("*")], "'Hause', but no object has that name.*'House'"),
-        ([Material("Q"), Material("*")], r"no object has that name\. There are House, Ground\.$"),
+        (
+            [Material("Q"), Material("*")],
+            r"no object has that name\. Available names: House, Ground\.$",
+        ),
     ],
 )
 def test_entries_that_fit_nothing_are_refused(house, entries, message):
@@ -175,11 +184,11 @@ def test_entries_that_fit_nothing_are_refused(house, entries, message):
 def test_names_of_materials_are_unknown_without_being_asked_for(house):
     scene = Scene.load(house)
     assert scene.materials is None and scene.material_names == ()
-    with pytest.raises(LidarError, match=r"'Glass', but no face .* No face has any"):
+    with pytest.raises(LidarError, match=r"'Glass', but no face .* No face has a named material"):
         cloud_of(scene, survey([Material(material="Glass"), Material("*")]))
-    with pytest.raises(LidarError, match="for nothing: give objects"):
+    with pytest.raises(LidarError, match=r"must apply to something. Set objects"):
         Material()
-    with pytest.raises(LidarError, match="material is ''"):
+    with pytest.raises(LidarError, match=r"material must .* but is ''"):
         Material(material="")
 
 

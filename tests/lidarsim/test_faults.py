@@ -297,10 +297,10 @@ def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
 
 
 WRONG = {
-    "there is no sensor 'roof'": Fault("frozen", 0.1, sensor="roof"),
-    "no channel 99, but 0 to 15": Fault("dead_channels", channels=[3, 99]),
-    "from_s is 10, and the survey lasts": Fault("frozen", 10),
-    "repeats a sweep: give a later from_s": Fault("frozen"),
+    "Unknown sensor 'roof'": Fault("frozen", 0.1, sensor="roof"),
+    "Channel 99 does not exist. The channels are 0 to 15": Fault("dead_channels", channels=[3, 99]),
+    "from_s must be less than the duration of the survey": Fault("frozen", 10),
+    "repeats its previous sweep, so from_s must be after": Fault("frozen"),
 }
 
 
@@ -330,13 +330,14 @@ PACKETS = {"share": 0.1, "packet": 9}
 @pytest.mark.parametrize(
     ("words", "fields"),
     [
-        ("kind is 'dirrt'.*Did you mean 'dirt'", {"kind": "dirrt"}),
-        ("give transmission", {"kind": "dirt"}),
-        ("leave share out", {"kind": "frozen", "share": 0.5}),
-        ("share, packet: leave by_s out", {"kind": "dropped_packets", **PACKETS, "by_s": 1}),
-        ("to_s is 1; give more than from_s, 2", {"kind": "frozen", "from_s": 2, "to_s": 1}),
+        ("kind cannot be 'dirrt'. Did you mean 'dirt'", {"kind": "dirrt"}),
+        ("Set transmission", {"kind": "dirt"}),
+        ("Remove share", {"kind": "frozen", "share": 0.5}),
+        ("share and packet. Remove by_s", {"kind": "dropped_packets", **PACKETS, "by_s": 1}),
+        (("to_s must be greater than from_s .2., "
+          "but is 1"), {"kind": "frozen", "from_s": 2, "to_s": 1}),
         ("least, largest", {"kind": "dirt", "transmission": 1, "elevation_deg": [2, 1]}),
-        ("transmission is 2; it must be 0 to 1", {"kind": "dirt", "transmission": 2}),
+        ("transmission must be from 0 to 1.*, but is 2", {"kind": "dirt", "transmission": 2}),
     ],
 )  # fmt: skip
 def test_what_is_no_fault(words, fields):

@@ -131,10 +131,19 @@ def test_ghosts_of_textures_take_what_the_colours_leave():
     ("values", "message"),
     [
         ({"specular_reflectance": 1.5}, "0 to 1, or fresnel"),
-        ({"specular_reflectance": "fresnel"}, "give fresnel for what light passes, else 0 to 1"),
-        ({"specular_reflectance": 0.1, "transparent": "pass"}, "give fresnel for what light"),
-        ({"specular_reflectance": 0.1, "roughness": 0.5}, "without retro and specular_reflectance"),
-        ({"specular_reflectance": 0.1, "leaf_area_density": 1.0}, "leave out"),
+        (
+            {"specular_reflectance": "fresnel"},
+            ("must be fresnel with transparent: pass, and a number otherwise"),
+        ),
+        ({"specular_reflectance": 0.1, "transparent": "pass"}, "must be fresnel with"),
+        (
+            {"specular_reflectance": 0.1, "roughness": 0.5},
+            ("cannot be combined with retro or specular_reflectance"),
+        ),
+        (
+            {"specular_reflectance": 0.1, "leaf_area_density": 1.0},
+            ("cannot be combined with transparent"),
+        ),
         ({"transparent": "mirror"}, "transparent"),
     ],
 )

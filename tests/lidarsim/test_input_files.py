@@ -125,7 +125,7 @@ def test_a_note_names_materials_that_are_a_pointer_of_git_lfs(tmp_path):
     path.write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl Glass\nf 1 2 3\n")
     notes = []
     load_meshes(path, tell=notes.append)
-    assert any("a.mtl (it is a Git LFS pointer, get the file itself" in note for note in notes)
+    assert any("a.mtl (it is a Git LFS pointer. Download the file" in note for note in notes)
 
 
 @pytest.mark.extended

@@ -105,11 +105,13 @@ def test_batches_and_backends_do_not_matter():
 
 
 def test_what_does_not_fit():
-    with pytest.raises(LidarError, match=r"has 2 numbers; .* needs 100"):
+    with pytest.raises(LidarError, match=r"100 channels .* but has 2 values"):
         replace(SURVEY, noise=Noise(channel_bias_m=[0.1, 0.2]))
-    with pytest.raises(LidarError, match="needs a head that turns, unlike Livox"):
+    with pytest.raises(LidarError, match="but the head of Livox"):
         Survey(load_sensor("livox/mid70"), poses=[(0, 0, 0)], noise=Noise(ripple_deg=0.1))
-    with pytest.raises(LidarError, match="channel_bias_m is 'x'; it must be a number of 0 to"):
+    with pytest.raises(
+        LidarError, match=r"channel_bias_m must be a number from 0 to .* but is 'x'"
+    ):
         Scenario.from_data({"noise": {"channel_bias_m": "x"}})
 
 

@@ -287,7 +287,7 @@ set_config("127.0.0.1", config, udp_dest_auto=True)
 try:
     get_config("site.example")
 except RuntimeError as error:
-    print("not a name of this service" in str(error))
+    print("not a name of this server" in str(error))
 """
 
 

@@ -398,10 +398,10 @@ def test_imu_packets_hold_the_samples_in_the_sensors_axes(tmp_path):
 @pytest.mark.parametrize(
     ("identifiers", "mode", "says"),
     [
-        ({"device_type": 9}, "dual", "have the returns strongest, first, last, not dual"),
-        ({"device_type": 15}, "first", "have the device types 9, 10, not 15"),
-        ({"device_type": 9, "data_type": 3}, "first", "have the data types 1, 2, not 3"),
-        ({"device_type": "HAP"}, "first", "state device_type 'HAP': give a whole number"),
+        ({"device_type": 9}, "dual", "support the returns strongest, first, last, not dual"),
+        ({"device_type": 15}, "first", "support the device types 9, 10, not 15"),
+        ({"device_type": 9, "data_type": 3}, "first", "support the data types 1, 2, not 3"),
+        ({"device_type": "HAP"}, "first", "have device_type 'HAP', which must be a whole number"),
     ],
 )
 def test_sensors_and_modes_that_do_not_fit_are_refused(identifiers, mode, says):
@@ -416,7 +416,9 @@ def test_lines_that_fill_no_packet_are_refused():
     sensor = replace(load_sensor("vlp32c"), packets=load_sensor("mid360").packets)
     encoder_of(PacketSource(sensor, "strongest"))
     sensor = replace(load_sensor("hdl64e-s3"), packets=load_sensor("mid360").packets)
-    with pytest.raises(LidarError, match="lines whose number divides 96, not 64"):
+    with pytest.raises(
+        LidarError, match=("a number of lines that divides 96, but the sensor has 64")
+    ):
         encoder_of(PacketSource(sensor, "strongest"))
 
 

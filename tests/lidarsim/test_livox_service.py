@@ -276,11 +276,11 @@ def test_a_flood_is_answered_in_part():
 def test_addresses_that_cannot_be_had_are_refused():
     with live() as sensor:
         again = sensor.encoder.service(SENSOR, Destination("127.0.0.1"), print)
-        with pytest.raises(LidarError, match=r":56000 \(.*another address") as taken, again:
+        with pytest.raises(LidarError, match=r":56000: .*Use a different address") as taken, again:
             pass
     assert len(str(taken.value).splitlines()) == 1
     service = sensor.encoder.service(f"{SENSOR}:8080", Destination("127.0.0.1"), print)
-    with pytest.raises(LidarError, match="ports are fixed"), service:
+    with pytest.raises(LidarError, match="an address without a port"), service:
         pass
 
 

@@ -217,7 +217,10 @@ def test_copies_of_a_node(tmp_path):
         load(path, header, body)
 
 
-GLASS = 'without holes, taken as solid: Leaf; Material(…, transparent="pass") makes objects glass'
+GLASS = (
+    "without holes, which are treated as opaque: Leaf. For glass, use "
+    'Material(…, transparent="pass")'
+)
 
 
 @pytest.mark.parametrize(
@@ -246,19 +249,20 @@ GLASS = 'without holes, taken as solid: Leaf; Material(…, transparent="pass") 
             ),
             GLASS,
         ),
-        (lambda h: h["images"].clear(), "Leaf (it is broken)"),
-        (lambda h: h["images"][0].update(bufferView=0), "Leaf (its image is no PNG"),
+        (lambda h: h["images"].clear(), "Leaf (it is invalid)"),
+        (lambda h: h["images"][0].update(bufferView=0), "Leaf (its image is not a PNG"),
         (lambda h: h["bufferViews"][3].update(byteLength=120), "Leaf (its image cannot be dec"),
         (lambda h: h["images"].__setitem__(0, {"uri": "x.png"}), "'x.png' is not there"),
         (lambda h: h["images"].__setitem__(0, {"uri": "../x.png"}), "only files in its own"),
         (lambda h: h["images"].__setitem__(0, {"uri": "a\0b.png"}), "is not there"),
         (lambda h: h["textures"][0].pop("source"), "in a format that cannot be read"),
-        (lambda h: h["meshes"][0]["primitives"][0].update(material=9), "material 9 (it is broken)"),
+        (lambda h: h["meshes"][0]["primitives"][0].update(material=9), ("material 9 (it is "
+            "invalid)")),
         (lambda h: h["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"),
          "Leaf (texture coordinates are missing)"),
         (lambda h: h["accessors"][1].update(count=3), "coordinates are missing"),
         (lambda h: h["accessors"][1].update(type="VEC3"), "Leaf ("),
-        (lambda h: h["materials"][0].update(alphaCutoff="half"), "Leaf (it is broken)"),
+        (lambda h: h["materials"][0].update(alphaCutoff="half"), "Leaf (it is invalid)"),
         (lambda h: h["materials"][0].update(name=["\x1b[31m"]), ""),
     ],
 )  # fmt: skip
@@ -377,8 +381,8 @@ def test_obj(tmp_path, backend, lines, face):
         ("map_d mask.png", f"f 1/{'9' * 30} 2/-9 3/x", "wire (texture coordinates are"),
         ("map_d mask.png", "vt nan 1\nf 1/5 2/2 3/3", "wire (texture coordinates are infinite"),
         ("map_d mask.png", "vt\nf 1/5 2/2 3/3", "wire (texture coordinates are infinite"),
-        ("map_d -mm x y mask.png", "f 1/1 2/2 3/3", "wire (it is broken)"),
-        ("map_Kd clear.png", "f 1/1 2/2 3/3", "taken as solid: wire;"),
+        ("map_d -mm x y mask.png", "f 1/1 2/2 3/3", "wire (it is invalid)"),
+        ("map_Kd clear.png", "f 1/1 2/2 3/3", "treated as opaque: wire."),
         ("map_Kd photo.jpg\nmap_d photo.jpg", "f 1/1 2/2 3/3", ""),
         ("map_d", "f 1/1 2/2 3/3", ""),
     ],
@@ -397,7 +401,7 @@ def test_obj_with_broken_materials_is_solid(tmp_path, caplog, lines, face, says)
 def test_a_library_that_is_not_there_is_told(tmp_path, caplog):
     caplog.set_level(logging.WARNING)
     assert obj(tmp_path, "", library="gone.mtl").triangles == 3
-    assert "names materials in gone.mtl, which cannot be read" in caplog.text
+    assert "refers to materials in gone.mtl, which cannot be read" in caplog.text
     caplog.clear()
     write(tmp_path / "mask.png", image(mode="L"))
     write(tmp_path / "other.mtl", "")

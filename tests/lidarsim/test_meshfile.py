@@ -238,11 +238,11 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "line 6 is '3 0 1 7', .*0 to 2"),
         ("m.off", "OFF # a b\n\n3 1 0\n0 0 0\n1 0 z\n0 1 0\n3 0 1 2\n", "line 5 is '1 0 z', "),
         ("m.off", "OFF\n3 one 0\n", "line 2 is '3 one 0', and the numbers of vertices and faces"),
-        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut short .*2 faces announced"),
+        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut short: .*2 faces announced"),
         ("m.off", "OFF\n3 1 0\n0 0 0 1 0 0\n0 1 0\n3 0 1 2\n", "each in a line of its own"),
         ("m.off", "OFF\n3 99999999999 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "faces announced"),
         ("m.off", "OFF BINARY\n3 1 0\n", "binary OFF"),
-        ("m.stl", "solid a\nfacet\n", "is cut short .*does not end"),
+        ("m.stl", "solid a\nfacet\n", "is cut short: .*does not end"),
         ("m.stl", TEXT_STL.replace("vertex 1 0 0", "vertex 1 0"), "line 4 is 'vertex 1 0', and"),
         ("m.stl", TEXT_STL.replace("vertex 1 0 0", "vertex 1 a 0"), "line 4 is 'vertex 1 a 0', "),
         ("m.stl", TEXT_STL.replace("vertex 1 0 0\n", ""), "ends in line 7 has 2 vertices"),
@@ -253,11 +253,11 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.ply", PLY.replace("double z", "half z"), "line .* is 'property half z', and format, "),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 b 3"), "line 15 has 'b', and a number"),
         ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "a list of face has the length -3"),
-        ("m.ply", PLY.replace("3 0 2 3", ""), "is cut short .2 rows of face announced"),
+        ("m.ply", PLY.replace("3 0 2 3", ""), "is cut short: 2 rows of face announced"),
         ("m.ply", "plain text\n", "first line is not 'ply'"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "0 to 9"),
         ("m.ply", PLY.replace("element face", "element tristrips"), "triangle strips"),
-        ("m.ply", PLY.partition("end_header")[0], "is cut short .*no line end_header"),
+        ("m.ply", PLY.partition("end_header")[0], "is cut short: .*no line end_header"),
         ("m.part", "LASF", "has the ending .part"),
         ("m.gltf", "[" * 100_000, "no valid JSON"),
         *[
@@ -290,7 +290,7 @@ def test_missing_and_folders(tmp_path):
 
 def test_without_the_library_of_openusd_the_error_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(usd, "find_spec", lambda name: None)
-    with pytest.raises(LidarError, match=r'pip install -e "\.\[usd\]" in lidarpool'):
+    with pytest.raises(LidarError, match=r'pip install -e "\.\[usd\]" in a checkout of lidarpool'):
         load_meshes(write(tmp_path / "m.usda", "#usda 1.0\n"))
 
 
@@ -322,7 +322,7 @@ def test_formats_of_a_package_that_is_not_installed_name_it(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, more_formats.__name__, None)
     package = more_formats.__name__.partition(".")[0]
     with pytest.raises(
-        LidarError, match=f"{package} reads more: pip install -e \\. in lidarpool's checkout"
+        LidarError, match=f"{package} reads more: pip install -e \\. in a checkout of lidarpool"
     ):
         load_meshes(write(tmp_path / "m.usd", "#usda 1.0"))
     assert len(load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)))) == 2

@@ -195,9 +195,9 @@ def test_a_station_may_end_a_rounding_beyond_the_last_pose():
     for options, gap in (
         ({"start_s": -0.9e-6}, None),
         ({"duration_s": 1 + 0.9e-6}, None),
-        ({"start_s": -1.1e-6}, "start_s is -1.1e-06 s, 1.1e-06 s outside"),
-        ({"duration_s": 1 + 1.1e-6}, r"duration_s is 1\.0000011 s, 1.1e-06 s outside"),
-        ({"start_s": 1.0}, "from 1 to 1 s has no duration"),
+        ({"start_s": -1.1e-6}, "start_s is -1.1e-06 s, which is 1.1e-06 s outside"),
+        ({"duration_s": 1 + 1.1e-6}, r"duration_s is 1\.0000011 s, which is 1.1e-06 s outside"),
+        ({"start_s": 1.0}, "must be above 0, but it covers 1 to 1 s"),
         ({"start_s": np.nan}, "start_s is nan"),
     ):
         if gap is None:
@@ -216,12 +216,12 @@ def test_a_station_may_end_a_rounding_beyond_the_last_pose():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([0.0], [[0, 0, 0]]), "two poses at least"),
-        (([0.0, 1], [[0, 0], [1, 0]]), r"positions of \(2, 2\)"),
-        (([0.0, 1, 1], np.zeros((3, 3))), "that of pose 2 does not come after"),
-        (([0.0, np.inf], np.zeros((2, 3))), "the time of pose 1 is not finite"),
-        (([0.0, 1], [[0, 0, 0], [0, np.nan, 0]]), "the position of pose 1 is not finite"),
-        (([0.0, 1], np.zeros((2, 3)), np.ones((2, 3))), r"not \(2, 3\)"),
+        (([0.0], [[0, 0, 0]]), "at least two poses"),
+        (([0.0, 1], [[0, 0], [1, 0]]), r"positions of the shape \(2, 2\)"),
+        (([0.0, 1, 1], np.zeros((3, 3))), "the time of pose 2 is not after"),
+        (([0.0, np.inf], np.zeros((2, 3))), "The time of pose 1 is not finite"),
+        (([0.0, 1], [[0, 0, 0], [0, np.nan, 0]]), "The position of pose 1 is not finite"),
+        (([0.0, 1], np.zeros((2, 3)), np.ones((2, 3))), r"has the shape \(2, 3\)"),
         (([0.0, 1], np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, 1.0011]]), "quaternion of pose 1"),
         (([0.0, 1], np.zeros((2, 3)), [[0, 0, 0, 1], [0, 0, 0, np.nan]]), "quaternion of pose 1"),
     ],
@@ -267,9 +267,9 @@ def test_angles_that_make_no_track(angles, message):
 def test_rounded_quaternions_are_scaled():
     track = Track([0, 1], np.zeros((2, 3)), [[0, 0, 0.6009, 0.8], [0.6, 0, 0, 0.8]])
     np.testing.assert_allclose(np.linalg.norm(track.quaternions, axis=1), 1, atol=1e-15)
-    with pytest.raises(LidarError, match="two poses at least; there are 1"):
+    with pytest.raises(LidarError, match="at least two poses, but has 1"):
         Track.from_matrices(np.zeros(1), np.eye(4)[None, None])
-    with pytest.raises(LidarError, match="that of pose 1 does not come after"):
+    with pytest.raises(LidarError, match="the time of pose 1 is not after"):
         Track.from_matrices(np.zeros(2), np.tile(np.eye(4), (1, 2, 1, 1)))
 
 

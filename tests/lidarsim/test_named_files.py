@@ -34,7 +34,7 @@ def test_names_that_lead_outside_are_refused(root, name):
     name = name.format(root=root)
     with pytest.raises(LidarError) as told:
         file_below(root, name, "list.txt, line 7,")
-    assert str(told.value).startswith(f"list.txt, line 7, names {name!r}, which leads outside")
+    assert str(told.value).startswith(f"list.txt, line 7, refers to {name!r}, which is outside")
     assert len(str(told.value).splitlines()) == 1
 
 

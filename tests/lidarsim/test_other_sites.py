@@ -39,7 +39,7 @@ def test_a_service_is_asked_by_its_names_and_by_addresses(host):
 )  # fmt: skip
 def test_another_name_is_refused_in_a_line(host):
     for words in (refusal({"host": host}, NAMES), refusal({}, NAMES, url_authority=host)):
-        assert "is not a name of this service: ask for its address" in words
+        assert "is not a name of this server. Use its address" in words
         assert len(words) < 200
     assert "not a name" in refusal({"host": "localhost"}, NAMES, url_authority=host)
 
@@ -74,7 +74,7 @@ def test_any_name_is_right_behind_a_proxy_whose_name_is_unknown():
 def test_what_browsers_say_of_a_request_decides(headers, is_refused):
     for changes_state in (False, True):
         words = refusal({"host": "127.0.0.2:8080"} | headers, NAMES, changes_state=changes_state)
-        assert words == ("requests of other websites are not answered" if is_refused else "")
+        assert words == ("requests from other websites are refused" if is_refused else "")
 
 
 def test_a_link_of_another_website_leads_to_a_page_only():

@@ -577,11 +577,16 @@ def test_metadata_of_a_unit_are_written_as_read(tmp_path):
             "os1-32",
             "dual",
             None,
-            "have the returns strongest, first, last, two_strongest, not dual",
+            "support the returns strongest, first, last, two_strongest, not dual",
         ),
-        ("os1-32", "two_strongest", LEGACY, "hold the returns strongest, first or last, not two_"),
-        ("os1-32", "strongest", DUAL, "hold the returns two_strongest, not strongest"),
-        ("os1-32", "strongest", "RNG", "have the profiles LEGACY, .*, not RNG"),
+        (
+            "os1-32",
+            "two_strongest",
+            LEGACY,
+            "require the returns strongest, first or last, not two_",
+        ),
+        ("os1-32", "strongest", DUAL, "require the returns two_strongest, not strongest"),
+        ("os1-32", "strongest", "RNG", "support the profiles LEGACY, .*, not RNG"),
     ],
 )
 def test_modes_and_profiles_that_do_not_fit_are_refused(model, mode, profile, message):
@@ -594,7 +599,7 @@ def test_modes_and_profiles_that_do_not_fit_are_refused(model, mode, profile, me
 
 @pytest.mark.parametrize("options", [{"columns": 500}, {"rate_hz": 10.5}])
 def test_heads_that_no_ouster_has_are_refused(options):
-    with pytest.raises(LidarError, match=r"512, 1024, 2048, 4096 columns a turn at a whole"):
+    with pytest.raises(LidarError, match=r"512, 1024, 2048, 4096 columns per turn at a whole"):
         encoder_of(PacketSource(load_sensor("ouster/os1-32", **options), "strongest"))
 
 
@@ -604,7 +609,13 @@ def test_packets_of_a_window_are_refused_and_its_sweeps_are_whole(tmp_path):
     metadata["lidar_data_format"]["column_window"] = [256, 767]
     (tmp_path / "os.json").write_text(json.dumps(metadata))
     sensor = load_sensor(calibration=tmp_path / "os.json")
-    with pytest.raises(LidarError, match="need a head that fires all around: remove the azimuth_"):
+    with pytest.raises(
+        LidarError,
+        match=(
+            r"require a head that fires in all directions. "
+            r"Remove azimuth_"
+        ),
+    ):
         encoder_of(PacketSource(sensor, "strongest"))
     cloud = Scanner(room(), sensor, coordinates="sensor").sweep(Pose((0, 0, 1)), number=3)
     azimuths_deg = np.degrees(np.arctan2(*cloud.positions[:, 1::-1].T))

@@ -156,8 +156,11 @@ def test_sensors_without_packets_are_refused(sensor, mode, says):
     [
         ({"unit_m": 0.002}, "lack the identifier product"),
         ({"product": 34, "unit_m": 0.002, "units_m": 1}, r"unknown identifier 'units_m'.*unit_m"),
-        ({"product": "VLP-16", "unit_m": 0.002}, "state product 'VLP-16': give a whole number"),
-        ({"product": 34, "unit_m": "2 mm"}, "state unit_m '2 mm': give a number"),
+        (
+            {"product": "VLP-16", "unit_m": 0.002},
+            ("have product 'VLP-16', which must be a whole number"),
+        ),
+        ({"product": 34, "unit_m": "2 mm"}, "have unit_m '2 mm', which must be a number"),
     ],
 )
 def test_wrong_identifiers_are_refused(identifiers, says):
@@ -171,7 +174,7 @@ def test_wrong_identifiers_are_refused(identifiers, says):
 def test_results_without_all_rays_are_refused():
     thinned = vlp16_survey(keep_every=2)
     cloud, sweeps = points_of(thinned, room())
-    with pytest.raises(LidarError, match=r"every ray and return .* keep_every 1") as raised:
+    with pytest.raises(LidarError, match=r"all rays and returns .* keep_every 1") as raised:
         PacketSource.of_sensor(sweeps, 0)
     assert one_line(raised)
     cloud, sweeps = points_of(vlp16_survey(columns=("ray", "range")), room())
@@ -220,7 +223,7 @@ def test_a_package_adds_a_format_of_packets(tmp_path, monkeypatch):
     assert issubclass(encoder_class("mine"), PacketEncoder)
     with pytest.raises(LidarError, match=r"lacks a subclass of .*PacketEncoder"):
         encoder_class("wrong")
-    with pytest.raises(LidarError, match=r"'velo' is not a format of packets.*'velodyne'"):
+    with pytest.raises(LidarError, match=r"Unknown packet format 'velo'.*'velodyne'"):
         encoder_class("velo")
 
 

@@ -268,7 +268,7 @@ def test_bytes_after_the_points_are_refused_and_zeros_are_padding(tmp_path):
 def test_a_small_file_does_not_take_much_memory(tmp_path):
     count = 100_000_000
     head = header([*"xyz"], ["f4"] * 3, count, "binary_compressed")
-    with pytest.raises(LidarError, match="write it uncompressed"):
+    with pytest.raises(LidarError, match="Write it uncompressed"):
         read(tmp_path, head + struct.pack("<II", 10, 12 * count) + bytes(10))
 
 

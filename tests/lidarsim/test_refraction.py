@@ -185,11 +185,13 @@ def test_water_in_a_tank_of_glass():
 
 
 def test_what_is_refused():
-    with pytest.raises(LidarError, match="add transparent: pass"):
+    with pytest.raises(LidarError, match="requires transparent: pass"):
         Material("*", refractive_index=1.33)
-    with pytest.raises(LidarError, match="needs a refractive_index"):
+    with pytest.raises(LidarError, match="requires refractive_index"):
         Material("*", transparent="pass", attenuation_per_m=0.1)
-    with pytest.raises(LidarError, match=r"refractive_index is 0\.9; it must be 1 to 4"):
+    with pytest.raises(
+        LidarError, match=r"refractive_index must be from 1 to 4 or None, but is 0\.9"
+    ):
         Material("*", transparent="pass", refractive_index=0.9)
 
 

@@ -59,11 +59,11 @@ def test_unique_names(names):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"faces": np.empty((0, 3), int)}, "needs triangles"),
-        ({"faces": [[0, 1, 3]]}, "name the 3 vertices"),
-        ({"faces": [[0, 1, -1]]}, "name the 3 vertices"),
+        ({"faces": np.empty((0, 3), int)}, "must have the shape .f, 3."),
+        ({"faces": [[0, 1, 3]]}, "refer to the 3 vertices"),
+        ({"faces": [[0, 1, -1]]}, "refer to the 3 vertices"),
         ({"vertices": [[0, 0, 0], [1, 0, 0], [0, np.nan, 0]]}, "1 of the 3 vertices"),
-        ({"vertices": np.zeros((3, 2))}, r"expected \(v, 3\)"),
+        ({"vertices": np.zeros((3, 2))}, r"the shape \(v, 3\)"),
         ({"face_object": [1]}, "face_object"),
         ({"face_object": [0, 0]}, "face_object"),
         ({"origin": [0, 0, np.inf]}, "origin"),
@@ -103,7 +103,7 @@ def test_scale_then_x_then_y_then_z_then_translation():
         (lambda: Transform.from_parts(scale=0), "flattens"),
         (lambda: Transform.from_parts((0, 0, np.nan)), "finite"),
         (lambda: Transform.from_matrix(np.eye(3)), "four rows"),
-        (lambda: Transform.from_matrix(np.full((4, 4), 1.0)), "last one 0 0 0 1"),
+        (lambda: Transform.from_matrix(np.full((4, 4), 1.0)), "0 0 0 1 as the last row"),
         (lambda: Transform(np.eye(2), np.zeros(3)), r"\(2, 2\)"),
     ],
 )
@@ -125,12 +125,12 @@ def test_objects_of_one_name_are_told_apart_with_a_note_or_joined(tmp_path, capl
     path = tmp_path / "a.obj"
     path.write_text(TWICE)
     assert face_counts(Scene.load(path)) == {"Wall": 1, "Door": 1, "Wall.2": 2}
-    (note,) = [line for line in caplog.messages if "another one" in line]
-    assert note.startswith(f"{path}: 1 object has the name of another one and a number now: Wall.2")
+    (note,) = [line for line in caplog.messages if "a duplicate name" in line]
+    assert note.startswith(f"{path}: 1 object with a duplicate name has a number appended: Wall.2")
     assert 'Scene.load(path, same_names="join")' in note
     caplog.clear()
     assert face_counts(Scene.load(path, same_names="join")) == {"Wall": 3, "Door": 1}
-    assert not [line for line in caplog.messages if "another one" in line]
+    assert not [line for line in caplog.messages if "a duplicate name" in line]
 
 
 def test_a_group_that_comes_again_continues(tmp_path, caplog):
@@ -156,7 +156,9 @@ def test_equal_names_of_the_files_of_a_scenario(tmp_path, same_names, counts):
         section["same_names"] = same_names
     built = build(Scenario.from_data({"scene": section, "poses": [[0, 0, 1]]}, folder=tmp_path))
     assert face_counts(built.scene) == counts
-    notes = [note for note in advice(built) if "the name of another" in note]
+    notes = [note for note in advice(built) if "a duplicate name" in note]
     assert len(notes) == (same_names != "join")
     if notes:
-        assert "Wall.2, Wall.3; same_names: join in scene makes one object" in notes[0]
+        assert (
+            "Wall.2, Wall.3. To merge objects with the same name, use same_names: join in scene"
+        ) in notes[0]

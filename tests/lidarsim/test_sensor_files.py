@@ -98,7 +98,7 @@ def test_a_table_states_its_conventions_and_what_it_lacks(tmp_path):
     header = {name: json.loads(value) for name, _, value in remarks}
     assert header["axes"] == "x forward, y left, z up"
     assert "counter-clockwise" in header["azimuth_deg"] and not header["repeats"]
-    assert "rays after 0.1 s, which do not repeat these" in header["not_in_this_file"]
+    assert "rays after 0.1 s, where the pattern does not repeat" in header["not_in_this_file"]
     rows = [*csv.DictReader(line for line in lines if not line.startswith("#"))]
     assert len(rows) == 10_000 and rows[1]["time_offset_ns"] == "10000"
     azimuth, elevation = np.radians([float(rows[77][f"{n}_deg"]) for n in ("azimuth", "elevation")])
@@ -215,13 +215,13 @@ def test_a_python_file_returns_the_angles_of_each_frame_for_mujoco(tmp_path):
 def test_rangefinders_measure_what_a_scanner_does(tmp_path):
     sensor = Sensor.grid(36, 8, 40, max_range_m=50)
     file = export_sensor(sensor, tmp_path / "lidar.xml", format="mjcf")
-    assert file.left_out == ("times of the rays", "channels", "frames a second")
+    assert file.left_out == ("times of the rays", "channels", "frame rate")
     _, model, data = mujoco_world(f'<include file="{tmp_path / "lidar.xml"}"/>')
     ranges = MujocoScanner(model, sensor, site="lidar").ranges(data).ravel()
     hit = np.isfinite(ranges)
     assert hit.sum() > 100 and np.abs(data.sensordata[hit] - ranges[hit]).max() < 1e-3
     assert "<!-- Not in this file: channels. -->" in (tmp_path / "lidar.xml").read_text()
-    with pytest.raises(LidarError, match="would have 28,944 sites with rangefinders"):
+    with pytest.raises(LidarError, match="would have 28,944 rangefinder sites"):
         export_sensor(load_sensor("velodyne/vlp16"), tmp_path / "vlp16.xml", format="mjcf")
 
 
@@ -269,7 +269,7 @@ def test_grids_come_back_from_gazebo(name, tmp_path):
 )
 def test_what_is_no_grid_is_refused_for_gazebo(sensor, reason, tmp_path):
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    with pytest.raises(LidarError, match=f"is no regular grid, as <gpu_lidar> is: .*{reason}"):
+    with pytest.raises(LidarError, match=f"is not a regular grid, .*{reason}"):
         export_sensor(sensor, tmp_path / "lidar.sdf")
     assert list(tmp_path.iterdir()) == []
 
@@ -448,19 +448,19 @@ def sensor_of_scanner(path, folder):
     return load_sensor(**entry), pose, notes
 
 
-STRETCHED = "18,084.49 pulses a second: they are a whole number, 18,084, at the same angles"
-AT_ONCE = "times of the rays within a firing: all channels fire at once"
+STRETCHED = "the exact pulse rate of 18,084.49 Hz (rounded to 18,084 Hz, with the same angles)"
+AT_ONCE = "time offsets of the rays in a firing (all channels fire at once)"
 SWING = Mirror(500, rate_hz=20, motion="triangle", width_deg=50, clockwise=True, zero_deg=12)
 HELIOS_SENSORS = {
     "channels": ("velodyne/vlp16", (AT_ONCE, STRETCHED)),
-    "beside": ("ouster/os1-64", ("starts of the rays beside the axis of the head",)),
+    "beside": ("ouster/os1-64", ("ray origins outside the rotation axis of the head",)),
     "prisms": ("livox/mid40", ()),  # which start at the same angle, half a turn from zero
     "several": ("livox/avia", ()),
     "polygon": ("airborne/riegl-vq780i", ()),
     "line": (Sensor(Beams(np.radians(np.linspace(-20, 50, 70)), time_ns=np.arange(70) * 1e4),
                     Spin(400, rate_hz=1, zero_deg=33)), ()),
     "swing": (LineSensor(Beams(np.zeros(1)), SWING),
-              ("even turns of the mirror: HELIOS++ slows it at the ends of lines",)),
+              ("the constant speed of the mirror (HELIOS++ slows it down at the ends of lines)",)),
     "grid": (Sensor.grid(360, 8, 40, max_range_m=50, min_range_m=0.5, rate_hz=20), ()),
 }  # fmt: skip
 
@@ -495,18 +495,20 @@ def test_scanners_of_helios_come_back_as_the_same_sensor(name, tmp_path):
 @pytest.mark.parametrize(
     ("sensor", "reason"),
     [
-        ("livox/mid360", "a mirror turns behind its prisms"),
-        ("airborne/leica-als50-ii", "its mirror swings as a sine"),
-        (ListedSensor(), "it is a list of rays"),
+        ("livox/mid360", "a mirror behind its prisms"),
+        ("airborne/leica-als50-ii", "its mirror oscillates sinusoidally"),
+        (ListedSensor(), "the sensor is a list of rays"),
         (
             Sensor(Beams(np.zeros(1)), Spin(1, rate_hz=0.1, step_deg=360)),
-            "fires 0.1 times a second",
+            "fires 0.1 times per second",
         ),
     ],
 )
 def test_what_is_no_scanner_is_refused_for_helios(sensor, reason, tmp_path):
     sensor = load_sensor(sensor) if isinstance(sensor, str) else sensor
-    with pytest.raises(LidarError, match=f"is no scanner of HELIOS.*: .*{reason}.*npz and csv"):
+    with pytest.raises(
+        LidarError, match=f"cannot be written as a HELIOS.*: .*{reason}.*npz and csv"
+    ):
         export_sensor(sensor, tmp_path / "lidar.xml", format="helios")
     assert list(tmp_path.iterdir()) == []
 
@@ -710,13 +712,16 @@ def test_rgl_rays_are_matrices_that_take_z_to_the_ray(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rays": np.zeros((2, 4, 4))}, r"rays has the shape \(2, 4, 4\)"),
+        ({"rays": np.zeros((2, 4, 4))}, r"rays must .* but has \(2, 4, 4\)"),
         ({"rays": np.zeros((2, 3, 4))}, "direction of ray 1 is zero"),
-        ({"time_offsets": np.array([1.0, 0.5])}, "times go back at ray 2"),
+        ({"time_offsets": np.array([1.0, 0.5])}, "times decrease at ray 2"),
         ({"ring_ids": np.zeros(3)}, "the same length"),
-        ({"intensity": np.zeros(2)}, "arrays that are not known: intensity"),
-        ({"ranges": np.zeros(2)}, "max_range_m of its header is 0.0"),
-        ({"header": np.array('{"rate_hz": 0}')}, "rate_hz of its header is 0"),
+        ({"intensity": np.zeros(2)}, "unknown arrays: intensity"),
+        ({"ranges": np.zeros(2)}, "max_range_m of its header must be greater than 0, but is 0.0"),
+        (
+            {"header": np.array('{"rate_hz": 0}')},
+            "rate_hz of its header must be greater than 0, but is 0",
+        ),
     ],
 )
 def test_arrays_that_are_no_inputs_of_rgl_are_refused(changes, message, tmp_path):
@@ -738,14 +743,23 @@ def test_arrays_of_mujoco_lidar_without_times_are_spread_over_a_frame(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"path": "rays.xyz"}, r"rays.xyz has no ending of a file of a sensor. Endings are \.npz"),
-        ({"path": "rays.npz", "format": "npzz"}, "not written as 'npzz'. Did you mean 'npz'"),
-        ({"path": "rays.npz", "format": "csv"}, "rays.npz does not end in .csv"),
+        (
+            {"path": "rays.xyz"},
+            r"rays.xyz is not a sensor format. The supported extensions are \.npz",
+        ),
+        (
+            {"path": "rays.npz", "format": "npzz"},
+            "Unknown sensor format 'npzz'. Did you mean 'npz'",
+        ),
+        ({"path": "rays.npz", "format": "csv"}, "rays.npz must end in .csv"),
         ({"path": "no/rays.npz"}, "folder .*no does not exist"),
         ({"path": "rays.npz", "seconds": 1e5}, "more than 20,000,000 rays in 100,000 s"),
-        ({"path": "rays.npz", "seconds": 1, "revolutions": 1}, "give one"),
+        ({"path": "rays.npz", "seconds": 1, "revolutions": 1}, "cannot be combined"),
         ({"path": "rays.npz", "seconds": -1}, "seconds"),
-        ({"path": "rays.npz", "sensor": "vlp16"}, "str is no Sensor: load_sensor"),
+        (
+            {"path": "rays.npz", "sensor": "vlp16"},
+            "sensor must be a Sensor, but is a str. Load one with load_sensor",
+        ),
     ],
 )
 def test_what_cannot_be_written_is_refused(arguments, message, tmp_path):
@@ -759,11 +773,14 @@ def test_what_cannot_be_written_is_refused(arguments, message, tmp_path):
     ("changes", "message"),
     [
         ({"direction_x": np.zeros(3)}, "direction of ray 1 is zero"),
-        ({"time_offset_ns": np.array([0, 2, 1])}, "times go back at ray 3"),
+        ({"time_offset_ns": np.array([0, 2, 1])}, "times decrease at ray 3"),
         ({"channel": np.zeros(2)}, "the same length"),
-        ({"speed": np.zeros(3)}, "arrays that are not known: speed"),
-        ({"azimuth_deg": np.array([0, np.nan, 0])}, "azimuth_deg of ray 2 is not finite"),
-        ({"header": np.array('{"rate_hz": -1}')}, "rate_hz of its header is -1"),
+        ({"speed": np.zeros(3)}, "unknown arrays: speed"),
+        ({"azimuth_deg": np.array([0, np.nan, 0])}, "azimuth_deg of ray 2 is NaN or infinite"),
+        (
+            {"header": np.array('{"rate_hz": -1}')},
+            "rate_hz of its header must be greater than 0, but is -1",
+        ),
         ({"header": np.array('{"cycle_ns": 1}')}, "before the last ray"),
     ],
 )
@@ -775,7 +792,9 @@ def test_arrays_that_are_no_rays_are_refused(changes, message, tmp_path):
     with pytest.raises(LidarError, match=message):
         load_sensor(calibration=tmp_path / "rays.npz")
     (tmp_path / "cut.npz").write_bytes((tmp_path / "rays.npz").read_bytes()[:200])
-    with pytest.raises(LidarError, match=r"cut\.npz is not a usable calibration: it is no \.npz"):
+    with pytest.raises(
+        LidarError, match=r"cut\.npz is not a valid calibration file: it is not a valid \.npz"
+    ):
         load_sensor(calibration=tmp_path / "cut.npz")
 
 

@@ -187,7 +187,7 @@ def test_parts_of_triangles_cover_the_box_and_share_corners():
 def test_a_note_says_what_is_left_out(caplog):
     Scanner(vast("faces"), GRID, backend="numpy")
     (record,) = caplog.records
-    assert "the scene is 400 km wide, and the sensor measures up to 40 m" in record.getMessage()
+    assert "the scene is 400 km wide, but the sensor measures up to 40 m" in record.getMessage()
     caplog.clear()
     Scanner(vast("faces"), Sensor.grid(64), backend="numpy")  # of any range
     Scanner(Scene.seed(), GRID, backend="numpy")

@@ -88,7 +88,13 @@ def test_random_numbers_belong_to_one_step():
 
 
 def test_a_number_of_random_numbers_is_declared_once():
-    with pytest.raises(ValueError, match=r"^random numbers 2 are of .* 'again' needs others$"):
+    with pytest.raises(
+        ValueError,
+        match=(
+            r"^random number stream 2 is already used for .* 'again' requires a different "
+            r"number$"
+        ),
+    ):
         Purpose(2, "again")
 
 
@@ -281,7 +287,7 @@ def test_foreign_steps_act_together():
 
 
 def test_a_step_without_a_role_cannot_be_defined():
-    with pytest.raises(TypeError, match=r"^step Silent states no role: set `role` to flags of "):
+    with pytest.raises(TypeError, match=r"^step Silent has no role. Set `role` to flags of "):
         type("Silent", (PulseStep,), {})
 
 
@@ -289,10 +295,10 @@ def test_a_step_where_it_would_not_act_is_refused():
     for step, before in ((Echo, CastStep), (Echo, RecordingStep), (HalfOfReturns, CastStep)):
         with pytest.raises(ValueError, match=rf"^step {step.__name__} of Role.* must be after "):
             add_step(step, before)
-    with pytest.raises(ValueError, match=r"^step Aside of Role.AIMS must be before CastStep"):
+    with pytest.raises(ValueError, match=r"^step Aside with Role.AIMS must be before CastStep"):
         add_step(Aside, DirtStep)
-    with pytest.raises(ValueError, match=r"^step Everywhere of Role.FRAME cannot be added"):
+    with pytest.raises(ValueError, match=r"^step Everywhere with Role.FRAME cannot be added"):
         add_step(Everywhere)
-    with pytest.raises(ValueError, match=r"^step DirtStep is among the steps already"):
+    with pytest.raises(ValueError, match=r"^step DirtStep has already been added"):
         add_step(DirtStep)
     assert "Echo" not in [step.__name__ for step in STEPS]

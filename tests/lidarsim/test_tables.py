@@ -57,7 +57,7 @@ def test_exact_names_are_not_spelled_otherwise():
     assert columns["Arm_1"].tolist() == [2]
     radians = read_table("time_s,arm_1 [rad]\n0,1\n", (TIME, JOINT))["Arm_1"]
     assert np.isclose(radians[0], np.degrees(1))
-    with pytest.raises(ValueError, match="not known: Arm1"):
+    with pytest.raises(ValueError, match="unknown column 'Arm1'"):
         read_table("time_s,Arm1\n0,2\n", (TIME, JOINT))
 
 
@@ -66,21 +66,24 @@ def test_exact_names_are_not_spelled_otherwise():
     [
         (
             "0,1\n1,2\n",
-            "it has no header: name its columns in its first line, as in time_s,range_m",
+            "it has no header. Name its columns in the first line, for example time_s,range_m",
         ),
         ("", "it has no header"),
         ("time_s,range\n", "it has no rows of numbers"),
-        ("time,range\n0,1\n", "'time' has no unit: call it time_s, in seconds; time_ms"),
-        ("time_s,range [ft]\n0,1\n", "'range \\[ft\\]' has the unit 'ft': give it in m or cm"),
-        ("time_s,range,range\n0,1,1\n", "has the column 'range' twice"),
-        ("time_s,range,distance\n0,1,1\n", "'range' and 'distance' are both range_m"),
-        ("time_s,rnage\n0,1\n", "not known: rnage"),
-        ("time_s,\n0,car\n", "column 2 has no name, and holds 'car'"),
-        ("time_s,range\n0,1\n1,2,3\n", "line 3 has 3 cells, and the header 2"),
+        ("time,range\n0,1\n", "'time' has no unit. Rename it to time_s .seconds., time_ms"),
+        (
+            "time_s,range [ft]\n0,1\n",
+            "'range \\[ft\\]' has the unit 'ft', which is not supported. Convert it to m, cm",
+        ),
+        ("time_s,range,range\n0,1,1\n", "its column 'range' occurs twice"),
+        ("time_s,range,distance\n0,1,1\n", "'range' and 'distance' both mean range_m"),
+        ("time_s,rnage\n0,1\n", "unknown column 'rnage'"),
+        ("time_s,\n0,car\n", "column 2 has no name, but contains 'car'"),
+        ("time_s,range\n0,1\n1,2,3\n", "line 3 has 3 cells, but the header has 2"),
         ("time_s,range\n0,1\n\n1\n", "line 4 has 1 cells"),
-        ("time_s,range\n0,1\n1,x\n", "column 'range' has 'x' in line 3: give a number in every"),
-        ("time_s,range\n0,1\n1,inf\n", "column 'range' has 'inf' in line 3"),
-        ("range\n1\n", "it has no column 'time_s'; it has range"),
+        ("time_s,range\n0,1\n1,x\n", "column 'range' contains 'x' in line 3"),
+        ("time_s,range\n0,1\n1,inf\n", "column 'range' contains 'inf' in line 3"),
+        ("range\n1\n", "it has no column 'time_s'. Its columns are range"),
     ],
 )
 def test_what_is_not_understood_is_refused(text, words):

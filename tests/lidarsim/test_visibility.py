@@ -335,12 +335,12 @@ def test_followers_do_not_see_their_housing():
 
 def test_patterns_that_match_nothing_are_refused_with_the_names_of_the_scene():
     scene = scene_of(objects("faces"), ("Car",))
-    with pytest.raises(LidarError, match=r"unseen names 'Cra\*', but no object has that name"):
+    with pytest.raises(LidarError, match=r"unseen contains 'Cra\*', but no object has that name"):
         Scanner(scene, GRID, unseen=["Cra*"], backend="numpy")
     with pytest.raises(LidarError, match=r"Did you mean 'Car'\?|Car"):
         Scanner(scene, GRID, unseen="Cra", backend="numpy")
     survey = Survey(sensors=[Mounted(GRID, name="roof", unseen=["Cra"])], poses=[(0, 0, 1)])
-    with pytest.raises(LidarError, match="unseen of sensor 'roof' names 'Cra'"):
+    with pytest.raises(LidarError, match="unseen of sensor 'roof' contains 'Cra'"):
         Job(scene, survey)
     with pytest.raises(LidarError, match="unseen"):
         Mounted(GRID, unseen=[""])

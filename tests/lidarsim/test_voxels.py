@@ -190,7 +190,7 @@ def test_empty_and_huge_grids_are_refused_in_little_memory(tmp_path):
         "#res:1\ni j k PadBVTotal\n0 0 0 1\n9999 9999 9999 1\n"
     )
     tracemalloc.start()
-    with pytest.raises(LidarError, match=r"would unpack to 3\.64 TiB"):
+    with pytest.raises(LidarError, match=r"would unpack to at least 3\.64 TiB"):
         load_meshes(path)
     assert tracemalloc.get_traced_memory()[1] < 10e6
     tracemalloc.stop()
@@ -368,15 +368,15 @@ def test_batches_blocks_and_backends_leave_no_trace(tmp_path, path, monkeypatch)
 )
 def test_materials_that_do_not_suit_voxels_are_refused(tmp_path, fields):
     mesh = tree(tmp_path / "T.vox", [[[1.0]]])
-    with pytest.raises(LidarError, match="'T' is of voxels, whose file has the leaf area"):
+    with pytest.raises(LidarError, match="'T' contains voxels, whose file defines the leaf area"):
         cast([mesh], rays(1), materials=[Material("*", **fields)])
 
 
 def test_what_voxels_cannot_do_is_refused(tmp_path):
     mesh = tree(tmp_path / "T.vox", [[[1.0]]])
-    with pytest.raises(LidarError, match="'T' is of voxels, which cannot move"):
+    with pytest.raises(LidarError, match="'T' contains voxels, which cannot move"):
         Actor(mesh)
-    with pytest.raises(LidarError, match="'X' has voxels, and cannot be joined"):
+    with pytest.raises(LidarError, match="'X' contains voxels and cannot be joined"):
         join_meshes("X", [mesh, mesh])
     assert join_meshes("X", [mesh]).voxels is not None
     with pytest.raises(LidarError, match="'T' consists of voxels, which cannot be written"):
@@ -387,7 +387,7 @@ def test_what_voxels_cannot_do_is_refused(tmp_path):
         (np.ones((1, 1, 1), np.float32), np.zeros((3, 4))),
         *[(np.zeros(np.roll((10_001, 1, 1), axis), np.float32), np.eye(3, 4)) for axis in range(3)],
     ]:
-        with pytest.raises(LidarError, match=r"voxels of 'T' are .*; they must be float32"):
+        with pytest.raises(LidarError, match=r"voxels of 'T' must be float32"):
             SceneMesh("T", mesh.vertices, mesh.faces, voxels=Voxels(density, matrix))
     most = Voxels(np.zeros((1, 10_000, 1), np.float32), np.eye(3, 4))
     assert SceneMesh("T", mesh.vertices, mesh.faces, voxels=most).voxels is most

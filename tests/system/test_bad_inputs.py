@@ -42,11 +42,15 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
 # What comes back of a pulse; what numbers cannot be is asked in tests/lidarsim/test_echoes.py.
 # {content of a scenario: what the message says}
 RETURNS = {
-    "materials: [{objects: V*, reflectance: 0.3}]": "no entry names the object",
+    "materials: [{objects: V*, reflectance: 0.3}]": "no entry matches the object",
     "materials: [{objects: ['*', Vace]}]": "no object has that name. Did you mean 'Vase'?",
-    "materials: [{objects: Q*}, {objects: '*'}]": "'Q*', but no object has that name. There are ",
-    "returns: {subrays: 19}": "the sensor has no divergence: give returns.divergence_mrad",
-    "noise: {range_m: -0.01}": "noise.range_m is -0.01",
+    "materials: [{objects: Q*}, {objects: '*'}]": (
+        "'Q*', but no object has that name. Available names: "
+    ),
+    "returns: {subrays: 19}": (
+        "beam divergence of the sensor is unknown. Set returns.divergence_mrad"
+    ),
+    "noise: {range_m: -0.01}": "noise.range_m must be from 0 to 1000, but is -0.01",
     "cloud: {columns: [intensities]}": "Did you mean 'intensity'?",
 }
 FILES |= {text: ("s.yaml", f"scene: seed\n{text}".encode(), says) for text, says in RETURNS.items()}
@@ -60,7 +64,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     ),
     "several meshes": (["run", "a.stl", "a.stl", "--pose", "0,0,1"], "require a single mesh file"),
     "misspelt model": (["run", "a.stl", "--sensor", "vlp61"], "Did you mean 'vlp16'?"),
-    "no model": (["run", "a.stl", "--sensor", ""], "There is no sensor model ''."),
+    "no model": (["run", "a.stl", "--sensor", ""], "Unknown sensor model ''."),
     "misspelt column": (["run", "a.stl", "--columns", "rang,time"], "Did you mean 'range'?"),
     "misspelt format": (["run", "a.stl", "--format", "lass"], "Did you mean 'las'?"),
     "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is not a position. Expected X,Y,Z"),

@@ -228,7 +228,7 @@ def test_a_campaign_has_the_same_bytes_twice(slots, tmp_path, monkeypatch, kept)
     assert all_bytes_of(tmp_path / "elsewhere" / "ds") == first
     assert {"jobs.csv", "jobs.parquet", "dataset.json", "campaign.json"} <= first.keys()
     assert {"README.md", "splits/train.txt", "pictures/results.png"} <= first.keys()
-    assert b"c.yaml: job 2: parts/cut.tum is not a usable trajectory" in first["jobs.csv"]
+    assert b"c.yaml: job 2: parts/cut.tum is not a valid trajectory" in first["jobs.csv"]
 
 
 # -- jobs that fail -------------------------------------------------------------------------------
@@ -828,7 +828,7 @@ def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
         run.send_signal(signal.SIGINT)
         _, err = run.communicate(timeout=300)
     assert run.returncode == 130, err
-    assert err.startswith("\nlidarpool: interrupted; everything was stopped")  # behind the ^C
+    assert err.startswith("\nlidarpool: Interrupted. All processes were stopped")  # behind the ^C
     assert re.search(r" of 100 jobs are kept in .*ds/run: continue with --resume .*\.\n$", err)
 
 

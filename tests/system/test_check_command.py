@@ -166,8 +166,8 @@ def test_each_file_has_a_line_that_says_what_it_gave(check, tmp_path):
     ]
     scenario["cloud"] = {"columns": ["red"]}
     told = check(text=json.dumps(scenario)).out
-    assert "38 triangles, in m, Y-up, 1 texture, 2 plain colours\n" in told
-    assert "in cm, Z-up, no colours\n" in told and "are grey" not in told
+    assert "38 triangles, in m, Y-up, 1 texture, 2 plain colors\n" in told
+    assert "in cm, Z-up, no colors\n" in told and "are grey" not in told
     scenario["materials"] = [
         {"objects": "m", "reflectance": 0.5}, {"objects": "*", "reflectance": "texture"}
     ]  # fmt: skip
@@ -204,7 +204,7 @@ def test_objects_that_sensors_do_not_see_are_named(check):
     scenario["sensors"]["rear"]["unseen"] = "Nobody"
     outcome = check(text=json.dumps(scenario))
     assert outcome.code == 2 and "unseen of sensor 'rear' names 'Nobody'" in outcome.err
-    assert f"There are {names[0]}, " in outcome.err
+    assert f"Available names: {names[0]}, " in outcome.err
     told = check(text=json.dumps(SHORT | {"sensor": {"unseen": "*"}})).out
     assert "no ray hit anything at any distance: check unseen, poses and units" in told
 
@@ -248,7 +248,7 @@ def test_an_error_of_several_jobs_is_a_line_with_its_jobs(tmp_path, lidarpool):
     start, streets, house = outcome.err.splitlines()[-3:]
     assert start == "lidarpool: it cannot run:"
     assert streets.startswith("jobs 0000, 0002: ") and streets.count("Street*") == 1
-    assert "There are " in streets and "tree* (9), " in streets and "Did you" not in streets
+    assert "Available names: " in streets and "tree* (9), " in streets and "Did you" not in streets
     assert house.startswith("job 0001: ")
 
 

@@ -165,7 +165,7 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
     monkeypatch.setattr(Format, "write", interrupted)
     told = lidarpool("export", tmp_path, "-f", "las", "-f", "nuscenes")
     assert told.code == 130
-    assert f"everything was stopped. Written before: {tmp_path}/cloud.las." in told.err
+    assert f"All processes were stopped. Written before: {tmp_path}/cloud.las." in told.err
 
 
 def many_files(lidarpool, tmp_path, address):

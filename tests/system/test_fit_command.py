@@ -71,7 +71,7 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
     ("arguments", "says"),
     [
         (["nowhere"], "nowhere does not exist: give the folder of a result"),
-        ([".", "--model", "no-such"], "There is no sensor model 'no-such'"),
+        ([".", "--model", "no-such"], "Unknown sensor model 'no-such'"),
         ([".", "--scene", "none.glb"], "none.glb"),
         ([".", "--out", "mine.txt"], "no sensor file: give a name such as mine.yaml"),
         ([".", "--pose", "0,0,0", "--pose", "1,0,0"], "pose has 2 poses, and . has 4 sweeps: give"),

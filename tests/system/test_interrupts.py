@@ -89,7 +89,9 @@ KEPT = r"[\d,]+ of 360,000 scans are kept in \S+/out/run: continue with --resume
 
 def check_interrupted(run: Any, code: int) -> None:
     assert code == 130
-    assert run.said.splitlines()[-1].startswith("lidarpool: interrupted; everything was stopped")
+    assert run.said.splitlines()[-1].startswith(
+        "lidarpool: Interrupted. All processes were stopped"
+    )
     assert said_besides_progress(run) == run.said.splitlines()[-1:]
     # Python's own helper process sees the end of its parent, and ends a moment after it.
     run.wait_until_alone()
@@ -120,7 +122,7 @@ def test_an_interrupted_survey_ends_cleanly(number, local, start, untouched, clu
     options = () if local else ("--scheduler", cluster)
     run = start(LONG, *options, prelude=NOT_IGNORED).wait_for(SURVEYING)
     check_interrupted(run, run.signal(number, group=True))
-    assert re.search(rf"everything was stopped\. {KEPT}", run.said)
+    assert re.search(rf"All processes were stopped\. {KEPT}", run.said)
     assert untouched(kept=True)
 
 
@@ -138,8 +140,8 @@ def test_ctrl_c_while_python_imports(start, untouched):
     run = start(LONG, prelude=ANNOUNCE).wait_for("armed\narmed")
     assert run.signal(signal.SIGINT, group=True) == 130
     assert {line for line in run.said.splitlines() if line} == {  # click ends the line of a ^C
-        "armed", "lidarpool: interrupted; everything was stopped, and the output folder is as "
-        "it was.",
+        "armed", "lidarpool: Interrupted. All processes were stopped, and the output folder is "
+        "unchanged.",
     }  # fmt: skip
     assert untouched()
 
@@ -165,7 +167,7 @@ def test_ctrl_c_when_the_result_is_whole(lidarpool, cluster, tmp_path, monkeypat
     run = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster, "-q")
     assert run.code == 130
     assert run.err.strip() == (
-        "lidarpool: interrupted; everything was stopped. The result in out is complete."
+        "lidarpool: Interrupted. All processes were stopped. The result in out is complete."
     )
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {name for name in FILES if not name.endswith(".png")}

@@ -218,7 +218,7 @@ def test_forks_read_a_data_set_that_their_parent_has_opened(environment, format)
 @pytest.mark.parametrize(
     ("url", "words"),
     [
-        ("s3://nobody/x", "make the bucket first"),
+        ("s3://nobody/x", "Create the bucket first"),
         ("s3://a:b@surveys/x", "has a password: leave it out"),
         ("s9://surveys/x", "Protocol not known: s9"),
     ],
@@ -236,14 +236,14 @@ def test_a_place_is_looked_at_before_a_run(lidarpool, environment, tmp_path):
     checked = lidarpool("check", tmp_path / "s.yaml", "--out", f"{BUCKET}/nothing")
     assert checked.code == 0 and Storage.at(f"{BUCKET}/nothing").sizes() == {}
     refused = lidarpool("check", tmp_path / "s.yaml", "--out", "s3://nobody/x")
-    assert refused.code == 2 and "make the bucket first" in refused.err
+    assert refused.code == 2 and "Create the bucket first" in refused.err
 
 
 def test_without_the_package_that_opens_it(lidarpool, monkeypatch):
     monkeypatch.setitem(sys.modules, "s3fs", None)
     monkeypatch.delitem(_registry, "s3", raising=False)
     refused = lidarpool("demo", "--out", f"{BUCKET}/x")
-    assert refused.code == 2 and 'pip install -e ".[s3]" in lidarpool\'s checkout' in refused.err
+    assert refused.code == 2 and 'pip install -e ".[s3]" in a checkout of lidarpool' in refused.err
     assert len(refused.err.splitlines()) == 1
 
 
@@ -255,7 +255,7 @@ def test_without_credentials_or_rights(lidarpool, environment, monkeypatch, tmp_
     fsspec.filesystem("s3").clear_instance_cache()
     refused = lidarpool("demo", "--out", f"{BUCKET}/x")
     fsspec.filesystem("s3").clear_instance_cache()
-    assert refused.code == 2 and "check the credentials and rights" in refused.err
+    assert refused.code == 2 and "Check the credentials" in refused.err
     assert len(refused.err.splitlines()) == 1
 
 

@@ -56,8 +56,8 @@ def test_pictures_are_drawn_and_what_they_cannot_be_is_told(result, tmp_path):
         ({"only": ["clod"]}, "Did you mean 'cloud'"),
         ({"size": (10, 10)}, "480 to 4096"),
         ({"only": ["cloud"], "colour": "rang"}, "no column 'rang'"),
-        ({"only": "cloud"}, "only is 'cloud'; it must be a list of text"),
-        ({"size": 480}, "size is 480; it must be a list of whole numbers"),
+        ({"only": "cloud"}, "only must be a list of text, but is 'cloud'"),
+        ({"size": 480}, "size must be a list of whole numbers, but is 480"),
     ):
         with pytest.raises(LidarError, match=words):
             result.pictures(tmp_path, **wrong)

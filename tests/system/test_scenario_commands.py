@@ -159,7 +159,7 @@ def test_sensors_writes_a_file_and_says_what_the_file_lacks(tmp_path, lidarpool)
     options = ("--max-range", "50", "--seconds", "0.001", "--out", "v.csv")
     outcome = lidarpool("sensors", "vlp16", *options)
     assert outcome.code == 0, outcome.err
-    lacks = "width of the beams; rays after 0.001051 s, which do not repeat these"
+    lacks = "beam divergence; rays after 0.001051 s, where the pattern does not repeat"
     assert outcome.out.endswith(f"\n304 rays: v.csv\nnot in the file: {lacks}\n")
     assert "# max_range_m: 50.0" in (tmp_path / "v.csv").read_text()
     again = lidarpool("sensors", "vlp16", "--out", "v.csv")

@@ -242,7 +242,7 @@ def test_the_first_job_without_points_is_named(cluster_client, caplog):
 
 def test_errors_are_told_in_a_line(cluster_client):
     for options, words in (
-        ({"ahead": 0}, "ahead is 0; it must be at least 1"),
+        ({"ahead": 0}, "ahead must be at least 1, but is 0"),
         ({"split": "tran"}, r"no split 'tran'\. Did you mean 'train'"),
         ({"split": "x"}, r"no split 'x'\. It has train, test"),
     ):

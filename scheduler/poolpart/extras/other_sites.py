@@ -70,18 +70,18 @@ def refusal(
     for authority in authorities:
         host = _host_of(authority)
         if host is None or not (names is None or _is_address(host) or host in names):
-            return f"{authority[:100]!r} is not a name of this service: ask for its address"
+            return f"{authority[:100]!r} is not a name of this server. Use its address."
     site = headers.get("sec-fetch-site")
     follows_link = is_page and headers.get("sec-fetch-mode") == "navigate"
     if site is not None and site not in _OWN_SITES and not follows_link:
-        return "requests of other websites are not answered"
+        return "requests from other websites are refused"
     origin = headers.get("origin")
     if origin is not None and not _is_of(origin, authorities):
-        return "requests of other websites are not answered"
+        return "requests from other websites are refused"
     is_browser = headers.get("user-agent", "").lower().startswith(_BROWSER)
     says_nothing = is_browser and site is None and origin is None
     if changes_state and says_nothing and not _is_of(headers.get("referer", ""), authorities):
-        return "a browser changes nothing here unless it says that no other website asks"
+        return "requests that change data must be same-origin"
     return ""
 
 

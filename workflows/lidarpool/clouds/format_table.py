@@ -455,7 +455,7 @@ def _row_of_plugin(plugin: Plugin) -> FormatRow:
 
 
 _FILES = [row.file for row in FORMATS.values()]
-_TABLE = PluginTable(GROUP, "a format of clouds", FORMATS, _row_of_plugin)
+_TABLE = PluginTable(GROUP, "cloud format", FORMATS, _row_of_plugin)
 
 
 def row_of(name: str) -> FormatRow:

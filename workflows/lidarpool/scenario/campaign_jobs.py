@@ -428,11 +428,13 @@ class _Base:
                 in_a_line = str(error).replace("\n  ", " ")  # joins the lines of a list
                 message = in_a_line.partition("\n")[0].removeprefix(": ")
                 value_line = f"{text} can be {shown(value)}"
-                expected = message.removeprefix(f"{field} is {shown(value)}")
-                if expected.startswith("; "):
-                    yield f"{value_line}{expected}{choice.hint(expected[2:])}"
-                elif expected.startswith(". "):
-                    yield f"{value_line}{expected}"
+                invalid = f"{field} cannot be {shown(value)}."
+                start, _, end = message.partition(f", but is {shown(value)}.")
+                if start.startswith(f"{field} must ") and start != message:
+                    requirement = start.removeprefix(f"{field} ")
+                    yield f"{value_line}, but {requirement}.{end}{choice.hint(requirement)}"
+                elif message.startswith(invalid):
+                    yield f"{value_line}.{message.removeprefix(invalid)}"
                 else:
                     yield f"{value_line}: {message}"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import psutil
 
-from .errors import LidarError
+from .errors import LidarError, as_sentence
 
 UNPACKED_TIMES = 100  # multiple of the file's bytes
 MIN_LIMIT_BYTES = 256 * 2**20  # limit for small files
@@ -36,8 +36,8 @@ class Allowance:
     --------
     >>> Allowance(1_500_000, "export it again").take(2_900_000_000)
     Traceback (most recent call last):
-    lidarsim.base.errors.LidarError: it has 1.43 MiB and would unpack to \
-2.70 GiB or more, of at most 256.00 MiB: export it again.
+    lidarsim.base.errors.LidarError: it has 1.43 MiB but would unpack to at \
+least 2.70 GiB, and the limit is 256.00 MiB. Export it again.
     """
 
     def __init__(self, size: int, advice: str, *, in_parts: bool = False) -> None:
@@ -82,9 +82,9 @@ class Allowance:
         """
         if not self.fits(count):
             raise LidarError(
-                f"it has {bytes_of(self._size)} and would unpack to "
-                f"{bytes_of(self.used_bytes + count)} or more, of at most {bytes_of(self.limit)}: "
-                f"{self._advice}."
+                f"it has {bytes_of(self._size)} but would unpack to at least "
+                f"{bytes_of(self.used_bytes + count)}, and the limit is {bytes_of(self.limit)}. "
+                f"{as_sentence(self._advice)}"
             )
 
 

@@ -43,7 +43,7 @@ _UNIX = 3 << 8  # system whose permissions the directory has
 _PERMISSIONS = 0o600 << 16
 _UTF8 = 0x800  # flag of a file's name
 _DATE = 1 << 5 | 1  # 1980-01-01: the same arrays give the same bytes
-_ADVICE = "get it again, or read it on a machine with more memory"
+_ADVICE = "download or copy it again, or read it on a machine with more memory"
 
 
 Piece = bytes | memoryview  # of a file that is written in pieces
@@ -165,8 +165,8 @@ def open_archive(
     except Exception as error:  # zipfile, zlib, NumPy and Scene have many
         reason = " ".join(str(error).split())
         raise LidarError(
-            f"{path} is damaged or not of this version of lidarpool ({reason}): run the survey "
-            "again."
+            f"{path} is damaged or was written by a different version of lidarpool ({reason}). Run "
+            "the survey again."
         ) from error
 
 
@@ -240,7 +240,7 @@ def _content(data: bytes, entry: zipfile.ZipInfo) -> bytes | memoryview:
     if entry.compress_type == zipfile.ZIP_DEFLATED:
         content = zlib.decompressobj(-zlib.MAX_WBITS).decompress(content, entry.file_size + 1)
     elif entry.compress_type != zipfile.ZIP_STORED:
-        raise ValueError(f"{entry.filename} is compressed by a method other than Deflate")
+        raise ValueError(f"{entry.filename} uses a compression method other than Deflate")
     same_name = data[name_start : name_start + length] == entry.orig_filename.encode()
     if not same_name or len(content) != entry.file_size or crc32(content) != entry.CRC:
         raise ValueError(f"{entry.filename} is damaged")
@@ -258,7 +258,7 @@ def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
     kind, shape, is_fortran, start = _array_type(content, name)
     data = bytearray(memoryview(content)[start:])
     if len(data) != math.prod(shape) * kind.itemsize:
-        raise ValueError(f"{name} is longer or shorter than its array")
+        raise ValueError(f"{name} does not have the length of its array")
     array = np.frombuffer(data, kind)
     return array.reshape(shape[::-1]).T if is_fortran else array.reshape(shape)
 

@@ -23,6 +23,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from .words import joined
+
 UnitShare = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Text = Annotated[str, Field(min_length=1)]
@@ -54,7 +56,7 @@ def _upright(value: Any, handler: Callable[[Any], Any]) -> Any:
     """Validate a rectangle, whose lowest x and y come first."""
     sides = handler(value)
     if sides[0] >= sides[2] or sides[1] >= sides[3]:
-        raise must_be("[x0, y0, x1, y1], the lowest x and y first")
+        raise must_be("[x0, y0, x1, y1] with the lower corner first")
     return sides
 
 
@@ -94,15 +96,10 @@ def by_text(field: str, kind: Any) -> Any:
 
 def one_of(*fields: str) -> Any:
     """Check that a section has exactly a single value among given fields."""
-    *first_fields, last_field = fields
-    if first_fields[1:]:
-        words = f"one of {', '.join(first_fields)} and"
-    else:
-        words = f"either {first_fields[0]} or"
 
     def check(section: Any) -> Any:
         if sum(bool(getattr(section, field)) for field in fields) != 1:
-            raise ValueError(f"give {words} {last_field}.")
+            raise ValueError(f"Set exactly one of {joined(fields)}.")
         return section
 
     return model_validator(mode="after")(check)

@@ -13,7 +13,7 @@ from .errors import Mistakes
 from .field_advice import Contradictory, list_advice, name_advice, place_advice
 from .section_fields import FieldPath, Fields, classes_in, dotted, fields_by_name, limits_of
 from .value_texts import shown, with_article
-from .words import did_you_mean, listed, plural
+from .words import alternatives, did_you_mean, listed, plural
 
 # {class: an example}
 _EXAMPLES = {
@@ -111,7 +111,8 @@ def _line(
     values = ""
     if kind == "literal_error":
         values = f": {listed([*dict.fromkeys(_in_file(d['input']) for d in further_details)])}"
-    return f"{line} {plural(len(further_details), 'more entry', 'more entries')} like it{values}."
+    others = plural(len(further_details), "other entry", "other entries")
+    return f"{line} The same applies to {others}{values}."
 
 
 def _in_file(value: Any) -> str:
@@ -149,49 +150,64 @@ def _sentence(
         message = str(details[0]["ctx"]["error"])
         return f"{location}: {message}" if location else message
     if kind in _UNKNOWN_FIELD:
-        return f"{location} is not a field.{advice}"
+        return f"Unknown field {location!r}.{advice}"
     if kind == "missing":
-        return f"{location} is missing; it must be given."
-    in_python = show is not _in_file
-    requirements = dict.fromkeys(_requirement(detail, hint, in_python) for detail in details)
-    allowed = f"must {' or '.join(requirements)}.".replace(" or be ", " or ")
+        return f"{location} is required."
+    requirements = [*dict.fromkeys(_requirement(detail, hint) for detail in details)]
+    if all(words.startswith("be ") for words in requirements):
+        allowed = f"must be {alternatives([words.removeprefix('be ') for words in requirements])}"
+    else:
+        allowed = f"must {' or '.join(requirements)}"
     if kind == "literal_error" and isinstance(value, str):
         suggestion = did_you_mean(value, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
         if suggestion:  # before the allowed values, which may be many
-            return f"{location} is {show(value)}.{suggestion} It {allowed}"
-    return f"{location} is {show(value)}; it {allowed}{advice}"
+            return f"{location} cannot be {show(value)}.{suggestion} It {allowed}."
+    if not advice and show is not _in_file:
+        examples = (_example(detail, hint) for detail in details)
+        advice = next((f" For example, pass {example}." for example in examples if example), "")
+    return f"{location} {allowed}, but is {show(value)}.{advice}"
 
 
-def _requirement(detail: ErrorDetails, hint: Any, in_python: bool) -> str:
-    """Return the requirement on a value: «be 1 to 10».
-
-    Examples are only given `in_python`.
-    """
+def _requirement(detail: ErrorDetails, hint: Any) -> str:
+    """Return the requirement on a value: «be from 1 to 10»."""
     kind = detail["type"]
     context = detail.get("ctx", {})
     if kind == "is_instance_of":
-        name = str(context["class"]).rpartition(".")[2]
-        example = f", such as {_EXAMPLES[name]}" if name in _EXAMPLES else ""
-        return f"be {_ALLOWED.get(name) or with_article(name)}{example}"
+        name = _class_name(context)
+        return f"be {_ALLOWED.get(name) or with_article(name)}"
     if kind in ("list_type", "tuple_type"):
-        inner = [*classes_in(hint)]
-        items = next((f" of {_ITEMS[kind]}" for kind in inner if kind in _ITEMS), "")
-        examples = [_EXAMPLES[kind.__name__] for kind in inner if kind.__name__ in _EXAMPLES]
-        example = f", such as [{examples[0]}]" if examples and not items and in_python else ""
-        return f"be a list{items}{example}"
+        items = next((f" of {_ITEMS[kind]}" for kind in classes_in(hint) if kind in _ITEMS), "")
+        return f"be a list{items}"
     if not _LIMIT_WORDS.keys().isdisjoint(context):
         limits = limits_of(hint)
         return f"be {_range(limits if context.items() <= limits.items() else context)}"
-    words = detail["msg"].replace(" after validation", "").partition(" should ")[2]
+    words = detail["msg"].partition(" should ")[2].partition(" after validation")[0]
     return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words or f"be valid ({detail['msg']})"
 
 
+def _example(detail: ErrorDetails, hint: Any) -> str:
+    """Return an allowed value in Python, or "" without an example."""
+    if detail["type"] == "is_instance_of":
+        return _EXAMPLES.get(_class_name(detail.get("ctx", {})), "")
+    if detail["type"] in ("list_type", "tuple_type"):
+        inner = [*classes_in(hint)]
+        names = [kind.__name__ for kind in inner if kind.__name__ in _EXAMPLES]
+        if names and not any(kind in _ITEMS for kind in inner):
+            return f"[{_EXAMPLES[names[0]]}]"
+    return ""
+
+
+def _class_name(context: Mapping[str, Any]) -> str:
+    """Return the name of the class in an error's context, without its module."""
+    return str(context["class"]).rpartition(".")[2]
+
+
 def _range(limits: Mapping[str, Any]) -> str:
-    """Return limits as text: «1 to 10», «at least 1, below 10»."""
+    """Return limits as text: «from 1 to 10», «at least 1 and below 10»."""
     numbers = {name: limit if limit % 1 else int(limit) for name, limit in limits.items()}
     if numbers.keys() == {"ge", "le"}:
-        return f"{numbers['ge']} to {numbers['le']}"
-    return ", ".join(f"{_LIMIT_WORDS[name]} {number}" for name, number in numbers.items())
+        return f"from {numbers['ge']} to {numbers['le']}"
+    return " and ".join(f"{_LIMIT_WORDS[name]} {number}" for name, number in numbers.items())
 
 
 def _annotation_at(path: FieldPath, hint: Any) -> tuple[Any, Fields]:

@@ -92,7 +92,7 @@ def reason_of(error: Exception) -> str:
     Examples
     --------
     >>> reason_of(TypeError("'NoneType' object is not iterable"))
-    "its content is not as its format says, 'NoneType' object is not iterable"
+    "its content does not match its format ('NoneType' object is not iterable)"
     >>> reason_of(RecursionError("maximum recursion depth exceeded"))
     'its content is nested too deeply'
     """
@@ -102,8 +102,19 @@ def reason_of(error: Exception) -> str:
     if str(error):
         reason = printable(message_of(error), _MAX_REASON).rstrip(".")
     if isinstance(error, _UNFORESEEN):  # whose messages speak of Python, not of the file
-        reason = f"its content is not as its format says, {reason}"
+        reason = f"its content does not match its format ({reason})"
     return reason
+
+
+def as_sentence(advice: str) -> str:
+    """Return advice as a sentence, with a capital letter and a period.
+
+    Examples
+    --------
+    >>> as_sentence("export it again")
+    'Export it again.'
+    """
+    return f"{advice[:1].upper()}{advice[1:].rstrip('.')}."
 
 
 def unreadable(subject: object, error: Exception, advice: str = "") -> str:
@@ -114,15 +125,11 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
     >>> unreadable("vlp16.yaml", KeyError("lasers"))
     "vlp16.yaml cannot be read: 'lasers' is missing."
     >>> unreadable("a.stl", CutShortError("line 7 is the last"), "export it again")
-    'a.stl is cut short (line 7 is the last): export it again.'
+    'a.stl is cut short: line 7 is the last. Export it again.'
     """
     failure = "is cut short" if isinstance(error, CutShortError) else "cannot be read"
-    reason = reason_of(error)
-    return (
-        f"{subject} {failure} ({reason}): {advice}."
-        if advice
-        else (f"{subject} {failure}: {reason}.")
-    )
+    message = f"{subject} {failure}: {reason_of(error)}."
+    return f"{message} {as_sentence(advice)}" if advice else message
 
 
 @contextmanager
@@ -137,7 +144,8 @@ def explained(failure: str, advice: str = "") -> Iterator[None]:
         raise
     except OSError as error:
         why = message_of(error).rstrip(".")
-        message = f"{failure} ({why}): {advice}." if advice else f"{failure}: {why}."
+        message = f"{failure}: {why}."
+        message = f"{message} {as_sentence(advice)}" if advice else message
         kind = MissingFileError if isinstance(error, FileNotFoundError) else LidarError
         raise kind(message) from error
 

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 
 from .errors import LidarError, message_of, prefixed, unreadable
 
-CHECKOUT = "lidarpool's checkout (docs/install.md#extras)"
+CHECKOUT = "a checkout of lidarpool (docs/install.md#extras)"
 
 
 def install_command(*requirements: str) -> str:
@@ -37,7 +37,10 @@ def need(package: str, extra: str, purpose: str) -> None:
     `purpose` starts the error: «clouds are read».
     """
     if find_spec(package) is None:
-        raise LidarError(f"{purpose} by {package}: {install_command(f'lidarpool[{extra}]')}.")
+        raise LidarError(
+            f"{purpose} by {package}, which is not installed. Run "
+            f"{install_command(f'lidarpool[{extra}]')}."
+        )
 
 
 @contextmanager

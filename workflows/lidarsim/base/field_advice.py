@@ -169,14 +169,14 @@ def _in_words(
     sections = [section for section in direct if section]
     listed = joined(sections)
     if suggestion and listed:
-        return f"{suggestion} Or {path[-1]} of {listed}?"
+        return f"{suggestion} {path[-1]!r} is a field of {listed}."
     if suggestion and "" in direct:
-        return f"{suggestion} Or write {path[-1]} beside {path[0]}."
+        return f"{suggestion} {path[-1]!r} is also a top-level field, next to {path[0]!r}."
     words = suggestion
     if "" in direct:
-        words = f" It is a field of the file itself: write it beside {path[0]}."
+        words = f" It is a top-level field. Move it next to {path[0]!r}."
     if listed:
-        words += f" It is a field of {listed}: write it there."
+        words += f" It is a field of {listed}. Move it there."
     elif examples:
         words += f" {'Or write' if words else 'Write'} {examples[0]}."
     return words
@@ -263,5 +263,5 @@ def name_advice(path: FieldPath, file: Any) -> str:
     for owner in _inner_sections(owner_of_file(file)):
         is_table = owner.names == path[:-1] and owner.forms[0].startswith("{")
         if is_table and path[-1] in fields_by_name(owner.kind):
-            return f" Each has a name: {_example(owner, str(path[-1]), None)}."
+            return f" Each entry has a name: {_example(owner, str(path[-1]), None)}."
     return ""

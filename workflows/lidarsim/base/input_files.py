@@ -63,7 +63,7 @@ def open_input(path: str | Path) -> BufferedReader:
         if len(_LFS_POINTER) <= state.st_size <= _LFS_MAX_BYTES:
             if os.read(handle, len(_LFS_POINTER)) == _LFS_POINTER:
                 raise InputFileError(
-                    path, "it is a Git LFS pointer, get the file itself with git lfs pull"
+                    path, "it is a Git LFS pointer. Download the file with git lfs pull"
                 )
             os.lseek(handle, 0, os.SEEK_SET)
         return os.fdopen(handle, "rb")
@@ -83,7 +83,7 @@ def not_found(path: str | Path, endings: Collection[str] = ()) -> str:
         names = [entry.name for entry in file.parent.iterdir()]
     likely = tuple(endings) or (file.suffix.lower(),)
     hint = did_you_mean(file.name, [name for name in names if name.lower().endswith(likely)])
-    return f"{path} does not exist: check the name and the folder.{hint}"
+    return f"{path} does not exist.{hint}"
 
 
 def _check_kind(path: str | Path, mode: int) -> None:
@@ -94,8 +94,8 @@ def _check_kind(path: str | Path, mode: int) -> None:
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(mode):
-        kind = _KINDS.get(stat.S_IFMT(mode), "no plain file")
-        raise InputFileError(path, f"it is {kind}, give a plain file")
+        kind = _KINDS.get(stat.S_IFMT(mode), "not a regular file")
+        raise InputFileError(path, f"it is {kind}. Expected a regular file")
 
 
 def input_size(path: str | Path) -> int:
@@ -120,8 +120,8 @@ def check_input(path: str | Path) -> int:
     size = input_size(path)
     if size > memory():
         raise LidarError(
-            f"it has {bytes_of(size)}, more than the memory of this machine "
-            f"({bytes_of(memory())}): read a part of it, or read it on a larger one."
+            f"it has {bytes_of(size)}, which exceeds the memory of this machine "
+            f"({bytes_of(memory())}). Use a part of the file, or a machine with more memory."
         )
     return size
 

@@ -14,8 +14,8 @@ from types import FrameType
 from typing import NoReturn
 
 INTERRUPTED = 130  # exit code of shells for a program ended by Ctrl-C
-STOPPED = "interrupted; everything was stopped"
-UNTOUCHED = f"{STOPPED}, and the output folder is as it was."
+STOPPED = "Interrupted. All processes were stopped"
+UNTOUCHED = f"{STOPPED}, and the output folder is unchanged."
 
 # From the keyboard, from a job manager, and from a terminal that is closed.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -98,6 +98,6 @@ def file_below(root: Path, name: str, entry: str) -> Path:
 
 def _outside(name: str, entry: str) -> LidarError:
     return LidarError(
-        f"{entry} names {printable(name, _MAX_LETTERS)!r}, which leads outside of the folder of "
-        "the data. Only files in that folder are read: copy the file there, and correct the name."
+        f"{entry} refers to {printable(name, _MAX_LETTERS)!r}, which is outside the data folder. "
+        "Only files in that folder are read. Copy the file there and correct the reference."
     )

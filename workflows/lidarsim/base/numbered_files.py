@@ -61,23 +61,23 @@ def rows_of_frames(files: Sequence[Path], row_count: int, table: str, kind: str)
     if not all(file.stem.isdecimal() and len(file.stem) <= _FRAME_DIGITS for file in files):
         if row_count != count:
             raise ValueError(
-                f"{table} has {plural(row_count, 'row')} for {count:,} {kind}, whose names are not "
-                "frame numbers. Give one row for each file, or name the files 000000, 000001, …"
+                f"{table} has {plural(row_count, 'row')} for {count:,} {kind} whose names are not "
+                "frame numbers. Write one row per file, or name the files 000000, 000001, …"
             )
         return np.arange(count)
     frames = np.array([int(file.stem) for file in files], np.int64)
     if missing := frames[frames >= row_count].tolist():
         raise ValueError(
-            f"{table} has no row for {frames_in_words(missing)}: it has "
+            f"{table} has no row for {frames_in_words(missing)}. It has "
             f"{plural(row_count, 'row')}, and row k, counted from 0, belongs to file k. Add the "
             "missing rows, or rename the files."
         )
     surplus = frames_without_file(files, row_count)
     if surplus and frames[-1] == count - 1:
         raise ValueError(
-            f"{table} has rows for {frames_in_words(surplus)}, which have no file in the "
-            f"{count:,} {kind}. Delete these rows if the frames were left out; if the files were "
-            "renumbered, give them the numbers of their rows."
+            f"{table} has rows for {frames_in_words(surplus)}, but the {count:,} {kind} do not "
+            "include these frames. If frames were skipped, delete these rows. If the files were "
+            "renumbered, name each file after its row."
         )
     return frames
 

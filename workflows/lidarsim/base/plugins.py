@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from .errors import LidarError
-from .words import did_you_mean, printable
+from .words import did_you_mean, joined, printable
 
 T = TypeVar("T")
 
@@ -48,15 +48,15 @@ class Plugin:
         value = _imported(self)
         if not isinstance(value, kind):
             raise LidarError(
-                f"{self} is {_a(type(value).__name__)}, and {self.group} takes "
-                f"{_a(kind.__name__)}: install another version of {self.distribution}."
+                f"{self} is {_a(type(value).__name__)}, but {self.group} requires "
+                f"{_a(kind.__name__)}. Install a different version of {self.distribution}."
             )
         return value
 
     def lacks(self, field: str) -> LidarError:
         """Return the error of a plug-in that lacks a field or function."""
         return LidarError(
-            f"{self} lacks {field}, which {self.group} needs: install another version of "
+            f"{self} lacks {field}, which {self.group} requires. Install a different version of "
             f"{self.distribution}."
         )
 
@@ -64,8 +64,8 @@ class Plugin:
         """Return the error of a plug-in that cannot be imported, or whose import failed later."""
         reason = printable(str(error)) or type(error).__name__
         return LidarError(
-            f"{self} cannot be imported ({reason}): install what {self.distribution} needs, or "
-            f"uninstall it."
+            f"{self} cannot be imported: {reason}. Install the dependencies of "
+            f"{self.distribution}, or uninstall it."
         )
 
 
@@ -112,7 +112,7 @@ def find_plugin(group: str, name: str) -> Plugin | None:
     candidates = plugins_of(group).get(name, ())
     if len(candidates) > 1:
         providers = " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in candidates)
-        raise LidarError(f"{providers} each provide {name!r} for {group}: uninstall all but one.")
+        raise LidarError(f"{providers} both provide {name!r} for {group}. Uninstall all but one.")
     return candidates[0] if candidates else None
 
 
@@ -157,8 +157,8 @@ class PluginTable(Generic[T]):
         plugin = find_plugin(self.group, name)
         if plugin is None:
             raise LidarError(
-                f"{name!r} is not {self._noun}.{did_you_mean(name, self.names)} There are "
-                f"{', '.join(self.names)}."
+                f"Unknown {self._noun} {name!r}.{did_you_mean(name, self.names)} The available "
+                f"names are {joined(self.names)}."
             )
         return self._load(plugin)
 

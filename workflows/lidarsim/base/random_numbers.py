@@ -48,7 +48,8 @@ class Purpose:
         earlier = Purpose.declared.setdefault(number, self)
         if earlier is not self:
             raise ValueError(
-                f"random numbers {number} are of {earlier.use!r}; {use!r} needs others"
+                f"random number stream {number} is already used for {earlier.use!r}, so {use!r} "
+                "requires a different number"
             )
         self.number = number
         self.use = use

@@ -84,12 +84,14 @@ class Storage:
             return cls(path, durable, path)
         if ":" in text.partition("://")[2].partition("/")[0].rpartition("@")[0]:
             raise LidarError(
-                f"A URL for {text.partition(':')[0]} has a password: leave it out, and give "
-                "it in the environment or the configuration of that storage's library."
+                f"A URL for {text.partition(':')[0]} must not contain a password. Set it in the "
+                "environment or in the configuration of the storage library."
             )
         # Else `s3://$BUCKET`, with no such variable, would be a local folder.
         if not is_url(text.rstrip("/")):
-            raise LidarError(f"{text} names no folder: give one, such as {text}bucket/run.")
+            raise LidarError(
+                f"{text} does not name a folder. Add one, for example {text}bucket/run."
+            )
         return cls(text.rstrip("/"), durable)
 
     def __str__(self) -> str:
@@ -124,8 +126,8 @@ class Storage:
                 break
             if ancestor.is_symlink():
                 raise LidarError(
-                    f"{ancestor} is a link, and nothing behind a link in {self.named} is opened, "
-                    "written or deleted: remove it, or put there what it leads to."
+                    f"{ancestor} is a symbolic link. Nothing behind a link in {self.named} is "
+                    "opened, written or deleted. Replace the link with its target."
                 ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # for every caller
         return path
 
@@ -155,12 +157,14 @@ class Storage:
             import fsspec
         except ImportError as error:
             command = install_command("fsspec")
-            raise LidarError(f"{self.url} is opened by fsspec: {command}.") from error
+            raise LidarError(
+                f"{self.url} requires fsspec, which is not installed. Run {command}."
+            ) from error
         try:
             system, folder = fsspec.core.url_to_fs(self.url)
         except (ImportError, ValueError) as error:
             extra = install_command("lidarpool[s3]") if self.url.startswith("s3://") else ""
-            hint = f": {extra}" if extra and isinstance(error, ImportError) else ""
+            hint = f". Run {extra}" if extra and isinstance(error, ImportError) else ""
             raise LidarError(f"{self.url} cannot be opened: {error}{hint}.") from error
         return os.getpid(), system, folder
 
@@ -198,12 +202,13 @@ class Storage:
             self.remove([name])
         except FileNotFoundError as error:
             raise LidarError(
-                f"Cannot write to {self.url} ({error}): make the bucket first, or give another."
+                f"Cannot write to {self.url}: {error}. Create the bucket first, or use a different "
+                "one."
             ) from error
         except OSError as error:
             raise LidarError(
-                f"Cannot write to {self.url} ({error}): check the credentials and rights that "
-                "its library finds, and at its address."
+                f"Cannot write to {self.url}: {error}. Check the credentials, the permissions and "
+                "the address."
             ) from error
 
     def write(self, name: str, content: Any) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 
 from .arrays import Floats
 from .time_units import SECONDS, TimeUnit, seconds_of
-from .words import did_you_mean_each, fits, in_yaml, joined, printable
+from .words import alternatives, did_you_mean_each, fits, in_yaml, joined, printable, rounded
 
 # {unit: number of these units in the first unit}
 METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
@@ -149,8 +149,11 @@ def ignored_columns(names: Sequence[str], ignore: Sequence[str]) -> set[int]:
         unmatched += [] if matches else [repr(pattern)]
         indices |= matches
     if unmatched:
-        verb = "are no columns" if len(unmatched) > 1 else "is no column"
-        raise ValueError(f"ignore names {joined(unmatched)}, which {verb}; it has {_listed(names)}")
+        columns = "columns" if len(unmatched) > 1 else "column"
+        raise ValueError(
+            f"ignore contains the unknown {columns} {joined(unmatched)}. The columns are "
+            f"{_listed(names)}"
+        )
     return indices
 
 
@@ -228,8 +231,8 @@ def _cells(line: str, separator: str | None) -> list[str]:
     except csv.Error as error:
         reason = str(error)
         if len(line) > csv.field_size_limit():
-            reason = f"a cell has more than {csv.field_size_limit():,} letters"
-        raise ValueError(f"one of its lines is not of a table: {reason}") from error
+            reason = f"a cell has more than {csv.field_size_limit():,} characters"
+        raise ValueError(f"one of its lines is not part of a table: {reason}") from error
     return [cell.strip().strip('"') for cell in cells]
 
 
@@ -293,7 +296,9 @@ def read_table(
     )
     if header is None:
         example = ",".join(quantity.name for quantity in quantities[:4])
-        raise ValueError(f"it has no header: name its columns in its first line, as in {example}")
+        raise ValueError(
+            f"it has no header. Name its columns in the first line, for example {example}"
+        )
     reader = _ColumnReader(header, quantities, spellings, exact, time_unit)
     reader.choose(columns)
     reader.leave_out(ignore)
@@ -303,7 +308,7 @@ def read_table(
     if missing := [repr(name) for name in required_names if name not in names]:
         columns_word = "columns" if len(missing) > 1 else "column"
         raise ValueError(
-            f"it has no {columns_word} {joined(missing)}; it has {_listed(header.cells)}"
+            f"it has no {columns_word} {joined(missing)}. Its columns are {_listed(header.cells)}"
         )
     values = _numbers(lines, header, names, [*required_names, *(columns or {})])
     return {name: reader.converted(name, values[:, i]) for i, name in enumerate(reader.assigned)}
@@ -357,25 +362,31 @@ class _ColumnReader:
         """Assign the column that the user names for a quantity."""
         match = self.quantity_of(name)
         if match is None:
-            raise ValueError(f"columns names {name!r}; possible names are {self.possible}")
+            raise ValueError(
+                f"columns contains the unknown name {name!r}. Possible names are {self.possible}"
+            )
         quantity, unit = match
         spelling = file_name.lstrip("#%").strip()
         matches = [i for i, cell in enumerate(self.cells) if cell == spelling] or [
             i for i, cell in enumerate(self.cells) if cell.lower() == spelling.lower()
         ]
         if not matches:
-            raise ValueError(f"it has no column {file_name!r}; it has {_listed(self.cells)}")
+            raise ValueError(
+                f"it has no column {file_name!r}. Its columns are {_listed(self.cells)}"
+            )
         if len(matches) > 1:
-            raise ValueError(f"it has the column {file_name!r} {len(matches)} times")
+            raise ValueError(f"its column {file_name!r} occurs {len(matches)} times")
         stated = column_name(spelling).unit
         if unit is not None and stated in quantity.units and stated != unit:
-            raise ValueError(f"columns reads {file_name!r} as {name}: the header states {stated}")
+            raise ValueError(
+                f"columns reads {file_name!r} as {name}, but the header states the unit {stated}"
+            )
         if unit is None:
             unit = self._unit(quantity, file_name, stated, {})
         elif quantity.units is SECONDS and self.time_unit not in (None, unit):
             raise ValueError(
-                f"columns reads {file_name!r} as {name}, and time_unit is {self.time_unit}: "
-                "give one of the two"
+                f"columns reads {file_name!r} as {name}, which cannot be combined with time_unit: "
+                f"{self.time_unit}"
             )
         self._add(quantity, matches[0], unit)
 
@@ -426,12 +437,13 @@ class _ColumnReader:
 
     def _unknown(self, cells: Sequence[str]) -> str:
         """Return a message on columns that are not known."""
-        columns = "columns are" if len(cells) > 1 else "column is"
+        columns = "columns" if len(cells) > 1 else "column"
         pronoun = "them" if len(cells) > 1 else "it"
         hint = did_you_mean_each(cells, [quantity.name for quantity in self.quantities])
         return (
-            f"its {columns} not known: {_listed(cells)}.{hint} Rename {pronoun}, or leave "
-            f"{pronoun} out with {_ignoring(cells)}. Known are {self.possible}"
+            f"unknown {columns} {_listed([repr(cell) for cell in cells])}.{hint} Rename "
+            f"{pronoun}, or ignore {pronoun} with `{_ignoring(cells)}`. The known "
+            f"columns are {self.possible}"
         )
 
     def _lacking_units(self, columns: Sequence[tuple[Quantity, str]]) -> str:
@@ -444,20 +456,21 @@ class _ColumnReader:
         ]
         pairs = ", ".join(f"{quantity.name}: {cell}" for quantity, cell in columns)
         return (
-            f"its columns {joined([repr(cell) for _, cell in columns])} have no unit: call them "
-            f"{joined(names)}" + f", or give columns: {{{pairs}}}" * self.can_choose
+            f"its columns {joined([repr(cell) for _, cell in columns])} have no unit. Rename "
+            f"them to {joined(names)}" + f", or set `columns: {{{pairs}}}`" * self.can_choose
         )
 
     def _unit_missing(self, quantity: Quantity, cell: str) -> _UnitMissingError:
         """Return the error on a column without a unit."""
         first, *other_units = quantity.units
         stem = quantity.name.removesuffix(f"_{first}")
-        choice = f", or give columns: {{{quantity.name}: {printable(cell)}}}" * self.can_choose
-        unit_option = ", or give time_unit" * (quantity.units is SECONDS)
-        names = " or ".join(f"{stem}_{other_unit}" for other_unit in other_units)
+        choice = f", or set `columns: {{{quantity.name}: {printable(cell)}}}`" * self.can_choose
+        unit_option = ", or set time_unit" * (quantity.units is SECONDS)
+        names = [f"{quantity.name} ({_UNIT_WORDS[first]})"]
+        names += [f"{stem}_{other_unit}" for other_unit in other_units]
         return _UnitMissingError(
-            f"its column {printable(cell)!r} has no unit: call it {quantity.name}, in "
-            f"{_UNIT_WORDS[first]}{choice}; {names} is read as well{unit_option}"
+            f"its column {printable(cell)!r} has no unit. Rename it to "
+            f"{alternatives(names)}{choice}{unit_option}"
         )
 
     def _unit(
@@ -468,10 +481,10 @@ class _ColumnReader:
             return self.time_unit
         if unit is not None:
             if unit not in quantity.units:
-                units_read = " or ".join(name or "none" for name in quantity.units)
+                units_read = alternatives([name or "none" for name in quantity.units])
                 raise ValueError(
-                    f"its column {printable(cell)!r} has the unit {printable(unit)!r}: give it in "
-                    f"{units_read}"
+                    f"its column {printable(cell)!r} has the unit {printable(unit)!r}, "
+                    f"which is not supported. Convert it to {units_read}"
                 )
             return unit
         if (implied := units.get(quantity.name)) is not None:
@@ -489,10 +502,10 @@ class _ColumnReader:
             earlier_cell = self.cells[earlier[0]]
             cell = self.cells[index]
             if earlier_cell == cell:
-                raise ValueError(f"it has the column {printable(cell)!r} twice")
+                raise ValueError(f"its column {printable(cell)!r} occurs twice")
             raise ValueError(
-                f"its columns {printable(earlier_cell)!r} and {printable(cell)!r} are both "
-                f"{quantity.name}: leave one out with {_ignoring([cell])}"
+                f"its columns {printable(earlier_cell)!r} and {printable(cell)!r} both mean "
+                f"{quantity.name}. Ignore one of them, for example with `{_ignoring([cell])}`"
             )
         self.assigned[quantity.name] = index, unit
 
@@ -507,8 +520,9 @@ class _ColumnReader:
                 stem = name.removesuffix(f"_{unit}")
                 names = " or ".join(f"{stem}_{unit_name}" for unit_name in quantity.units)
                 raise ValueError(
-                    f"its column {printable(self.cells[index])!r} has no unit, and values up to "
-                    f"{largest:.3g} may have any: call it {names}"
+                    f"the unit of its column {printable(self.cells[index])!r} is ambiguous, "
+                    f"because its values do not exceed {rounded(largest)}. Rename the "
+                    f"column to {names}"
                 )
         assert unit is not None  # set above
         if quantity.units is SECONDS:
@@ -574,16 +588,16 @@ def _numbers(
             usecols=[*names.values()],
         )
         if not np.isfinite(values).all():
-            raise ValueError("it has a nan or inf")
+            raise ValueError("it contains NaN or infinite values")
     except ValueError as error:
         for number, cells in _rows_of(lines, header):
             for name, index in names.items():
                 if not _is_finite(cells[index]):
-                    alternative = "" if name in required_names else ", or ignore the column"
+                    alternative = "" if name in required_names else ". Otherwise, ignore the column"
                     raise ValueError(
-                        f"its column {printable(header.cells[index])!r} has "
-                        f"{printable(cells[index])!r} in line {number}: give a number in every line"
-                        f"{alternative}"
+                        f"its column {printable(header.cells[index])!r} contains "
+                        f"{printable(cells[index])!r} in line {number}. Each row must have a "
+                        f"number in this column{alternative}"
                     ) from error
         raise
     return np.asarray(values, np.float64)
@@ -614,7 +628,7 @@ def _check_widths(lines: Sequence[str], header: Header) -> None:
         if count == width + 1 and header.separator and line.rstrip().endswith(header.separator):
             continue
         if count != width:
-            raise ValueError(f"line {number} has {count} cells, and the header {width}")
+            raise ValueError(f"line {number} has {count} cells, but the header has {width}")
 
 
 def _check_unnamed(rows: Sequence[str], header: Header) -> None:
@@ -630,6 +644,6 @@ def _check_unnamed(rows: Sequence[str], header: Header) -> None:
             text = cells[index] if index < len(cells) else ""
             if text not in ("", str(number)):
                 raise ValueError(
-                    f"its column {index + 1} has no name, and holds {text[:20]!r}: name it in "
+                    f"its column {index + 1} has no name, but contains {text[:20]!r}. Name it in "
                     "the header"
                 )

@@ -9,20 +9,22 @@ from .input_files import open_input, read_input
 _START_BYTES = 4096  # bytes that tell text from other content
 # {first bytes of a file that is not a text: format and advice}
 _KINDS = {
-    b"\x89MCAP0\r\n": "a bag (MCAP): give it the ending .mcap",
-    b"SQLite format 3": "a database (SQLite), as bags of ROS 2 are: give it the ending .db3, or "
-    "give the folder of the bag",
-    b"#ROSBAG V": "a bag of ROS 1: convert it, rosbags-convert --src FILE.bag --dst FOLDER",
-    b"TSCANTRJ": "a trajectory of TerraScan: export it as text",
-    b"\x1f\x8b": "compressed by gzip: unpack it",
-    b"\x28\xb5\x2f\xfd": "compressed by Zstandard: unpack it",
-    b"PK\x03\x04": "a zip archive: unpack it, or save a spreadsheet as .csv",
-    b"\x89HDF": "of HDF5: export its poses as .csv",
-    b"PAR1": "of Parquet: export it as .csv",
-    b"LASF": "a cloud (LAS)",
-    b"\xff\xfe": "text in UTF-16: save it as UTF-8",
-    b"\xfe\xff": "text in UTF-16: save it as UTF-8",
-    b"\x93NUMPY": "an array of NumPy: save it as .csv with a header",
+    b"\x89MCAP0\r\n": "an MCAP bag. Its name must end with .mcap",
+    b"SQLite format 3": (
+        "an SQLite database, like ROS 2 bags. Its name must end with .db3, "
+        "or pass the folder of the bag"
+    ),
+    b"#ROSBAG V": "a ROS 1 bag. Convert it with rosbags-convert --src FILE.bag --dst FOLDER",
+    b"TSCANTRJ": "a TerraScan trajectory. Export it as text",
+    b"\x1f\x8b": "compressed with gzip. Decompress it",
+    b"\x28\xb5\x2f\xfd": "compressed with Zstandard. Decompress it",
+    b"PK\x03\x04": "a zip archive. Unpack it, or save a spreadsheet as .csv",
+    b"\x89HDF": "an HDF5 file. Export its poses as .csv",
+    b"PAR1": "a Parquet file. Export it as .csv",
+    b"LASF": "a LAS point cloud",
+    b"\xff\xfe": "encoded in UTF-16. Save it as UTF-8",
+    b"\xfe\xff": "encoded in UTF-16. Save it as UTF-8",
+    b"\x93NUMPY": "a NumPy array. Save it as .csv with a header",
 }
 
 
@@ -42,13 +44,13 @@ def read_text(path: Path) -> str:
         first = file.read(_START_BYTES)
     kind = next((kind for magic, kind in _KINDS.items() if first.startswith(magic)), None)
     if kind is not None:
-        raise ValueError(f"it is {kind}; a text file is expected")
+        raise ValueError(f"expected a text file, but it is {kind}")
     if b"\0" in first:
-        raise ValueError("it is a binary file of an unknown kind, and a text file is expected")
+        raise ValueError("expected a text file, but it is a binary file in an unknown format")
     try:
         text = read_input(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError("it is no text in UTF-8: save it as UTF-8") from error
+        raise ValueError("it is not encoded in UTF-8. Save it as UTF-8") from error
     if not text.strip():
         raise ValueError("it is empty")
     return text.replace("\r\n", "\n").replace("\r", "\n")

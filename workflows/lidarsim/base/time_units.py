@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from .arrays import Floats
+from .errors import as_sentence
 from .words import rounded
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
@@ -55,15 +56,15 @@ def seconds_of(
     if are_plausible(first_s, last_s):
         return seconds
     span_s = last_s - first_s
-    fault = f"its times go from {first_s:.9g} to {last_s:.9g} s"
+    fault = f"its times range from {first_s:.9g} to {last_s:.9g} s"
     if span_s > _YEAR_S:
-        fault += f", which are {rounded(span_s / _YEAR_S)} years"
+        fault += f", a span of {rounded(span_s / _YEAR_S)} years"
     unit = _probable_unit(times[np.isfinite(times)], stated)
     if unit == stated:
-        advice = advice or f"correct those that are far from the others, or give time_unit: {unit}"
-        raise ValueError(f"{fault}: {advice}")
-    advice = advice or f"give time_unit: {unit}, or {stated} if they are right"
-    raise ValueError(f"{fault}: they are probably {_UNIT_NAMES[unit]}; {advice}")
+        advice = advice or f"Correct the outliers, or set `time_unit: {unit}`"
+        raise ValueError(f"{fault}. {as_sentence(advice)[:-1]}")
+    advice = advice or f"Set `time_unit: {unit}`, or `time_unit: {stated}` if they are correct"
+    raise ValueError(f"{fault}. They are probably {_UNIT_NAMES[unit]}. {as_sentence(advice)[:-1]}")
 
 
 def are_plausible(first_s: float, last_s: float) -> bool:

@@ -291,6 +291,4 @@ def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> Any
     try:
         return np.asarray(values, dtype)
     except (TypeError, ValueError, OverflowError) as error:
-        raise LidarError(
-            f"{name} is {shown(values)}; it must be an array of numbers, or lists of them."
-        ) from error
+        raise LidarError(f"{name} must be an array of numbers, but is {shown(values)}.") from error

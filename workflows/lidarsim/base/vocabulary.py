@@ -65,5 +65,5 @@ PATIENCE_S = 60.0  # wait for partitions that become empty; a nanny needs a few 
 # Mercator and cylindrical projections, such as Web Mercator, EPSG:3857.
 WORLD_EPSG = frozenset({3395, 3410, 3785, 3832, 3857, 3975, 4087, 4088, 6933, 32662, 54004})
 OF_THE_WORLD = (
-    "for maps of the world, whose metres are not true: choose a UTM zone or a national grid"
+    "a world map projection that does not preserve distances. Use a UTM zone or a national grid"
 )

@@ -39,7 +39,7 @@ def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
     Examples
     --------
     >>> did_you_mean_each(["layer", "speed", "step"], ["layers", "step_deg"])
-    " Did you mean 'layers' for layer, 'step_deg' for step?"
+    " Did you mean 'layers' for 'layer', 'step_deg' for 'step'?"
     """
     names = [*candidates]
     if len(words) == 1:
@@ -48,7 +48,7 @@ def did_you_mean_each(words: Sequence[str], candidates: Iterable[str]) -> str:
     pairs = {word: name for word, name in similar.items() if name is not None}
     if not pairs:
         return ""
-    suggestions = ", ".join(f"{name!r} for {word}" for word, name in pairs.items())
+    suggestions = ", ".join(f"{name!r} for {word!r}" for word, name in pairs.items())
     changed = [word for word, name in pairs.items() if factor_between(word, name) is not None]
     units = f" Convert the units of {joined(changed)}." if changed else ""
     return f" Did you mean {suggestions}?{units}"
@@ -76,7 +76,7 @@ def name_hint(pattern: str, names: Sequence[str]) -> str:
     >>> name_hint("Hose", ["House", "Tree"])
     " Did you mean 'House'?"
     >>> name_hint("Street*", ["House", "Tree", "Tree.2", "Tree.3"])
-    ' There are House, Tree* (3).'
+    ' Available names: House, Tree* (3).'
     """
     is_pattern = any(sign in pattern for sign in "*?[")
     if similar := "" if is_pattern else did_you_mean(pattern, names):
@@ -87,7 +87,7 @@ def name_hint(pattern: str, names: Sequence[str]) -> str:
     entries: list[str] = []
     for stem, group in groups.items():
         entries += [f"{stem}* ({len(group):,})"] if stem and len(group) > 2 else group
-    return f" There are {listed(entries, 8) or 'none'}."
+    return f" Available names: {listed(entries, 8) or 'none'}."
 
 
 _LAST_NUMBER = re.compile(r"[\s._-]*\d+$")
@@ -242,6 +242,19 @@ def joined(names: Sequence[str]) -> str:
     'x, y and z'
     """
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+
+
+def alternatives(names: Sequence[str]) -> str:
+    """Return alternatives as an enumeration. A quoted alternative may be an enumeration itself.
+
+    Examples
+    --------
+    >>> alternatives(["'even' or 'gaussian'", "a number", "None"])
+    "'even', 'gaussian', a number or None"
+    """
+    *others, last = names
+    flat = (name.replace("' or '", "', '") for name in others)
+    return " or ".join(filter(None, [", ".join(flat), last]))
 
 
 def listed(names: Sequence[str], max_names: int = 3) -> str:

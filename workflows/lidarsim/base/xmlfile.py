@@ -57,7 +57,7 @@ def xml_root(data: bytes) -> Element:
         if error.code not in AT_END:
             raise
         raise CutShortError(
-            f"its XML ends within an element, in line {error.position[0]}"
+            f"its XML ends inside an element in line {error.position[0]}"
         ) from error
 
 
@@ -81,7 +81,7 @@ def parse_pieces(parser: expat.XMLParserType, pieces: Iterable[bytes]) -> Iterat
         parser.Parse(piece)
         count += len(piece)
         if count - parser.CurrentByteIndex > MAX_TAG_BYTES:
-            raise ValueError(f"it has a tag or remark of more than {bytes_of(MAX_TAG_BYTES)}")
+            raise ValueError(f"it has a tag or comment of more than {bytes_of(MAX_TAG_BYTES)}")
         yield
     parser.Parse(b"", True)
     yield
@@ -93,4 +93,4 @@ def refuse_entity(name: str, *details: object) -> NoReturn:
     Expat itself stops an expansion only at a hundred times the file, of text; elements take thirty
     times their text.
     """
-    raise ValueError(f"it declares an XML entity, {name[:20]!r}, which may expand to any length")
+    raise ValueError(f"it declares the XML entity {name[:20]!r}, which may expand without limit")

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from .allowance import Allowance
-from .errors import LidarError, MissingFileError, prefixed
+from .errors import LidarError, MissingFileError, as_sentence, prefixed
 from .input_files import not_found, read_input_text
 
 _NODE_BYTES = 500  # memory of a value in the loader
@@ -24,7 +24,7 @@ class _Loader(yaml.SafeLoader):
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
-        self._allowance = Allowance(len(text), "write less, or without aliases (*name)")
+        self._allowance = Allowance(len(text), "shorten it, or do not use aliases (*name)")
         # {value with an anchor: bytes with aliases written out}
         self._node_bytes: dict[yaml.Node, int] = {}
 
@@ -55,7 +55,7 @@ class _Loader(yaml.SafeLoader):
                 continue
             if key.value in keys:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"{key.value!r} is given twice", key.start_mark
+                    None, None, f"the key {key.value!r} is duplicated", key.start_mark
                 )
             keys.add(key.value)
         return super().construct_mapping(node, deep)
@@ -89,7 +89,7 @@ def load_yaml(text: str) -> Any:
 
 
 def read_yaml(
-    path: Path, form: str = "a scenario has sections (scene:, sensor:, poses:, …)"
+    path: Path, form: str = "A scenario is a mapping with sections such as scene, sensor and poses"
 ) -> dict[str, Any]:
     """Read a YAML file of a mapping, for errors that describe the expected mapping by `form`.
 
@@ -115,8 +115,8 @@ def read_yaml(
         reason = " ".join(str(error).partition(";")[0].split())[:200]
         raise LidarError(f"{path} is not valid YAML: {reason}.") from error
     if content is None:
-        raise LidarError(f"{path} is empty; {form}.")
+        raise LidarError(f"{path} is empty. {as_sentence(form)}")
     if not isinstance(content, dict):
         kind = "a list" if isinstance(content, list) else f"only {str(content)[:40]!r}"
-        raise LidarError(f"{path} holds {kind}; {form}.")
+        raise LidarError(f"{path} contains {kind}. {as_sentence(form)}")
     return content

@@ -81,8 +81,8 @@ def open_bag(path: Path, name: str) -> Reader:
             if "Profile is not ros2" not in str(error):
                 raise
             raise LidarError(
-                "it has no messages of ROS 2: record PointCloud2, or, if it is a trace of OSI, "
-                "name it as the traffic of a scenario."
+                "it has no ROS 2 messages. Record PointCloud2, or set an OSI trace as the traffic "
+                "of a scenario."
             ) from error
     return bag
 
@@ -126,13 +126,13 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
         if field.datatype not in kinds or not field.count:
             raise ValueError(
                 f"its field {printable(field.name)!r} has datatype {field.datatype} and count "
-                f"{field.count}; PointField has datatypes 1 to {len(kinds)} and a count of 1 or "
-                "more. Record it again with a driver that sets both"
+                f"{field.count}, but a PointField has datatypes 1 to {len(kinds)} and a count of "
+                "at least 1. Record it again with a driver that sets both"
             )
         if field.offset + field.count > message.point_step:  # each number has a byte or more
             raise ValueError(
                 f"its field {printable(field.name)!r} has {field.count:,} numbers from byte "
-                f"{field.offset:,} on, and a point {message.point_step:,} bytes"
+                f"{field.offset:,} on, but a point has {message.point_step:,} bytes"
             )
     numbers = [
         (field.name if field.count == 1 else f"{field.name}_{index}", field, index)
@@ -174,7 +174,7 @@ def livox_columns(data: bytes) -> dict[str, AnyArray]:
     count = number(start - 4)
     row = LIVOX_POINT.newbyteorder(order)
     if len(data) < start + count * row.itemsize - LIVOX_PADDING * bool(count):
-        raise CutShortError(f"{count:,} points announced, and there are fewer")
+        raise CutShortError(f"{count:,} points were expected, but there are fewer")
     content = data[start : start + count * row.itemsize].ljust(count * row.itemsize, b"\0")
     rows = np.frombuffer(content, row)
     return {name: rows[name] for name in row.names or ()}

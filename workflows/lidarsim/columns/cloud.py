@@ -107,17 +107,19 @@ class Cloud(CloudDisplay):
         if positions.dtype not in (np.float32, np.float64):
             positions = as_array("positions", self.positions)
         if positions.ndim != 2 or positions.shape[1:] != (3,):
-            raise LidarError(f"A cloud needs positions of (n, 3), not {positions.shape}.")
+            raise LidarError(
+                f"The positions of a cloud must have the shape (n, 3), but have {positions.shape}."
+            )
         if not np.isfinite(positions).all():
-            raise LidarError("A point of the cloud is NaN or infinite; it cannot be stored.")
+            raise LidarError("A point of the cloud is NaN or infinite.")
         known_columns = TABLE | {column.name: column for column in self.custom_columns}
         columns = {}
         for name, values in self.columns.items():
             array = np.asarray(values)
             if array.shape != (len(positions),):
                 raise LidarError(
-                    f"Column {name!r} has the shape {array.shape}, but there are {len(positions)} "
-                    "points: give one value for each point."
+                    f"Column {name!r} must have one value for each of the {len(positions)} points, "
+                    f"but has the shape {array.shape}."
                 )
             columns[name] = _fitting(known_columns[name], array) if name in known_columns else array
         object.__setattr__(self, "positions", positions)
@@ -135,8 +137,8 @@ class Cloud(CloudDisplay):
                 return self.columns[key]
             except KeyError:
                 raise KeyError(
-                    f"the cloud has no column {key!r}; it has {list(self.columns)}, and x, y and "
-                    "z in `positions`"
+                    f"Unknown column {key!r}. The columns are {list(self.columns)}, and x, y and z "
+                    "are in `positions`"
                 ) from None
         rows = key if isinstance(key, slice) else np.asarray(key, None if np.size(key) else int)
         try:
@@ -145,8 +147,9 @@ class Cloud(CloudDisplay):
             positions = np.empty(0)
         if positions.ndim != 2:
             raise LidarError(
-                f"Points of a cloud of {len(self):,} are a slice, as cloud[:100], a mask, or a "
-                f"list of their rows, not {shown(key)}; a column is its name, as cloud['range']."
+                "The points of a cloud are selected by a slice such as cloud[:100], a mask or a "
+                "list of row numbers, and a column by its name such as cloud['range'], not by "
+                f"{shown(key)}."
             )
         columns = {name: array[rows] for name, array in self.columns.items()}
         return Cloud(positions, columns, self.custom_columns, self.sweeps)
@@ -189,8 +192,8 @@ class Cloud(CloudDisplay):
         """
         if not self.has_waveforms:
             raise LidarError(
-                "The cloud has no waveforms: give the survey cloud.waveform_samples, and take the "
-                "cloud of its result; of files only LAS and LAZ hold them."
+                "The cloud has no waveforms. Set cloud.waveform_samples in the survey and read "
+                "the cloud from its result. Only LAS and LAZ files can store waveforms."
             )
         return Waveforms.from_records(self.columns[WAVEFORM])
 
@@ -246,7 +249,9 @@ def need_packages(*packages: str) -> None:
         name for name in packages if sys.modules.get(name) is None and find_spec(name) is None
     ]
     if missing:
-        raise LidarError(f"Dataframes need {' and '.join(missing)}: {install_command(*missing)}.")
+        raise LidarError(
+            f"Dataframes require {' and '.join(missing)}. Run {install_command(*missing)}."
+        )
 
 
 def _fitting(column: Column, values: ArrayLike) -> AnyArray:
@@ -260,7 +265,7 @@ def _fitting(column: Column, values: ArrayLike) -> AnyArray:
     if converted is not array and dtype.kind in "iu" and not np.array_equal(converted, array):
         limits = np.iinfo(dtype)
         raise LidarError(
-            f"{column.name} holds {array.min()} to {array.max()}; it must be whole numbers of "
-            f"{limits.min} to {limits.max}."
+            f"Column {column.name!r} must contain whole numbers from {limits.min} to {limits.max}, "
+            f"but contains {array.min()} to {array.max()}."
         )
     return converted

@@ -26,7 +26,7 @@ _INDEX_HEAD = Struct("<QQQQI")
 _NAME_LENGTH = Struct("<I")
 _SIZES = Struct("<QQ")  # packed and unpacked
 _ZSTD = b"zstd"
-_ADVICE = "record it with smaller chunks, or without compression"
+_ADVICE = "record it with smaller chunks or without compression"
 
 _FRAME = 0xFD2FB528
 _SKIPPABLE_FRAMES = range(0x184D2A50, 0x184D2A60)

@@ -59,8 +59,8 @@ def as_file_type(column: Column, values: AnyArray) -> AnyArray:
         largest = max(abs(int(values.min())), abs(int(values.max())))
         if largest > _EXACT:
             raise LidarError(
-                f"Column {column.name!r} holds {largest}, and a PLY file holds whole numbers up to "
-                f"{_EXACT} exactly: leave the column out."
+                f"Column {column.name!r} contains {largest}, but PLY files store whole numbers "
+                f"exactly only up to {_EXACT}. Omit the column."
             )
     return values.astype(dtype, copy=False)
 
@@ -99,12 +99,14 @@ def layout(path: Path) -> PlyLayout:
     head, end_marker, _ = data.partition(b"end_header\n")
     text = head.decode("ascii", errors="replace")
     if not end_marker or not text.startswith(_MAGIC):
-        raise ValueError("it has no header of a binary little-endian PLY file")
+        raise ValueError("it has no binary little-endian PLY header")
     count, dtype = _parse_header(text)
     start = len(head) + len(end_marker)
     announced = start + count * dtype.itemsize
     if size != announced:
-        raise ValueError(f"{count:,} points in {announced:,} bytes announced, {size:,} bytes there")
+        raise ValueError(
+            f"{count:,} points in {announced:,} bytes were expected, but there are {size:,} bytes"
+        )
     return PlyLayout(start, count, dtype)
 
 
@@ -130,9 +132,9 @@ def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:
     elements = [line.split() for line in text.splitlines() if line.startswith("element")]
     properties = [line.split() for line in text.splitlines() if line.startswith("property")]
     if len(elements) != 1 or elements[0][1] != "vertex" or not elements[0][-1].isdigit():
-        raise ValueError("it holds more than points, or no points")
+        raise ValueError("it contains elements other than points, or no points")
     if any(len(entry) != 3 or entry[1] not in _PLY_TYPES for entry in properties):
-        raise ValueError("it has list properties or unknown types")
+        raise ValueError("it has list properties or unknown data types")
     dtype = np.dtype([(name, _PLY_TYPES[kind]) for _, kind, name in properties])
     missing = {*AXES} - set(dtype.names or ())
     if missing:

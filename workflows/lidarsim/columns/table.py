@@ -81,7 +81,7 @@ class Column:
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
-            raise LidarError(f"A column cannot have the name {self.name!r}: use an identifier.")
+            raise LidarError(f"The name of a column must be an identifier, but is {self.name!r}.")
         try:
             kind = np.dtype(self.dtype).kind
             supported = kind in "iuf" or (kind == "V" and self.name == WAVEFORM)
@@ -89,8 +89,8 @@ class Column:
             supported = False
         if not supported:
             raise LidarError(
-                f"Column {self.name!r} has the type {self.dtype!r}; give a type of whole or real "
-                "numbers, such as uint8 or float32."
+                f"The type of column {self.name!r} must be integer or floating point, such as "
+                f"uint8 or float32, but is {self.dtype!r}."
             )
 
     @property
@@ -107,18 +107,21 @@ class Column:
         values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
         if values.shape != (len(returns),):
             raise LidarError(
-                f"Column {self.name!r} was made with the shape {values.shape}; it needs one value "
-                f"for each of the {len(returns)} points."
+                f"Column {self.name!r} must have one value for each of the {len(returns)} points, "
+                f"but has the shape {values.shape}."
             )
         dtype = np.dtype(self.dtype)
         if dtype.kind in "iu" and len(values) and values.dtype != dtype:
             limits = np.iinfo(dtype)
             if values.dtype.kind == "f" and not np.isfinite(values).all():
-                raise LidarError(f"Column {self.name!r} holds NaN or infinity as {dtype}.")
+                raise LidarError(
+                    f"Column {self.name!r} contains NaN or infinity, which {dtype} cannot "
+                    "represent."
+                )
             if values.min() < limits.min or values.max() > limits.max:
                 raise LidarError(
-                    f"Column {self.name!r} holds {values.min()} to {values.max()}, and {dtype} "
-                    f"holds {limits.min} to {limits.max}: give it a wider type."
+                    f"Column {self.name!r} contains {values.min()} to {values.max()}, but {dtype} "
+                    f"is limited to {limits.min} to {limits.max}. Use a wider type."
                 )
         return values.astype(dtype, copy=False)
 
@@ -259,20 +262,20 @@ def optional_columns(columns: Iterable[str | Column]) -> tuple[Column, ...]:
         if isinstance(column, str):
             if column not in names:
                 raise LidarError(
-                    f"There is no column {column!r}."
-                    + (did_you_mean(column, names) or f" There are {', '.join(names)}.")
+                    f"Unknown column {column!r}."
+                    + (did_you_mean(column, names) or f" Available columns: {', '.join(names)}.")
                 )
             column = names[column]
         if by_name.get(column.name, column) != column or (
             column.name in TABLE and TABLE[column.name] != column
         ):
-            raise LidarError(f"Two columns have the name {column.name!r}: rename one.")
+            raise LidarError(f"Two columns have the name {column.name!r}. Rename one of them.")
         by_name[column.name] = column
     for vector in VECTORS:
         if 0 < len(by_name.keys() & {*vector}) < len(vector):
             raise LidarError(
-                f"The columns {', '.join(vector)} are one vector, which formats turn to other "
-                "axes: give all three."
+                f"The columns {', '.join(vector)} form a vector, which some formats rotate. "
+                "Select all three."
             )
     optional = tuple(column for column in by_name.values() if column not in (SCAN, *ALWAYS))
     check_names((SCAN, *ALWAYS, *optional))
@@ -285,15 +288,16 @@ def check_names(columns: Iterable[Column]) -> None:
     for name in (column.in_files for column in columns):
         if not name.isascii() or not name.isprintable() or " " in name:
             raise LidarError(
-                f"A column cannot have the name {name!r} in files: use ASCII letters and digits."
+                "The name of a column in files must consist of ASCII letters and digits, but is "
+                f"{name!r}."
             )
         if name in _OPEN3D:
             raise LidarError(
-                f"A column cannot have the name {name!r} in files, where Open3D expects three "
-                "numbers for each point: use another name."
+                f"A column in files cannot have the name {name!r}, because Open3D expects three "
+                "numbers per point in it. Use a different name."
             )
         if name in used_names:
-            raise LidarError(f"Two columns have the name {name!r} in files: rename one.")
+            raise LidarError(f"Two columns have the name {name!r} in files. Rename one of them.")
         used_names.add(name)
 
 

@@ -58,8 +58,8 @@ def _checked_names(names: Any, handler: Callable[[Any], Any]) -> Any:
         unique = [*names.values()].count(name) == 1
         if not (valid and unique and 0 < len(name) < 100 and name.isprintable()):
             raise ValueError(
-                f"{shown({number: name})} is no class with a name of its own: give whole numbers "
-                "of 0 to 65535 and a different text for each, such as {10: car}."
+                "expected whole numbers from 0 to 65535 with unique names, such as {10: car}, "
+                f"but found {shown({number: name})}."
             )
     return handler(names)
 
@@ -114,7 +114,7 @@ class Material:
     ] = None
     reflectance: Annotated[
         UnitShare | Literal["texture"] | None,
-        allowed("0 to 1, or texture"),
+        allowed("from 0 to 1, or texture"),
         about(
             "share of light that is scattered; by default 0.5, for glass and whole mirrors "
             "0; texture: the luminance of the colour that was hit"
@@ -129,7 +129,7 @@ class Material:
     )
     specular_reflectance: Annotated[
         UnitShare | Literal["fresnel"] | None,
-        allowed("0 to 1, or fresnel"),
+        allowed("from 0 to 1, or fresnel"),
         about(
             "share of the rest that is mirrored at right angles, and shows ghosts; grows towards "
             "grazing angles. 1 for a mirror, 0.04 for paint; fresnel for what light passes",
@@ -193,8 +193,8 @@ class Material:
     def __post_init__(self) -> None:
         if self.objects is None and self.material is None:
             raise LidarError(
-                'a material is for nothing: give objects, such as objects: "*", or material, a '
-                "name of the scene's file."
+                'A material must apply to something. Set objects, such as `objects: "*"`, or '
+                "material."
             )
         self._set_names("objects")
         self._set_names("material")
@@ -212,7 +212,7 @@ class Material:
             return
         names = (value,) if isinstance(value, str) else tuple(value)
         if not names or not all(names):
-            raise LidarError(f"{field_name} is {value!r}; it must be names of {field_name}.")
+            raise LidarError(f"{field_name} must be one or more names, but is {value!r}.")
         object.__setattr__(self, field_name, names)
 
     def _check_reflectance(self) -> None:
@@ -220,26 +220,29 @@ class Material:
         if self.spectrum is not None:
             if self.spectrum not in (spectra := reflectances()):
                 hint = _materials_like(self.spectrum, [*spectra])
-                raise LidarError(f"There is no spectrum {self.spectrum!r}.{hint}")
+                raise LidarError(f"Unknown spectrum {self.spectrum!r}.{hint}")
             if self.reflectance is not None:
-                raise LidarError("give either spectrum or reflectance, not both.")
+                raise LidarError("spectrum and reflectance cannot be combined.")
         if self.reflectance == "texture":
             if self.transparent != "none":
                 raise LidarError(
-                    f"reflectance texture is for opaque objects: with transparent "
-                    f"{self.transparent}, give a number."
+                    "reflectance: texture requires an opaque material. With transparent: "
+                    f"{self.transparent}, set reflectance to a number."
                 )
         elif self.scale != 1:
-            raise LidarError("scale is a factor of colours: give reflectance texture with it.")
+            raise LidarError("scale is a factor of colors and requires reflectance: texture.")
 
     def _check_roughness(self) -> None:
         """Check that only a matt, opaque surface has a gloss."""
         if self.roughness is None and self.metalness:
-            raise LidarError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
+            raise LidarError(
+                "metalness requires roughness. Set it to a value from 0.1 (polished) to 1 (matte)."
+            )
         smooth = self.transparent != "none" or self.specular_reflectance is not None
         if self.roughness is not None and (self.retro or smooth):
             raise LidarError(
-                "roughness is for opaque surfaces without retro and specular_reflectance."
+                "roughness requires an opaque material and cannot be combined with retro or "
+                "specular_reflectance."
             )
 
     def _check_medium(self) -> None:
@@ -247,20 +250,19 @@ class Material:
         mirrors = self.specular_reflectance
         if mirrors is not None and (mirrors == "fresnel") != (self.transparent == "pass"):
             raise LidarError(
-                f"specular_reflectance is {mirrors!r} with transparent: {self.transparent}; give "
-                "fresnel for what light passes, else 0 to 1."
+                "specular_reflectance must be fresnel with transparent: pass, and a number "
+                f"otherwise, but is {mirrors!r} with transparent: {self.transparent}."
             )
         if self.refractive_index is not None and self.transparent != "pass":
-            raise LidarError("refractive_index is for light that passes: add transparent: pass.")
+            raise LidarError("refractive_index requires transparent: pass.")
         if self.attenuation_per_m and self.refractive_index is None:
-            raise LidarError("attenuation_per_m needs a refractive_index, such as 1.33.")
+            raise LidarError("attenuation_per_m requires refractive_index, such as 1.33.")
         if self.leaf_area_density is None:
             return
         if not self._suits_leaves:
             raise LidarError(
-                "leaf_area_density is for leaves that scatter light: leave out transparent, "
-                "retro, roughness and specular_reflectance, and give reflectance as a number, or a "
-                "spectrum."
+                "leaf_area_density cannot be combined with transparent, retro, roughness or "
+                "specular_reflectance, and requires a number or a spectrum as the reflectance."
             )
 
     @property
@@ -281,13 +283,13 @@ class Material:
         """
         if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
             raise LidarError(
-                f"materials: {name!r} is of voxels, whose file has the leaf area: give it an entry "
-                "with a reflectance, or a spectrum, and perhaps a leaf_angle, but nothing else."
+                f"materials: {name!r} contains voxels, whose file defines the leaf area density. "
+                "Its entry may only set reflectance or spectrum, and leaf_angle."
             )
         if not voxels and self.leaf_angle != "spherical" and self.leaf_area_density is None:
             raise LidarError(
-                f"materials: {name!r} has a leaf_angle, which needs a leaf_area_density, m²/m³, "
-                "such as 0.8, if it is not of voxels (.vox)."
+                f"materials: {name!r} contains no voxels (.vox), so its leaf_angle requires "
+                "leaf_area_density in m²/m³, such as 0.8."
             )
 
     def share(self, wavelength_nm: float) -> float:
@@ -333,10 +335,10 @@ def _materials_like(name: str, materials: Sequence[str]) -> str:
     """Return a hint with the materials that contain a word, else the most similar, else all."""
     containing = [material for material in materials if name.lower() in material.lower()]
     if len(containing) > 1:
-        return f" There are: {'; '.join(containing)}."
+        return f" Available spectra: {'; '.join(containing)}."
     return (
         did_you_mean(name, containing or materials)
-        or f" There are: {'; '.join(containing or materials)}."
+        or f" Available spectra: {'; '.join(containing or materials)}."
     )
 
 
@@ -409,8 +411,8 @@ def first_matches(materials: Sequence[Material], kinds: SurfaceKinds) -> Indices
     for number, entry in enumerate(materials):
         if entry.for_all and number + 1 < len(materials):
             raise LidarError(
-                f"materials: the first entry for a surface counts, so that none after number "
-                f'{number + 1}, {{objects: "*"}}, would: put it last.'
+                "materials: the first matching entry applies, so entries after number "
+                f'{number + 1}, {{objects: "*"}}, have no effect. Move it to the end.'
             )
         matches = _matching_kinds(entry, kinds, object_rows, kinds_by_material)
         first[matches[first[matches] < 0]] = number
@@ -447,11 +449,13 @@ def _matching_kinds(
     for pattern in entry.material:
         rows_of_pattern = rows_named(pattern, names)
         if not len(rows_of_pattern):
-            measured = f" For a measured reflectance, write spectrum: {pattern!r}."
+            measured = f" For a measured reflectance, use spectrum: {pattern!r}."
             raise LidarError(
-                f"materials names the material {pattern!r}, but no face of the scene has one of "
-                "that name."
-                + (name_hint(pattern, names) if names else " No face has any.")
+                (
+                    f"materials contains the material {pattern!r}, but no face of the scene has a "
+                    "material of that name."
+                )
+                + (name_hint(pattern, names) if names else " No face has a named material.")
                 + measured * (pattern in reflectances())
             )
         for row in rows_of_pattern.tolist():
@@ -492,7 +496,8 @@ def matching_rows(
     rows = rows_named(pattern, names)
     if not len(rows):
         raise LidarError(
-            f"{subject} names {pattern!r}, but no object has that name.{name_hint(pattern, names)}"
+            f"{subject} contains {pattern!r}, but no object has that "
+            f"name.{name_hint(pattern, names)}"
         )
     return rows
 
@@ -598,8 +603,9 @@ class MaterialTable:
         if len(unmatched) and materials:
             uncovered = f" and {len(unmatched) - 1} more" if unmatched[1:].size else ""
             raise LidarError(
-                f"materials: no entry names the object {kinds.describe(unmatched[0])}{uncovered}: "
-                'end with one for all the others, such as {objects: "*"}.'
+                "materials: no entry matches the object "
+                f"{kinds.describe(unmatched[0])}{uncovered}. "
+                'Add a last entry for all other objects, such as {objects: "*"}.'
             )
         entries = [*materials, Material("*")]  # so that each surface has an entry
         textured = [m.scale * (m.reflectance == "texture") for m in entries]

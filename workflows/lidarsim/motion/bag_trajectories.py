@@ -12,7 +12,7 @@ import numpy as np
 from ..base.arrays import Floats, Ints
 from ..base.errors import LidarError
 from ..base.vectors import applied, matmul
-from ..base.words import did_you_mean
+from ..base.words import did_you_mean, joined, plural
 from ..columns.bags import messages_of, opened_bag
 from .navigation import local_positions
 from .rotations import quaternions_of
@@ -107,11 +107,15 @@ def _chosen(labels: Sequence[str], topic: str | None) -> str:
     if topic is None and len(labels) == 1:
         return labels[0]
     if not labels:
-        raise LidarError(f"it has no poses: topics of {_READABLE_TYPES} are read.")
-    available = f"it has the poses {', '.join(labels)}"
+        raise LidarError(f"it has no poses. Supported topics are {_READABLE_TYPES}.")
+    available = f"The topics with poses are {joined(labels)}"
     if topic is None:
-        raise LidarError(f"{available}: choose one with topic.")
-    raise LidarError(f"it has no poses {topic!r}.{did_you_mean(topic, labels)} I{available[1:]}.")
+        raise LidarError(
+            f"it has several topics with poses. {available}. Set topic to one of them."
+        )
+    raise LidarError(
+        f"it has no topic {topic!r} with poses.{did_you_mean(topic, labels)} {available}."
+    )
 
 
 def _row_of(pose: Any) -> list[float]:
@@ -158,9 +162,9 @@ def _topic_poses(bag: Reader, topic: str, pose_of: Callable[[Any], Any]) -> Time
         rows.append(_row_of(pose_of(message)))
         frames.add(message.header.frame_id)
     if not rows:
-        raise LidarError(f"{topic} has no messages.")
+        raise LidarError(f"topic {topic} has no messages.")
     if len(frames) > 1:
-        raise LidarError(f"{topic} has poses in several frames: {', '.join(sorted(frames))}.")
+        raise LidarError(f"topic {topic} has poses in several frames: {', '.join(sorted(frames))}.")
     # Programs that set no stamps leave zeros.
     times_ns, table = _in_order(stamps if any(stamps) else times, rows)
     return TimedPoses(times_ns / 1e9, table[:, :3], table[:, 3:])
@@ -178,7 +182,10 @@ def _gnss_poses(
             times_ns.append(_stamp_ns(fix.header))
             fixes.append(geodetic)
     if len(fixes) < 2:
-        raise LidarError(f"{topic} has {len(fixes)} fixes, and a trajectory needs two.")
+        raise LidarError(
+            f"topic {topic} has {plural(len(fixes), 'fix', 'fixes')}, but a trajectory requires at "
+            "least two."
+        )
     times, table = _in_order(times_ns, fixes)
     origin_row = table[0] if origin is None else np.asarray(origin, np.float64)
     latitude, longitude, height = origin_row.tolist()
@@ -188,7 +195,7 @@ def _gnss_poses(
         return TimedPoses(times / 1e9, positions, None)
     within = (times >= orientations[0][0]) & (times <= orientations[0][-1])
     if within.sum() < 2:
-        raise LidarError(f"{topic} and the orientations of its Imu are not of the same time.")
+        raise LidarError(f"topic {topic} and the orientations of its IMU do not overlap in time.")
     _, rotations = _edge_poses(*orientations, times[within])
     return TimedPoses(times[within] / 1e9, positions[within], quaternions_of(rotations))
 
@@ -197,7 +204,7 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
     """Return times (k,), ns, and rows (k, 7) with orientations of an IMU, or None without any."""
     topics = [topic for topic, kind in kinds.items() if kind == _IMU]
     if imu and imu not in topics:
-        raise LidarError(f"it has no Imu {imu!r}.{did_you_mean(imu, topics)}")
+        raise LidarError(f"it has no IMU topic {imu!r}.{did_you_mean(imu, topics)}")
     measured: dict[str, tuple[list[int], list[list[float]]]] = {}
     for topic, _, message in messages_of(bag, [imu] if imu else topics):
         if message.orientation_covariance[0] != -1:  # an IMU without orientation, by its definition
@@ -207,12 +214,12 @@ def _orientations(bag: Reader, kinds: Mapping[str, str], imu: str) -> tuple[Ints
             rows.append([0.0, 0.0, 0.0, orientation.x, orientation.y, orientation.z, orientation.w])
     if len(measured) > 1:
         raise LidarError(
-            f"it has several Imu with orientations, {', '.join(measured)}: give topic both names, "
-            f"of the NavSatFix and the Imu, separated by a space."
+            f"it has several IMU topics with orientations: {joined([*measured])}. Set topic to the "
+            "names of the NavSatFix and the Imu topic, separated by a space."
         )
     if not measured:
         if imu:
-            raise LidarError(f"{imu} has no orientations.")
+            raise LidarError(f"topic {imu} has no orientations.")
         return None
     return _in_order(*next(iter(measured.values())))
 
@@ -229,7 +236,7 @@ def _edges_of(bag: Reader, kinds: Mapping[str, str]) -> dict[str, _Edge]:
             edge = edges.setdefault(child, _Edge(parent))
             if edge.parent != parent:
                 raise LidarError(
-                    f"its frame {child!r} is in the frames {edge.parent!r} and {parent!r}."
+                    f"its frame {child!r} has two parent frames, {edge.parent!r} and {parent!r}."
                 )
             if topic.endswith(_STATIC):
                 edge.times_ns.clear()
@@ -245,7 +252,7 @@ def _chain(edges: Mapping[str, _Edge], frame: str) -> list[_Edge]:
     visited = set[str]()
     while frame in edges:
         if frame in visited:
-            raise LidarError(f"its frame {frame!r} is above itself.")
+            raise LidarError(f"its frame {frame!r} is its own ancestor.")
         visited.add(frame)
         chain.append(edges[frame])
         frame = edges[frame].parent
@@ -270,12 +277,14 @@ def _frame_poses(edges: Mapping[str, _Edge], frame: str) -> TimedPoses:
     tables = [_in_order(edge.times_ns, edge.rows) for edge in chain]
     moving = [times for times, _ in tables if len(times) > 1]
     if not moving:
-        raise LidarError(f"its frame {frame!r} has one pose, and a trajectory needs two.")
+        raise LidarError(
+            f"its frame {frame!r} has one pose, but a trajectory requires at least two."
+        )
     first = max(times[0] for times in moving)
     last = min(times[-1] for times in moving)
     times = moving[0][(moving[0] >= first) & (moving[0] <= last)]
     if len(times) < 2:
-        raise LidarError(f"the frames above {frame!r} have no poses at the same time.")
+        raise LidarError(f"the parent frames of {frame!r} have no poses at a common time.")
     positions = np.zeros((len(times), 3))
     rotations = np.broadcast_to(np.eye(3), (len(times), 3, 3))
     for edge_times, rows in tables:

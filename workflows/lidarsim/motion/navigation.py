@@ -231,14 +231,14 @@ def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None)
     """
     if path.stations > 1:
         raise LidarError(
-            f"navigation needs a carrier that drives or stands, and this one jumps between "
-            f"{path.stations} poses: give a trajectory, or one pose."
+            f"navigation requires a continuous motion, but the survey has {path.stations} separate "
+            "poses. Use a trajectory, or a single pose."
         )
     gnss = navigation.gnss
     if gnss and epsg and gnss.origin is None and find_spec("rasterio") is None:
         raise LidarError(
-            f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: "
-            f"{install_command('lidarpool[geo]')}, or give navigation.gnss.origin."
+            f"Latitudes of navigation.gnss in EPSG:{epsg} require rasterio. Run "
+            f"{install_command('lidarpool[geo]')}, or set navigation.gnss.origin."
         )
 
 

@@ -55,16 +55,18 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
     """
     files = oxts_files(folder)
     if not files:
-        raise ValueError("its folder data has no .txt files")
+        raise ValueError("its folder data contains no .txt files")
     rows = []
     for file in files:
         numbers = read_input_text(file).split()
         if len(numbers) != WIDTH:
-            raise ValueError(f"data/{file.name} has {len(numbers)} numbers, not {WIDTH}")
+            raise ValueError(f"data/{file.name} has {len(numbers)} numbers instead of {WIDTH}")
         rows.append([float(number) for number in numbers])
     seconds = dates_of(read_input_text(folder / OXTS_TIMES))
     if seconds is None:
-        raise ValueError(f"{OXTS_TIMES} has rows that are no dates, as 2011-09-26 13:02:25.964")
+        raise ValueError(
+            f"{OXTS_TIMES} contains rows that are not dates such as 2011-09-26 13:02:25.964"
+        )
     seconds = seconds[rows_of_frames(files, len(seconds), OXTS_TIMES, "files in data")]
     return seconds, *oxts_poses(np.array(rows), origin)
 
@@ -91,7 +93,7 @@ def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Fl
     """
     latitude, longitude, altitude = rows[:, :3].T
     if not ((np.abs(latitude) < 90) & (np.abs(longitude) <= 360)).all():
-        raise ValueError("its first two numbers are not latitude and longitude in degrees")
+        raise ValueError("its first two columns are not latitude and longitude in degrees")
     origin_row = rows[0, :3] if origin is None else np.asarray(origin, np.float64)
     scale = sin_cos_of(np.radians(float(origin_row[0])))[1]
 

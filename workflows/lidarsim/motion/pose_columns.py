@@ -59,12 +59,12 @@ POSE_TABLES = (
 )
 
 _NO_PHOTOGRAMMETRY = (
-    "is an angle of photogrammetry (omega, phi, kappa), whose axes differ: convert the angles to "
-    "yaw_deg, pitch_deg and roll_deg, or to qx, qy, qz and qw"
+    "is a photogrammetric angle (omega, phi, kappa) with different axes. "
+    "Convert the angles to yaw_deg, pitch_deg and roll_deg, or to qx, qy, "
+    "qz and qw"
 )
 _NO_GEODETIC = (
-    "is a geodetic coordinate: convert positions to x, y and z in metres, in the world "
-    "coordinates of the scene"
+    "is a geodetic coordinate. Convert positions to x, y and z in meters in world coordinates"
 )
 REFUSED_COLUMNS = {
     **dict.fromkeys(("omega", "phi", "kappa"), _NO_PHOTOGRAMMETRY),
@@ -84,7 +84,7 @@ def with_yaw(columns: Mapping[str, Floats]) -> dict[str, Floats]:
     if "heading_deg" not in angles:
         return angles
     if "yaw_deg" in angles:
-        raise ValueError("it has both a yaw and a heading: give ignore to leave one out")
+        raise ValueError("it has both a yaw and a heading. Ignore one of them with `ignore`")
     angles["yaw_deg"] = 90.0 - angles.pop("heading_deg")
     if "pitch_deg" in angles:
         angles["pitch_deg"] = -angles["pitch_deg"]

@@ -57,9 +57,9 @@ def check_rotations(rotations: Floats, slack: float = 1e-6) -> None:
         first = int(bad[0])
         fault = "mirrors" if rigid[first] else "deforms"
         raise LidarError(
-            f"Matrix {first} of a pose {fault}: {rotations[first].round(6).tolist()}. A pose turns "
-            "and moves: give a matrix with orthonormal rows and the determinant 1 (matrices are "
-            "counted from 0)."
+            f"Matrix {first} of a pose {fault}: {rotations[first].round(6).tolist()}. A pose is a "
+            "rigid transform, so the matrix must have orthonormal rows and the determinant 1 "
+            "(matrices are counted from 0)."
         )
 
 

@@ -124,8 +124,8 @@ def pose_of(name: str, value: Any) -> Pose:
         position = tuple(map(float, value))
     except (TypeError, ValueError) as error:
         raise LidarError(
-            f"{name} is {shown(value)}; it must be a Pose, or x, y and z in metres, such as "
-            "(0, 0, 1)."
+            f"{name} must be a Pose, or x, y and z in meters, such as (0, 0, 1), but is "
+            f"{shown(value)}."
         ) from error
     return Pose(position)  # type: ignore[arg-type]  # it counts them
 
@@ -388,7 +388,7 @@ class Track:
         """
         times = np.asarray(times_s, np.float64)
         if len(times) < 2:
-            raise LidarError(f"A trajectory needs two poses at least; there are {len(times)}.")
+            raise LidarError(f"A trajectory requires at least two poses, but has {len(times)}.")
         _check_times(times)
         batch = TrackBatch.from_matrices(times, matrices, beyond)
         return [_BatchTrack.of_batch(batch, number) for number in range(len(matrices))]
@@ -419,24 +419,24 @@ class Track:
         positions = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or positions.shape != (len(times), 3):
             raise LidarError(
-                f"A trajectory needs two poses at least, with x, y and z each; there are "
-                f"{times.size} times and positions of {positions.shape}."
+                "A trajectory requires at least two poses with x, y and z each, but has "
+                f"{times.size} times and positions of the shape {positions.shape}."
             )
         finite = np.isfinite(positions[:, 0] + positions[:, 1] + positions[:, 2])
-        _check_poses(~finite, "the position of pose {} is not finite")
+        _check_poses(~finite, "The position of pose {} is not finite")
         _check_times(times)
         arrays = {"times_s": times, "positions": positions}
         if self.quaternions is not None:
             quaternions = as_array("quaternions", self.quaternions).copy()
             if quaternions.shape != (len(times), 4):
                 raise LidarError(
-                    f"quaternions are x, y, z and w of each of the {len(times)} poses, not "
-                    f"{quaternions.shape}."
+                    f"quaternions must be x, y, z and w for each of the {len(times)} poses, but "
+                    f"has the shape {quaternions.shape}."
                 )
             lengths = length(quaternions)
             # Written so that NaN is an error.
             bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
-            _check_poses(bad, "the quaternion of pose {} is not of length 1")
+            _check_poses(bad, "The quaternion of pose {} does not have the length 1")
             quaternions /= lengths[:, None]
             arrays["quaternions"] = quaternions
         for name, array in arrays.items():
@@ -449,15 +449,18 @@ class Track:
         start = times[0] if self.start_s is None else self.start_s
         last = times[-1] if self.duration_s is None else start + self.duration_s
         max_gap_s = CLOCK_S if self.beyond == "refuse" else np.inf
-        for label, time in (("start_s", start), ("the end by duration_s", last)):
+        for label, time in (("start_s", start), ("The end by duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
             if not gap <= max_gap_s:  # or NaN
                 raise LidarError(
-                    f"{label} is {time:.9g} s, {gap:.6g} s outside the trajectory, which goes from "
-                    f"{times[0]:.9g} to {times[-1]:.9g} s."
+                    f"{label} is {time:.9g} s, which is {gap:.6g} s outside the trajectory. It "
+                    f"covers {times[0]:.9g} to {times[-1]:.9g} s."
                 )
         if self.beyond == "refuse" and last <= start:
-            raise LidarError(f"A trajectory from {start:.9g} to {last:.9g} s has no duration.")
+            raise LidarError(
+                f"The duration of a trajectory must be above 0, but it covers {start:.9g} to "
+                f"{last:.9g} s."
+            )
         object.__setattr__(self, "start_s", float(start))
         object.__setattr__(self, "duration_s", float(max(last - start, 0.0)))
 
@@ -557,8 +560,8 @@ class Track:
             moments_s = moments_s.clip(times[0], times[-1])
         elif gap > self.slack_s:
             raise LidarError(
-                f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
-                f"for from {first_s:.9g} to {last_s:.9g} s, {gap:.6g} s outside."
+                f"The trajectory covers {times[0]:.9g} to {times[-1]:.9g} s, but poses from "
+                f"{first_s:.9g} to {last_s:.9g} s are required, {gap:.6g} s outside it."
             )
         segment = np.clip(np.searchsorted(times, moments_s, "right") - 1, 0, len(times) - 2)
         return _SegmentTimes(segment, moments_s - times.take(segment), within)
@@ -755,10 +758,10 @@ def _check_times(times_s: Floats) -> None:
 
     Raises LidarError if not.
     """
-    _check_poses(~np.isfinite(times_s), "the time of pose {} is not finite")
+    _check_poses(~np.isfinite(times_s), "The time of pose {} is not finite")
     _check_poses(
         np.append(False, np.diff(times_s) <= 0),
-        "times must ascend, and that of pose {} does not come after the one before",
+        "Times must increase, but the time of pose {} is not after the previous one",
     )
 
 

@@ -43,7 +43,7 @@ _KITTI_WIDTH = 12  # numbers of a row
 # Cameras look along z with y down; carriers look along x with z up.
 _CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # A .trj of HELIOS++ states neither units nor the order of rotations: its survey does.
-_HELIOS = " `lidarpool import` reads a .trj of HELIOS++ with its survey."
+_HELIOS = " To read a HELIOS++ .trj with its survey, run `lidarpool import`."
 
 
 class PoseTable(NamedTuple):
@@ -139,9 +139,11 @@ def load_trajectory(
             text = read_text(path)
             kind, poses = _of_text(text, format, timing, columns or {}, ignore, origin)
         if (columns or ignore) and kind != "csv":
-            raise ValueError(f"columns and ignore are of tables with a header, and it is {kind}")
+            raise ValueError(
+                f"columns and ignore require a table with a header, but the format is {kind}"
+            )
         if origin is not None and kind not in ("oxts", "bag"):
-            raise ValueError(f"origin is of latitudes and longitudes, and it is {kind}")
+            raise ValueError(f"origin requires latitudes and longitudes, but the format is {kind}")
         seconds, positions, quaternions = poses
         seconds = seconds + offset_s
         track = Track(
@@ -158,7 +160,7 @@ def load_trajectory(
         return track
     except (OSError, ValueError, LidarError) as error:
         note = _HELIOS if path.suffix.lower() == ".trj" else ""
-        raise LidarError(f"{path} is not a usable trajectory: {message_of(error)}{note}") from error
+        raise LidarError(f"{path} is not a valid trajectory: {message_of(error)}{note}") from error
 
 
 def read_kitti_poses(path: Path) -> Floats | None:
@@ -182,7 +184,7 @@ def read_kitti_poses(path: Path) -> Floats | None:
     try:
         check_rotations(matrices[..., :3], slack=2 * QUATERNION_SLACK)
     except (ValueError, LidarError) as error:
-        raise LidarError(f"{path} is not a usable trajectory: {message_of(error)}") from error
+        raise LidarError(f"{path} is not a valid trajectory: {message_of(error)}") from error
     return matrices
 
 
@@ -199,7 +201,7 @@ def files_of_trajectory(path: Path) -> list[Path]:
 def _refuse_topic(topic: str | None) -> None:
     """Raise ValueError if a topic is given for a file that is not a bag."""
     if topic is not None:
-        raise ValueError("topic is of bags, and it is none")
+        raise ValueError("topic requires a bag, but this file is not a bag")
 
 
 def _of_container(
@@ -214,21 +216,21 @@ def _of_container(
         raise FileNotFoundError(2, "No such file or directory")
     if is_bag(path) and kind in (None, "bag"):
         if timing.file is not None:
-            raise ValueError("a bag has times of its own: leave out times")
+            raise ValueError("a bag contains its own times. Remove `times`")
         poses = PoseTable(*read_bag(path, topic, origin))
         return "bag", poses._replace(seconds=seconds_of(poses.seconds, timing.unit))
     _refuse_topic(topic)
     folder = find_oxts(path)
     if folder is not None and kind in (None, "oxts"):
         if timing.file is not None:
-            raise ValueError("a folder of oxts has times of its own: leave out times")
+            raise ValueError("an oxts folder contains its own times. Remove `times`")
         poses = PoseTable(*read_oxts(folder, origin))
         return "oxts", poses._replace(seconds=_seconds_of_dates(poses.seconds, timing.unit))
     if path.is_file() and kind == "oxts":
         return _of_text(read_text(path), kind, timing, {}, (), origin)
     raise ValueError(
-        "a folder is one of KITTI, with timestamps.txt and data, or a bag of ROS 2, with "
-        f"metadata.yaml{'' if kind is None else f'; format says {kind}'}"
+        "a folder must be a KITTI folder with timestamps.txt and data, or a ROS 2 bag with "
+        f"metadata.yaml{'' if kind is None else f', but format is {kind}'}"
     )
 
 
@@ -243,7 +245,7 @@ def _of_text(
     """Return the format and the poses of a text file."""
     lines = text.splitlines()
     if timing.file is not None and kind not in (None, "kitti", "oxts"):
-        raise ValueError(f"times are of KITTI's poses, and format says {kind}")
+        raise ValueError(f"times can only be combined with KITTI poses, but format is {kind}")
     header = find_header(lines, _is_pose_column) if timing.file is None else None
     if kind == "csv" or (kind in (None, "tum") and header is not None):
         # Rows of TUM are separated by spaces, and may have their header in a remark.
@@ -268,18 +270,18 @@ def _of_rows(
     if kind == "tum":
         if width != 8:
             raise ValueError(
-                f"its rows have {width} numbers and no header: rows of TUM have 8, those of KITTI "
-                "12; give a table a header, as in time_s,x,y,z,yaw_deg"
+                f"its rows have {width} numbers and no header. TUM rows have 8 numbers and KITTI "
+                "rows have 12. Any other table requires a header, such as time_s,x,y,z,yaw_deg"
             )
         return kind, PoseTable(seconds_of(rows[:, 0], timing.unit), rows[:, 1:4], rows[:, 4:])
     if timing.file is None:
-        raise ValueError("KITTI's poses have no times. Set `times` to the file that holds them")
+        raise ValueError("KITTI poses have no times. Set `times` to the file that contains them")
     seconds = _seconds_in_file(Path(timing.file), timing.unit)
     expected = WIDTH if kind == "oxts" else _KITTI_WIDTH
     if width != expected:
-        raise ValueError(f"its rows have {width} numbers, not {expected}")
+        raise ValueError(f"its rows have {width} numbers instead of {expected}")
     if len(rows) != len(seconds):
-        raise ValueError(f"it has {len(rows)} poses and {timing.file} {len(seconds)} times")
+        raise ValueError(f"it has {len(rows)} poses, but {timing.file} has {len(seconds)} times")
     if kind == "oxts":
         return kind, PoseTable(seconds, *oxts_poses(rows, origin))
     poses = rows.reshape(-1, 3, 4)
@@ -309,8 +311,8 @@ def _seconds_of_dates(seconds: Floats, unit: TimeUnit | None) -> Floats:
     Raises ValueError if the user states their unit.
     """
     if unit is not None:
-        raise ValueError("its times are dates: leave out time_unit")
-    return seconds_of(seconds, None, advice="correct them")
+        raise ValueError("its times are dates, so time_unit cannot be set")
+    return seconds_of(seconds, None, advice="Correct them")
 
 
 def _is_pose_column(cell: str) -> bool:
@@ -332,12 +334,12 @@ def _numbers(text: str, columns: int | None = None) -> Floats:
     except ValueError as error:
         if "," in lines[0] or ";" in lines[0]:
             raise ValueError(
-                "it has no header: name its columns in the first line, as in "
+                "it has no header. Name its columns in the first line, for example "
                 "time_s,x,y,z,qx,qy,qz,qw"
             ) from error
         raise
     if columns is not None and rows.shape[1:] != (columns,):
-        raise ValueError(f"its rows have {rows.shape[1]} numbers, not {columns}")
+        raise ValueError(f"its rows have {rows.shape[1]} numbers instead of {columns}")
     return rows
 
 
@@ -374,14 +376,14 @@ def _table(
     angles = [name for name in ("yaw_deg", "pitch_deg", "roll_deg") if name in columns]
     if "qx" in columns:
         if angles:
-            raise ValueError(f"it has both a quaternion and {angles[0]}: ignore one of these")
+            raise ValueError(f"it has both a quaternion and {angles[0]}. Ignore one of them")
         quaternions = np.stack([columns[name] for name in quaternion], axis=1)
         return PoseTable(seconds, positions, quaternions)
     if not angles:
         return PoseTable(seconds, positions, None)
     if "yaw_deg" not in angles:
         raise ValueError(
-            f"it has {angles[0]} and neither yaw_deg nor heading_deg: give one, or ignore "
+            f"it has {angles[0]} but neither yaw_deg nor heading_deg. Add one of them, or ignore "
             f"{angles[0]} to face the direction of travel"
         )
     return PoseTable(

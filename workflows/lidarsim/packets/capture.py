@@ -117,11 +117,11 @@ class Capture:
         """Clauses on what is missing from the file, once `datagrams` has ended."""
         notes = []
         if self.ends_early:
-            notes.append("ends inside a frame; the rest of the recording is missing")
+            notes.append("ends inside a frame. The rest of the recording is missing")
         if self.cut_datagrams:
             notes.append(
-                f"has {self.cut_datagrams:,} datagrams that were not captured as a whole; they are "
-                "skipped. Capture whole frames (tcpdump -s 0)"
+                f"has {self.cut_datagrams:,} truncated datagrams, which are skipped. Capture whole "
+                "frames, for example with tcpdump -s 0"
             )
         return notes
 
@@ -169,8 +169,8 @@ class Capture:
         """Return the end of a sentence on a file without datagrams, and advice."""
         if self.cut_datagrams:
             return (
-                "has only the beginnings of its datagrams. Capture whole frames, "
-                "for example with tcpdump -s 0."
+                "contains only truncated datagrams. Capture whole frames, for example "
+                "with tcpdump -s 0."
             )
         if unknown_links:
             numbers = ", ".join(map(str, sorted(unknown_links)))

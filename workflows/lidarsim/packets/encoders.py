@@ -76,8 +76,8 @@ class PacketSource:
         """
         if sweeps.fired is None:
             raise LidarError(
-                "Packets hold every ray and return of a survey: run it with keep_every 1 and the "
-                "column ray."
+                "Packets contain all rays and returns of a survey. Run it with keep_every 1 and "
+                "the column ray."
             )
         sensor = sweeps.fired.sensors[number]
         settings_of(sensor)
@@ -159,7 +159,7 @@ class PacketEncoder(ABC):
 
     def unusable(self, reason: str) -> LidarError:
         """Return the error of packets that cannot be made: «… {reason}»."""
-        return LidarError(f"The packets of {self.source.sensor.model} {reason}.")
+        return LidarError(f"Packets of {self.source.sensor.model} {reason}.")
 
     def number(self, name: str) -> int:
         """Return an identifier that is a whole number.
@@ -168,7 +168,7 @@ class PacketEncoder(ABC):
         """
         value: Identifier = self.source.settings.identifiers[name]
         if not isinstance(value, int):
-            raise self.unusable(f"state {name} {value!r}: give a whole number")
+            raise self.unusable(f"have {name} {value!r}, which must be a whole number")
         return value
 
     def text(self, name: str) -> str:
@@ -182,7 +182,7 @@ class PacketEncoder(ABC):
         """
         value: Identifier = self.source.settings.identifiers[name]
         if isinstance(value, str):
-            raise self.unusable(f"state {name} {value!r}: give a number")
+            raise self.unusable(f"have {name} {value!r}, which must be a number")
         return float(value)
 
 
@@ -271,8 +271,8 @@ def decoder_of(path: Path, name: str) -> PacketDecoder:
             if decoder.recognizes(datagram.payload):
                 return _decoder(decoder, path, name)
     raise LidarError(
-        f"{name} has no packets of a known sensor. Sweeps are read from packets of Velodyne and "
-        "Ouster."
+        f"{name} contains no packets of a supported sensor. Sweeps can be read from packets of "
+        "Velodyne and Ouster sensors."
     )
 
 
@@ -282,7 +282,7 @@ def _decoder(decoder: type[PacketDecoder], path: Path, name: str) -> PacketDecod
     Raises LidarError if the file is not read.
     """
     if decoder.refusal:
-        raise LidarError(f"{name} has {decoder.refusal}.")
+        raise LidarError(f"{name} contains {decoder.refusal}.")
     return decoder(path, name)
 
 
@@ -303,7 +303,7 @@ def _encoder_of_plugin(plugin: Plugin) -> type[PacketEncoder]:
     return encoder
 
 
-_TABLE: PluginTable[Any] = PluginTable(GROUP, "a format of packets", ENCODERS, _encoder_of_plugin)
+_TABLE: PluginTable[Any] = PluginTable(GROUP, "packet format", ENCODERS, _encoder_of_plugin)
 
 
 def encoder_class(name: str) -> type[PacketEncoder]:

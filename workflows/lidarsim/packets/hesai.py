@@ -52,7 +52,7 @@ class HesaiEncoder(PacketEncoder):
         layout = self._layout
         if source.mode not in layout.modes:
             modes = ", ".join(layout.modes)
-            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+            raise self.unusable(f"support the returns {modes}, not {source.mode}. Set returns.mode")
         self._lasers = LaserTable.of_sensor(source.sensor, layout)
         self._planes = 2 if source.mode == "dual" else 1
         self._firings = layout.blocks // self._planes
@@ -116,7 +116,7 @@ class HesaiEncoder(PacketEncoder):
         model = self.text("model")
         if model not in LAYOUTS:
             names = ", ".join(LAYOUTS)
-            error = self.unusable(f"are of the models {names}, not {model}")
+            error = self.unusable(f"support the models {names}, not {model}")
             raise LidarError(f"{error}{did_you_mean(model, LAYOUTS)}")
         return LAYOUTS[model]
 
@@ -126,14 +126,16 @@ class HesaiEncoder(PacketEncoder):
         layout = self._layout
         head = sensor.head
         if not isinstance(head, Spin) or isinstance(head, Mirror) or not head.clockwise:
-            raise self.unusable("need a head that spins clockwise")
+            raise self.unusable("require a head that rotates clockwise")
         if sensor.channels != layout.channels:
-            raise self.unusable(f"hold {layout.channels} lasers, not {sensor.channels}")
+            raise self.unusable(
+                f"contain {layout.channels} lasers, but the sensor has {sensor.channels}"
+            )
         firing_us = self.firing_interval_ns / 1000
         if abs(firing_us - layout.firing_us) > _PERIOD_TOLERANCE_US:
             raise self.unusable(
-                f"hold firings every {layout.firing_us:.2f} µs, not {firing_us:.2f}: readers "
-                "assume this time"
+                f"have a firing interval of {layout.firing_us:.2f} µs, which readers assume, but "
+                f"the sensor has {firing_us:.2f} µs"
             )
 
     def _is_ptp(self) -> bool:
@@ -144,7 +146,7 @@ class HesaiEncoder(PacketEncoder):
         clock = self.source.settings.identifiers.get("clock", "gps")
         clocks = _CLOCKS if self._layout.has_epoch_seconds else _CLOCKS[:1]
         if clock not in clocks:
-            raise self.unusable(f"have the clock {' or '.join(clocks)}, not {clock}")
+            raise self.unusable(f"support the clock {' or '.join(clocks)}, not {clock}")
         return clock == "ptp"
 
     def _packets(self, shots: Shots) -> Records:
@@ -228,7 +230,7 @@ def _fill_checksums(packets: Records) -> None:
 class HesaiDecoder(PacketDecoder):
     """Refuses packets of Hesai, which no package of the index reads as sweeps."""
 
-    refusal = "packets of a Hesai, which are not read. Write their points as .pcd with Hesai's SDK"
+    refusal = "Hesai packets, which are not supported. Convert them to .pcd with the Hesai SDK"
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:

@@ -121,7 +121,7 @@ class PtcService(TcpService):
         As of `TcpService`.
     """
 
-    name = "Hesai's commands (PTC)"
+    name = "Hesai commands (PTC)"
     usual_port = PTC_PORT
     example_port = 9348
     max_connections = 16  # one more closes the connection that was silent longest

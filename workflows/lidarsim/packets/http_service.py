@@ -166,9 +166,11 @@ def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
     line, *lines = head.decode("latin-1").rstrip("\r\n").split("\r\n")
     words = line.split(" ")
     if len(words) != 3 or not words[2].startswith("HTTP/1."):
-        raise RefusedError("this is no request of HTTP/1.1")
+        raise RefusedError("this is not an HTTP/1.1 request")
     if words[0] not in _METHODS:
-        raise RefusedError(f"use {', '.join(_METHODS)}", HTTPStatus.METHOD_NOT_ALLOWED)
+        raise RefusedError(
+            f"the method must be {' or '.join(_METHODS)}", HTTPStatus.METHOD_NOT_ALLOWED
+        )
     headers: dict[str, str] = {}
     for entry in lines:
         name, separator, value = entry.partition(":")
@@ -179,7 +181,7 @@ def _parsed(head: bytes) -> tuple[str, SplitResult, Headers]:
     try:
         return words[0], urlsplit(words[1]), headers
     except ValueError as error:
-        raise RefusedError("the URL is not understood") from error
+        raise RefusedError("the URL is invalid") from error
 
 
 def _body_size(headers: Headers) -> int:
@@ -188,10 +190,10 @@ def _body_size(headers: Headers) -> int:
     Raises RefusedError for other encodings.
     """
     if "transfer-encoding" in headers:
-        raise RefusedError("give a Content-Length", HTTPStatus.LENGTH_REQUIRED)
+        raise RefusedError("Content-Length is required", HTTPStatus.LENGTH_REQUIRED)
     size = headers.get("content-length", "0")
     if not (size.isascii() and size.isdecimal()):
-        raise RefusedError("the Content-Length is no number")
+        raise RefusedError("Content-Length must be a number")
     if len(size) > 9 or int(size) > _MAX_BODY_BYTES:
         raise RefusedError("the body is too large", HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
     return int(size)
@@ -205,9 +207,9 @@ def receiver_of(name: str, value: Any) -> str:
     try:
         address = IPv4Address(str(value))
     except AddressValueError as error:
-        raise RefusedError(f"{name} is no IPv4 address") from error
+        raise RefusedError(f"{name} is not an IPv4 address") from error
     if not is_single_receiver(address):
-        raise RefusedError(f"{name} is not the address of one receiver")
+        raise RefusedError(f"{name} is not the address of a single receiver")
     return str(address)
 
 
@@ -217,5 +219,5 @@ def receiver_port(name: str, value: Any) -> int:
     Raises RefusedError for other values.
     """
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < 1 << 16:
-        raise RefusedError(f"{name} is no port")
+        raise RefusedError(f"{name} is not a port")
     return value

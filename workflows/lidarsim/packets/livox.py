@@ -133,17 +133,19 @@ class LivoxEncoder(PacketEncoder):
         self.device_type = self.number("device_type")
         if self.device_type not in PORTS:
             types = ", ".join(map(str, PORTS))
-            raise self.unusable(f"have the device types {types}, not {self.device_type}")
+            raise self.unusable(f"support the device types {types}, not {self.device_type}")
         self.data_type = source.settings.identifiers.get("data_type", 1)
         if self.data_type not in CARTESIAN:
             types = ", ".join(map(str, CARTESIAN))
-            raise self.unusable(f"have the data types {types}, not {self.data_type}")
+            raise self.unusable(f"support the data types {types}, not {self.data_type}")
         if source.mode not in _MODES:
             modes = ", ".join(_MODES)
-            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+            raise self.unusable(f"support the returns {modes}, not {source.mode}. Set returns.mode")
         lines = source.sensor.channels
         if DOTS % lines:
-            raise self.unusable(f"hold lines whose number divides {DOTS}, not {lines}")
+            raise self.unusable(
+                f"require a number of lines that divides {DOTS}, but the sensor has {lines}"
+            )
         self._firings = DOTS // lines
         # Time from the first to the last line of a firing, as readers space points evenly.
         self._lines_ns = self.firing_interval_ns * (lines - 1) / lines
@@ -307,7 +309,7 @@ def _with_checksums(packets: Records) -> Bytes:
 class LivoxDecoder(PacketDecoder):
     """Refuses packets of Livox, which no package of the index reads as sweeps."""
 
-    refusal = "packets of a Livox, which are not read. Record a bag of ROS 2 with livox_ros_driver2"
+    refusal = "Livox packets, which are not supported. Record a ROS 2 bag with livox_ros_driver2"
 
     @staticmethod
     def recognizes(payload: bytes) -> bool:

@@ -126,7 +126,7 @@ class LivoxService(Service):
     @property
     def description(self) -> str:
         """The address of the sensor."""
-        return f"Livox's commands at {self.host} for a host at {self.destination.host}"
+        return f"Livox commands at {self.host} for the host {self.destination.host}"
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -149,8 +149,8 @@ class LivoxService(Service):
         """
         if ":" in self.host:
             raise LidarError(
-                f"--api {self.host}: Livox's ports are fixed, give an address without a port, such "
-                "as 127.0.0.2."
+                f"--api {self.host} must be an address without a port, such as 127.0.0.2, because "
+                "the ports of Livox sensors are fixed."
             )
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -158,8 +158,9 @@ class LivoxService(Service):
         except OSError as error:
             opened.close()
             raise LidarError(
-                f"Livox's commands cannot be answered at {self.host}:{port} "
-                f"({os.strerror(error.errno or 0)}): give another address, such as --api 127.0.0.9."
+                f"The Livox service cannot listen on {self.host}:{port}: "
+                f"{os.strerror(error.errno or 0)}. Use a different address, such as --api "
+                "127.0.0.9."
             ) from error
         opened.setblocking(False)
         return opened

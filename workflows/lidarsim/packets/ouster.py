@@ -289,17 +289,18 @@ class OusterEncoder(PacketEncoder):
         mode = self.source.mode
         if mode not in _RETURN_ORDERS:
             modes = ", ".join(_RETURN_ORDERS)
-            raise self.unusable(f"have the returns {modes}, not {mode}: set returns.mode")
+            raise self.unusable(f"support the returns {modes}, not {mode}. Set returns.mode")
         two = mode == "two_strongest"
         default = "RNG19_RFL8_SIG16_NIR16_DUAL" if two else "RNG19_RFL8_SIG16_NIR16"
         name = self.source.settings.identifiers.get("profile", default)
         if name not in PROFILES:
-            raise self.unusable(f"have the profiles {', '.join(PROFILES)}, not {name}")
+            raise self.unusable(f"support the profiles {', '.join(PROFILES)}, not {name}")
         profile = PROFILES[str(name)]
         if (profile.layout == DUAL) != two:
             needed = "two_strongest" if profile.layout == DUAL else "strongest, first or last"
             raise self.unusable(
-                f"of the profile {name} hold the returns {needed}, not {mode}: set returns.mode"
+                f"with the profile {name} require the returns {needed}, not {mode}. Set "
+                "returns.mode"
             )
         return profile
 
@@ -309,21 +310,21 @@ class OusterEncoder(PacketEncoder):
         head = sensor.head
         if isinstance(head, Mirror):
             raise self.unusable(
-                "need a head that fires all around: remove the azimuth_window and column_window "
-                "of its metadata"
+                "require a head that fires in all directions. Remove azimuth_window and "
+                "column_window from its metadata"
             )
         if not isinstance(head, Spin) or not head.clockwise:
-            raise self.unusable("need a head that spins clockwise")
+            raise self.unusable("require a head that rotates clockwise")
         if head.firings_per_turn not in _COLUMNS or head.rate_hz != int(head.rate_hz):
             raise self.unusable(
-                f"hold {', '.join(map(str, _COLUMNS))} columns a turn at a whole number of turns a "
-                f"second, not {head.firings_per_turn:g} at {head.rate_hz:g}: set columns and "
-                "rate_hz"
+                f"support {', '.join(map(str, _COLUMNS))} columns per turn at a whole number of "
+                f"turns per second, not {head.firings_per_turn:g} at {head.rate_hz:g}. Set columns "
+                "and rate_hz"
             )
         origin = sensor.beams.origin
         if sensor.beams.time_ns.any() or (origin != origin[0]).any() or origin[0, 1]:
             raise self.unusable(
-                "need beams that fire at one time, from one point ahead of the axis"
+                "require beams that fire simultaneously from one point in front of the axis"
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:
@@ -509,7 +510,10 @@ class OusterDecoder(PacketDecoder):
             input_size(path)
         if find_spec("ouster") is None:
             # ouster-sdk requires old versions of packages that it can do without.
-            raise LidarError(f"{name} is read by ouster-sdk: pip install --no-deps ouster-sdk.")
+            raise LidarError(
+                f"{name} requires ouster-sdk, which is not installed. Run pip install --no-deps "
+                "ouster-sdk."
+            )
         with reading(name):
             if (metadata := path.with_suffix(".json")).exists():
                 input_size(metadata)

@@ -77,7 +77,8 @@ class Actor:
     def __post_init__(self) -> None:
         if self.mesh.voxels is not None:
             raise LidarError(
-                f"{self.name!r} is of voxels, which cannot move: name it in scene.files or copies."
+                f"{self.name!r} contains voxels, which cannot move. List it in scene.files or "
+                "scene.copies."
             )
         if not isinstance(self.trajectory, CHECKED_TRAJECTORIES):
             self._check_first_pose()
@@ -201,7 +202,7 @@ class Actor:
         except LidarError as error:
             reason = str(error).rstrip(".")
             raise LidarError(
-                f"Actor {self.name!r}: {reason}: let its trajectory begin before the first scan "
+                f"Actor {self.name!r}: {reason}. Its trajectory must start before the first scan "
                 "and end after the last."
             ) from error
 
@@ -214,8 +215,8 @@ def check_spray(actors: Iterable[Actor]) -> None:
     for actor in actors:
         if actor.spray and not (np.ptp(actor.mesh.vertices, axis=0) > 0).all():
             raise LidarError(
-                f"Actor {actor.name!r} raises spray as wide and high as it is, and is flat: give "
-                "it a mesh with a length, width and height, or spray: false."
+                f"Actor {actor.name!r} is flat, so the size of its spray is unknown. Use a mesh "
+                "with a length, width and height, or set spray to false."
             )
 
 
@@ -259,7 +260,7 @@ def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> Scen
     flat = [item.flat() if isinstance(item, SceneInstance) else item for item in objects]
     if any(part.voxels is not None for part in flat):
         if flat[1:]:
-            raise LidarError(f"{name!r} has voxels, and cannot be joined to other objects.")
+            raise LidarError(f"{name!r} contains voxels and cannot be joined with other objects.")
         return replace(flat[0], name=name)
     if any(mesh.animation for mesh in flat):
         return _join_animated(name, flat)

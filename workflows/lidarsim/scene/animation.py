@@ -58,8 +58,8 @@ class Animation:
         valid = valid and self.step_s > 0 and (speed is None or speed > 0)
         if not valid or not np.isfinite(self.vertices).all():
             raise LidarError(
-                "An animation has finite vertices (f, v, 3) of two poses at least, and a step and "
-                f"speed above 0; given: {shape}, {self.step_s} s, {speed} m/s."
+                "An animation requires finite vertices (f, v, 3) with at least two poses, and a "
+                f"step and a speed above 0, but has {shape}, {self.step_s} s and {speed} m/s."
             )
 
     @property

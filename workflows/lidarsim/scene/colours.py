@@ -117,8 +117,8 @@ class Colours:
         valid &= self.uv is None or bool(np.isfinite(self.uv).all())
         if not valid or not are_indices(self.image, len(self.images)):
             raise LidarError(
-                f"The colours of {name!r} do not fit its {faces} faces: images are uint8 "
-                "(h, w, 3), image (f,), uv (f, 3, 2), finite, and corners (f, 3, 3)."
+                f"The colors of {name!r} do not match its {faces} faces. Expected uint8 images (h, "
+                "w, 3), image (f,), finite uv (f, 3, 2) and corners (f, 3, 3)."
             )
 
     def means(self) -> Bytes:
@@ -342,12 +342,12 @@ def colours_summary(mesh_colours: Iterable[Colours | None]) -> str:
     """Return a summary of colours: «2 textures, 1 plain colour, colours of vertices»."""
     coloured = [part for part in mesh_colours if part is not None]
     kinds = {
-        id(part.images[number]): "texture" if part.images[number].size > 3 else "plain colour"
+        id(part.images[number]): "texture" if part.images[number].size > 3 else "plain color"
         for part in coloured
         for number in np.unique(part.image)
         if part.images[number] is not WHITE
     }
     counts = Counter(kinds.values())
-    words = [plural(counts[kind], kind) for kind in ("texture", "plain colour") if counts[kind]]
-    words += ["colours of vertices"] * any(part.corners is not None for part in coloured)
-    return ", ".join(words) or "no colours"
+    words = [plural(counts[kind], kind) for kind in ("texture", "plain color") if counts[kind]]
+    words += ["vertex colors"] * any(part.corners is not None for part in coloured)
+    return ", ".join(words) or "no colors"

@@ -48,8 +48,8 @@ class FaceMaterials:
             fits = fits and are_indices(index, len(self.names))
         if not fits:
             raise LidarError(
-                f"The materials of {name!r} do not fit its {faces} faces: names are distinct, and "
-                "index is int32 (f,), rows of them, or None."
+                f"The materials of {name!r} do not match its {faces} faces. Names must be unique, "
+                "and index must be None or int32 (f,) with row numbers of the names."
             )
 
 

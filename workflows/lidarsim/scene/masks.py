@@ -104,7 +104,7 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
         is_grey = opened.mode in ("L", "I", "F") or opened.mode.startswith("I;16")
         values = np.asarray(opened if is_grey else opened.convert("L"), np.float64)
     if not np.isfinite(values).all() or values.min() < 0:
-        raise MaskError(f"{image.name} has no heights")
+        raise MaskError(f"{image.name} has no height channel")
     return values
 
 
@@ -126,11 +126,13 @@ def _opened(image: Path | bytes) -> Iterator[Image.Image]:
             ):
                 yield opened
     except Image.UnidentifiedImageError as error:
-        raise MaskError(f"{name} is no {', '.join(FORMATS)}") from error
+        raise MaskError(
+            f"{name} is not a {', '.join(FORMATS[:-1])} or {FORMATS[-1]} image"
+        ) from error
     except (Image.DecompressionBombError, Image.DecompressionBombWarning, _TooLargeError) as error:
         raise MaskError(f"{name} has too many pixels") from error
     except InputFileError as error:
-        raise MaskError(f"{name} is no image: {error.strerror}") from error
+        raise MaskError(f"{name} cannot be read: {error.strerror}") from error
     except Exception as error:
         # Decoders raise errors of any class: OSError, SyntaxError, struct.error, …
         raise MaskError(f"{name} cannot be decoded") from error
@@ -293,27 +295,30 @@ class MaskNotes:
         notes = []
         if self.missing_files:
             files = _listed(self.missing_files)
-            notes.append(f"names materials in {files}, which cannot be read: all is solid")
+            notes.append(
+                f"refers to materials in {files}, which cannot be read. All surfaces are opaque"
+            )
         for reasons, kind, consequence in (
-            (self.mask_errors, "masks", "are solid"),
-            (self.colour_errors, "colours", "lack them"),
+            (self.mask_errors, "masks", "are opaque"),
+            (self.colour_errors, "colors", "have no color"),
         ):
             if reasons:
                 shown = _listed([f"{name} ({why})" for name, why in reasons.items()])
                 notes.append(
-                    f"has {kind} that cannot be read, so that these materials {consequence}: "
-                    f"{shown}"
+                    f"has {kind} that cannot be read, so these materials {consequence}: {shown}"
                 )
         if self.reduced_sizes:
             sizes = _listed(self.reduced_sizes)
             notes.append(
-                f"has images of {sizes} pixels, taken at {MAX_SIDE_PIXELS:,} at most on a side"
+                f"has images of {sizes} pixels, which are reduced to at most {MAX_SIDE_PIXELS:,} "
+                "pixels per side"
             )
         if self.glass:
             names = _listed([*self.glass])
             notes.append(
-                f"has transparent materials without holes, taken as solid: {names}; "
-                '<materials.transparent="pass"> makes objects glass'
+                f"has transparent materials without holes, which are treated as opaque: {names}. "
+                "For "
+                'glass, use <materials.transparent="pass">'
             )
         return notes
 
@@ -326,7 +331,7 @@ def _noted(reasons: dict[str, str], material: str) -> Iterator[None]:
     except MaskError as error:
         reasons.setdefault(material, str(error))
     except Exception:
-        reasons.setdefault(material, "it is broken")
+        reasons.setdefault(material, "it is invalid")
 
 
 def _listed(names: list[str]) -> str:

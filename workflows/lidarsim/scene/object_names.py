@@ -51,8 +51,8 @@ def resolve_same_names(
         shown = ", ".join(numbered[:_MAX_SHOWN]) + ", …" * (len(numbered) > _MAX_SHOWN)
         have = "has" if len(numbered) == 1 else "have"
         tell(
-            f"{plural(len(numbered), 'object')} {have} the name of another one and a number now: "
-            f'{shown}; <scene.same_names="join"> makes one object of each name'
+            f"{plural(len(numbered), 'object')} with a duplicate name {have} a number appended: "
+            f'{shown}. To merge objects with the same name, use <scene.same_names="join">'
         )
     return list(objects)
 

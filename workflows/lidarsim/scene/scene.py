@@ -126,13 +126,15 @@ class Scene:
         (origin,) = points_array("the scene's origin", [as_array("origin", self.origin)])
         world_origin = _world_position(self.world_origin)
         if faces.ndim != 2 or faces.shape[1:] != (3,) or not (len(faces) or self.instances):
-            raise LidarError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
+            raise LidarError(
+                f"The faces of a scene must have the shape (f, 3), but have {faces.shape}."
+            )
         if not are_indices(faces, len(vertices)):
-            raise LidarError(f"Faces must name the {len(vertices)} vertices, from 0 up.")
+            raise LidarError(f"Faces must refer to the {len(vertices)} vertices, counted from 0.")
         if owners.shape != faces.shape[:1] or not are_indices(owners, len(self.names)):
             raise LidarError(
-                f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
-                f"each of the {len(faces)} faces."
+                f"face_object must have the index of one of the {len(self.names)} objects, counted "
+                f"from 0, for each of the {len(faces)} faces."
             )
         arrays = {"vertices": vertices, "faces": faces, "face_object": owners}
         arrays |= {"origin": origin, "world_origin": world_origin}
@@ -219,8 +221,8 @@ class Scene:
         """
         if options.get("animation") is not None:
             raise LidarError(
-                f"{path}: a scene plays no animation: leave out animation, and give an Actor the "
-                "meshes of load_objects(path, animation=…), joined by join_meshes."
+                f"{path}: animation cannot be used in a scene. Create an Actor from "
+                "load_objects(path, animation=…) and join_meshes."
             )
         objects = load_objects(path, **options)
         static = resolve_same_names(
@@ -311,7 +313,7 @@ class Scene:
         for actor in actors:
             if not isinstance(actor, Actor):
                 raise LidarError(
-                    f"actors holds {shown(actor)}; each must be an Actor(mesh, trajectory)."
+                    f"actors must contain Actor(mesh, trajectory), but contains {shown(actor)}."
                 )
         scene = copy(self)
         object.__setattr__(scene, "actors", actors)
@@ -615,7 +617,7 @@ def _world_position(value: ArrayLike) -> Floats:
     """
     position = np.array(as_array("world_origin", value))
     if position.shape != (3,) or not np.isfinite(position).all():
-        raise LidarError(f"world_origin is {shown(value)}; it must be x, y and z in metres.")
+        raise LidarError(f"world_origin must be x, y and z in meters, but is {shown(value)}.")
     position.flags.writeable = False
     return position
 
@@ -679,11 +681,10 @@ def _check_objects(objects: Sequence[object]) -> None:
     for item in objects:
         if not isinstance(item, (SceneMesh, SceneInstance)):
             raise LidarError(
-                f"meshes holds {shown(item)}; each must be a SceneMesh(name, vertices, faces), "
-                "or a SceneInstance of one."
+                f"meshes must contain SceneMesh or SceneInstance, but contains {shown(item)}."
             )
     if not objects:
-        raise LidarError("A scene needs at least one object with triangles.")
+        raise LidarError("A scene requires at least one object with triangles.")
 
 
 def _split_by_kind(objects: Sequence[SceneMesh | SceneInstance]) -> _SplitObjects:
@@ -741,6 +742,6 @@ def _check_counts(split: _SplitObjects) -> None:
     max_count = np.iinfo(np.int32).max
     if max(vertices, triangles) > max_count:
         raise LidarError(
-            f"The scene has {vertices} vertices and {triangles} triangles; at most {max_count} of "
-            "each can be numbered."
+            f"The scene has {vertices} vertices and {triangles} triangles, but each is limited to "
+            f"{max_count}."
         )

@@ -106,8 +106,8 @@ def check_coordinate(position: Floats) -> None:
     """
     if not (np.abs(position) <= MAX_COORDINATE_M).all():
         raise LidarError(
-            f"An instance cannot be at {np.asarray(position).tolist()}: give metres within "
-            f"{MAX_COORDINATE_M:g} of zero."
+            f"The position of an instance must be in meters and within {MAX_COORDINATE_M:g} of "
+            f"zero, but is {np.asarray(position).tolist()}."
         )
 
 

@@ -110,15 +110,15 @@ class SceneMesh:
         faces = np.asarray(self.faces)
         if faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer):
             raise LidarError(
-                f"The faces of {self.name!r} have shape {faces.shape} and type {faces.dtype}; "
-                "expected integers of shape (f, 3)."
+                f"The faces of {self.name!r} must be integers of the shape (f, 3), but are "
+                f"{faces.dtype} of the shape {faces.shape}."
             )
         if not len(faces):
             raise LidarError(f"Object {self.name!r} has no triangles.")
         if faces.min() < 0 or faces.max() >= len(self.vertices):
             raise LidarError(
-                f"The faces of {self.name!r} refer to vertices {faces.min()} to {faces.max()}; "
-                f"there are {len(self.vertices)}, counted from 0."
+                f"The faces of {self.name!r} refer to vertices {faces.min()} to {faces.max()}, but "
+                f"there are {len(self.vertices)} vertices, counted from 0."
             )
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
         object.__setattr__(self, "cutouts", tuple(self.cutouts))
@@ -130,13 +130,14 @@ class SceneMesh:
         if self.voxels is not None:
             _check_voxels(self.name, self.voxels)
             if self.cutouts:
-                raise LidarError(f"{self.name!r} has voxels and cutouts: leave out one.")
+                raise LidarError(f"{self.name!r} cannot have both voxels and cutouts.")
         if self.animation is not None:
             moving = self.animation.vertices.shape[1]
             if moving != len(self.vertices) or self.cutouts or self.voxels is not None:
                 raise LidarError(
-                    f"{self.name!r} has {len(self.vertices)} vertices, and its animation moves "
-                    f"{moving}: it must move all of them, of a mesh without cutouts and voxels."
+                    f"{self.name!r} has {len(self.vertices)} vertices, but its animation moves "
+                    f"{moving}. An animation must move all vertices of a mesh without cutouts and "
+                    "voxels."
                 )
 
     @cached_property
@@ -190,10 +191,9 @@ def _check_voxels(name: str, voxels: Voxels) -> None:
     valid = valid and matrix.shape == (3, 4) and bool(np.isfinite(matrix).all())
     if not valid or rank(matrix[:, :3]) < 3:
         raise LidarError(
-            f"The voxels of {name!r} are {density.dtype} {density.shape}, with a matrix "
-            f"{matrix.shape}; they must be float32 (nx, ny, nz), {MAX_VOXELS:,} at most along "
-            f"each axis, of 0 to {MAX_LEAF_DENSITY:g} m²/m³, and the matrix finite (3, 4), "
-            "invertible."
+            f"The voxels of {name!r} must be float32 (nx, ny, nz) from 0 to {MAX_LEAF_DENSITY:g} "
+            f"m²/m³, with at most {MAX_VOXELS:,} along each axis and a finite, invertible (3, 4) "
+            f"matrix, but are {density.dtype} {density.shape} with a matrix {matrix.shape}."
         )
 
 
@@ -207,11 +207,12 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
         valid = valid and cut.uv.shape[1:] == (3, 2) and len(cut.uv) > 0
         if not valid or not (np.abs(cut.uv) < MAX_UV).all():
             raise LidarError(
-                f"A cutout of {name!r} has a mask {cut.mask.dtype} {cut.mask.shape} and uv "
-                f"{cut.uv.shape}; they must be bool (h, w), and (k, 3, 2) within {MAX_UV:,}."
+                f"A cutout of {name!r} must have a bool mask (h, w) and uv (k, 3, 2) within "
+                f"{MAX_UV:,}, but has a mask {cut.mask.dtype} {cut.mask.shape} and uv "
+                f"{cut.uv.shape}."
             )
     if (cutout_faces := sum(len(cut.uv) for cut in cutouts)) > faces:
-        raise LidarError(f"{name!r} has {faces} faces, and cutouts of {cutout_faces}.")
+        raise LidarError(f"{name!r} has {faces} faces, but its cutouts have {cutout_faces}.")
 
 
 def stacked(meshes: Iterable[tuple[AnyArray, AnyArray]]) -> tuple[AnyArray, AnyArray]:
@@ -248,12 +249,14 @@ def points_array(name: str, points: ArrayLike) -> Floats:
     """
     array = np.ascontiguousarray(as_array(f"vertices of {name!r}", points))
     if array.ndim != 2 or array.shape[1] != 3:
-        raise LidarError(f"The vertices of {name!r} have shape {array.shape}; expected (v, 3).")
+        raise LidarError(
+            f"The vertices of {name!r} must have the shape (v, 3), but have {array.shape}."
+        )
     bad = ~np.isfinite(array).all(axis=1)
     if bad.any():
         raise LidarError(
-            f"{int(bad.sum())} of the {len(array)} vertices of {name!r} are NaN or infinite, "
-            f"the first is number {int(bad.argmax())}: repair the mesh."
+            f"{int(bad.sum())} of the {len(array)} vertices of {name!r} are NaN or infinite. The "
+            f"first is vertex {int(bad.argmax())}. Repair the mesh."
         )
     return array
 

@@ -72,13 +72,13 @@ class Transform:
         offset = as_array("offset", self.offset)
         if linear.shape != (3, 3) or offset.shape != (3,):
             raise LidarError(
-                f"A transform needs a (3, 3) matrix and 3 offsets, not {linear.shape} and "
+                f"A transform requires a (3, 3) matrix and 3 offsets, but has {linear.shape} and "
                 f"{offset.shape}."
             )
         if not (np.isfinite(linear).all() and np.isfinite(offset).all()):
-            raise LidarError("A transform must be of finite numbers.")
+            raise LidarError("The numbers of a transform must be finite.")
         if rank(linear) < 3:
-            raise LidarError("The transform flattens the mesh: its matrix has no inverse.")
+            raise LidarError("The matrix of the transform is singular, so it flattens the mesh.")
         object.__setattr__(self, "linear", linear)
         object.__setattr__(self, "offset", offset)
 
@@ -117,7 +117,7 @@ class Transform:
         array = as_array("transform", matrix)
         if array.shape != (4, 4) or not np.array_equal(array[3], [0, 0, 0, 1]):
             raise LidarError(
-                "A transform matrix has four rows of four numbers, the last one 0 0 0 1; "
-                f"given: {array.tolist()}."
+                "A transform matrix must have four rows of four numbers with 0 0 0 1 as the last "
+                f"row, but is {array.tolist()}."
             )
         return cls(array[:3, :3], array[:3, 3])

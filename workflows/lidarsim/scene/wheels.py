@@ -52,12 +52,12 @@ def rolling(
     _check_names(wheels, [mesh.name for mesh in meshes])
     radii, notes = _radii(meshes, wheels)
     if not radii:
-        raise LidarError(f"no object that wheels names can turn: {notes[0]}.")
+        raise LidarError(f"no object in wheels can rotate: {notes[0]}.")
     largest = max(radii.values())
     revolutions = {index: round(largest / radius) for index, radius in radii.items()}
     for index in [index for index, count in revolutions.items() if count > _MAX_REVOLUTIONS]:
-        smaller = f"{revolutions.pop(index)} times smaller than the largest"
-        notes.append(f"{meshes[index].name} is {smaller}, and does not turn")
+        smaller = f"{revolutions.pop(index)} times smaller than the largest wheel"
+        notes.append(f"{meshes[index].name} is {smaller} and does not rotate")
     for line in notes:
         tell(line)
     steps = _POSES_PER_REVOLUTION * max(revolutions.values())
@@ -77,7 +77,7 @@ def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
     for wheel in wheels:
         if not any(name == wheel or fnmatchcase(name, wheel) for name in names):
             raise LidarError(
-                f"wheels names {wheel!r}, but no object has that name.{name_hint(wheel, names)}"
+                f"wheels contains {wheel!r}, but no object has that name.{name_hint(wheel, names)}"
             )
 
 
@@ -92,8 +92,8 @@ def _radii(
             length, _, height = np.ptp(mesh.bounds, axis=0).tolist()
             if abs(length - height) > _ROUNDNESS * height or not height:
                 notes.append(
-                    f"{mesh.name} has no axle, and does not turn: it is {length:.3g} m long and "
-                    f"{height:.3g} m high, not round about y"
+                    f"{mesh.name} is not round about y ({length:.3g} m long, {height:.3g} m high) "
+                    "and does not rotate"
                 )
             else:
                 radii[index] = height / 2

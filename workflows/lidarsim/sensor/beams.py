@@ -55,7 +55,7 @@ class Beams:
     def __post_init__(self) -> None:
         count = as_array("Beams.elevation", self.elevation).size
         if not 1 <= count <= MAX_CHANNELS:
-            raise LidarError(f"A sensor has 1 to {MAX_CHANNELS} beams, not {count}.")
+            raise LidarError(f"A sensor must have 1 to {MAX_CHANNELS} beams, but has {count}.")
         for name, shape in (
             ("elevation", (count,)),
             ("azimuth", (count,)),
@@ -162,9 +162,9 @@ class Spin:
     def __post_init__(self) -> None:
         if self._firings_per_step < 1:
             raise LidarError(
-                f"step_deg {self.step_deg} is less than one firing "
-                f"({360 / self.firings_per_turn:g} degrees), so some scans would be empty: make "
-                "step_deg or the number of firings larger."
+                f"step_deg is {self.step_deg}, which is less than the angle between two firings "
+                f"({360 / self.firings_per_turn:g} degrees), so some scans would be empty. "
+                "Increase step_deg or the number of firings per turn."
             )
 
     @cached_property
@@ -279,7 +279,8 @@ def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
         array = np.zeros(shape)
     if array.shape != shape or not np.isfinite(array).all():
         raise LidarError(
-            f"Beams.{name} must be {shape} finite numbers, one for each beam; given: {array.shape}."
+            f"Beams.{name} must be {shape} finite numbers, one for each beam, but has the shape "
+            f"{array.shape}."
         )
     array.flags.writeable = False
     return array

@@ -15,7 +15,7 @@ from ..base.arrays import Floats
 from ..base.elementary import sin_cos
 from ..base.errors import converted
 from ..base.textfile import read_text
-from ..base.words import did_you_mean_each, printable
+from ..base.words import did_you_mean_each, joined, printable
 from ..base.yamlfile import load_yaml
 from ..sensor_files.comma_rows import rows_of
 from ..sensor_files.fired_rays import FiredRays
@@ -64,7 +64,7 @@ def read_calibration(path: Path) -> Calibration:
         If the file has none of these formats, or numbers are missing, not finite or in the wrong
         order.
     """
-    with converted(f"{path} is not a usable calibration"):
+    with converted(f"{path} is not a valid calibration file"):
         if path.suffix.lower() not in (".yaml", ".yml", ".json", ".csv"):
             rays = read_rays(path)
             if rays is not None:
@@ -83,11 +83,11 @@ def _velodyne(name: str, data: Any) -> Calibration:
     The geometry is as in ros-drivers/velodyne, rawdata.cc.
     """
     if not isinstance(data, dict) or not isinstance(data.get("lasers"), list):
-        raise ValueError("it has no list of lasers, as Velodyne's calibrations have")
+        raise ValueError("it has no list of lasers, which Velodyne calibration files contain")
     lasers = sorted(data["lasers"], key=lambda laser: laser["laser_id"])
     count = data.get("num_lasers", len(lasers))
     if len(lasers) != count or any(laser["laser_id"] != i for i, laser in enumerate(lasers)):
-        raise ValueError(f"it must have lasers 0 to {count - 1}, each once")
+        raise ValueError(f"it must list each of the lasers 0 to {count - 1} exactly once")
     elevation, azimuth, upwards, leftwards = np.array(
         [
             [
@@ -121,17 +121,18 @@ def _ouster(name: str, data: Any) -> Calibration:
     Ranges are measured from the beam's start, as of all sensors; Ouster's ranges from the axis.
     """
     if not isinstance(data, dict):
-        raise ValueError("it is not Ouster metadata")
+        raise ValueError("it is not an Ouster metadata file")
     beam = _ouster_section(data, "beam_intrinsics", data)
     if "beam_altitude_angles" not in beam:
-        raise ValueError("it has no beam_altitude_angles, as Ouster's metadata have")
+        raise ValueError("it has no beam_altitude_angles, which Ouster metadata files contain")
     elevation = np.array(beam["beam_altitude_angles"], np.float64)
     azimuth = np.array(beam["beam_azimuth_angles"], np.float64)
     layout = _ouster_section(data, "lidar_data_format") or _ouster_section(data, "data_format")
     rows = layout.get("pixels_per_column", len(elevation))
     if elevation.shape != azimuth.shape or len(elevation) != rows:
         raise ValueError(
-            f"it has {elevation.size} altitude and {azimuth.size} azimuth angles of {rows} beams"
+            f"it has {elevation.size} altitude angles and {azimuth.size} azimuth angles for {rows} "
+            "beams"
         )
     present = (elevation != 0) | (azimuth != 0)  # older firmware writes zeros for missing beams
     origin_mm = _ouster_origin_mm(data, beam)
@@ -161,8 +162,8 @@ def _ouster_mode(data: dict[str, Any]) -> tuple[int, int]:
     numbers = re.fullmatch(r"([1-9]\d{2,4})x([1-9]\d{0,2})", mode)
     if numbers is None:
         raise ValueError(
-            f"its lidar_mode is {printable(mode)!r}; columns and revolutions a second are "
-            "expected, such as 1024x10"
+            "its lidar_mode must be the columns and revolutions per second, such as 1024x10, but "
+            f"is {printable(mode)!r}"
         )
     return int(numbers[1]), int(numbers[2])
 
@@ -200,8 +201,8 @@ def _limits(name: str, limits: Any, maximum: int) -> tuple[int, int]:
     is_pair = isinstance(limits, list) and len(limits) == 2
     if not is_pair or not all(type(limit) is int and 0 <= limit <= maximum for limit in limits):
         raise ValueError(
-            f"its {name} is {printable(str(limits), 60)}; two whole numbers from 0 to {maximum:,} "
-            "are expected"
+            f"its {name} must be two whole numbers from 0 to {maximum:,}, but is "
+            f"{printable(str(limits), 60)}"
         )
     return limits[0], limits[1]
 
@@ -219,7 +220,9 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
     """Return the start (3,) of Ouster's beams at azimuth 0, in the sensor frame, millimetres."""
     beam_pose = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))
     if not np.allclose(beam_pose[:3, :3], np.eye(3)):
-        raise ValueError("its beam_to_lidar_transform turns the beams; a translation is expected")
+        raise ValueError(
+            "its beam_to_lidar_transform contains a rotation. Only a translation is supported"
+        )
     origin_mm = beam_pose[:3, 3].copy()
     if "lidar_origin_to_beam_origin_mm" in beam:
         origin_mm[0] = beam["lidar_origin_to_beam_origin_mm"]
@@ -231,7 +234,9 @@ def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
     half_turn[2, 3] = 36.18
     pose = np.reshape(lidar.get("lidar_to_sensor_transform", half_turn), (4, 4))
     if not np.allclose(pose[:3, :3], half_turn[:3, :3]) or pose[:2, 3].any():
-        raise ValueError("its lidar_to_sensor_transform is not half a turn and a height")
+        raise ValueError(
+            "its lidar_to_sensor_transform must be a rotation by 180 degrees about z and a height"
+        )
     origin_mm[2] += pose[2, 3]
     return np.asarray(origin_mm, np.float64)
 
@@ -281,13 +286,13 @@ def _table(name: str, text: str) -> Calibration:
         names = ("elevation_deg", "azimuth_deg", "time_us", "x_m", "y_m", "z_m")
         unknown = [word for word in header if word not in names]
         if unknown:
-            verb = "columns are" if unknown[1:] else "column is"
+            noun = "columns" if unknown[1:] else "column"
             raise ValueError(
-                f"its {verb} not known: {', '.join(map(printable, unknown))}."
-                f"{did_you_mean_each(unknown, names)} Known are {', '.join(names)}"
+                f"unknown {noun} {joined([repr(printable(name)) for name in unknown])}."
+                f"{did_you_mean_each(unknown, names)} The known columns are {', '.join(names)}"
             )
         if duplicate := next((word for word in header if header.count(word) > 1), None):
-            raise ValueError(f"it has the column {duplicate!r} twice")
+            raise ValueError(f"the column {duplicate!r} occurs twice")
         columns = dict(zip(header, rows_of(text, 1, len(header)).T, strict=True))
         zero = np.zeros(len(columns["elevation_deg"]))
         beams = Beams(
@@ -301,7 +306,7 @@ def _table(name: str, text: str) -> Calibration:
         [float(word) for word in header]
     except ValueError:
         raise ValueError(
-            f"its first line, {','.join(header)[:60]!r}, has no known format"
+            f"the format of its first line, {','.join(header)[:60]!r}, is unknown"
         ) from None
     elevation, azimuth = np.radians(rows_of(text, 0, 2)).T
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
@@ -314,12 +319,12 @@ def _hesai(name: str, text: str) -> Calibration:
     header = lines[skip - 1] if len(lines) >= skip else ""
     if _cells(header)[1:] != _HESAI_COLUMNS:
         raise ValueError(
-            f"its second line is {printable(header, 60)!r}; after a line {_HESAI_MARK}, as Hesai "
-            "writes it, Channel,Elevation,Azimuth is expected"
+            f"the line after {_HESAI_MARK} must be Channel,Elevation,Azimuth, but is "
+            f"{printable(header, 60)!r}"
         )
     rows = rows_of(_HESAI_CHECKSUM.sub("", text), skip, 3)
     if (np.diff(rows[:, 0]) != 1).any() or rows[0, 0] != 1:
-        raise ValueError(f"channels must be 1 to {len(rows)}, each once and in order")
+        raise ValueError(f"its channels must be 1 to {len(rows)}, each exactly once and in order")
     elevation, azimuth = np.radians(rows[:, 1:]).T
     return Calibration(name, "hesai", Beams(elevation, -azimuth))
 

@@ -90,9 +90,12 @@ def export_sensor(
     path = Path(path)
     row = format_of(path, format)
     if not isinstance(sensor, Sensor):
-        raise LidarError(f"{type(sensor).__name__} is no Sensor: load_sensor(MODEL) returns one.")
+        raise LidarError(
+            f"sensor must be a Sensor, but is a {type(sensor).__name__}. Load one with "
+            "load_sensor(MODEL)."
+        )
     if not path.parent.is_dir():
-        raise MissingFileError(f"The folder {path.parent} does not exist: make it first.")
+        raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
     write = row.function("write")
     if row.describes:
         rays = FiredRays(np.zeros((0, 3)))
@@ -104,7 +107,7 @@ def export_sensor(
         if not rays.repeats:
             assert rays.cycle_ns is not None  # of a sensor
             lost.append(
-                f"rays after {rounded(rays.cycle_ns / 1e9, 4)} s, which do not repeat these"
+                f"rays after {rounded(rays.cycle_ns / 1e9, 4)} s, where the pattern does not repeat"
             )
         left_out = write(path, rays, lost)
     return SensorFile(path, row.name, rays, tuple(left_out))
@@ -151,7 +154,7 @@ def _duration_ns(sensor: Sensor, seconds: float | None, revolutions: int | None)
     Raises LidarError if both figures are given.
     """
     if seconds is not None and revolutions is not None:
-        raise LidarError("seconds and revolutions both say how long the pattern is: give one.")
+        raise LidarError("seconds and revolutions cannot be combined.")
     if seconds is not None:
         return 1e9 * seconds
     return sensor.revolution_start_ns(revolutions or 1)
@@ -184,7 +187,7 @@ def _firings_before(sensor: Sensor, duration_ns: float) -> int:
     if starts_before(limit):
         raise LidarError(
             f"{sensor.model} fires more than {MAX_RAYS:,} rays in {rounded(duration_ns / 1e9, 4)} "
-            "s: give fewer seconds or revolutions."
+            "s. Reduce seconds or revolutions."
         )
     lower = 0
     while limit - lower > 1:

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.errors import LidarError
+from ..base.words import rounded
 from ..sensor_files.complete_files import remark, write_text_of
 from .beams import Beams, Mirror, Spin
 from .noise import Noise
@@ -37,7 +38,7 @@ _REVERSED = np.diag([-1.0, 1, -1])  # of a mirror that turns the other way
 _EVEN_DEG = 1e-6  # of elevations of a line
 _EVEN_NS = 10.0  # of times of a line
 _MIN_LINE = 3  # beams of a line
-_ADVICE = "Formats npz and csv hold any rays."
+_ADVICE = "The formats npz and csv support any rays."
 
 
 @dataclass
@@ -105,8 +106,8 @@ def write(path: Path, sensor: Sensor, duration_s: float, left_out: Sequence[str]
         '<?xml version="1.0" encoding="UTF-8"?>',
         f"<!-- {remark(sensor.model)}. Axes of the platform: {AXES}. -->",
         *(f"<!-- Not in this file: {remark(clause)}. -->" for clause in lost),
-        f'<!-- A survey names it: scanner="{remark(path.name)}#{name}", and its legs name',
-        f'     their settings: <scannerSettings template="{remark(path.name)}#{name}"/>. -->',
+        f'<!-- In a survey, set scanner="{remark(path.name)}#{name}", and in each leg',
+        f'     <scannerSettings template="{remark(path.name)}#{name}"/>. -->',
         "<document>",
         *_scanner_lines(name, sensor, scanner),
         f'  <scannerSettings id="{name}" active="true" pulseFreq_hz="{scanner.pulse_hz}"'
@@ -195,19 +196,22 @@ def _lost_light(sensor: Sensor) -> Iterable[str]:
     """Yield what HELIOS++ does not hold of a sensor's light and noise, a clause each."""
     divergence_mrad = sensor.optics.divergence_mrad
     if divergence_mrad is not None and np.ptp(divergence_mrad):
-        yield "the two widths of an oval beam: beams are round, of the geometric mean"
+        yield (
+            "the two divergences of an elliptical beam (written as a round beam with "
+            "their geometric mean)"
+        )
     if sensor.optics.wavelength_nm % 1:
-        yield "a part of a nanometre of the wavelength"
+        yield "fractions of a nanometer of the wavelength"
     if sensor.noise is not None and replace(sensor.noise, range_m=0.0, seed=0) != Noise():
-        yield "noise, but that of ranges"
+        yield "noise other than range noise"
 
 
 def _lost_rate(scanner: _Scanner) -> Iterable[str]:
     """Yield a clause if the pulses a second are no whole number."""
     if abs(scanner.exact_hz - scanner.pulse_hz) > 1e-6 * scanner.exact_hz / 1e3:
         yield (
-            f"{scanner.exact_hz:,.2f} pulses a second: they are a whole number, "
-            f"{scanner.pulse_hz:,}, at the same angles"
+            f"the exact pulse rate of {scanner.exact_hz:,.2f} Hz (rounded to {scanner.pulse_hz:,} "
+            "Hz, with the same angles)"
         )
 
 
@@ -220,22 +224,26 @@ def _scanner_of(sensor: Sensor, duration_s: float) -> _Scanner:
         return _prisms(sensor, duration_s)
     kind = type(sensor)
     if isinstance(sensor, ListedSensor):
-        raise _refusal(sensor, "it is a list of rays, and scanners of HELIOS++ have optics")
+        raise _refusal(
+            sensor, "the sensor is a list of rays, but HELIOS++ scanners have deflecting optics"
+        )
     if kind not in (Sensor, LineSensor) or type(sensor.head) not in (Spin, Mirror):
         part = sensor if kind not in (Sensor, LineSensor) else sensor.head
-        raise _refusal(sensor, f"HELIOS++ has no optics like {type(part).__name__}")
+        raise _refusal(sensor, f"HELIOS++ has no optics that correspond to {type(part).__name__}")
     if isinstance(sensor.head, Mirror):
         return _mirror(sensor, sensor.head, duration_s)
     assert isinstance(sensor.head, Spin)
     if kind is LineSensor:
-        raise _refusal(sensor, "its head spins about x, and heads of HELIOS++ about z")
+        raise _refusal(sensor, "its head rotates about x, but HELIOS++ heads rotate about z")
     line = _line_of_beams(sensor, sensor.head, duration_s)
     return line or _spinning_head(sensor, sensor.head, duration_s)
 
 
 def _refusal(sensor: Sensor, reason: str) -> LidarError:
     """Return an error that says why HELIOS++ has no such scanner."""
-    return LidarError(f"{sensor.model} is no scanner of HELIOS++: {reason}. {_ADVICE}")
+    return LidarError(
+        f"{sensor.model} cannot be written as a HELIOS++ scanner: {reason}. {_ADVICE}"
+    )
 
 
 def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
@@ -244,7 +252,11 @@ def _whole_hz(sensor: Sensor, exact_hz: float) -> int:
     Raises LidarError for less than one.
     """
     if exact_hz < 0.5:
-        raise _refusal(sensor, f"it fires {exact_hz:.3g} times a second, and pulseFreq_hz is whole")
+        raise _refusal(
+            sensor,
+            f"it fires {rounded(exact_hz)} times per second, but pulseFreq_hz must be a whole "
+            "number",
+        )
     return round(exact_hz)
 
 
@@ -276,8 +288,8 @@ def _spinning_head(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
     if sensor.channels > MAX_CHANNELS:
         raise _refusal(
             sensor,
-            f"its {sensor.channels:,} beams are no even line, and a scanner has at most "
-            f"{MAX_CHANNELS:,} channels here",
+            f"its {sensor.channels:,} beams are not evenly spaced, and more than {MAX_CHANNELS:,} "
+            "channels cannot be written",
         )
     exact_hz = head.firings_per_turn * head.rate_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
@@ -288,9 +300,9 @@ def _spinning_head(sensor: Sensor, head: Spin, duration_s: float) -> _Scanner:
     scanner.settings |= {"scanFreq_hz": 0, "scanAngle_deg": 1}
     beams = sensor.beams
     if np.ptp(beams.time_ns):
-        scanner.left_out.append("times of the rays within a firing: all channels fire at once")
+        scanner.left_out.append("time offsets of the rays in a firing (all channels fire at once)")
     if beams.origin[:, :2].any():
-        scanner.left_out.append("starts of the rays beside the axis of the head")
+        scanner.left_out.append("ray origins outside the rotation axis of the head")
     scanner.channels = [
         _Channel(_about_z(azimuth) @ _about_x(elevation), height_m)
         for elevation, azimuth, height_m in zip(
@@ -399,13 +411,21 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     beams = sensor.beams
     if len(beams) > 1 or abs(beams.elevation[0]) > 1e-9 or beams.origin.any():
         raise _refusal(
-            sensor, "its mirror sweeps more than a beam at right angles to its axis from the centre"
+            sensor,
+            "its mirror must deflect a single beam, centered and perpendicular to the mirror axis",
         )
     if head.motion == "sine":
-        raise _refusal(sensor, "its mirror swings as a sine, and HELIOS++'s goes to and fro evenly")
+        raise _refusal(
+            sensor,
+            "its mirror oscillates sinusoidally, but a HELIOS++ mirror oscillates at constant "
+            "speed",
+        )
     count = head.period
     if count is None or count < _MIN_LINE:
-        raise _refusal(sensor, f"{head.firings_per_turn:g} firings of a line are no whole number")
+        raise _refusal(
+            sensor,
+            f"it fires {head.firings_per_turn:g} times per line, which is not a whole number",
+        )
     pulses_per_line = count if head.motion == "triangle" else round(count / head.duty)
     exact_hz = pulses_per_line * head.rate_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
@@ -415,7 +435,10 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
     sign = -1 if head.clockwise else 1
     if head.motion == "triangle":
         if head.duty != 1:
-            raise _refusal(sensor, f"its mirror pauses, with a duty of {head.duty:g}")
+            raise _refusal(
+                sensor,
+                f"its mirror has a duty cycle of {head.duty:g}, but HELIOS++ mirrors do not pause",
+            )
         half_deg = head.width_deg / 2
         scan_hz = pulse_hz / count
         scanner.limits |= {
@@ -424,7 +447,9 @@ def _mirror(sensor: Sensor, head: Mirror, duration_s: float) -> _Scanner:
             "scanFreqMax_Hz": scan_hz,
         }
         scanner.settings |= {"scanFreq_hz": scan_hz, "scanAngle_deg": half_deg}
-        scanner.left_out.append("even turns of the mirror: HELIOS++ slows it at the ends of lines")
+        scanner.left_out.append(
+            "the constant speed of the mirror (HELIOS++ slows it down at the ends of lines)"
+        )
     else:
         step_deg = head.width_deg / count
         line_deg = _set_line(scanner, step_deg, count, pulses_per_line, pulse_hz)
@@ -443,11 +468,15 @@ def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
     Raises LidarError for prisms that HELIOS++ does not have.
     """
     if sensor.mirror is not None:
-        raise _refusal(sensor, "a mirror turns behind its prisms, and HELIOS++ has prisms alone")
+        raise _refusal(sensor, "it has a mirror behind its prisms, which HELIOS++ does not support")
     if len(sensor.prisms) > MAX_PRISMS:
-        raise _refusal(sensor, f"it has {len(sensor.prisms)} prisms, and HELIOS++ {MAX_PRISMS}")
+        raise _refusal(
+            sensor, f"it has {len(sensor.prisms)} prisms, but HELIOS++ supports {MAX_PRISMS}"
+        )
     if not isinstance(sensor.head, Spin):
-        raise _refusal(sensor, f"HELIOS++ has no clock like {type(sensor.head).__name__}")
+        raise _refusal(
+            sensor, f"HELIOS++ has no timing that corresponds to {type(sensor.head).__name__}"
+        )
     exact_hz = sensor.head.firings_per_turn * sensor.head.rate_hz
     pulse_hz = _whole_hz(sensor, exact_hz)
     scanner = _Scanner("risley", pulse_hz, exact_hz, [], {"refrIndex_air": 1.0})
@@ -462,11 +491,11 @@ def _prisms(sensor: PrismSensor, duration_s: float) -> _Scanner:
     if np.ptp(phases_deg):
         listed = ", ".join(f"{phase_deg:g}" for phase_deg in phases_deg)
         scanner.left_out.append(
-            f"different starting angles of the prisms, {listed} degrees: the same pattern starts "
-            "elsewhere"
+            f"the starting angles of the prisms, {listed} degrees (the pattern is the same but "
+            "starts elsewhere)"
         )
     if np.ptp(sensor.beams.time_ns):
-        scanner.left_out.append("times of the rays within a firing: all channels fire at once")
+        scanner.left_out.append("time offsets of the rays in a firing (all channels fire at once)")
     # All prisms start at the angle of the first: the whole device is turned by it.
     turned = _about_x(np.radians(phases_deg[0]))
     rotation = _FRAME @ turned @ _OPTICS.T

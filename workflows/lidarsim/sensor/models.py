@@ -49,11 +49,13 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, dict):
         count = value.get("count")
         if isinstance(count, int) and count > _MAX_BEAMS:
-            raise ValueError(f"count is {count:,}; a sensor has {_MAX_BEAMS:,} beams at most")
+            raise ValueError(f"count must be at most {_MAX_BEAMS:,}, but is {count:,}.")
         try:
             return np.linspace(value["first"], value["last"], value["count"]).tolist()
         except (KeyError, TypeError, ValueError):
-            raise ValueError("give numbers, or first, last and count, a whole number") from None
+            raise ValueError(
+                "Pass a list of numbers, or first, last and count, where count is a whole number."
+            ) from None
     return value
 
 
@@ -132,9 +134,9 @@ class Detection(_ModelSection):
 
 # Figures that a data sheet may state: {field of `Noise`: words}.
 STATED = {
-    "range_m": "precision of ranges",
-    "detection_range_m": "detection range at a reflectance",
-    "angle_deg": "accuracy of angles",
+    "range_m": "range precision",
+    "detection_range_m": "detection range at a given reflectance",
+    "angle_deg": "angular accuracy",
     "false_alarm_hz": "false alarms",
 }
 
@@ -162,10 +164,10 @@ class Performance(_ModelSection):
     def _check_consistency(self) -> Performance:
         """Check that the figures fit together."""
         if self.precision and (self.range_m or self.range_per_m or self.range_at_threshold_m):
-            raise ValueError("precision takes the place of the other figures of ranges")
+            raise ValueError("precision cannot be combined with other range accuracy values.")
         for name in ("precision", "false_alarms", "range_at_threshold_m"):
             if getattr(self, name) and self.detection is None:
-                raise ValueError(f"{name} needs detection")
+                raise ValueError(f"{name} requires detection.")
         self.noise(1.0)  # LidarError if figures are impossible
         return self
 
@@ -195,7 +197,10 @@ class Performance(_ModelSection):
         s, t = np.square([surface.sigma_m for surface in self.precision])
         slope = (t - s) / (y - x)
         if not (slope >= 0 and s - slope * x >= 0):
-            raise LidarError("performance.precision does not fall as the energy grows.")
+            raise LidarError(
+                "The standard deviation in performance.precision must decrease as the energy "
+                "increases."
+            )
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
@@ -237,21 +242,23 @@ class SensorModel(_ModelSection):
     def _check_consistency(self) -> SensorModel:
         """Check that the fields fit together."""
         if (self.firing_us is None) == (self.firings_per_turn is None):
-            raise ValueError("give either firing_us or firings_per_turn")
+            raise ValueError("Set exactly one of firing_us and firings_per_turn.")
         if self.range_m is not None and not 0 <= self.range_m[0] < self.range_m[1]:
-            raise ValueError(
-                f"range_m is {list(self.range_m)}; give the shortest, then the longest"
-            )
+            raise ValueError(f"range_m must be [shortest, longest], but is {list(self.range_m)}.")
         if any(abs(angle) > 90 for angle in self.beams.elevation_deg):
-            raise ValueError("beams.elevation_deg goes beyond 90 degrees")
+            raise ValueError("beams.elevation_deg must be between -90 and 90 degrees.")
         if self.beams.crossing_m and self.beams.origin_m:
-            raise ValueError("beams.crossing_m and origin_m both state origins: give one")
+            raise ValueError("beams.crossing_m and origin_m cannot be combined.")
         head_fields = {"axis", "clockwise", "mirror", "zero_deg"}
         unused = self.model_dump(include=head_fields, exclude_defaults=True)
         if self.prisms and unused:
-            raise ValueError(f"prisms turn about x: leave {min(unused)} out, and turn the sensor")
+            raise ValueError(
+                f"Prisms rotate about x, so {min(unused)} cannot be set. Rotate the sensor instead."
+            )
         if self.turning_mirror and not self.prisms:
-            raise ValueError("turning_mirror needs prisms: a mirror that sweeps lines is mirror")
+            raise ValueError(
+                "turning_mirror requires prisms. For a mirror that scans lines, use mirror."
+            )
         self.beams.beams()  # LidarError if beams are impossible
         return self
 
@@ -268,8 +275,7 @@ class SensorModel(_ModelSection):
         performance = self.performance
         if performance is None:
             raise LidarError(
-                f"{self.name} has no performance in its data file, since no source that could be "
-                "read states it: give noise yourself."
+                f"No performance values are available for {self.name}. Set noise instead."
             )
         min_range_m, max_range_m = self.range_m or (0.0, float("inf"))
         noise = performance.noise(2e-9 * (max_range_m - min_range_m) / LIGHT_M_NS)
@@ -297,8 +303,8 @@ class SensorModel(_ModelSection):
         if self.firing_us is not None:
             if columns is not None:
                 raise LidarError(
-                    f"{self.name} fires every {float(self.firing_us):g} µs, so its firings a turn "
-                    "follow from rate_hz: leave columns out."
+                    f"{self.name} fires every {float(self.firing_us):g} µs, so rate_hz determines "
+                    "the firings per turn. Remove columns."
                 )
             return float(1_000_000 / (self.firing_us * Fraction(str(rate)))), rate
         assert self.firings_per_turn is not None
@@ -359,8 +365,8 @@ def read_model(name: str | Path) -> SensorModel:
     hint = f" Did you mean {' or '.join(map(repr, similar))}?" if similar else ""
     names = [*models, *(model.partition("/")[2] for model in models)]
     raise LidarError(
-        f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
-        "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
+        f"Unknown sensor model {name!r}.{hint or did_you_mean(name, names)} To list the models, "
+        "run `lidarpool sensors`. A model can also be a file, such as mine.yaml."
     )
 
 
@@ -380,7 +386,7 @@ def _read(path: Path | Traversable) -> SensorModel:
 
     Raises LidarError if the file cannot be used.
     """
-    with converted(f"{path} is not a usable model"):
+    with converted(f"{path} is not a valid sensor model"):
         text = read_input_text(path) if isinstance(path, Path) else path.read_text("utf-8")
         content = load_yaml(text)
         with sentences(SensorModel, path, content):
@@ -460,12 +466,12 @@ def load_sensor(
     elif unit is not None:
         sensor_model = _model_of(unit, columns)
     else:
-        raise LidarError("A sensor needs a model, a calibration, or both.")
+        raise LidarError("A sensor requires a model, a calibration or both.")
     if unit is not None:
         sensor_model = sensor_model.model_copy(update=unit.head)
     elif sensor_model.needs_calibration:
         raise LidarError(
-            f"{sensor_model.name} has no rays of its own: give calibration: FILE "
+            f"{sensor_model.name} has no ray pattern of its own. Set `calibration` to a file "
             f"({next(iter(sensor_model.sources.values()), 'of the unit')})."
         )
     firings, rate = sensor_model.firing_rates(rate_hz, columns)
@@ -524,8 +530,8 @@ def _model_of(unit: Calibration, columns: int | None) -> SensorModel:
     head = {"firings_per_turn": columns} if columns and unit.maker is None else unit.head
     if not head:
         raise LidarError(
-            f"{unit.file} fits no known model, and has no firing times: give model:"
-            f"{'' if unit.maker else ', or columns: (firings in a turn),'} as well."
+            f"{unit.file} does not match a known model and has no firing times. Set "
+            f"`model`{'' if unit.maker else ' or `columns` (firings per turn)'}."
         )
     return SensorModel(name=unit.sensor or (unit.maker or "beams").title(), sources={}, **head)
 
@@ -536,7 +542,8 @@ def _listed(
     """Return a sensor with a unit's list of rays, at the model's rate if the list has no times."""
     if unit.rays is None or (sensor_model.beams.elevation_deg and not sensor_model.prisms):
         raise LidarError(
-            f"{unit.file} does not fit {sensor_model.name}: one lists rays, the other beams."
+            f"{unit.file} does not match {sensor_model.name}. One describes rays and the other "
+            "describes beams."
         )
     if not unit.head:  # a firing of the model has all beams, a firing of the list has one ray
         firings = head.firings_per_turn * len(sensor_model.beams.beams())

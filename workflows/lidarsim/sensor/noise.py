@@ -126,7 +126,7 @@ class Noise:
     ] = None
     channel_bias_m: Annotated[
         Metres | Several[Bias],
-        allowed("a number of 0 to 1000, or a list of numbers, one for each channel"),
+        allowed("a number from 0 to 1000, or a list of numbers, one for each channel"),
         about("constant errors of channels' ranges, metres: standard deviation, or one for each"),
     ] = 0.0
     warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
@@ -150,8 +150,8 @@ class Noise:
             for name in (*threshold_fields, "saturation"):
                 if getattr(self, name):
                     raise LidarError(
-                        f"noise.{name} is measured by the threshold of detection: give "
-                        "noise.detection_range_m as well."
+                        f"noise.{name} is relative to the detection threshold and requires "
+                        "noise.detection_range_m."
                     )
 
     @property

@@ -15,6 +15,7 @@ from ..base.elementary_scalars import log_of
 from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.vectors import hypot
+from ..base.words import rounded
 from .disc import SUBRAYS, Beam, Profile
 from .reflectivity import SCALES
 
@@ -34,7 +35,7 @@ AngleMrad = Annotated[float, Field(ge=0, le=1000)]
 # Full angle of a beam's cone, at 1/e² of the maximum; or two angles, across and up.
 Divergence = Annotated[
     AngleMrad | Annotated[Sequence[AngleMrad], Field(min_length=2, max_length=2)],
-    allowed("0 to 1000, or two such: [across, up]"),
+    allowed("from 0 to 1000, or two such numbers as [across, up]"),
 ]
 Diameter = Annotated[float, Field(ge=0, le=10)]
 Pulse = Annotated[float, Field(ge=0, le=1e6)]
@@ -176,8 +177,8 @@ class Returns:
         )
         if divergence_mrad is None and self.subrays > 1:
             raise LidarError(
-                f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
-                "returns.divergence_mrad."
+                f"returns.subrays is {self.subrays}, but the beam divergence of the sensor is "
+                "unknown. Set returns.divergence_mrad."
             )
         if isinstance(divergence_mrad, Sequence):
             across, up = divergence_mrad
@@ -204,8 +205,8 @@ class Returns:
         sigma = hypot(self.length_ns(optics) / FWHM, response)
         if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
             raise LidarError(
-                f"returns.sample_ns is {self.sample_ns:g}, and the pulse is {FWHM * sigma:.3g} ns "
-                f"wide in the waveform: sample it twice at least, every {FWHM * sigma / 2:.3g} ns, "
-                "or give a longer pulse_ns."
+                f"returns.sample_ns must be at most {rounded(FWHM * sigma / 2)}, which is half of "
+                f"the pulse width in the waveform, but is {self.sample_ns:g}. Reduce it, or "
+                "increase pulse_ns."
             )
         return sigma

@@ -64,7 +64,7 @@ def _to_plain_data(value: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
         of_fields = {name: _to_plain_data(getattr(value, name), arrays) for name in names}
         return {"kind": type(value).__name__, **of_fields}
     if not isinstance(value, (str, int, float, type(None))):
-        raise TypeError("a class of a user's own, which no file describes")
+        raise TypeError("user-defined classes cannot be written to a file")
     return value
 
 

@@ -139,8 +139,8 @@ def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
     behind = 1 - ratio * ratio * (1 - cosine * cosine)
     if not (behind >= 0).all():
         raise LidarError(
-            "A prism reflects light back at its inner face, so that no ray leaves the sensor: "
-            "make its wedge or its index smaller."
+            "No ray leaves the sensor because of total internal reflection in a prism. Reduce its "
+            "wedge angle or its refractive index."
         )
     along_normal = np.sqrt(behind) - ratio * cosine
     refracted = ratio * rays

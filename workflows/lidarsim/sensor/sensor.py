@@ -96,7 +96,9 @@ class Sensor:
 
     def __post_init__(self) -> None:
         if not self.max_range_m > self.min_range_m:
-            raise LidarError(f"max_range_m is {self.max_range_m}; it must be above min_range_m.")
+            raise LidarError(
+                f"max_range_m must be greater than min_range_m, but is {self.max_range_m}."
+            )
 
     def _repr_html_(self) -> str:
         """Return the table of the main figures, and a picture if a package draws sensors."""
@@ -146,7 +148,7 @@ class Sensor:
             If the sensor has no packets.
         """
         if self.packets is None:
-            raise LidarError(f"{self.model} has no packets: leave packets out.")
+            raise LidarError(f"{self.model} has no packet format. Remove packets.")
         packets = replace(
             self.packets,
             ports={**self.packets.ports, **ports},
@@ -207,8 +209,8 @@ class Sensor:
         """
         if layers > 1 and vertical_fov_deg == 0:
             raise LidarError(
-                f"vertical_fov_deg is 0 with {layers:,} layers, which would be the same: give one "
-                "layer, or a field of view above 0."
+                f"vertical_fov_deg is 0, so all {layers:,} layers would be identical. Set layers "
+                "to 1, or increase vertical_fov_deg."
             )
         head = Spin(rays_per_revolution, step_deg, rate_hz)
         if horizontal_fov_deg != 360:

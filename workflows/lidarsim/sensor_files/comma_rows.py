@@ -21,8 +21,8 @@ def rows_of(text: str, skip: int, columns: int) -> Floats:
         raise ValueError(f"it has no lines of {columns} numbers")
     rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skip, ndmin=2)
     if rows.shape[1] != columns:
-        raise ValueError(f"it needs lines of {columns} numbers")
+        raise ValueError(f"its lines must have {columns} numbers")
     bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
     if len(bad):
-        raise ValueError(f"line {bad[0] + skip + 1} has numbers that are not finite")
+        raise ValueError(f"line {bad[0] + skip + 1} contains NaN or infinity")
     return rows

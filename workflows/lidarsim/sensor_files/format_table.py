@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 PROPERTIES = {
     "times": "times of the rays",
     "channels": "channels",
-    "origins": "starts of the rays beside the sensor's centre",
-    "min_range": "shortest range",
-    "max_range": "longest range",
-    "rate": "frames a second",
-    "divergence": "width of the beams",
-    "returns": "returns of a pulse",
+    "origins": "ray origins outside the sensor's center",
+    "min_range": "minimum range",
+    "max_range": "maximum range",
+    "rate": "frame rate",
+    "divergence": "beam divergence",
+    "returns": "returns per pulse",
     "noise": "noise",
 }
 
@@ -79,7 +79,7 @@ class SensorFormat:
         Raises LidarError if a package that the module needs is not installed.
         """
         for package in self.packages:
-            need(package, self.extra, f"Sensors as {self.name} are written and read")
+            need(package, self.extra, f"Sensors in the format {self.name} are read and written")
         return getattr(import_module(self.module), name)
 
 
@@ -180,18 +180,18 @@ def format_of(path: Path, name: str | None) -> SensorFormat:
     if name is not None and name not in _BY_NAME:
         names = ", ".join(_BY_NAME)
         raise LidarError(
-            f"Sensors are not written as {name!r}.{did_you_mean(name, [*_BY_NAME])} "
-            f"Formats: {names}."
+            f"Unknown sensor format {name!r}.{did_you_mean(name, [*_BY_NAME])} The formats are "
+            f"{names}."
         )
     if name is None:
         row = next((row for row in FORMATS if row.by_ending and ending in row.endings), None)
         if row is None:
-            raise LidarError(f"{path} has no ending of a file of a sensor. {_choices(ending)}")
+            raise LidarError(f"The extension of {path} is not a sensor format. {_choices(ending)}")
         return row
     row = _BY_NAME[name]
     if ending not in row.endings:
         expected = " or ".join(row.endings)
-        raise LidarError(f"{path} does not end in {expected}, as files of {name} do.")
+        raise LidarError(f"{path} must end in {expected} for the format {name}.")
     return row
 
 
@@ -199,9 +199,11 @@ def _choices(ending: str) -> str:
     """Return a sentence on the formats of an ending, or on all endings."""
     names = [row.name for row in FORMATS if ending in row.endings]
     if names:
-        return f"Say which format it is: {' or '.join(f'--as {name}' for name in names)}."
+        return f"Select a format with {' or '.join(f'--as {name}' for name in names)}."
     endings = dict.fromkeys(ending for row in FORMATS for ending in row.endings)
-    return f"Endings are {', '.join(endings)}; .png draws the beams."
+    return (
+        f"The supported extensions are {', '.join(endings)}, and .png for a picture of the beams."
+    )
 
 
 def read_rays(path: Path) -> FiredRays | None:

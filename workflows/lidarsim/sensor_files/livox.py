@@ -62,7 +62,7 @@ def rays_of_text(text: str) -> FiredRays:
     times_s, azimuths_deg, zeniths_deg = rows_of(text, 1, 3).T
     backward_rows = np.flatnonzero(np.diff(times_s) < 0)
     if len(backward_rows):
-        raise ValueError(f"times go back in line {backward_rows[0] + 3}")
+        raise ValueError(f"times decrease in line {backward_rows[0] + 3}")
     directions = directions_of(azimuths_deg, 90 - zeniths_deg)
     if times_s[-1] == times_s[0] or (np.diff(times_s) == 1).all():
         return FiredRays(directions)

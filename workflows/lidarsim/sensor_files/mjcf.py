@@ -29,8 +29,8 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     """
     if len(rays) > MAX_SITES:
         raise LidarError(
-            f"{path} would have {len(rays):,} sites with rangefinders; at most {MAX_SITES:,} are "
-            "written. Give fewer seconds, or write an .npz for MuJoCo-LiDAR, format mujoco."
+            f"{path} would have {len(rays):,} rangefinder sites, but the limit is {MAX_SITES:,}. "
+            "Reduce seconds, or write an .npz for MuJoCo-LiDAR (format mujoco)."
         )
     max_range_m = rays.range_m[1]
     cutoff = f' cutoff="{max_range_m!r}"' if isfinite(max_range_m) else ""

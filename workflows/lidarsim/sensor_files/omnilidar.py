@@ -37,8 +37,8 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     """
     if rays.rate_hz != round(rays.rate_hz) or rays.rate_hz < MIN_RATE_HZ:
         raise LidarError(
-            f"{rays.name} makes {rays.rate_hz:.6g} scans a second, and OmniLidar's scanRateBaseHz "
-            "is a whole number: give another rate."
+            f"{rays.name} has {rays.rate_hz:.6g} scans per second, but scanRateBaseHz of OmniLidar "
+            "must be a whole number. Use a different rate."
         )
     frames = _frames(rays)
     lines = [
@@ -92,14 +92,17 @@ def _frames(rays: FiredRays) -> list[Ints]:
     assert rays.times_ns is not None and rays.cycle_ns is not None  # of timed rays
     count = max(round(rays.cycle_ns * rays.rate_hz / 1e9), 1)
     if count > MAX_STATES:
-        raise LidarError(f"OmniLidar has at most {MAX_STATES} emitter states, not {count:,}.")
+        raise LidarError(
+            f"OmniLidar supports at most {MAX_STATES} emitter states, but the pattern requires "
+            f"{count:,}."
+        )
     starts_ns = np.rint(np.arange(1, count) * (1e9 / rays.rate_hz))
     frames = np.split(np.arange(len(rays)), np.searchsorted(rays.times_ns, starts_ns))
     sizes = [len(frame) for frame in frames]
     if len(set(sizes)) > 1:
         raise LidarError(
-            f"{rays.name} fires {min(sizes):,} to {max(sizes):,} rays in a scan, and all emitter "
-            "states of OmniLidar have the same number: give one revolution."
+            f"{rays.name} fires {min(sizes):,} to {max(sizes):,} rays per scan, but all emitter "
+            "states of OmniLidar must have the same number. Write a single revolution."
         )
     return frames
 

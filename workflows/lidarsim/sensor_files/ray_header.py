@@ -95,12 +95,12 @@ def rays_of(columns: Mapping[str, Any], header: Mapping[str, Any]) -> FiredRays:
     """
     lengths = {name: np.shape(values) for name, values in columns.items()}
     if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
-        raise ValueError("its columns must have a number for each ray, and the same length")
+        raise ValueError("its columns must have the same length, with one number for each ray")
     for name, values in columns.items():
         check_numbers(name, values.dtype)
         bad = np.flatnonzero(~np.isfinite(np.asarray(values, np.float64)))
         if len(bad):
-            raise ValueError(f"{name} of ray {bad[0] + 1} is not finite")
+            raise ValueError(f"{name} of ray {bad[0] + 1} is NaN or infinite")
     directions = _directions(columns)
     if not len(directions):
         raise ValueError("it has no rays")
@@ -142,7 +142,7 @@ def check_names(kind: str, names: Iterable[str], known: Sequence[str]) -> None:
     """
     if unknown := [name for name in names if name not in known]:
         shown = ", ".join(map(printable, unknown[:5]))
-        raise ValueError(f"it has {kind} that are not known: {shown}. Known: {', '.join(known)}")
+        raise ValueError(f"it has unknown {kind}: {shown}. The known names are {', '.join(known)}")
 
 
 def check_numbers(name: str, dtype: np.dtype[Any]) -> None:
@@ -154,7 +154,7 @@ def check_numbers(name: str, dtype: np.dtype[Any]) -> None:
 def not_numbers(name: str, kind: object) -> ValueError:
     """Return the error of a column without real numbers."""
     shown = printable(str(kind), 60)
-    return ValueError(f"its column {name} has the type {shown}; real numbers are expected")
+    return ValueError(f"its column {name} must contain real numbers, but has the type {shown}")
 
 
 def check_times(rays: FiredRays) -> None:
@@ -164,11 +164,14 @@ def check_times(rays: FiredRays) -> None:
         return
     backward_rays = np.flatnonzero(np.diff(times_ns) < 0)
     if len(backward_rays):
-        raise ValueError(f"times go back at ray {backward_rays[0] + 2}")
+        raise ValueError(f"times decrease at ray {backward_rays[0] + 2}")
     if times_ns[0] < 0:
-        raise ValueError(f"its first time is {times_ns[0]} ns; times are counted from 0 on")
+        raise ValueError(f"its first time must be 0 ns or later, but is {times_ns[0]} ns")
     if rays.cycle_ns is not None and rays.cycle_ns < times_ns[-1]:
-        raise ValueError(f"cycle_ns is {rays.cycle_ns:.15g}, before the last ray: {times_ns[-1]}")
+        raise ValueError(
+            f"cycle_ns must not be before the last ray ({times_ns[-1]}), but is "
+            f"{rays.cycle_ns:.15g}"
+        )
 
 
 def _directions(columns: Mapping[str, Any]) -> Floats:
@@ -189,9 +192,11 @@ def _directions(columns: Mapping[str, Any]) -> Floats:
     if "azimuth_deg" in columns and "elevation_deg" in columns:
         elevations = np.asarray(columns["elevation_deg"], np.float64)
         if len(elevations) and np.abs(elevations).max() > 90 + 1e-9:
-            raise ValueError("elevation_deg goes beyond 90 degrees")
+            raise ValueError("elevation_deg must be between -90 and 90 degrees")
         return directions_of(np.asarray(columns["azimuth_deg"], np.float64), elevations)
-    raise ValueError("it needs azimuth_deg and elevation_deg, or direction_x, _y and _z")
+    raise ValueError(
+        "it requires azimuth_deg and elevation_deg, or direction_x, direction_y and direction_z"
+    )
 
 
 def _number(header: Mapping[str, Any], name: str) -> float:
@@ -201,7 +206,7 @@ def _number(header: Mapping[str, Any], name: str) -> float:
     """
     value = header[name]
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < inf:
-        raise ValueError(f"{name} of its header is {_shown(value)}; a number from 0 on is expected")
+        raise ValueError(f"{name} of its header must be 0 or greater, but is {_shown(value)}")
     return float(value)
 
 
@@ -217,5 +222,5 @@ def _positive(header: Mapping[str, Any], name: str, default: float | None = None
     """
     value = header.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < inf:
-        raise ValueError(f"{name} of its header is {_shown(value)}; a number above 0 is expected")
+        raise ValueError(f"{name} of its header must be greater than 0, but is {_shown(value)}")
     return float(value)

@@ -84,7 +84,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         with np.load(path, allow_pickle=False) as content:
             arrays = {name: content[name] for name in content.files}
     except BadZipFile as error:
-        raise ValueError(f"it is no .npz, or it is damaged ({error})") from error
+        raise ValueError(f"it is not a valid .npz file ({error})") from error
     for name, array in arrays.items():
         if name != HEADER:
             check_numbers(name, array.dtype)

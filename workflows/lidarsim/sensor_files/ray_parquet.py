@@ -62,7 +62,7 @@ def read(path: Path) -> FiredRays | None:
             allowance.take(_bytes_of(content.metadata))
             table = content.read()
     except pa.ArrowException as error:
-        raise ValueError(f"it is not a table of Parquet: {message_of(error)}") from error
+        raise ValueError(f"it is not a Parquet file: {message_of(error)}") from error
     header = parsed_header((schema.metadata or {}).get(_HEADER, b"{}"))
     return rays_of({name: table[name].to_numpy() for name in table.column_names}, header)
 

@@ -81,7 +81,7 @@ def read(path: Path) -> FiredRays | None:
     check_names("arrays", arrays, _NAMES)
     matrices = arrays["rays"]
     if matrices.shape[1:] != (3, 4):
-        raise ValueError(f"rays has the shape {matrices.shape}; (n, 3, 4) is expected")
+        raise ValueError(f"rays must have the shape (n, 3, 4), but has {matrices.shape}")
     vectors = np.asarray(matrices[:, :, 2:], np.float64).reshape(-1, 6)
     names = chain.from_iterable(zip(DIRECTION, ORIGIN, strict=True))
     columns = dict(zip(names, vectors.T, strict=True))
@@ -92,7 +92,7 @@ def read(path: Path) -> FiredRays | None:
     if "ranges" in arrays:
         ranges = np.asarray(arrays["ranges"], np.float64)
         if ranges.shape[-1:] != (2,) or not ranges.size:
-            raise ValueError(f"ranges has the shape {ranges.shape}; (n, 2) is expected")
+            raise ValueError(f"ranges must have the shape (n, 2), but has {ranges.shape}")
         longest_m = float(ranges[..., 1].max())
         header["min_range_m"] = float(ranges[..., 0].min())
         header["max_range_m"] = None if longest_m == inf else longest_m

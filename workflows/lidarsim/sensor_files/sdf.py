@@ -20,7 +20,7 @@ from .fired_rays import AXES, FiredRays
 
 _SLACK_DEG = 1e-4  # from the even spacing
 _SAME_DEG = 1e-6  # angles nearer than this are equal
-_ADVICE = "Formats livox, npz and csv hold any rays."
+_ADVICE = "The formats livox, npz and csv support any rays."
 
 
 class _Angles(NamedTuple):
@@ -94,9 +94,9 @@ def _grid(rays: FiredRays) -> tuple[_Angles, _Angles]:
     expected = len(azimuths.angles_deg) * len(elevations.angles_deg)
     if len(pairs) != expected:
         raise LidarError(
-            f"{rays.name} is no regular grid, as <gpu_lidar> is: its {len(pairs):,} rays have "
-            f"{len(azimuths.angles_deg):,} azimuths and {len(elevations.angles_deg):,} elevations, "
-            "because channels fire at different azimuths, or the pattern has no rows. "
+            f"{rays.name} is not a regular grid, which <gpu_lidar> requires. Its {len(pairs):,} "
+            f"rays have {len(azimuths.angles_deg):,} azimuths and {len(elevations.angles_deg):,} "
+            "elevations, because channels fire at different azimuths or the pattern has no rows. "
             f"{_ADVICE}"
         )
     vertical = _even(rays.name, "elevations", elevations.angles_deg)
@@ -138,7 +138,7 @@ def _even(name: str, words: str, angles_deg: Floats) -> _Angles:
     if np.abs(even_deg - angles_deg).max() > _SLACK_DEG:
         steps = np.diff(angles_deg)
         raise LidarError(
-            f"{name} is no regular grid, as <gpu_lidar> is: neighbouring {words} are "
+            f"{name} is not a regular grid, which <gpu_lidar> requires. Neighboring {words} are "
             f"{steps.min():.4g} to {steps.max():.4g} degrees apart. {_ADVICE}"
         )
     return _Angles(float(angles_deg[0]), float(angles_deg[-1]), count)

@@ -83,8 +83,8 @@ def poses_of_bodies(poses: Any, count: int, times_s: ArrayLike | None) -> BodyPo
         check_matrices(table)
         return BodyPoses(table[:, :3, 3], table[:, :3, :3], (None,) * count)
     raise LidarError(
-        f"poses is {shown(poses)} of the shape {table.shape}; it must be a list of Pose, positions "
-        "(k, 3), or matrices (k, 4, 4)."
+        "poses must be a list of Pose, positions (k, 3) or matrices (k, 4, 4), but is "
+        f"{shown(poses)} of the shape {table.shape}."
     )
 
 
@@ -130,7 +130,7 @@ def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPos
     if times.ndim != 1 or table.shape[1:] != (len(times), 4, 4):
         raise LidarError(
             f"With times_s of the shape {times.shape}, poses must be matrices (k, samples, 4, 4) "
-            f"at times (samples,); their shape is {table.shape}."
+            f"at times (samples,), but has the shape {table.shape}."
         )
     _check_count(len(table), count)
     with prefixed("poses, of all bodies in turn"):
@@ -153,7 +153,9 @@ def _check_count(poses: int, names: int) -> None:
     Raises LidarError if not.
     """
     if poses != names:
-        raise LidarError(f"There are {names} names and {poses} poses: give a pose for each name.")
+        raise LidarError(
+            f"There are {names} names, but {poses} poses. Pass one pose for each name."
+        )
 
 
 def _check_finite(table: Floats) -> None:
@@ -164,4 +166,4 @@ def _check_finite(table: Floats) -> None:
     finite = np.isfinite(table).reshape(len(table), -1).all(axis=1)
     if not finite.all():
         first = int(finite.argmin())
-        raise LidarError(f"Pose {first} is not finite (poses are counted from 0).")
+        raise LidarError(f"Pose {first} (counted from 0) is not finite.")

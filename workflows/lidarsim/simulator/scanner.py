@@ -118,7 +118,7 @@ class Scanner:
     ) -> None:
         if name and isinstance(sensor, Mounted):
             raise LidarError(
-                f"name is {name!r}, and a Mounted sensor has a name of its own: give it there, "
+                f"The name of a Mounted sensor is set in Mounted, but name is {name!r}. Use "
                 f"Mounted(sensor, name={name!r})."
             )
         mounted = sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)
@@ -256,9 +256,9 @@ class Scanner:
             begin_ns, end_ns = _span_ns(rig, specs)
             if end_ns > path.duration_ns:
                 raise LidarError(
-                    f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and "
-                    f"the trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier "
-                    "(start_s), or take a longer one."
+                    f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, but "
+                    f"the trajectory lasts {path.duration_ns / 1e9:.6g} s. Reduce start_s, or use "
+                    "a longer trajectory."
                 )
             try:
                 check_trajectory(path)
@@ -384,8 +384,8 @@ class Scanner:
         moving = np.flatnonzero(is_instance & poses.moves)
         if len(moving):
             raise LidarError(
-                f"{names[moving[0]]!r} is a SceneInstance, which stands still during a sweep: give "
-                "a pose, or make it an Actor."
+                f"{names[moving[0]]!r} is a SceneInstance, which is stationary during a sweep. "
+                "Pass a single pose, or make it an Actor."
             )
         actors = [
             (number - object_count, poses.trajectory(row))
@@ -417,7 +417,7 @@ class Scanner:
             self._refuse_name(names[row], int(numbers[row]))
         if len(set(names)) < len(names):
             double = next(name for row, name in enumerate(names) if name in names[:row])
-            raise LidarError(f"{double!r} is among the names twice: give each body one pose.")
+            raise LidarError(f"names contains {double!r} twice. Pass one pose for each body.")
         return numbers
 
     def _refuse_name(self, name: str, number: int) -> NoReturn:
@@ -432,8 +432,8 @@ class Scanner:
         ]
         hint = name_hint(name, names)
         if number >= 0:
-            hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
-        raise LidarError(f"There is no actor or instance {name!r}.{hint}")
+            hint = " It is part of the static scene. Make it an Actor or a SceneInstance."
+        raise LidarError(f"Unknown actor or instance {name!r}.{hint}")
 
     def _with_moved(self, moves: list[tuple[int, Trajectory]]) -> list[Actor]:
         """Return all actors, some of them, by index, on new trajectories.
@@ -506,7 +506,7 @@ class Scanner:
         sensor = rig.survey.sensor
         specs = self._revolution(sensor, number)
         if specs[-1].scan >= MAX_SCANS:
-            raise LidarError(f"number is {number}; scans are counted up to {MAX_SCANS:,}.")
+            raise LidarError(f"number must be at most {MAX_SCANS:,}, but is {number}.")
         late_ns = (
             0 if start_s is None else round(start_s * 1e9 - sensor.revolution_start_ns(number))
         )
@@ -575,6 +575,6 @@ def _poses_of(poses: Any) -> tuple[Floats, Floats | None]:
             raise LidarError("The last row of each matrix of poses must be 0, 0, 0, 1.")
         return table[:, :3, 3], table[:, :3, :3]
     raise LidarError(
-        f"poses is {shown(poses)} of the shape {table.shape}; it must be a list of Pose, positions "
-        "(k, 3), or matrices (k, 4, 4)."
+        "poses must be a list of Pose, positions (k, 3) or matrices (k, 4, 4), but is "
+        f"{shown(poses)} of the shape {table.shape}."
     )

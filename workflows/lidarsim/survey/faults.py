@@ -15,7 +15,7 @@ from ..base.declared import AngleDeg, MinMax, Several, Text, Two, UnitShare, abo
 from ..base.errors import LidarError, prefixed
 from ..base.random_numbers import Purpose, uniform
 from ..base.validation import checked_fields, without_numpy
-from ..base.words import did_you_mean
+from ..base.words import did_you_mean, joined
 from ..sensor.sensor import Sensor
 
 PACKET = Purpose(61, "whether a packet is lost")
@@ -72,11 +72,15 @@ class Fault:
         present = self.words().keys() - {"kind", "from_s", "to_s", "sensor"}
         optional = {name for name in kind_fields if name.endswith("_deg")}
         for name in sorted((present ^ {*kind_fields}) - optional):
-            advice = f"leave {name} out" if name in present else f"give {name}"
-            takes = f"takes {', '.join(kind_fields)}" if kind_fields else "has times only"
-            raise LidarError(f"{self.kind} {takes}: {advice}.")
+            advice = f"Remove {name}" if name in present else f"Set {name}"
+            takes = (
+                f"takes {joined([*kind_fields])}" if kind_fields else "takes only from_s and to_s"
+            )
+            raise LidarError(f"A fault of kind {self.kind!r} {takes}. {advice}.")
         if self.to_s is not None and self.to_s <= self.from_s:
-            raise LidarError(f"to_s is {self.to_s:g}; give more than from_s, {self.from_s:g}.")
+            raise LidarError(
+                f"to_s must be greater than from_s ({self.from_s:g}), but is {self.to_s:g}."
+            )
 
     def words(self) -> dict[str, Any]:
         """Return the fields that are not None, for labels: {field: value}."""
@@ -127,21 +131,23 @@ def _check_fault(fault: Fault, sensors: Mapping[str, Sensor], duration_s: float)
     """Check that a fault fits the sensors {name: sensor} and the duration of a survey."""
     faulty = [sensor for name, sensor in sensors.items() if fault.sensor in (None, name)]
     if not faulty:
-        advice = " Leave it out."
+        advice = " The survey has a single unnamed sensor. Remove sensor."
         if any(sensors):
-            advice = f" There are {', '.join(sensors)}."
+            advice = f" Available sensors: {', '.join(sensors)}."
         hint = did_you_mean(str(fault.sensor), sensors) or advice
-        raise LidarError(f"there is no sensor {fault.sensor!r}.{hint}")
+        raise LidarError(f"Unknown sensor {fault.sensor!r}.{hint}")
     first_firing = np.zeros(1, np.int64)
     starts_ns = [sensor.begins_ns(first_firing)[0] + sensor.lead_ns for sensor in faulty]
     if fault.kind == "frozen" and fault.from_s <= max(starts_ns) / 1e9:
-        raise LidarError("a frozen sensor repeats a sweep: give a later from_s.")
+        raise LidarError(
+            "A frozen sensor repeats its previous sweep, so from_s must be after the first sweep."
+        )
     if fault.from_s > duration_s:
         raise LidarError(
-            f"from_s is {fault.from_s:g}, and the survey lasts {duration_s:.6g} s: make "
-            "from_s smaller."
+            f"from_s must be less than the duration of the survey ({duration_s:.6g} s), but is "
+            f"{fault.from_s:g}."
         )
     channels = min(sensor.channels for sensor in faulty)
     highest = max(fault.channels or (0,))
     if highest >= channels:
-        raise LidarError(f"there is no channel {highest}, but 0 to {channels - 1}.")
+        raise LidarError(f"Channel {highest} does not exist. The channels are 0 to {channels - 1}.")

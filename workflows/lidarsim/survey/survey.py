@@ -22,7 +22,7 @@ from ..base.signatures import ReadableSignature
 from ..base.validation import checked_fields
 from ..base.value_texts import shown
 from ..base.vocabulary import OF_THE_WORLD, WORLD_EPSG
-from ..base.words import listed, plural, rounded, scans_in_words
+from ..base.words import joined, listed, plural, rounded, scans_in_words
 from ..columns.table import (
     COORDINATES,
     OPTIONAL,
@@ -349,10 +349,10 @@ class Survey(CloudOptions, Weather):
         """
         if self.trajectory is None:
             if not self.poses:
-                raise LidarError("A survey needs at least one pose to scan from.")
+                raise LidarError("A survey requires at least one pose.")
             return Stations(tuple(self.poses))
         if self.poses and self.trajectory != Stations(tuple(self.poses)):
-            raise LidarError("A survey has either poses or a trajectory, not both.")
+            raise LidarError("poses and a trajectory cannot be combined.")
         return self.trajectory
 
     def _check_names(self) -> None:
@@ -360,8 +360,8 @@ class Survey(CloudOptions, Weather):
         names = [carried.name for carried in self.sensors]
         if len(names) > MAX_SENSORS or len({*names}) < len(names):
             raise LidarError(
-                f"A survey has at most {MAX_SENSORS} sensors, each with a name of its own; given: "
-                f"{', '.join(names[:10])}."
+                f"A survey supports at most {MAX_SENSORS} sensors, each with a unique name. "
+                f"The names are {joined(names[:10])}."
             )
 
     def _check_values(self) -> None:
@@ -372,8 +372,8 @@ class Survey(CloudOptions, Weather):
             check_navigation(self.navigation, self.path, self.epsg)
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
             raise LidarError(
-                f"start is {self.start}; it must be a time from 2017 on, with its time zone: "
-                "2026-11-21T10:00:00Z."
+                "start must be a time from 2017 on with its time zone, such as "
+                f"2026-11-21T10:00:00Z, but is {self.start}."
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
             returns.divergence(carried.sensor.optics)  # LidarError for sub-rays without divergence
@@ -383,9 +383,7 @@ class Survey(CloudOptions, Weather):
             if noise.crosstalk:
                 self._check_crosstalk(number)
         if self.spray_g_m3 and not self.wet:
-            raise LidarError(
-                "spray_g_m3 is of wheels on wet ground, and none is: give wet as well, 0 to 1."
-            )
+            raise LidarError("spray_g_m3 requires wet ground. Set wet to a value above 0.")
         if self.rain_mm_h or self.snow_mm_h or self.dust_mg_m3 or self.spray_g_m3:
             for number in range(len(self.carried)):
                 self._check_air(number)
@@ -397,31 +395,32 @@ class Survey(CloudOptions, Weather):
             min_samples = ceil(WINDOW_SIGMAS * sigma_ns / returns.sample_ns) + 2
             if 0 < self.waveform_samples < min_samples:
                 raise LidarError(
-                    f"waveform_samples is {self.waveform_samples}, and one echo takes "
-                    f"{min_samples} samples of {returns.sample_ns:g} ns: record as many at least."
+                    f"waveform_samples must be at least {min_samples}, the number of samples of "
+                    f"{returns.sample_ns:g} ns in one echo, but is {self.waveform_samples}."
                 )
         if self.waveform_samples and abs(returns.sample_ns * 1000 % 1 - 0.5) < 0.5 - 1e-6:
             raise LidarError(
-                f"returns.sample_ns is {returns.sample_ns:g}, and LAS records whole "
-                f"picoseconds: with waveform_samples, give {round(returns.sample_ns, 3):g}."
+                f"returns.sample_ns is {returns.sample_ns:g}, but LAS stores sample times in whole "
+                f"picoseconds. Set it to {round(returns.sample_ns, 3):g} to record "
+                "waveform_samples."
             )
 
     def _check_crosstalk(self, number: int) -> None:
         """Check that the survey has several sensors, with a greatest range and a divergence."""
         if len(self.carried) == 1:
             raise LidarError(
-                "noise.crosstalk needs several sensors, and this survey has one: give sensors."
+                "noise.crosstalk requires at least two sensors, but this survey has one."
             )
         for carried in self.carried:
             if not carried.sensor.max_range_m < float("inf"):
                 raise LidarError(
-                    f"noise.crosstalk needs sensors with a greatest range, and {carried.name} has "
-                    "none: give its max_range_m."
+                    f"noise.crosstalk requires a maximum range, but {carried.name} has none. Set "
+                    "its max_range_m."
                 )
         if not self.returns_each[number].divergence(self.carried[number].sensor.optics):
             raise LidarError(
-                "noise.crosstalk needs a field of view as wide as the beam, and "
-                f"{self.carried[number].name} has no divergence: give returns.divergence_mrad."
+                f"noise.crosstalk requires the beam divergence, but {self.carried[number].name} "
+                "has none. Set returns.divergence_mrad."
             )
 
     def _check_air(self, number: int) -> None:
@@ -430,23 +429,24 @@ class Survey(CloudOptions, Weather):
         sensor = carried.sensor
         name = f" of {carried.name}" if carried.name else ""
         if self.noise_each[number].detection_range_m is None:
-            missing = "is not given" if carried.noise is None else "its data sheet does not state"
-            guess = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
+            missing = "is not set" if carried.noise is None else "is not in its data sheet"
+            guess_m = sensor.max_range_m / 2 if sensor.max_range_m < np.inf else 100
+            guess = f"{float(f'{guess_m:.3g}'):g}"  # never 1e+03, which YAML reads as text
             raise LidarError(
-                f"Returns from rain, snow, spray or dust need noise.detection_range_m{name}, "
-                f"the range at 10 % reflectance, which {missing}: write what is known of it, or "
-                f"half of the sensor's range, noise: {{detection_range_m: {guess:.3g}}}."
+                f"Returns from rain, snow, spray or dust require noise.detection_range_m{name}, "
+                f"the range at 10 % reflectance, which {missing}. Set it, or use half of the "
+                f"maximum range of the sensor: `noise: {{detection_range_m: {guess}}}`."
             )
         divergences = (self.returns_each[number].divergence_mrad, sensor.optics.divergence_mrad)
         if (self.particles or self.spray_g_m3) and divergences == (None, None):
             raise LidarError(
-                f"Rain, snow and spray need the width of the beam{name}: give "
+                f"Rain, snow and spray require the beam divergence{name}. Set "
                 "returns.divergence_mrad."
             )
         if (particle_count := self.mean_particles(number)) > MAX_PARTICLES:
             raise LidarError(
-                f"A pulse{name} would return from {particle_count:,.0f} drops or flakes, more than "
-                f"{MAX_PARTICLES}: make rain_mm_h, snow_mm_h or noise.detection_range_m smaller."
+                f"A pulse{name} would return from {particle_count:,.0f} drops or flakes, but the "
+                f"limit is {MAX_PARTICLES}. Reduce rain_mm_h, snow_mm_h or noise.detection_range_m."
             )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
@@ -455,21 +455,21 @@ class Survey(CloudOptions, Weather):
         available_s = self.path.duration_ns / 1e9
         if needed_s > available_s:
             raise LidarError(
-                f"steps {steps} take until {needed_s:.6g} s and the trajectory lasts "
-                f"{available_s:.6g} s, {needed_s - available_s:.6g} s less: take fewer steps, or "
-                "leave them out for as many as it lasts."
+                f"{steps} steps end at {needed_s:.6g} s, which is {needed_s - available_s:.6g} s "
+                f"after the end of the trajectory ({available_s:.6g} s). Reduce steps, or omit it "
+                "to use the whole trajectory."
             )
         first, stop = sensor.firings(0)
         if (rays := (stop - first) * sensor.channels) > MAX_RAYS:
             raise LidarError(
-                f"A scan would have {rays:,} rays, more than {MAX_RAYS:,}: make step_deg smaller, "
-                "or take fewer rays."
+                f"A scan would have {rays:,} rays, but the limit is {MAX_RAYS:,}. Reduce step_deg "
+                "or the number of rays."
             )
         duration_ns = firing_start_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
         if not duration_ns < MAX_DURATION_NS:
             raise LidarError(
-                f"The survey would last {rounded(duration_ns / 1e9)} s, and times are counted in "
-                "nanoseconds for 292 years: make rate_hz larger, or start_s or steps smaller."
+                f"The survey would last {rounded(duration_ns / 1e9)} s, but times in nanoseconds "
+                "are limited to 292 years. Increase rate_hz, or reduce start_s or steps."
             )
 
     @cached_property
@@ -541,15 +541,15 @@ class Survey(CloudOptions, Weather):
             counts.append(bisect_right(candidates, self.path.duration_ns, key=end_ns))
             if counts[-1] > MAX_STEPS:
                 raise LidarError(
-                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and "
-                    f"{MAX_STEPS:,} time steps of the sensor, the limit of a survey, take "
-                    f"{end_ns(MAX_STEPS) / 1e9:.6g} s: give duration_s or steps for a part of it, "
-                    "or a larger step_deg."
+                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, but a survey is "
+                    f"limited to {MAX_STEPS:,} time steps, which take "
+                    f"{end_ns(MAX_STEPS) / 1e9:.6g} s. Set duration_s or steps to use a part of "
+                    "it, or increase step_deg."
                 )
             if not counts[-1]:
                 raise LidarError(
-                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, and one time step "
-                    f"of the sensor takes until {end_ns(1) / 1e9:.6g} s."
+                    f"The trajectory lasts {self.path.duration_ns / 1e9:.6g} s, but the first time "
+                    f"step of the sensor ends at {end_ns(1) / 1e9:.6g} s. Use a longer trajectory."
                 )
         return tuple(counts)
 
@@ -693,20 +693,23 @@ def _check_noise(noise: Noise, sensor: Sensor) -> None:
     channels = sensor.channels
     if isinstance(biases, Sequence) and len(biases) != channels:
         raise LidarError(
-            f"noise.channel_bias_m has {len(biases)} numbers; {sensor.model} needs {channels}: "
-            "give one for each channel, or their standard deviation."
+            f"noise.channel_bias_m must have one value for each of the {channels} channels of "
+            f"{sensor.model}, or be their standard deviation, but has {len(biases)} values."
         )
     if noise.ripple_deg and sensor.spins(np.zeros(1, np.int64)) is None:
-        raise LidarError(f"noise.ripple_deg needs a head that turns, unlike {sensor.model}'s.")
+        raise LidarError(
+            "noise.ripple_deg requires a sensor with a rotating head, but the head of "
+            f"{sensor.model} does not rotate."
+        )
     if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
         raise LidarError(
-            f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "
-            "none: give max_range_m."
+            f"noise.false_alarm_hz requires a maximum range, but {sensor.model} has none. Set "
+            "max_range_m."
         )
     if noise.false_alarm_hz and (mean := noise.false_alarm_hz * sensor.gate_s) > MAX_ALARMS:
         raise LidarError(
-            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which are {rounded(mean)} false "
-            f"alarms of each pulse; {MAX_ALARMS} are possible: make it or max_range_m smaller."
+            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which causes {rounded(mean)} false "
+            f"alarms per pulse, but the limit is {MAX_ALARMS}. Reduce it, or reduce max_range_m."
         )
 
 
@@ -726,5 +729,7 @@ def _poses(poses: Sequence[Any]) -> tuple[Pose, ...]:
     Raises LidarError if they are not a list of poses.
     """
     if isinstance(poses, str) or not isinstance(poses, Iterable):
-        raise LidarError(f"poses is {shown(poses)}; it must be a list of poses: [(0, 0, 1)].")
+        raise LidarError(
+            f"poses must be a list of poses, such as [(0, 0, 1)], but is {shown(poses)}."
+        )
     return tuple(pose_of("poses", pose) for pose in poses)

@@ -123,8 +123,8 @@ def fired_of(sweeps: Sweeps) -> FiredRays:
     """
     if sweeps.fired is None:
         raise LidarError(
-            "Range images and organized clouds need every return of a survey: run it with "
-            "keep_every 1 and the column ray. Of a Sensor class of your own they are written with "
-            "the run only (output.write, Result.report)."
+            "Range images and organized clouds require all returns of a survey. Run it with "
+            "keep_every 1 and the column ray. With a custom Sensor class, they can only be "
+            "written during the run (output.write, Result.report)."
         )
     return sweeps.fired

@@ -34,8 +34,8 @@ from .sweep_motion import STILL, FiringPoses, knots_of, poses_at
 
 SWEEPS_FILE = "sweeps.npz"
 MIXED_UP = (
-    "The points are not in the order of their scans, or of another survey than the sweeps "
-    f"({SWEEPS_FILE}): give both of one run, and keep the order."
+    "The points are not in scan order, or come from a different survey than the "
+    f"sweeps ({SWEEPS_FILE}). Use both from one run, and keep the order."
 )
 # Descriptions of the frame of points in files.
 COMPENSATED = "points in the sensor's axes at the start of the sweep: motion is compensated"
@@ -546,7 +546,7 @@ class Sweeps:
         with open_archive(path, read) as arrays:
             values = json.loads(arrays["words"].tobytes())
             if values["format"] != _FORMAT:
-                raise ValueError(f"it is of format {values['format']}, not {_FORMAT}")
+                raise ValueError(f"its format is {values['format']}, but {_FORMAT} is required")
             values |= {name: tuple(values[name]) for name in ("sensors", "objects", "actors")}
             pose, mounts, actor_poses = (
                 SweepPoses(arrays[f"{prefix}positions"], arrays[f"{prefix}quaternions"])

@@ -115,8 +115,8 @@ class Follower:
         """Scanner of a world that moves during a sweep, whose bodies are actors."""
         if not self._static:
             raise LidarError(
-                "Nothing stands in the world: `step` needs at least one static mesh, such as a "
-                "ground."
+                "The world contains nothing stationary. `step` requires at least one static mesh, "
+                "such as a ground."
             )
         actors = [Actor(mesh) for mesh in self._bodies]
         scene = Scene.from_meshes(self._static).with_actors(actors)
@@ -289,6 +289,7 @@ def _matrices(values: ArrayLike, count: int | None) -> Floats:
         raise LidarError(f"Matrices must be numbers of the shape (k, 4, 4): {error}.") from error
     if count is not None and len(matrices) != count:
         raise LidarError(
-            f"There are {len(matrices)} matrices; expected {count}, one for each body."
+            f"There are {len(matrices)} matrices, but {count} bodies. Pass one matrix for each "
+            "body."
         )
     return matrices

@@ -77,7 +77,7 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) 
             return GeomMesh((cube.vertices - [0, 0, 1]) * size, cube.faces)
         case GeomType.MESH | GeomType.SDF:
             return _mesh(model, int(model.geom_dataid[geom]))
-    raise LidarError(f"Geom {geom} is of type {kind}, which is none of {[*GeomType]}.")
+    raise LidarError(f"Geom {geom} has the unknown type {kind}. The known types are {[*GeomType]}.")
 
 
 def segments(radius: float, sag_m: float) -> int:

@@ -79,7 +79,7 @@ class MujocoScanner:
         **options: Any,
     ) -> None:
         if (body is None) == (site is None):
-            raise LidarError("Give the body or the site of the lidar: body=NAME or site=NAME.")
+            raise LidarError("Set the body or the site of the lidar with body=NAME or site=NAME.")
         self._kind = "body" if site is None else "site"
         names = body if site is None else site
         self._is_single = isinstance(names, str | int)
@@ -91,9 +91,9 @@ class MujocoScanner:
         if self._kind == "site":
             carriers = np.asarray(model.site_bodyid)[self._frames]
         if objects not in ("body", "geom"):
-            raise LidarError(f'objects is {objects!r}; expected "body" or "geom".')
+            raise LidarError(f"objects must be 'body' or 'geom', but is {objects!r}.")
         if not sag_m > 0:
-            raise LidarError(f"sag_m is {sag_m}; it must be above 0.")
+            raise LidarError(f"sag_m must be above 0, but is {sag_m}.")
         excluded_bodies, excluded_geoms = excluded(model, exclude)
         # The world, body 0, cannot carry a lidar that would not see it.
         unseen = [*excluded_bodies, *(carrier for carrier in carriers.tolist() if carrier)]
@@ -103,7 +103,9 @@ class MujocoScanner:
         bodies = bodies_of(model, choice)
         self._bodies: Indices = np.array([item.body for item in bodies.moving], np.intp)
         if not bodies.static and not bodies.moving:
-            raise LidarError(f"The lidar sees no geom of the groups {tuple(groups)} of the model.")
+            raise LidarError(
+                f"None of the geoms in the model belongs to the groups {tuple(groups)}."
+            )
         self.follower = Follower(
             [item.mesh for item in bodies.moving],
             sensor,
@@ -168,8 +170,8 @@ class MujocoScanner:
         """
         if len(self._frames) != 1:
             raise LidarError(
-                f"There are {len(self._frames)} lidars: `sweep` and `step` are for a single body "
-                "or site; make a scanner for each, or use `ranges`."
+                f"There are {len(self._frames)} lidars, but `sweep` and `step` require a single "
+                "body or site. Create a scanner for each, or use `ranges`."
             )
         return np.asarray(self._poses(data)[0])
 

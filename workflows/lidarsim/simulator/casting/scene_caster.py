@@ -32,7 +32,7 @@ from .static_bodies import StaticBodies, largest_range_m, mesh_of
 from .surfaces import Surfaces
 from .visibility import static_key, unseen_objects
 
-AUTO_TAKES = "Backend 'auto' takes one that works."
+AUTO_TAKES = "The backend 'auto' selects one that is available."
 _MAX_ROOM_RAYS = 1 << 18  # rays that are stored for casts on static bodies and on actors: 13 MB
 _NEVER_NS = np.array([np.inf, -np.inf])  # first and last time of an actor that is never present
 REACHED = 1e-3  # share of a distance: a ray that ends this close before a point reaches the point
@@ -73,8 +73,8 @@ def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
     with deferred_interrupts():
         backends = {"auto": "", **available_backends()}
     if backend not in backends:
-        hint = did_you_mean(backend, backends) or f" There are {', '.join(backends)}."
-        raise LidarError(f"There is no backend {backend!r}.{hint}")
+        hint = did_you_mean(backend, backends) or f" Available backends: {', '.join(backends)}."
+        raise LidarError(f"Unknown backend {backend!r}.{hint}")
     if backends[backend]:
         raise LidarError(f"Backend {backend!r} cannot be used here: {backends[backend]}. {advice}")
 

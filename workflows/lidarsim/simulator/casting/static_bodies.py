@@ -45,8 +45,8 @@ def warn_of_reach(scene: Scene, survey: Survey) -> None:
     reach_m = _half_side(scene.bounds)
     if reach_m > MAX_REACH_M and _is_short(range_m):
         _log.warning(
-            "the scene is %s km wide, and the sensor measures up to %.6g m: what is more than %s "
-            "km from the sensor is left out, so that casting stays fast; no point is lost",
+            "the scene is %s km wide, but the sensor measures up to %.6g m. Objects more than %s "
+            "km from the sensor are excluded to speed up ray casting. No points are lost.",
             f"{2 * reach_m / 1e3:,.0f}",
             range_m,
             f"{(2 * range_m + MARGIN_M) / 1e3:.3g}",

@@ -65,8 +65,8 @@ def warn_of_grey(scene: Scene, survey: Survey) -> None:
     """Warn if a survey takes colours for reflectance, and the scene has no colours."""
     if not scene.coloured and any(m.reflectance == "texture" for m in survey.materials):
         _log.warning(
-            "a material has reflectance: texture, but nothing in the scene has colours, so that "
-            "all is grey; in Python, Scene.load(path, colours=True) reads them"
+            "a material has reflectance: texture, but the scene has no colors, so all surfaces "
+            "are gray. In Python, read colors with Scene.load(path, colours=True)"
         )
 
 

@@ -242,8 +242,8 @@ class BatchPoints:
             extent_m = np.abs(scaled).max() * self.survey.precision_m
             step = self.survey.precision_m
             raise LidarError(
-                f"precision_m {step} is too fine for points {extent_m:.0f} m from the "
-                f"origin: use at least {extent_m / 2e9:.2g}."
+                f"precision_m is {step}, which is too fine for points {extent_m:.0f} m from the "
+                f"origin. Use at least {extent_m / 2e9:.2g}."
             ) from None
         return cells
 

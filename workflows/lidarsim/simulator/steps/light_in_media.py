@@ -198,8 +198,8 @@ class Media:
             if not closed[number]:
                 raise LidarError(
                     f"materials: {surfaces.triangle_kinds.material_kinds.describe(number)} has a "
-                    "leaf_area_density, but its surface has gaps: give a closed one, such as a box "
-                    "or a sphere."
+                    "leaf_area_density, but its surface has gaps. Use a closed surface, such as a "
+                    "box or a sphere."
                 )
         # Boxes that may put sensors within media. A surface of water that is an open sheet has
         # water below at any depth; an actor that holds a medium may be anywhere.

@@ -308,7 +308,7 @@ class PulseStep(ABC):
 
     def __init_subclass__(cls) -> None:
         if not getattr(cls, "role", None):
-            raise TypeError(f"step {cls.__name__} states no role: set `role` to flags of `Role`")
+            raise TypeError(f"step {cls.__name__} has no role. Set `role` to flags of `Role`")
 
     def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
         self.setup = setup

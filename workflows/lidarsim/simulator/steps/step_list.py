@@ -102,9 +102,9 @@ def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> No
     >>> remove_step(Dimmer)
     """
     if step in STEPS:
-        raise ValueError(f"step {step.__name__} is among the steps already")
+        raise ValueError(f"step {step.__name__} has already been added")
     if Role.FRAME in step.role:
-        raise ValueError(f"step {step.__name__} of {Role.FRAME} cannot be added: set other roles")
+        raise ValueError(f"step {step.__name__} with {Role.FRAME} cannot be added. Set other roles")
     if before is None:
         before = next((following for role, following in _POSITIONS if role in step.role), None)
     position = len(STEPS) if before is None else STEPS.index(before)
@@ -115,7 +115,9 @@ def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> No
                 f"{last.__name__}"
             )
     if Role.AIMS in step.role and position > STEPS.index(CastStep):
-        raise ValueError(f"step {step.__name__} of {Role.AIMS} must be before {CastStep.__name__}")
+        raise ValueError(
+            f"step {step.__name__} with {Role.AIMS} must be before {CastStep.__name__}"
+        )
     STEPS.insert(position, step)
 
 
