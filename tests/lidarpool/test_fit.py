@@ -291,6 +291,15 @@ def test_a_slow_sensor_is_refused_with_its_speed(block):
     assert speed == pytest.approx(0.3, rel=0.15)
 
 
+@pytest.mark.extended
+def test_a_sensor_that_creeps_is_refused_with_its_speed(block):
+    """Steps of 4 mm: no two sweeps are far enough apart, but all of them together show it."""
+    with pytest.raises(LidarError, match="is of a sensor that moves") as raised:
+        fit(drive(block, 1.8, 0.004, sweeps=12))
+    speed = float(str(raised.value).partition("(")[2].partition(" m/s")[0])
+    assert speed == pytest.approx(0.08, rel=0.1)
+
+
 @pytest.mark.slow
 def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
     stands = drive(block, 1.8, 0.0)

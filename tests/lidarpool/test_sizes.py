@@ -117,8 +117,11 @@ def test_a_data_set_of_parquet_is_limited_by_its_files(tmp_path, strict):
     assert "\n" not in str(caught.value)
 
 
-def mcap(chunk, stated_bytes, compression=b"zstd", is_indexed=False):
-    """A bag of a chunk, which an attachment hides if only the index names it."""
+def mcap(chunk, stated_bytes, compression=b"zstd", is_indexed=False, index_bytes=None):
+    """A bag of a chunk, which an attachment hides if only the index names it.
+
+    `index_bytes` is the length of the chunk that the index states, if it is not the right one.
+    """
 
     def record(kind, content):
         return bytes([kind]) + struct.pack("<Q", len(content)) + content
@@ -127,7 +130,7 @@ def mcap(chunk, stated_bytes, compression=b"zstd", is_indexed=False):
     head = struct.pack("<QQQI", 0, 0, stated_bytes, 0) + name + struct.pack("<Q", len(chunk))
     start = b"\x89MCAP0\r\n" + record(1, struct.pack("<I", 4) + b"ros2" + bytes(4))
     index = struct.pack("<QQQQIQ", 0, 0, len(start), 9 + len(head) + len(chunk), 0, 0)
-    index += name + struct.pack("<QQ", len(chunk), stated_bytes)
+    index += name + struct.pack("<QQ", index_bytes or len(chunk), stated_bytes)
     content = start + record(9 if is_indexed else 6, head + chunk)
     summary = len(content)
     content += record(8, index) + record(2, struct.pack("<QQI", summary, 0, 0))
@@ -147,6 +150,15 @@ def test_chunks_of_mcap_unpack_to_no_more_than_the_file_allows(
         path = tmp_path / "zeros.mcap"
         path.write_bytes(mcap(packed, stated_bytes, is_indexed=is_indexed))
         assert "would unpack to 9.54 MiB or more, of at most" in refused(open_recording, path)
+
+
+def test_a_chunk_that_ends_after_the_file_is_searched_in_the_file_alone(tmp_path):
+    zstandard = pytest.importorskip("zstandard", reason="zstandard is an extra")
+    pytest.importorskip("rosbags", reason="rosbags is an extra")
+    packed = zstandard.compress(bytes(100))
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(mcap(packed[:-3], 100, is_indexed=True, index_bytes=1 << 60))
+    refused(open_recording, path)
 
 
 def test_bags_that_are_packed_as_a_whole_are_limited(tmp_path, strict):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -159,6 +161,26 @@ def _is_running(pid):
         return Path(f"/proc/{pid}/stat").read_text().split(") ")[1][0] != "Z"
     except FileNotFoundError:
         return False
+
+
+def test_the_process_stops_reading_when_many_bytes_wait():
+    """So that a producer that is ahead of time waits, and memory is bounded."""
+    body = bytes(1 << 20)
+    due_ns = time.monotonic_ns() + 3600 * 10**9
+    route = b'{"host": "127.0.0.1", "ports": {}, "source": ""}'
+    record = sender_process.HEADER.pack(sender_process.DATAGRAM, 0, 1, 0, len(body), due_ns) + body
+    command = [sys.executable, sender_process.__file__]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        header = sender_process.HEADER.pack(sender_process.ROUTE, 0, 0, 0, len(route), 0)
+        process.stdin.write(header + route)
+        process.stdin.flush()
+        os.set_blocking(process.stdin.fileno(), False)
+        written = 0
+        while written < 300 << 20 and select.select([], [process.stdin], [], 2)[1]:
+            with suppress(BlockingIOError):
+                written += os.write(process.stdin.fileno(), record[written % len(record) :])
+        process.kill()
+    assert 256 << 20 <= written < 258 << 20
 
 
 def test_the_process_imports_nothing_that_takes_time_to_start():
