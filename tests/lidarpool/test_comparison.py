@@ -67,7 +67,7 @@ RANGES = room(AZIMUTH)
 
 def of_image(a, b, **options):
     found = compare(a, b, **options)
-    return found.figures["range_image"]
+    return found.figures["ranges"]
 
 
 # -- closed forms ---------------------------------------------------------------------------------
@@ -75,7 +75,7 @@ def of_image(a, b, **options):
 
 def test_an_offset_is_the_residual_of_each_ring():
     found = compare(cloud(RANGES + 0.05), cloud())
-    image = found.figures["range_image"]
+    image = found.figures["ranges"]
     assert (len(image["rings"]), image["columns"]) == (RINGS, COLUMNS)
     assert image["azimuth_step_deg"] == pytest.approx(0.5, abs=1e-6)
     for told in (image["residual"], *image["rings"]):
@@ -160,7 +160,7 @@ def test_distances_between_parallel_planes():
     score = compare(a, half, distances_m=[0.05]).figures["distances"]["f_scores"][0]
     assert (score["precision"], score["recall"]) == (0.5, 1.0)
     assert score["f1"] == pytest.approx(2 / 3)
-    assert told["range_image"] is None and "cloud A has no sweeps" in told["notes"][0]
+    assert told["ranges"] is None and "cloud A has no sweeps" in told["notes"][0]
 
 
 # -- cells ----------------------------------------------------------------------------------------
@@ -211,7 +211,7 @@ def test_the_first_of_several_returns_counts():
 )
 def test_rings_are_matched_whatever_their_numbers(numbers, note):
     found = compare(cloud(RANGES + 0.05, rings=numbers), cloud())
-    image = found.figures["range_image"]
+    image = found.figures["ranges"]
     assert [ring["ring"] for ring in image["rings"]] == list(range(RINGS))[::-1]
     assert image["residual"]["mad_m"] < 2e-6 and image["residual"]["cells"] == CELLS
     assert [text for text in found.figures["notes"] if text.startswith(note)]
@@ -226,16 +226,24 @@ def test_what_has_no_range_image_says_why():
         (
             replace(made, columns=ringless),
             made,
-            "cloud A has no rings: the range image needs a column ring or channel",
+            "cloud A has no column with rings, such as ring or channel",
         ),
-        (made, replace(made, positions=made.positions + 30), "not cones around zero"),
-        (made, replace(made, positions=made.positions + far), "cloud B are 5,423 km from zero"),
+        (
+            made,
+            replace(made, positions=made.positions + 30),
+            "elevation angles within the rings of cloud B vary",
+        ),
+        (
+            made,
+            replace(made, positions=made.positions + far),
+            "cloud B are 5,423 km from the origin",
+        ),
         (made, replace(made, positions=made.positions * [1, 1, 9]), "not of the same sensor"),
         (whole, whole, "cloud A has no sweeps: all points are compared at once in world"),
         (made, whole, "cloud B has no sweeps"),
     ):
         found = compare(a, b).figures
-        assert found["range_image"] is None and found["distances"]["a_to_b"]["points"] == CELLS
+        assert found["ranges"] is None and found["distances"]["a_to_b"]["points"] == CELLS
         assert any(says in note for note in found["notes"]), found["notes"]
 
 
@@ -243,9 +251,9 @@ def test_of_many_points_and_cells_some_are_compared(monkeypatch):
     monkeypatch.setattr(two_clouds, "MAX_VALUES", 2000)
     rng = np.random.default_rng(5)
     found = compare(cloud(RANGES + rng.normal(0, 0.02, RANGES.shape)), cloud()).figures
-    assert found["range_image"]["residual"]["cells"] == 2000
-    assert found["range_image"]["no_return"]["returns_in_both"] == CELLS
-    assert found["range_image"]["residual"]["rmse_m"] == pytest.approx(0.02, rel=0.07)
+    assert found["ranges"]["residual"]["cells"] == 2000
+    assert found["ranges"]["no_return"]["returns_in_both"] == CELLS
+    assert found["ranges"]["residual"]["rmse_m"] == pytest.approx(0.02, rel=0.07)
     assert "2,000 points and cells" in found["notes"][0]
     whole = Cloud(cloud().positions, {})
     thin = compare(whole, whole, most_points=3000).figures
@@ -306,7 +314,7 @@ def written(tmp_path_factory):
 def test_sweeps_of_each_format_are_those_of_the_result(written, name):
     folder, made, _ = written
     found = compare(folder / name, folder).figures
-    image = found["range_image"]
+    image = found["ranges"]
     assert found["pairs"] == 3 and found["a"]["sweeps"] == 3 and not found["notes"]
     assert image["no_return"]["returns_in_both"] == found["b"]["points"] == len(made)
     assert image["no_return"]["in_both"] == 0
@@ -444,7 +452,7 @@ def test_names_and_places_of_other_programs(tmp_path):
     file = PointCloud.from_points(arrays, fields, [one.dtype for one in arrays])
     file.save(tmp_path / "turn.pcd")
     found = compare(tmp_path / "turn.pcd", tmp_path, intensity_a="signal", intensity_b="signal")
-    assert found.figures["range_image"]["no_return"]["returns_in_both"] == CELLS
+    assert found.figures["ranges"]["no_return"]["returns_in_both"] == CELLS
     assert found.figures["intensity"]["rank_correlation"] == pytest.approx(1)
     with pytest.raises(LidarError, match=r"no column 'signl'.* Did you mean 'signal'\?"):
         compare(tmp_path, tmp_path, intensity_a="signl")
@@ -456,13 +464,17 @@ def test_a_thinned_result_has_no_lost_returns(written, tmp_path):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     (tmp_path / "report.json").write_text(json.dumps({"parameters": {"keep_every": 5}}))
     found = compare(tmp_path, folder).figures
-    assert found["range_image"]["no_return"] is None and "one of 5 hits" in found["notes"][0]
+    assert found["ranges"]["no_return"] is None and "one of 5 hits" in found["notes"][0]
     assert "one of 5 hits" in repr(compare(tmp_path, folder))
 
 
+@pytest.mark.parametrize("scans_in_rings", [True, False])
 @pytest.mark.parametrize("told", ["time", "ray", "neither"])
-def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
-    """A carrier that moves sees one cell by several rays; two returns of a ray are told apart."""
+def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told, scans_in_rings):
+    """A moving platform sees one cell by several rays, and airborne scanners have no rings.
+
+    Two returns of a ray are told apart.
+    """
     rng = np.random.default_rng(2)
     speed = 8.0
     track = lidarpool.Track([0, 1], [[0, 0, 1], [speed, 0, 1]])
@@ -471,7 +483,10 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
     ray = np.repeat(np.arange(360 * LAYERS), 2)  # two returns each
     firing, channel = np.divmod(ray, LAYERS)
     ranges = 10 + 20 * rng.integers(0, 2, len(ray) // 2)[:, None] + [0, 5]  # posts before walls
-    way = directions(firing, np.linspace(-30, 30, LAYERS)[channel])
+    elevation = np.linspace(-30, 30, LAYERS)[channel]
+    if not scans_in_rings:
+        elevation = 40 * np.sin(np.radians(7 * firing))
+    way = directions(firing, elevation)
     start = np.array([0, 0, 1]) + firing[:, None] / 360 * [0.1 * speed, 0, 0]
     columns = {"scan": firing // 10, "channel": channel, "object": 0 * ray, "intensity": 0.0 * ray}
     if told != "neither":
@@ -486,10 +501,23 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
         save_cloud(made, tmp_path / name / "cloud.ply")
         sweeps.save(tmp_path / name / "sweeps.npz")
     found = compare(tmp_path / "a", tmp_path / "b")
-    image = found.figures["range_image"]
-    assert found.figures["pairs"] == 1 and found.figures["notes"] == []
-    assert image["paired_by"] == ("cells" if told == "neither" else "rays")
-    assert f" {image['paired_by']} of 16 rings" in repr(found)
+    image = found.figures["ranges"]
+    assert found.figures["pairs"] == 1 and found.figures["pictured"] == (0, 0)
+    assert len(found.save(tmp_path / "page")) == (6 if scans_in_rings else 4)
+    if not scans_in_rings:
+        (note,) = found.figures["notes"]
+        assert "1 pair of sweeps cannot be shown as range images" in note
+        assert ("run both with `cloud: {columns: [time]}`" in note) == (told == "neither")
+        if told == "neither":
+            assert image is None
+            return
+        lost = image["no_return"]
+        assert lost["in_both"] is None and image["rings"] == []
+        assert f"no return {lost['in_a_only']:,} in A only, 0 in B only\n" in repr(found)
+    else:
+        assert found.figures["notes"] == []
+        assert image["paired_by"] == ("cells" if told == "neither" else "rays")
+        assert f" {image['paired_by']} of 16 rings" in repr(found)
     if told == "neither":
         assert image["residual"]["rmse_m"] > 0.5
         return
@@ -563,7 +591,7 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
     save_cloud(noisy, folder / "cloud.ply")
     ONE_SWEEP.save(folder / "sweeps.npz")
     found = lidarpool.compare(folder, cloud(light=light))
-    assert found.figures["range_image"]["residual"]["cells"] == np.count_nonzero(there)
+    assert found.figures["ranges"]["residual"]["cells"] == np.count_nonzero(there)
     names = [path.name for path in found.save(tmp_path / "out")]
     assert sorted(names) == sorted(path.name for path in (tmp_path / "out").iterdir())
     assert {"compare.json", "compare.html", "compare-ranges.png", "compare-above.png"} <= {*names}

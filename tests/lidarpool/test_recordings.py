@@ -294,7 +294,7 @@ def test_sweeps_of_bags_have_the_times_of_their_headers(tmp_path):
     np.testing.assert_allclose([*open_recording(live).times()], expected_ns, rtol=0, atol=512)
     found = compare(live, offline, match="time").figures
     assert found["pairs"] == SWEEPS
-    assert found["range_image"]["residual"]["rmse_m"] < 1e-6
+    assert found["ranges"]["residual"]["rmse_m"] < 1e-6
 
 
 def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):

@@ -317,7 +317,7 @@ def test_fields_of_several_numbers_and_of_the_same_name():
     with pytest.raises(ValueError, match="its field 'n' has 4,000,000,000 numbers from byte 12 on"):
         point_columns(point_cloud(rows, [*axes, ("n", 12, 7, 4_000_000_000)]))
     for datatype, count in ((0, 1), (9, 1), (7, 0)):
-        says = f"its field 'n' has datatype {datatype} and count {count}, but a PointField has datatypes"
+        says = f"its field 'n' has datatype {datatype} and count {count}, but a PointField has"
         with pytest.raises(ValueError, match=says):
             point_columns(point_cloud(rows, [*axes, ("n", 12, datatype, count)]))
 

@@ -31,7 +31,7 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
     done = lidarpool("compare", surveys / "noisy", surveys / "clean", "--out", out)
     assert (done.code, done.err) == (0, "")
     figures = json.loads((out / "compare.json").read_text())
-    image = figures["range_image"]
+    image = figures["ranges"]
     told = image["residual"]
     assert told["cells"] == figures["a"]["points"]  # each return is in its cell
     assert figures["intensity"]["rank_correlation"] > 0.999
@@ -48,7 +48,7 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
     )
     again = json.loads(printed.out)
     assert printed.code == 0 and again == json.loads((out / "compare.json").read_text())
-    assert again["pairs"] == 1 and again["range_image"]["residual"]["rmse_m"] == 0
+    assert again["pairs"] == 1 and again["ranges"]["residual"]["rmse_m"] == 0
     assert [one["distance_m"] for one in again["distances"]["f_scores"]] == [0.3]
 
 

@@ -203,7 +203,7 @@ def _show_image(axes: Axes, images: RangeImages, colours: AnyArray) -> None:
 
 def draw_rings(comparison: Comparison) -> Page:
     """Draw residuals and lost returns of each ring, and a histogram of all residuals."""
-    image = comparison.figures["range_image"]
+    image = comparison.figures["ranges"]
     rings = [ring for ring in image["rings"] if ring["cells"]]
     page = Page((WIDTH, 760))
     page.title("Residuals by ring", f"A − B in {image['residual']['cells']:,} {image['paired_by']}")
@@ -335,7 +335,9 @@ def draw_above(comparison: Comparison) -> Page:
     """Draw both clouds from above, coloured by the distance between the clouds."""
     height = 830
     page = Page((WIDTH, height))
-    page.title("From above", "the nearest neighbour in the other cloud; the farthest on top")
+    pictured = comparison.figures["pictured"]
+    which = "" if pictured is None else f"sweep {pictured[0]} of A and sweep {pictured[1]} of B, "
+    page.title("From above", f"{which}colored by the distance to the nearest point of the other")
     measured = comparison.measured_points
     lower = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points, _ in measured], axis=0)
     upper = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points, _ in measured], axis=0)
@@ -381,7 +383,7 @@ def _scatter_points(page: Page, axes: Axes, cloud: MeasuredPoints, scale: LogNor
 
 def _residual_limit(comparison: Comparison) -> float:
     """Return the end of the scale of residuals, millimetres."""
-    residual = comparison.figures["range_image"]["residual"]
+    residual = comparison.figures["ranges"]["residual"]
     if not residual["cells"]:
         return 1
     return max(1000 * (abs(residual["median_m"]) + RESIDUAL_SCALE * residual["mad_m"]), 0.1)

@@ -85,12 +85,12 @@ class _PolarSweep:
         around zero, or the points are too far away.
         """
         if sweep.rings is None:
-            raise LidarError(f"{name} has no rings: the range image needs a column ring or channel")
+            raise LidarError(f"{name} has no column with rings, such as ring or channel")
         ranges = np.linalg.norm(sweep.points, axis=1)
         if np.median(ranges) > _MAX_RANGE_M:
             raise LidarError(
-                f"the points of {name} are {np.median(ranges) / 1000:,.0f} km from zero, and the "
-                "range image needs points in the sensor's axes: these are in the world's axes"
+                f"the points of {name} are {np.median(ranges) / 1000:,.0f} km from the origin, so "
+                "they are in world coordinates instead of the sensor frame"
             )
         x, y, z = sweep.points.T
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
@@ -104,9 +104,9 @@ class _PolarSweep:
         )
         if np.median(upper - lower) > max(_TILT_DEG, _spacing(middle) / 2):
             raise LidarError(
-                f"{name} has rings that are not cones around zero, and the range image needs "
-                "cones: its points are in the world's axes, or of several poses, or its sensor has "
-                "no rings, as a Livox"
+                f"the elevation angles within the rings of {name} vary: either the sensor does not "
+                "scan in rings, like airborne and Livox sensors, or the points are not in the "
+                "sensor frame"
             )
         azimuth = np.degrees(np.arctan2(y, x)) % 360
         return cls(
@@ -262,34 +262,46 @@ def _common_phases(
     return _CommonPhases(step, middle, middle)
 
 
-def paired_images(
-    a: RecordedPoints, b: RecordedPoints, names: tuple[str, str], azimuth_deg: float | None = None
-) -> RangeImages:
-    """Pair the ranges of each ray of two sweeps with the same rays.
+class RayPairs(NamedTuple):
+    """Returns of two sweeps with the same rays, paired ray by ray.
 
-    Pulses that look into the same cell are often not of the same ray where the sensor moves. The
-    images and errors are as for `range_images`.
+    Where the sensor moves, pulses in the same cell of two range images are often different rays.
     """
+
+    values: Floats  # (2, 2, k): range and intensity in A and in B, NaN without a return
+    points: Floats  # (k, 3): positions in A, or in B without a return in A, meters
+    rings: Ints  # (k,)
+
+
+def pair_rays(a: RecordedPoints, b: RecordedPoints) -> RayPairs:
+    """Pair the returns of two sweeps with the same rays."""
     assert a.rays is not None and b.rays is not None and a.rings is not None and b.rings is not None
-    polar_a = _PolarSweep.from_points(a, names[0])
-    polar_b = _PolarSweep.from_points(b, names[1])
-    _common_rings(polar_a, polar_b, names)  # refuses another sensor
     _, first, ray = np.unique(np.append(a.rays, b.rays), return_index=True, return_inverse=True)
-    values = np.full((2, 3, len(first) + 1), np.nan)  # the last column is of no ray
+    values = np.full((2, 2, len(first)), np.nan)
     for index, sweep, columns in ((0, a, ray[: len(a)]), (1, b, ray[len(a) :])):
         values[index, 0, columns] = np.linalg.norm(sweep.points, axis=1)
         values[index, 1, columns] = np.nan if sweep.intensities is None else sweep.intensities
     points = np.concatenate([a.points, b.points])[first]
-    rings = np.append(a.rings, b.rings)[first]
-    ray_index = np.arange(len(first), dtype=np.float64)
-    all_rays = RecordedPoints(points, rings, intensities=ray_index)
+    return RayPairs(values, points, np.append(a.rings, b.rings)[first])
+
+
+def images_of_rays(
+    pairs: RayPairs, names: tuple[str, str], azimuth_deg: float | None = None
+) -> RangeImages:
+    """Put paired rays into cells, as `range_images` does with sweeps.
+
+    Each cell shows one of its rays. Raises the same errors as `range_images`.
+    """
+    ray_index = np.arange(len(pairs.rings), dtype=np.float64)
+    all_rays = RecordedPoints(pairs.points, pairs.rings, intensities=ray_index)
     images = range_images(all_rays, all_rays, names, azimuth_deg)
     ray_of_cell = np.nan_to_num(images.images[0, 1], nan=-1).astype(int)
+    values = np.pad(pairs.values, ((0, 0), (0, 0), (0, 1)), constant_values=np.nan)  # -1: no ray
     return replace(
         images,
         images=values[..., ray_of_cell],
-        cell_rows=(rings[:, None] == images.rings).argmax(axis=1),
-        compared=values[:, :2, :-1],
+        cell_rows=(pairs.rings[:, None] == images.rings).argmax(axis=1),
+        compared=pairs.values,
         paired_by="rays",
     )
 

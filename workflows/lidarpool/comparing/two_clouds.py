@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,7 +26,7 @@ from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..recordings.opening import open_recording
 from .comparison import CELLS, RESIDUALS, Comparison, MeasuredPoints
-from .range_image import RangeImages, paired_images, range_images
+from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range_images
 
 MAX_POINTS = 10_000_000  # points of each cloud in memory
 
@@ -112,7 +113,8 @@ def compare(
         comparing.pairs = pairs
         budget = MAX_VALUES // len(pairs)
         for number_a, number_b in pairs:
-            comparing.add_sweeps(first.read_points(number_a), second.read_points(number_b), budget)
+            pair = first.read_points(number_a), second.read_points(number_b)
+            comparing.add_sweeps((number_a, number_b), *pair, budget)
         return comparing.result()
     cloud = first if first.is_cloud else second
     if sweeps or match == "time":
@@ -206,13 +208,18 @@ class _Comparing:
         self.notes = [note for recording in self.recordings for note in recording.notes]
         self.pairs: list[tuple[int, int]] = []  # numbers of sweeps; empty for whole clouds
         self.point_counts = np.zeros(2, np.int64)
-        self.images: RangeImages | None = None
+        self.images: RangeImages | None = None  # of the first pair that has any
+        self.pictured: tuple[int, int] | None = None  # pair of sweeps of `measured_points`
+        # {why pairs of sweeps have no range images: number of these pairs}
+        self.without_images: Counter[str] = Counter()
         self.measured_points: list[MeasuredPoints] = []
         self.cells: list[_CellPairs] = []
         # pairs from A, and from B
         self.nearest: tuple[list[_NearestPairs], list[_NearestPairs]] = ([], [])
         # {ring: its elevation, and the number of its cells in each state of `CELLS`}
         self.rings: dict[int, tuple[float, Ints]] = {}
+        # rays without range images in each state of `CELLS`; the first is unknown, and 0
+        self.ray_counts = np.zeros(4, np.int64)
 
     def note(self, text: str) -> None:
         """Add a note, unless the same note was added before."""
@@ -235,12 +242,15 @@ class _Comparing:
         )
         return RecordedPoints.joined(parts)
 
-    def add_sweeps(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+    def add_sweeps(
+        self, numbers: tuple[int, int], a: RecordedPoints, b: RecordedPoints, budget: int
+    ) -> None:
         """Compare two sweeps in the sensor frame, at most `budget` cells and points of each."""
         if max(len(a), len(b)) > budget:
             self.note(f"of each sweep, {budget:,} points and cells are compared, chosen evenly")
         if len(a) and len(b):
-            self._add_images(a, b, budget)
+            self.pictured = self.pictured or numbers
+            self._add_ranges(a, b, budget)
         else:
             self.note("pairs with an empty sweep are left out")
         self.add_points(a, b, budget)
@@ -261,29 +271,55 @@ class _Comparing:
             else:
                 pairs.append(_NearestPairs(distance, intensity, reference.intensities[index]))
 
-    def _add_images(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
-        """Compare the range images of two sweeps.
+    @property
+    def has_same_rays(self) -> bool:
+        """Whether A and B are known to have the same rays."""
+        first, second = self.recordings
+        return bool(first.firing_key) and first.firing_key == second.firing_key
 
-        Without range images, a note is added instead.
+    def _add_ranges(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+        """Compare the ranges of two sweeps, ray by ray if they have the same rays, else by cell.
+
+        Sweeps of the same rays need no range images. Without either, a note is added.
         """
         first, second = self.recordings
-        same_rays = first.firing_key and first.firing_key == second.firing_key
-        make_images = paired_images if same_rays else range_images
+        names = first.name, second.name
+        rays = pair_rays(a, b) if self.has_same_rays else None
+        images = None
         try:
-            images = make_images(a, b, (first.name, second.name), self.azimuth_deg)
+            if rays is None:
+                images = range_images(a, b, names, self.azimuth_deg)
+            else:
+                images = images_of_rays(rays, names, self.azimuth_deg)
         except LidarError as error:
-            self.note(f"no range image: {error}")
-            return
+            self.without_images[str(error)] += 1
+        if images is not None:
+            self._add_image_cells(images, budget)
+        elif rays is not None:
+            self._add_rays(rays, budget)
+
+    def _add_image_cells(self, images: RangeImages, budget: int) -> None:
+        """Compare the cells, or the rays, of the range images of two sweeps."""
         for note in images.notes:
             self.note(note)
         self.images = self.images or images
         in_a, in_b = np.isfinite(images.compared[:, 0])
         self._count_cells(images, in_a, in_b)
-        in_both = np.flatnonzero(in_a & in_b)
+        self._add_residuals(images.compared, images.rings[images.cell_rows], budget)
+
+    def _add_rays(self, rays: RayPairs, budget: int) -> None:
+        """Compare the rays of two sweeps that have no range images."""
+        in_a, in_b = np.isfinite(rays.values[:, 0])
+        states = in_b & ~in_a, in_a & ~in_b, in_a & in_b
+        self.ray_counts[1:] += [np.count_nonzero(state) for state in states]
+        self._add_residuals(rays.values, rays.rings, budget)
+
+    def _add_residuals(self, compared: Floats, rings: Ints, budget: int) -> None:
+        """Add `compared` (2, 2, k) ranges and intensities of rings (k,) where both have returns."""
+        in_both = np.flatnonzero(np.isfinite(compared[:, 0]).all(axis=0))
         in_both = in_both[even_indices(len(in_both), budget)]
-        (range_a, intensity_a), (range_b, intensity_b) = images.compared[..., in_both]
-        ring = images.rings[images.cell_rows[in_both]]
-        self.cells.append(_CellPairs(range_a - range_b, ring, intensity_a, intensity_b))
+        (range_a, intensity_a), (range_b, intensity_b) = compared[..., in_both]
+        self.cells.append(_CellPairs(range_a - range_b, rings[in_both], intensity_a, intensity_b))
 
     def _count_cells(self, images: RangeImages, in_a: Bools, in_b: Bools) -> None:
         """Add the cells of each ring to its states.
@@ -323,32 +359,35 @@ class _Comparing:
             _NearestPairs(*map(np.concatenate, zip(*pairs, strict=True))) for pairs in self.nearest
         )
         residuals = np.empty(0)
-        image_figures = None
+        range_figures = None
         paired_by = "nearest points"
         is_close = from_a.distance <= self.distances_m[0]
         intensity_a = from_a.intensity[is_close]
         intensity_b = from_a.nearest_intensity[is_close]
-        if self.images is not None:
+        if self.cells:
             cells = _CellPairs(*map(np.concatenate, zip(*self.cells, strict=True)))
             residuals = cells.residual
             intensity_a = cells.intensity_a
             intensity_b = cells.intensity_b
-            image_figures = self._image_figures(cells)
-            paired_by = self.images.paired_by
+            paired_by = "rays" if self.has_same_rays else "cells"
+            range_figures = self._range_figures(cells, paired_by)
         is_known = np.isfinite(intensity_a) & np.isfinite(intensity_b)
         intensities = intensity_a[is_known], intensity_b[is_known]
         figures: dict[str, Any] = {
             "versions": {"lidarpool": __version__},
             **self._source_figures(),
             "pairs": len(self.pairs),
-            "notes": self.notes + [note for r in self.recordings for note in r.left_out_notes],
-            "range_image": image_figures,
+            "pictured": self.pictured,
+            "notes": self.notes
+            + self._image_notes()
+            + [note for r in self.recordings for note in r.left_out_notes],
+            "ranges": range_figures,
             "intensity": self._intensity_figures(*intensities, paired_by),
             "distances": self._distance_figures(from_a.distance, from_b.distance),
         }
         distances = from_a.distance, from_b.distance
         return Comparison(
-            figures, self.images, residuals, distances, intensities, self.measured_points
+            figures, self._images(), residuals, distances, intensities, self.measured_points
         )
 
     def _source_figures(self) -> dict[str, Any]:
@@ -393,20 +432,44 @@ class _Comparing:
             "f_scores": f_scores,
         }
 
-    def _image_figures(self, cells: _CellPairs) -> dict[str, Any]:
-        """Return figures of the range images and of each ring, the highest first."""
-        images = self.images
-        assert images is not None
+    def _image_notes(self) -> list[str]:
+        """Return notes on pairs of sweeps without range images, and on what is compared then."""
+        instead = "Their ranges are compared ray by ray"
+        first, second = self.recordings
+        if not self.has_same_rays:
+            instead = "Their ranges are not compared"
+            if first.energies and second.energies and not (first.firing_key and second.firing_key):
+                instead += (
+                    ". To compare two results ray by ray, run both with `cloud: {columns: [time]}`"
+                )
+        return [
+            f"{plural(count, 'pair')} of sweeps cannot be shown as range images, because {reason}. "
+            f"{instead}"
+            for reason, count in self.without_images.items()
+        ]
+
+    def _images(self) -> RangeImages | None:
+        """Return the range images to show; None if any pair of sweeps is compared without them."""
+        return None if self.ray_counts.any() else self.images
+
+    def _range_figures(self, cells: _CellPairs, paired_by: str) -> dict[str, Any]:
+        """Return figures of all ranges, and of each ring of range images, the highest first."""
+        images = self._images()
         has_gaps = not any(recording.thinned for recording in self.recordings)
-        rings = sorted(self.rings.items(), key=lambda item: -item[1][0])
-        all_counts = sum(count for _, count in self.rings.values())
+        rings = sorted(self.rings.items(), key=lambda item: -item[1][0]) if images else []
+        all_counts = sum((count for _, count in self.rings.values()), self.ray_counts)
+        no_return = _no_return_figures(all_counts) if has_gaps else None
+        if no_return is not None and images is None:  # rays without any return are unknown
+            no_return |= dict.fromkeys(("in_both", "precision", "recall", "f1"))
         return {
-            "paired_by": images.paired_by,
-            "columns": images.ranges[0].shape[1],
-            "azimuth_step_deg": images.step_deg,
-            "hidden_points": dict(zip("ab", images.hidden_shares, strict=True)),
+            "paired_by": paired_by,
+            "columns": None if images is None else images.ranges[0].shape[1],
+            "azimuth_step_deg": None if images is None else images.step_deg,
+            "hidden_points": (
+                None if images is None else dict(zip("ab", images.hidden_shares, strict=True))
+            ),
             "residual": _residual_figures(cells.residual),
-            "no_return": _no_return_figures(all_counts) if has_gaps else None,
+            "no_return": no_return,
             "rings": [
                 {
                     "ring": ring,
