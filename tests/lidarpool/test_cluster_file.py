@@ -59,17 +59,20 @@ def test_partitions_that_grow_with_their_work(tmp_path):
 
 
 WRONG = {
-    "a list": ("[1]", "holds a list; a cluster file has"),
+    "a list": ("[1]", "contains a list. A cluster file has"),
     "a misspelt field": (
         GOOD.replace("arguments", "argument"),
         "Unknown field 'argument'. Did you mean 'arguments'?",
     ),
-    "no partitions": ("cluster: distributed.SSHCluster", "partitions is missing"),
+    "no partitions": ("cluster: distributed.SSHCluster", "partitions is required"),
     "a partition of others": (
         GOOD.replace("GPU", "GPUS"),
         "not a partition of a survey.*mean 'GPU'",
     ),
-    "workers": (GOOD.replace("workers: 5", "workers: many"), "partitions.OTHER.workers is 'many'"),
+    "workers": (
+        GOOD.replace("workers: 5", "workers: many"),
+        "partitions.OTHER.workers must be a whole number, but is 'many'",
+    ),
     "a swapped range": (
         GOOD.replace("workers: 5", "adapt: [8, 0]"),
         r"partitions.OTHER.adapt is \[8, 0\]: give the least and the greatest number",
@@ -82,7 +85,10 @@ WRONG = {
         GOOD.replace("workers: 5", "idle_s: 60"),
         "partitions.OTHER.idle_s needs adapt",
     ),
-    "no host": (GOOD.replace("[a, b], slots: 2", "[]"), "partitions.GPU.hosts is"),
+    "no host": (
+        GOOD.replace("[a, b], slots: 2", "[]"),
+        "partitions.GPU.hosts must have at least 1 item",
+    ),
     "no such package": (
         GOOD.replace("distributed.", "dask_jobqueues."),
         r"is not installed.*\.\[clusters\]",

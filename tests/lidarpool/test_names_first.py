@@ -32,10 +32,13 @@ def unread(monkeypatch):
 @pytest.mark.parametrize(
     ("sections", "message"),
     [
-        ({"sensor": {"model": "velodyne/vlp61"}}, "no sensor model .* Did you mean 'velodyne/vlp1"),
-        ({"sensors": {"a": {"model": "velodyne/vlp61"}}}, "no sensor model"),
+        (
+            {"sensor": {"model": "velodyne/vlp61"}},
+            "Unknown sensor model .* Did you mean 'velodyne/vlp1",
+        ),
+        ({"sensors": {"a": {"model": "velodyne/vlp61"}}}, "Unknown sensor model"),
         ({"sensor": {"calibration": "none.yaml"}}, "none.yaml.* does not exist"),
-        ({"output": {"write": ["lza"]}}, r"'lza' is not a format of clouds\. Did you mean 'laz'"),
+        ({"output": {"write": ["lza"]}}, r"Unknown cloud format 'lza'\. Did you mean 'laz'"),
     ],
 )
 def test_a_scenario(unread, sections, message):
@@ -45,7 +48,7 @@ def test_a_scenario(unread, sections, message):
 
 def test_models_of_fits_and_twins(unread, tmp_path):
     for call in (fit, twin):
-        with pytest.raises(LidarError, match="no sensor model 'velodyne/vlp61'"):
+        with pytest.raises(LidarError, match="Unknown sensor model 'velodyne/vlp61'"):
             call(tmp_path / "drive.mcap", model="velodyne/vlp61")
 
 

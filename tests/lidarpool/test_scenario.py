@@ -338,7 +338,7 @@ BAD = [
     ("sensor: {vertical_fov_deg: .nan}", r"must be a finite number, but is nan"),
     ("sensor: {model: velodyne/vlp61}", "Unknown sensor model .* Did you mean 'velodyne/vlp16'"),
     ("sensor: vlp61", "Unknown sensor model .* Did you mean 'vlp16'"),
-    ("mount: roof", r"mount must be x, y and z in metres, \[0, 0, 1\], or .*, but is 'roof'"),
+    ("mount: roof", r"mount must be x, y and z in meters, \[0, 0, 1\], or .*, but is 'roof'"),
     (
         "actors: [{name: A, box: [1, 1, 1], at: [1, 2]}]",
         r"actors\[0\]\.at\.position\[2\] is required",
@@ -349,7 +349,7 @@ BAD = [
     ),
     ("sensor: {model: ouster/os1-64, layers: 64}", "a model defines the beams: leave out layers"),
     ("sensor: [1]", r"sensor must be a mapping, but is \[1\]"),
-    ("poses: [0, 0, 1]", r"poses\[0\] must be x, y and z in metres.*, but is 0"),
+    ("poses: [0, 0, 1]", r"poses\[0\] must be x, y and z in meters.*, but is 0"),
     ("poses: [{position: [0, 0, 0], yaw: 5}]", r"'poses\[0\]\.yaw'.*'yaw_deg'"),
     ("poses: &a [*a]", r"s\.yaml, line 1: 'a' contains itself"),
     ("scene: {files: [{file: a.stl, unit: parsec}]}", r"unit must be 'um', .*, but is 'parsec'"),

@@ -84,7 +84,7 @@ def test_equal_rows_of_parquet_unpack_to_no_more_than_the_file_allows(
 ):
     path = tmp_path / "zeros.parquet"
     parquet(path, dict.fromkeys("xyz", np.zeros(1_000_000)), rows_per_group)
-    assert "would unpack to 22.89 MiB or more, of at most" in refused(open_recording, path)
+    assert "would unpack to at least 22.89 MiB, and the limit is" in refused(open_recording, path)
     rng = np.random.default_rng(0)
     parquet(path, {axis: rng.random(10_000) for axis in "xyz"}, rows_per_group)
     assert sum(map(len, points_in(path))) == 10_000
@@ -149,7 +149,9 @@ def test_chunks_of_mcap_unpack_to_no_more_than_the_file_allows(
         packed = compressor.compress(bytes(10_000_000))
         path = tmp_path / "zeros.mcap"
         path.write_bytes(mcap(packed, stated_bytes, is_indexed=is_indexed))
-        assert "would unpack to 9.54 MiB or more, of at most" in refused(open_recording, path)
+        assert "would unpack to at least 9.54 MiB, and the limit is" in refused(
+            open_recording, path
+        )
 
 
 def test_a_chunk_that_ends_after_the_file_is_searched_in_the_file_alone(tmp_path):
@@ -168,14 +170,14 @@ def test_bags_that_are_packed_as_a_whole_are_limited(tmp_path, strict):
     bag.mkdir()
     (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
     (bag / "a.db3.zstd").write_bytes(zstandard.compress(bytes(10_000_000)))
-    assert "would unpack to 9.54 MiB or more, of at most" in refused(open_recording, bag)
+    assert "would unpack to at least 9.54 MiB, and the limit is" in refused(open_recording, bag)
 
 
 def test_points_of_a_message_of_livox_are_not_more_than_its_bytes():
     """The number of points alone would take 80 GB."""
     header = b"\0\1\0\0" + bytes(8) + struct.pack("<I", 1) + bytes(4)
     message = header + bytes(8) + struct.pack("<III", 1, 0, 2**32 - 1) + bytes(100)
-    with pytest.raises(ValueError, match="points announced, and there are fewer"):
+    with pytest.raises(ValueError, match="points were expected, but there are fewer"):
         livox_columns(message)
 
 
@@ -188,4 +190,4 @@ def test_points_of_an_e57_are_limited_by_the_file(tmp_path, monkeypatch):
     assert open_recording(path).count == 1
     monkeypatch.setattr(allowance, "MIN_LIMIT_BYTES", 0)
     monkeypatch.setattr(allowance, "UNPACKED_TIMES", 0.5)
-    assert "would unpack to 23.44 kiB" in refused(open_recording, path)
+    assert "would unpack to at least 23.44 kiB" in refused(open_recording, path)

@@ -397,7 +397,7 @@ def test_another_run_behind_a_link_stays(where, use, folder, tmp_path):
     link.symlink_to(target if target.exists() else theirs / "run.db")
     before = {name: (theirs / name).read_bytes() for name in names(theirs)}
     assert len(before) == 3
-    with pytest.raises(LidarError, match=f"{link} is a link"):
+    with pytest.raises(LidarError, match=f"{link} is a symbolic link"):
         use(folder) if callable(use) else opened(folder, resume=use == "resume").remove()
     assert before == {name: (theirs / name).read_bytes() for name in names(theirs)}
     link.unlink()
@@ -662,5 +662,5 @@ def test_storage_that_fails(url, monkeypatch):
     monkeypatch.setattr(lidarpool.run.store.remote.Storage, "write", fail)
     with pytest.raises(LidarError, match=f"cannot be kept in {url}: it is full"):
         store.save(force=True)
-    with pytest.raises(LidarError, match=rf"Cannot write to {url} \(it is full\)"):
+    with pytest.raises(LidarError, match=rf"Cannot write to {url}: it is full"):
         opened(url, resume=True)

@@ -94,7 +94,7 @@ def test_a_scene_is_placed_in_python_and_again():
     assert placed.origin.tolist() == [500_000, 5_400_000, 300]
     assert placed.georeferenced((1, 2, 3)).origin.tolist() == [1, 2, 3]
     assert placed.georeferenced((0, 0, 0)).origin.tolist() == [0, 0, 0]
-    with pytest.raises(LidarError, match="must be x, y and z in metres"):
+    with pytest.raises(LidarError, match="must be x, y and z in meters"):
         scene.georeferenced((1, 2))
 
 

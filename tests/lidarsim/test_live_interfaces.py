@@ -105,11 +105,11 @@ def test_ouster_sends_where_a_client_of_firmware_3_0_asks():
 @pytest.mark.parametrize(
     ("values", "reason"),
     [
-        ('{"udp_dest": "239.0.0.1"}', "udp_dest is not the address of one receiver"),
-        ('{"udp_dest": "255.255.255.255"}', "udp_dest is not the address of one receiver"),
-        ('{"udp_dest": 2130706433}', "udp_dest is no IPv4 address"),
-        ('{"udp_port_imu": 70000}', "udp_port_imu is no port"),
-        ('{"udp_port_imu": true}', "udp_port_imu is no port"),
+        ('{"udp_dest": "239.0.0.1"}', "udp_dest is not the address of a single receiver"),
+        ('{"udp_dest": "255.255.255.255"}', "udp_dest is not the address of a single receiver"),
+        ('{"udp_dest": 2130706433}', "udp_dest is not an IPv4 address"),
+        ('{"udp_port_imu": 70000}', "udp_port_imu is not a port"),
+        ('{"udp_port_imu": true}', "udp_port_imu is not a port"),
         ('{"lidar_mode": "2048x10"}', "lidar_mode is 1024x10 in this simulated sensor: set it in"),
         ('{"speed": 1}', "there is no parameter speed"),
         ("[]", "give an object"),

@@ -198,7 +198,7 @@ def test_a_station_may_end_a_rounding_beyond_the_last_pose():
         ({"start_s": -1.1e-6}, "start_s is -1.1e-06 s, which is 1.1e-06 s outside"),
         ({"duration_s": 1 + 1.1e-6}, r"duration_s is 1\.0000011 s, which is 1.1e-06 s outside"),
         ({"start_s": 1.0}, "must be above 0, but it covers 1 to 1 s"),
-        ({"start_s": np.nan}, "start_s is nan"),
+        ({"start_s": np.nan}, "start_s must be a finite number"),
     ):
         if gap is None:
             assert Track(times, places, **options).duration_ns == pytest.approx(1e9, abs=1e3)

@@ -203,7 +203,7 @@ def test_objects_that_sensors_do_not_see_are_named(check):
     assert said["unseen"] == {"front": names[:2], "blind": names}
     scenario["sensors"]["rear"]["unseen"] = "Nobody"
     outcome = check(text=json.dumps(scenario))
-    assert outcome.code == 2 and "unseen of sensor 'rear' names 'Nobody'" in outcome.err
+    assert outcome.code == 2 and "unseen of sensor 'rear' contains 'Nobody'" in outcome.err
     assert f"Available names: {names[0]}, " in outcome.err
     told = check(text=json.dumps(SHORT | {"sensor": {"unseen": "*"}})).out
     assert "no ray hit anything at any distance: check unseen, poses and units" in told
@@ -267,7 +267,7 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
 
 def test_a_scenario_with_errors_gives_json_too(check):
     outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0]]}))
-    assert outcome.code == 2 and "poses[0].position[2] is missing" in outcome.err
+    assert outcome.code == 2 and "poses[0].position[2] is required" in outcome.err
     said = json.loads(outcome.out)
     assert said["can_run"] is False and said["notes"] == []
     assert f"lidarpool: {said['reasons'][0]}" == outcome.err.strip()

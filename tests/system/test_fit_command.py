@@ -75,7 +75,7 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
         ([".", "--scene", "none.glb"], "none.glb"),
         ([".", "--out", "mine.txt"], "no sensor file: give a name such as mine.yaml"),
         ([".", "--pose", "0,0,0", "--pose", "1,0,0"], "pose has 2 poses, and . has 4 sweeps: give"),
-        ([".", "--white", "0"], "white is 0.0; it must be above 0"),
+        ([".", "--white", "0"], "white must be above 0"),
     ],
 )
 def test_what_cannot_be_done_is_told_in_a_line(sweeps, lidarpool, monkeypatch, arguments, says):

@@ -219,7 +219,7 @@ def test_forks_read_a_data_set_that_their_parent_has_opened(environment, format)
     ("url", "words"),
     [
         ("s3://nobody/x", "Create the bucket first"),
-        ("s3://a:b@surveys/x", "has a password: leave it out"),
+        ("s3://a:b@surveys/x", "must not contain a password"),
         ("s9://surveys/x", "Protocol not known: s9"),
     ],
 )

@@ -122,5 +122,7 @@ def test_thinned_returns_make_no_laser_scan_and_a_note(folder, lidarpool):
 
 def test_several_layers_need_a_field_of_view():
     assert Sensor.grid(layers=1, vertical_fov_deg=0).channels == 1
-    with pytest.raises(LidarError, match="vertical_fov_deg is 0 with 40 layers"):
+    with pytest.raises(
+        LidarError, match="vertical_fov_deg is 0, so all 40 layers would be identical"
+    ):
         Sensor.grid(vertical_fov_deg=0)
