@@ -207,7 +207,10 @@ WRONG = {
         "(2 copies): give z.",
     ),
     "name": (TREE | {"scatter": {"count": 1, "surfaces": "Hil"}}, "'Hil', but no object has"),
-    "ordered": (TREE | {"scatter": {"count": 1, "within": [5, 0, 4, 1]}}, "with the lower corner first"),
+    "ordered": (
+        TREE | {"scatter": {"count": 1, "within": [5, 0, 4, 1]}},
+        "with the lower corner first",
+    ),
     "full": (
         TREE | {"scatter": {"count": 9, "spacing_m": 25}},
         "of 9 found room on * within x -20 to 20, y -10 to 10: take fewer",

@@ -358,6 +358,10 @@ def test_a_flight_is_told_by_its_lines_without_turns(check):
     assert scanner["metres_a_turn"] == pytest.approx(60 / 200, rel=0.02)
     assert drive["metres"] / drive["seconds"] / 200 < 0.95 * scanner["metres_a_turn"]
     told = check(text=json.dumps(scenario)).out
+    model = scenario.pop("sensor")
+    scenario["sensors"] = {"turn": {"model": model, "start_s": 12, "steps": 5400}}
+    [turn] = json.loads(check("--json", text=json.dumps(scenario)).out)["drive"]["sensors"]
+    assert turn["metres_a_turn"] < 0.95 * scanner["metres_a_turn"], "it fires during the turn only"
     assert re.search(r"^trajectory  .* s; 2 flight lines, [\d,]+ m in 1\d\.\d s$", told, re.M)
     assert re.search(r"in one the carrier moves 0\.30\d m on the flight lines$", told, re.M)
 

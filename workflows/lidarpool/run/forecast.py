@@ -18,7 +18,6 @@ from distributed.system import MEMORY_LIMIT
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import CHUNK_POINTS
-from lidarsim.motion.straight_lines import StraightLines
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.casting.visibility import unseen_objects
@@ -278,22 +277,28 @@ def _unseen(job: Job) -> dict[str, list[str]]:
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
-    """Describe the length of a moving carrier's trajectory, and the revolutions of each sensor.
+    """Describe the trajectory of a moving platform, and the revolutions of each sensor.
 
-    The distance of lines of an airborne scanner is the distance on flight lines, not in turns.
+    The distance per cycle of an airborne scanner is that on flight lines while the sensor fires.
     """
     if not survey.path.moves:
         return None
     seconds = survey.duration_ns / 1e9
-    positions, _ = survey.path.poses(0, np.linspace(0, survey.duration_ns, TRAJECTORY_POSES))
-    metres = float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+    times_s = np.linspace(0, seconds, TRAJECTORY_POSES)
+    positions, _ = survey.path.poses(0, 1e9 * times_s)
+    traveled_m = np.append(0.0, np.linalg.norm(np.diff(positions, axis=0), axis=1).cumsum())
     lines = flight_lines(survey)
     sensors = []
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
         sensor = carried.sensor
         firings = sensor.firings(steps - 1)[1]
         rate_hz = getattr(sensor.head, "rate_hz", None)
-        on_ns = sensor.begins_ns(np.array([firings])).item() - sensor.start_ns
+        start_s = sensor.start_ns / 1e9
+        stop_s = sensor.begins_ns(np.array([firings])).item() / 1e9
+        speed_m_s = float(np.diff(np.interp([start_s, stop_s], times_s, traveled_m))[0])
+        speed_m_s /= stop_s - start_s
+        if lines is not None:
+            speed_m_s = lines.mean_speed(start_s, stop_s) or speed_m_s
         sensors.append(
             {
                 "name": carried.name,
@@ -301,21 +306,16 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
                 "cycle": sensor.cycle,
                 "scans": steps * survey.path.stations,
                 "firings": firings * survey.path.stations,
-                "turns": rate_hz and on_ns / 1e9 * rate_hz,
-                "metres_a_turn": rate_hz and _speed(lines, seconds, metres) / rate_hz,
+                "turns": rate_hz and (stop_s - start_s) * rate_hz,
+                "metres_a_turn": rate_hz and speed_m_s / rate_hz,
             }
         )
     return {
         "seconds": seconds,
-        "metres": metres,
+        "metres": float(traveled_m[-1]),
         "lines": lines and lines.summary(),
         "sensors": sensors,
     }
-
-
-def _speed(lines: StraightLines | None, seconds: float, metres: float) -> float:
-    """Return the mean speed on flight lines, or without any along the trajectory, m/s."""
-    return lines.length_m / lines.seconds if lines else metres / seconds
 
 
 def _existing(folder: Path) -> Path:

@@ -37,6 +37,22 @@ class StraightLines(NamedTuple):
         """Total length of the lines, meters."""
         return float(self.lengths_m.sum())
 
+    def mean_speed(self, start_s: float, stop_s: float) -> float | None:
+        """Return the mean speed in m/s on lines within an interval, or None without any lines.
+
+        Examples
+        --------
+        >>> lines = StraightLines(np.array([0.0, 20]), np.array([10.0, 30]), np.array([600.0, 300]))
+        >>> lines.mean_speed(0, 30), lines.mean_speed(25, 40)
+        (45.0, 30.0)
+        """
+        within_s = np.minimum(self.stops_s, stop_s) - np.maximum(self.starts_s, start_s)
+        within_s = np.maximum(within_s, 0)
+        if not within_s.any():
+            return None
+        speeds_m_s = self.lengths_m / (self.stops_s - self.starts_s)
+        return float((speeds_m_s * within_s).sum() / within_s.sum())
+
     def summary(self) -> dict[str, float]:
         """Return number, total duration and total length of the lines as plain data."""
         return {"count": len(self.starts_s), "seconds": self.seconds, "length_m": self.length_m}
