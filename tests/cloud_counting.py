@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidarpool import Cloud
 from lidarpool.columns.parts import StoredCloud
 from lidarpool.report.cloud_counts import CloudCounts
-from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.cloud import CloudLike
 
 
 def counts_of(cloud: CloudLike, objects: int, materials: int = 0) -> CloudCounts:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpool import Cloud, Mounted, Pose, Scene, Sensor, Survey, Track
+from lidarpool import Actor, Cloud, Mounted, Pose, Scene, Sensor, Survey, Track, box
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarsim.base.storage import Storage
-from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps
 
 # of a sensor, of a turn

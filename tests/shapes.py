@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from lidarpool import Beams, Optics, Pose, Scene, Sensor, Spin, Survey
+from lidarpool import Beams, Optics, Pose, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.scene.colours import Colours
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpool import Column, Scene, Sensor, Survey, Track
+from lidarpool import Actor, Column, Scene, Sensor, Survey, Track, box
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent, sensor_positions
 from lidarview.viewer.view import View

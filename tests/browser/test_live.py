@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidarpool import Scene, Survey
+from lidarpool import Job, Scene, Survey
 from lidarpool.run.cluster.connection import local_client
 from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
 from lidarpool.run.runner import Run, StoredOutput
-from lidarpool.scenario.build import Job
 from lidarpool.showing.pages.live_page import live_page
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

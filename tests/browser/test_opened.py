@@ -11,12 +11,11 @@ from tests.drives import the_scene, the_sweeps, write_set
 from tests.packet_surveys import points_of
 from tests.shapes import room
 
-from lidarpool import Mounted, Pose, Survey, Track, load_sensor
+from lidarpool import LidarError, Mounted, Pose, Survey, Track, load_sensor
 from lidarpool.clouds.writing import Format
 from lidarpool.showing.pages import opened, recorded
 from lidarpool.showing.pages.job_list import JobList
 from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view
-from lidarsim.base.errors import LidarError
 from lidarsim.sweeps.sweeps import SWEEPS_FILE
 from lidarview.picture_file import PICTURE_FILE, PictureContent
 from lidarview.viewer.server import page_server

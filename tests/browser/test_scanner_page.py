@@ -6,8 +6,7 @@ import threading
 
 import pytest
 
-from lidarpool import Pose, Scanner, Scene, Sensor, show
-from lidarsim.scene.actors import Actor, box
+from lidarpool import Actor, Pose, Scanner, Scene, Sensor, box, show
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

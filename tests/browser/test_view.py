@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from tests.spirals import COUNT, WET, spiral, spiral_view
 
-from lidarpool import Pose, Scene, Sensor, Survey, Track
+from lidarpool import Actor, Pose, Scene, Sensor, Survey, Track, box
 from lidarpool.showing.pages.downloads import downloads
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import OBJECT, TABLE
-from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent, sensor_positions

@@ -10,6 +10,8 @@ import pytest
 
 import lidarpool
 from lidarpool import (
+    Actor,
+    Cloud,
     Fault,
     LidarError,
     Mounted,
@@ -18,6 +20,7 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    box,
     save_cloud,
 )  # fmt: skip
 from lidarpool.clouds.boxes import Boxes, SweepBoxes
@@ -25,9 +28,7 @@ from lidarpool.clouds.writing import Format
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarsim.base.storage import Storage
-from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
-from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.animation import Animation
 from lidarsim.sweeps.sweeps import Sweeps
 

@@ -10,12 +10,11 @@ from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
 from tests.lidarsim.test_device_columns import MADE, backend, scenes  # noqa: F401 - fixtures
 from tests.lidarsim.test_rig import TURNED, survey
 
-from lidarpool import Scene
+from lidarpool import Scene, box
 from lidarpool.base.shared_memory import Pickled
 from lidarpool.columns.parts import pack
 from lidarpool.run.pipeline import rigs
 from lidarpool.run.pipeline.failures import naming_scans
-from lidarsim.scene.actors import box
 from lidarsim.simulator.rig import Rig
 from poolpart.task_context import WorkerLeft
 

@@ -7,14 +7,12 @@ import pytest
 import trimesh
 from tests.shapes import quad
 
-from lidarpool import LidarError, Pose
+from lidarpool import LidarError, Pose, Scene, SceneMesh
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim.media.materials import MaterialTable
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_mesh import SceneMesh
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import LidarError
+from lidarpool import LidarError, Planning
 from lidarpool.columns.parts import part_name
-from lidarpool.plan import Planning, run_trial
+from lidarpool.plan import run_trial
 from lidarpool.run.pipeline.committed_job import CommittedJob
 from lidarpool.run.pipeline.stage_messages import Receipt
 from lidarpool.run.store.database import RunDatabase

@@ -13,6 +13,7 @@ import trimesh
 from tests.shapes import block, level, quad, wall
 from trimesh import creation
 
+from lidarpool import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, load_sensor
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.default_poses import place_sensor, poses_around
@@ -24,14 +25,8 @@ from lidarscenes.procedural.plants import SPECIES, tree
 from lidarscenes.procedural.surroundings import Surroundings, in_the_way
 from lidarscenes.procedural.terrain import terrain
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_instances import SceneInstance
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import Transform
-from lidarsim.sensor import Sensor
-from lidarsim.sensor.models import load_sensor
 from lidarsim.simulator.rig import Rig
-from lidarsim.survey.survey import Mounted, Survey
 
 GRID = Mounted(Sensor.grid())
 

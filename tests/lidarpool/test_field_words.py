@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarpool import Planning
 from lidarpool.base.field_words import differences, fields_in_words
-from lidarpool.plan import Planning
 from lidarpool.run.job_source import fields_of
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario

@@ -23,6 +23,7 @@ from pypcd4.pypcd4 import PointCloud
 from tests.shapes import level, room
 
 from lidarpool import (
+    Beams,
     Fault,
     LidarError,
     Mounted,
@@ -39,7 +40,7 @@ from lidarpool.clouds.writing import Format
 from lidarscenes.procedural.city import city
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
-from lidarsim.sensor.beams import Beams, Mirror
+from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

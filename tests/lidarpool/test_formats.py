@@ -27,6 +27,7 @@ from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import (
+    Actor,
     Cloud,
     LidarError,
     Mounted,
@@ -35,6 +36,7 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    box,
     load_trajectory,
     read_cloud,
     save_cloud,
@@ -53,7 +55,6 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import COLOURS, TABLE
 from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
-from lidarsim.scene.actors import Actor, box
 from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tests.shapes import room
 
-from lidarpool import Cloud, Sensor, Survey, load_sensor
+from lidarpool import Beams, Cloud, Sensor, Spin, Survey, load_sensor
 from lidarpool.clouds.laser_scan import (
     ScanRays,
     has_laser_scans,
@@ -17,7 +17,7 @@ from lidarpool.clouds.laser_scan import (
     with_laser_scans,
 )
 from lidarsim.columns.table import SCAN
-from lidarsim.sensor.beams import Beams, Mirror, Spin
+from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.sensor import LineSensor
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

@@ -3,14 +3,13 @@
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import LidarError, Scene, fit, twin
+from lidarpool import LidarError, Scene, box, fit, twin
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.writing import Format
 from lidarpool.scenario import build as build_module
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.scene.actors import box
 
 
 @pytest.fixture

@@ -4,16 +4,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import compare
+from lidarpool import Comparison, LidarError, Scene, compare
 from lidarpool.cli.result_commands import compare as compare_command
 from lidarpool.cli.scenario_commands import scene as scene_command
-from lidarpool.comparing.comparison import Comparison
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.showing.pages.opened import open_view
-from lidarsim.base.errors import LidarError
 from lidarsim.scene.files.noise_points import LeftOut, usable_points
-from lidarsim.scene.scene import Scene
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 

@@ -20,6 +20,7 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    box,
     save_cloud,
 )
 from lidarpool.cli.result_commands import view as view_command
@@ -32,7 +33,6 @@ from lidarpool.showing.pages.job_list import JobList
 from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view, open_views
 from lidarsim.columns.ply_format import header
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.actors import box
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

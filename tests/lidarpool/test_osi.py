@@ -9,11 +9,21 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from lidarpool import LidarError, Mounted, Pose, Scene, Sensor, Survey, Track, save_cloud
+from lidarpool import (
+    Actor,
+    LidarError,
+    Mounted,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    box,
+    save_cloud,
+)
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

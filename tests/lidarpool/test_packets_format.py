@@ -11,12 +11,21 @@ import numpy as np
 import pytest
 from tests.shapes import room
 
-from lidarpool import LidarError, Mounted, Pose, Scene, Sensor, Survey, load_sensor, save_cloud
+from lidarpool import (
+    Cloud,
+    LidarError,
+    Mounted,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    load_sensor,
+    save_cloud,
+)
 from lidarpool.clouds.packets import with_packet_columns
 from lidarpool.clouds.writing import Format
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN, TABLE
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig

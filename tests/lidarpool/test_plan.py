@@ -14,9 +14,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from lidarpool.plan import Planning, Trial, best, run_trial, shortest_path_length
+from lidarpool import LidarError, Planning
+from lidarpool.plan import Trial, best, run_trial, shortest_path_length
 from lidarpool.plan.geometry import clearance, segment_distances
-from lidarsim.base.errors import LidarError
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
 DEFAULT = Planning((25, 25), (-30, -20), SEED_SCENE, 2.0)

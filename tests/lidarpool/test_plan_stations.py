@@ -8,11 +8,10 @@ import pytest
 from click.testing import CliRunner
 from tests.shapes import block, wall
 
-from lidarpool import LidarError, Scene, SceneMesh, Sensor
+from lidarpool import LidarError, Scene, SceneMesh, Sensor, box
 from lidarpool.cli.commands import cli
 from lidarpool.plan.stations import plan_stations
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.scene.actors import box
 
 EVERYWHERE = Sensor.grid(vertical_fov_deg=180)
 

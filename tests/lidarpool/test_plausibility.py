@@ -11,6 +11,7 @@ import pytest
 from trimesh import Trimesh, creation
 from trimesh.transformations import rotation_matrix
 
+from lidarpool import Scene, SceneMesh
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.campaign_sections import is_campaign
@@ -19,8 +20,6 @@ from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.paint import painted
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_mesh import SceneMesh
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CITY = {"city-drive", "crossing", "crossing-night", "drive"}

@@ -24,6 +24,7 @@ from click.testing import CliRunner
 from tests.shapes import room
 
 from lidarpool import (
+    Cloud,
     LidarError,
     Mounted,
     Packets,
@@ -42,7 +43,6 @@ from lidarpool.showing.playback.live_sensor import RepeatedInstruments
 from lidarpool.showing.playback.pcap_recording import PcapRecording
 from lidarpool.showing.playback.sources import open_source, scenario_job
 from lidarpool.showing.playback.transmitter import Transmitter, sensor_streams
-from lidarsim.columns.cloud import Cloud
 from lidarsim.packets.encoders import Datagrams, PacketSource, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.simulator.points.batch_columns import columns_of

@@ -8,7 +8,7 @@ import pytest
 from tests.meshes import write
 from tests.plugin_files import write_distribution
 
-from lidarpool import Cloud, load_sensor, save_cloud
+from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
 from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import row_of
@@ -19,10 +19,8 @@ from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarpool.scenario.point_files import read_points
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.schema import scenario_schema
-from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import find_plugin, plugins_of
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene import Scene
 
 # A mesh of one triangle, whatever is in the file.
 TRIANGLE = """

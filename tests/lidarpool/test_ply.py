@@ -16,13 +16,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from tests.drives import the_scene, the_sweeps
 
+from lidarpool import Cloud, Column, LidarError, read_cloud, save_cloud
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.clouds import ply
-from lidarpool.clouds.ply import read_cloud
-from lidarpool.clouds.writing import save_cloud
-from lidarsim.base.errors import LidarError
-from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import Column
 from lidarsim.sweeps.sweeps import Sweeps
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidarpool import Column, LidarError
 from lidarpool.clouds.ply_rows import RowMaker
 from lidarpool.columns.part_blocks import BlockMemory
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.part_columns import positions_of
 from lidarsim.columns.ply_format import as_file_type, row_type
-from lidarsim.columns.table import AXES, OPTIONAL, SCAN, TABLE, Column
+from lidarsim.columns.table import AXES, OPTIONAL, SCAN, TABLE
 
 TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
 OF_ALL_TYPES = tuple(Column(f"of_{name}", name, "", "") for name in TYPES)

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
+from lidarpool import Cloud, LidarError, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.showing.pages.opened import open_view
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.base.errors import LidarError
 from lidarsim.scene.files.pcd import pcd_bytes
 
 GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T

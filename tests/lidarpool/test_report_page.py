@@ -25,6 +25,8 @@ from lidarpool import (
     Result,
     Returns,
     Scene,
+    SceneMesh,
+    Sensor,
     Survey,
     Track,
     load_sensor,
@@ -38,8 +40,6 @@ from lidarpool.run.pipeline.task_book import TaskBook
 from lidarpool.run.pipeline.task_records import TaskRecord
 from lidarpool.run.planning_trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.scene.scene_mesh import SceneMesh
-from lidarsim.sensor import Sensor
 
 EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from tests.pages import ask
 
-from lidarpool import LidarError, Mounted, Pose, Scanner, Scene, Sensor, Track, show
-from lidarsim.scene.actors import Actor, box
+from lidarpool import Actor, LidarError, Mounted, Pose, Scanner, Scene, Sensor, Track, box, show
 
 SCRIPT = """
 from lidarpool import Pose, Scanner, Scene, Sensor, show

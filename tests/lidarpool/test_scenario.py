@@ -14,18 +14,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trimesh.exchange.gltf import export_glb
 
-from lidarpool import Pose, Scene, SceneInstance
+from lidarpool import (
+    Job,
+    LidarError,
+    Noise,
+    Pose,
+    Returns,
+    Scene,
+    SceneInstance,
+    Sensor,
+    Survey,
+    box,
+)
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import Job, build
+from lidarpool.scenario.build import build
 from lidarpool.scenario.demo import demo_scenario
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.static_scene import SceneCache
-from lidarsim.base.errors import LidarError
 from lidarsim.media.materials import MaterialTable, SurfaceKinds
-from lidarsim.scene.actors import box
-from lidarsim.sensor import Noise, Returns, Sensor
-from lidarsim.survey.survey import Survey
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEFAULT = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)], keep_every=5)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import compare
+from lidarpool import LidarError, Scene, compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
@@ -16,9 +16,7 @@ from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.showing.pages.opened import growing_view, open_view
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.base.errors import LidarError
 from lidarsim.scene.files import coordinate_systems
-from lidarsim.scene.scene import Scene
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 pytestmark = pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")

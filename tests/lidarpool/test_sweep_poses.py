@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from lidarpool import SceneMesh
 from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.places.alignment import Alignment
 from lidarpool.places.labels import divided, labels_of
@@ -15,7 +16,6 @@ from lidarpool.places.odometry import RecordedPoses
 from lidarpool.places.recorded_sweeps import RecordedSweep
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
 from lidarsim.scene.face_materials import FaceMaterials
-from lidarsim.scene.scene_mesh import SceneMesh
 
 STAMPS_S = np.array([0.0, 0.1, 0.26, 0.33, 0.5])
 SPIN_RAD_S = np.array([0.1, -0.2, 0.8])

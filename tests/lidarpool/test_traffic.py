@@ -11,15 +11,25 @@ import numpy as np
 import pytest
 from tests.shapes import cast_between, made
 
-from lidarpool import LidarError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
+from lidarpool import (
+    Actor,
+    Cloud,
+    LidarError,
+    Mounted,
+    Pose,
+    Scene,
+    Survey,
+    Track,
+    box,
+    load_sensor,
+    save_cloud,
+)
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.report.picture_content import picture_content
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.base import allowance
-from lidarsim.columns.cloud import Cloud
-from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.casting.surfaces import Surfaces
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

@@ -13,14 +13,17 @@ from click.testing import CliRunner
 from scipy.spatial import cKDTree
 
 from lidarpool import (
+    Actor,
     LidarError,
     Material,
     Mounted,
     Pose,
     Scene,
+    SceneMesh,
     Sensor,
     Survey,
     Track,
+    box,
     load_sensor,
     save_cloud,
     twin,
@@ -37,9 +40,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.actors import Actor, box
 from lidarsim.scene.colours import LINEAR
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

@@ -30,6 +30,7 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
+    box,
     load_sensor,
     simulate,
 )
@@ -43,7 +44,6 @@ from lidarpool.showing.viewers import attached_child
 from lidarpool.showing.viewers.viewer import Address, Viewer, open_viewer
 from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
-from lidarsim.scene.actors import box
 
 SCENARIO = """
 sensors:

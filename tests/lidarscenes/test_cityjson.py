@@ -9,11 +9,10 @@ from tests.meshes import NESTED
 
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, SceneInstance
 from lidarsim.media.materials import MaterialTable
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import triangle_areas
 
 # A cube of 2 units, its rings running outward.

@@ -5,9 +5,8 @@ import pytest
 import trimesh
 from tests.meshes import NESTED
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene import Scene
 
 DAE = """<?xml version="1.0"?>{doctype}
 <COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">

@@ -15,10 +15,8 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.files import ifc as reader
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Scene, SceneInstance
 from lidarsim.scene.files.meshfile import load_meshes, load_objects
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_instances import SceneInstance
 
 needs_ifcopenshell = pytest.mark.skipif(
     find_spec("ifcopenshell") is None, reason="needs ifcopenshell, an extra"

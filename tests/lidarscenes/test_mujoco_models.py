@@ -20,9 +20,9 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process
 from lidarscenes.mujoco import model_file
+from lidarsim import SceneInstance
 from lidarsim.base import allowance
 from lidarsim.scene.files.meshfile import load_objects
-from lidarsim.scene.scene_instances import SceneInstance
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
 

@@ -10,9 +10,8 @@ import pytest
 
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene import Scene
 
 SHAPES = {
     "1": '<line/>',

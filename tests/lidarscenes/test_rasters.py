@@ -15,10 +15,8 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import rasters
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Scanner, Sensor
 from lidarsim.scene.files.meshfile import load_meshes, load_objects
-from lidarsim.sensor import Sensor
-from lidarsim.simulator.scanner import Scanner
 
 pytestmark = pytest.mark.skipif(find_spec("rasterio") is None, reason="needs rasterio, an extra")
 if find_spec("rasterio") is not None:

@@ -16,7 +16,7 @@ from tests.lidarscenes.test_opendrive import (
     width,
 )
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError
 from lidarsim.scene.files.meshfile import load_meshes
 from raybeam import RayCaster
 

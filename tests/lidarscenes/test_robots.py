@@ -16,11 +16,10 @@ from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
+from lidarsim import Mounted, box
 from lidarsim.base.vectors import into_axes
 from lidarsim.motion.trajectory import presence_ns
-from lidarsim.scene.actors import box
 from lidarsim.simulator.rig import Rig
-from lidarsim.survey.survey import Mounted
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 BOX = '<visual><geometry><box size="0.2 0.2 0.2"/></geometry></visual>'

@@ -15,10 +15,9 @@ from lidarpool import LidarError, Scene
 from lidarpool.cli.scenario_commands import scene as command
 from lidarscenes.procedural.city import city
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.scene.actors import box
+from lidarsim import SceneInstance, box
 from lidarsim.scene.colours import WHITE, Colours
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.scene_mesh import Cutout
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.meshes import NESTED
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError
 from lidarsim.scene.files.meshfile import load_meshes
 
 MODEL = (

@@ -22,13 +22,12 @@ from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process, usd
+from lidarsim import LidarError, SceneInstance
 from lidarsim.base import allowance
-from lidarsim.base.errors import LidarError
 from lidarsim.columns.table import COLOURS
 from lidarsim.scene.colours import LINEAR, as_srgb
 from lidarsim.scene.files import scene_graph as nodes
 from lidarsim.scene.files.meshfile import load_meshes, load_objects
-from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.transform import Transform
 
 pytestmark = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")

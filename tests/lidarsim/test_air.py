@@ -24,11 +24,11 @@ from lidarpool import (
     Survey,
     Track,
 )
+from lidarsim import SceneMesh
+from lidarsim import box as cuboid
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.materials import extinction
 from lidarsim.media.weather import EXIT_M, dust, rain, snow, spray
-from lidarsim.scene.actors import box as cuboid
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.particles import highest_probabilities
 

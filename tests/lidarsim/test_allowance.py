@@ -11,8 +11,8 @@ import pytest
 import trimesh
 from tests.meshes import NESTED
 
+from lidarsim import LidarError
 from lidarsim.base import allowance, input_files
-from lidarsim.base.errors import LidarError
 from lidarsim.scene.files.meshfile import load_meshes
 
 VERTEX = b'<vertex x="0" y="0" z="0"/>'

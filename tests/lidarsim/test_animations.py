@@ -15,12 +15,11 @@ from lidarpool.clouds.boxes import Boxes
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.columns.cloud import Cloud
+from lidarsim import Cloud, SceneMesh, box
 from lidarsim.motion.rotations import matrices
-from lidarsim.scene.actors import box, distinct_meshes, join_meshes
+from lidarsim.scene.actors import distinct_meshes, join_meshes
 from lidarsim.scene.animation import MAX_PICTURED_VERTICES, Animation
 from lidarsim.scene.files.meshfile import load_objects
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.wheels import rolling
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent

@@ -23,7 +23,7 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim import SceneMesh
 from lidarsim.sensor.disc import SUBRAYS, Beam
 from lidarsim.sensor.ray_sensors import PrismSensor
 from lidarsim.sensor.sensor import LineSensor

@@ -7,7 +7,7 @@ import struct
 import pytest
 from tests.captures import ARP, IPV4, MACS, ip_packet, pcap, pcapng, variants
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError
 from lidarsim.packets.capture import Capture
 from lidarsim.packets.encoders import decoder_of
 

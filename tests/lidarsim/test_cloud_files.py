@@ -5,7 +5,8 @@ import io
 import numpy as np
 import pytest
 
-from lidarsim.base.errors import CutShortError, LidarError
+from lidarsim import LidarError
+from lidarsim.base.errors import CutShortError
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.cloud_scan import usual_names
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Survey
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.files.coordinate_systems import (
     crs_of_code,
@@ -22,7 +22,6 @@ from lidarsim.scene.files.coordinate_systems import (
     zone_in_area,
     zone_in_metres,
 )
-from lidarsim.survey.survey import Survey
 
 needs_registry = pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
 AXIS_M = 6378137.0

@@ -30,13 +30,10 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarsim.media.materials import Material
+from lidarsim import Material, Returns, box, load_sensor
 from lidarsim.motion.trajectory import Stations
-from lidarsim.scene.actors import box
 from lidarsim.scene.colours import Colours
 from lidarsim.scene.shapes import seed_objects
-from lidarsim.sensor.models import load_sensor
-from lidarsim.sensor.optics import Returns
 from lidarsim.simulator.memory import cast_bytes
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.points.device_columns import OPTIONS, DevicePoints

@@ -21,9 +21,9 @@ from lidarpool import (
     load_sensor,
 )
 from lidarscenes.robots.robot import Hinge, LinkPath
+from lidarsim import Actor, box
 from lidarsim.motion.rotations import quaternions_of, rotations_of
 from lidarsim.motion.trajectory import Stations, velocities
-from lidarsim.scene.actors import Actor, box
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.false_alarms import FALSE_ALARM

@@ -37,10 +37,10 @@ from lidarpool import (
     Survey,
     Track,
 )
+from lidarsim import SceneMesh
+from lidarsim import box as cuboid
 from lidarsim.base.random_numbers import raw
 from lidarsim.media.materials import extinction, fresnel
-from lidarsim.scene.actors import box as cuboid
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig

@@ -23,6 +23,7 @@ from lidarpool import (
     Scene,
     Sensor,
     Survey,
+    Sweep,
     Track,
     load_sensor,
 )
@@ -31,11 +32,10 @@ from lidarpool.clouds.images import Image
 from lidarpool.clouds.ros.bags import write_rosbag2
 from lidarpool.clouds.webdataset import Pieces
 from lidarpool.datasets.job_table import JobRow
-from lidarpool.datasets.sweep_data import Sweep
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.columns.cloud import Cloud
+from lidarsim import Cloud
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps

@@ -19,7 +19,7 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarsim.scene.actors import box
+from lidarsim import box
 
 VLP16 = load_sensor("velodyne/vlp16")
 GRID = Sensor.grid(rays_per_revolution=120, layers=8, step_deg=30, max_range_m=40)

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from tests.meshes import write
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, SceneInstance
 from lidarsim.scene.files import scene_graph
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene_instances import SceneInstance
 from lidarsim.scene.transform import Transform
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()

@@ -18,7 +18,7 @@ from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.point_scene import scene_of_points, surfels
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.helios import import_survey
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError
 from lidarsim.base.input_files import open_input, read_input, read_input_text
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import read_yaml

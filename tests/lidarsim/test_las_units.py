@@ -9,9 +9,8 @@ from click.testing import CliRunner
 from lidarpool import compare
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scenario.point_scene import scene_of_points
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files import coordinate_systems
-from lidarsim.scene.scene import Scene
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 

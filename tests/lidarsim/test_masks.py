@@ -13,12 +13,10 @@ from tests.meshes import write
 
 from lidarpool import LidarError, Pose, Scanner, Scene
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import Actor, SceneInstance, SceneMesh, Sensor
 from lidarsim.base import allowance
-from lidarsim.scene.actors import Actor
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene_instances import SceneInstance
-from lidarsim.scene.scene_mesh import Cutout, SceneMesh
-from lidarsim.sensor import Sensor
+from lidarsim.scene.scene_mesh import Cutout
 
 BACKENDS = ["numpy", "tiles"]
 # No row or column is another's, reversed or not.

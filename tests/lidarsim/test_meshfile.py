@@ -15,10 +15,9 @@ from tests.meshes import PLY, write
 
 from lidarscenes.files import formats as more_formats
 from lidarscenes.files import rasters, usd
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Scene
 from lidarsim.scene.files.mesh_formats import endings, known_formats
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import Transform
 
 TEXT_STL = """solid a

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarError
+from lidarsim import Sensor, Spin, load_sensor
 from lidarsim.base.model_names import model_names
-from lidarsim.sensor.beams import Spin
-from lidarsim.sensor.models import load_sensor, read_model
+from lidarsim.sensor.models import read_model
 from lidarsim.sensor.ray_sensors import ListedSensor, Prism, PrismSensor
-from lidarsim.sensor.sensor import Sensor
 from raybeam import Pattern
 
 READY = [name for name in model_names() if not read_model(name).needs_calibration]

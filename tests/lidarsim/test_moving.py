@@ -9,12 +9,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.shapes import level, made, quad
 
-from lidarpool import LidarError, Material, Mounted, Noise, Pose, Scene, Survey, Track, load_sensor
+from lidarpool import (
+    Job,
+    LidarError,
+    Material,
+    Mounted,
+    Noise,
+    Pose,
+    Scene,
+    Survey,
+    Track,
+    load_sensor,
+)
 from lidarpool.run.job_source import identity_of
-from lidarpool.scenario.build import Job
+from lidarsim import Actor, Returns, box
 from lidarsim.base.vectors import into_axes
-from lidarsim.scene.actors import Actor, box
-from lidarsim.sensor.optics import Returns
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweep_motion import poses_at
 from raybeam import moving_loops

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError
 from lidarsim.base.named_files import file_below, is_inside, is_plain
 from lidarsim.base.storage import Storage
 from lidarsim.scene.files.meshfile import load_meshes

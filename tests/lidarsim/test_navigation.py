@@ -14,6 +14,7 @@ from lidarpool import (
     Cloud,
     Gnss,
     Imu,
+    Job,
     LidarError,
     Mounted,
     Navigation,
@@ -26,7 +27,7 @@ from lidarpool import (
 )
 from lidarpool.clouds.navigation_files import instrument_bytes, write_instruments
 from lidarpool.clouds.writing import Format
-from lidarpool.scenario.build import Job, build
+from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.motion.navigation import fixes, geodetic, imu_samples

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarsim.base.errors import CutShortError, LidarError
+from lidarsim import LidarError
+from lidarsim.base.errors import CutShortError
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 
 RNG = np.random.default_rng(3)

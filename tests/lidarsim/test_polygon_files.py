@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.meshes import PLY, write
 
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.files.polygons import MAX_CORNERS, triangulated, with_holes
 

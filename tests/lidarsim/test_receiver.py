@@ -26,9 +26,9 @@ from lidarpool import (
     Spin,
     Survey,
 )
+from lidarsim import SceneMesh
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.returns import SURFACE

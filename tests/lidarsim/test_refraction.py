@@ -27,8 +27,8 @@ from lidarpool import (
     Survey,
     Track,
 )
+from lidarsim import SceneMesh
 from lidarsim.media.materials import extinction, fresnel
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.steps.cast import MAX_PASSES, MAX_REFLECTIONS
 
 WATER = {"transparent": "pass", "refractive_index": 1.33}

@@ -10,7 +10,7 @@ from tests.shapes import Cart, cast_between, tally_of
 
 from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
 from lidarpool.columns.parts import pack
-from lidarsim.scene.actors import box
+from lidarsim import box
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.casting import static_bodies
 from lidarsim.simulator.points.batch_columns import columns_of

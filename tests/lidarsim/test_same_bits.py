@@ -14,7 +14,7 @@ import lidarscenes
 import lidarsim
 import raybeam
 from lidarpool import Actor, Material, Noise, Returns, Scanner, Scene, Track, load_sensor
-from lidarsim.columns.table import Column
+from lidarsim import Column
 from lidarsim.scene.shapes import capsule, cylinder
 
 # Of numpy and math: their last bits depend on the processor, or on versions of C's library.

@@ -36,8 +36,8 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarsim import box
 from lidarsim.columns.table import OPTIONAL, SCAN
-from lidarsim.scene.actors import box
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator import rig as rig_module

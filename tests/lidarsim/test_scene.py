@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.base.errors import LidarError
+from lidarsim import LidarError, Scene, SceneMesh
 from lidarsim.scene.object_names import unique_names
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import UP_AXES, Transform
 
 FACES = np.array([[0, 1, 2]])

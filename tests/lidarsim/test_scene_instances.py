@@ -22,8 +22,9 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarsim import box
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.actors import box, join_meshes
+from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.points.batch_columns import columns_of

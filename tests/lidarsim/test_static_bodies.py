@@ -22,8 +22,8 @@ from lidarpool import (
     Track,
 )
 from lidarpool.columns.parts import pack
+from lidarsim import box
 from lidarsim.columns.table import OPTIONAL
-from lidarsim.scene.actors import box
 from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.casting import static_bodies

@@ -25,8 +25,8 @@ from lidarpool import (
     Survey,
     Track,
 )
+from lidarsim import SceneMesh
 from lidarsim.media.leaves import NAMES, brightness, density, projection
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.light_in_media import depths
 

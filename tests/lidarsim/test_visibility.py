@@ -14,6 +14,7 @@ from lidarpool import (
     Actor,
     Beams,
     Follower,
+    Job,
     LidarError,
     Material,
     Mounted,
@@ -29,10 +30,9 @@ from lidarpool import (
     Survey,
     Track,
 )
-from lidarpool.scenario.build import Job
+from lidarsim import SceneMesh, box
 from lidarsim.columns.table import CAUSES
-from lidarsim.scene.actors import box
-from lidarsim.scene.scene_mesh import Cutout, SceneMesh
+from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.casting import static_bodies
 from lidarsim.simulator.memory import rig_bytes

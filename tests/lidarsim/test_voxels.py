@@ -26,10 +26,11 @@ from lidarpool import (
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
+from lidarsim import SceneMesh
 from lidarsim.media.leaves import projection
 from lidarsim.scene.actors import join_meshes
 from lidarsim.scene.files.meshfile import load_meshes
-from lidarsim.scene.scene_mesh import SceneMesh, Voxels
+from lidarsim.scene.scene_mesh import Voxels
 from lidarsim.scene.transform import Transform
 from lidarsim.simulator.memory import cast_bytes
 from lidarsim.simulator.rig import Rig

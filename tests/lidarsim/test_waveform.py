@@ -23,9 +23,10 @@ from lidarpool import (
     Survey,
     save_cloud,
 )
+from lidarsim import Optics
 from lidarsim.columns.table import AXES, CAUSES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
-from lidarsim.sensor.optics import FWHM, LIGHT_M_NS, Optics
+from lidarsim.sensor.optics import FWHM, LIGHT_M_NS
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from tests.shapes import block, level
 
-from lidarpool import Scene
+from lidarpool import Scene, SceneMesh, box
 from lidarscenes.procedural.plants import SPECIES, place_instances, tree
-from lidarsim.scene.actors import box
-from lidarsim.scene.scene_mesh import Cutout, SceneMesh, triangle_areas
+from lidarsim.scene.scene_mesh import Cutout, triangle_areas
 from lidarsim.scene.simplified import MIN_PART_TRIANGLES, SimplifiedScene, cut_masks
 from lidarview.render.closeup import ShownPart, floor_and_cut
 from raybeam import RayCaster

@@ -12,13 +12,24 @@ import pytest
 import trimesh
 from matplotlib import colormaps
 
-from lidarpool import LidarError, Pose, Scene, SceneInstance, SceneMesh, Sensor, Survey, Track
+from lidarpool import (
+    Actor,
+    Cloud,
+    Column,
+    LidarError,
+    Pose,
+    Scene,
+    SceneInstance,
+    SceneMesh,
+    Sensor,
+    Survey,
+    Track,
+    box,
+)
 from lidarpool.showing.pages.opened import open_views
-from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
-from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column, Z
-from lidarsim.scene.actors import Actor, box
+from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Z
 from lidarsim.scene.colours import Colours, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps

@@ -12,15 +12,19 @@ import numpy as np
 import pytest
 
 from lidarpool import (
+    Actor,
     Cloud,
+    Column,
     LidarError,
     Mounted,
     Planning,
     Pose,
     Scene,
+    SceneMesh,
     Sensor,
     Survey,
     Track,
+    box,
     save_cloud,
 )
 from lidarpool.cli.commands import cli
@@ -28,9 +32,6 @@ from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.picture_content import planning_picture
 from lidarsim.base.storage import Storage
-from lidarsim.columns.table import Column
-from lidarsim.scene.actors import Actor, box
-from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.shapes import seed_objects
 from lidarview.picture_file import PICTURE_FILE, PictureContent, SensorPositions, sensor_positions
 from lidarview.render.picture_page import Page

@@ -17,14 +17,11 @@ from matplotlib.text import Text
 from PIL import Image
 from tests.shapes import block, quad
 
-from lidarpool import Cloud, LidarError
-from lidarpool.plan import Planning, best, run_trial
+from lidarpool import Cloud, Column, LidarError, Planning, Scene, SceneMesh, box
+from lidarpool.plan import best, run_trial
 from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
-from lidarsim.columns.table import AXES, TABLE, Column, X, Z
-from lidarsim.scene.actors import box
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_mesh import SceneMesh
+from lidarsim.columns.table import AXES, TABLE, X, Z
 from lidarsim.scene.shapes import seed_objects
 from lidarview.render.colouring import TURBO, colours_of
 from lidarview.render.hit_density import hit_density

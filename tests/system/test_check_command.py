@@ -18,15 +18,26 @@ from tests.clusters import thread_cluster
 from tests.meshes import PLY
 
 import lidarpool.run.forecast
-from lidarpool import Fault, Mounted, Noise, Returns, Sensor, Survey, Track, read_cloud, simulate
+from lidarpool import (
+    Fault,
+    Mounted,
+    Noise,
+    Returns,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Survey,
+    Track,
+    box,
+    read_cloud,
+    simulate,
+)
 from lidarpool.run.forecast import forecast
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.writers.scene_file import write_scene
-from lidarsim.scene.actors import box
-from lidarsim.scene.scene import Scene
-from lidarsim.scene.scene_mesh import Cutout, SceneMesh
+from lidarsim.scene.scene_mesh import Cutout
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.sampling import sample_survey
 from raybeam import available_backends

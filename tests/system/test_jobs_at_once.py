@@ -14,9 +14,8 @@ from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 
 import lidarsim.simulator.casting.static_bodies
-from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, save_cloud, simulate
+from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, box, save_cloud, simulate
 from lidarpool.run.pipeline import rigs
-from lidarsim.scene.actors import box
 
 SEED = Scene.seed()
 ROOM = Scene.from_meshes([box("Room", (8, 6, 3))])

@@ -12,9 +12,8 @@ import pytest
 import yaml
 from tests.plugin_files import write_distribution
 
-from lidarpool import load_sensor, read_cloud
+from lidarpool import LidarError, load_sensor, read_cloud
 from lidarpool.base.software import call_with_plugins
-from lidarsim.base.errors import LidarError
 from lidarsim.base.plugins import Plugin, plugins_of
 
 ROOT = Path(__file__).parents[2]

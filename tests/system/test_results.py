@@ -7,8 +7,17 @@ from dataclasses import replace
 
 import pytest
 
-from lidarpool import LidarError, Planning, Scene, SceneMesh, Sensor, Survey, read_cloud, simulate
-from lidarpool.api.result import Result
+from lidarpool import (
+    LidarError,
+    Planning,
+    Result,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Survey,
+    read_cloud,
+    simulate,
+)
 from lidarsim.scene.shapes import seed_objects
 
 SENSOR = Sensor.grid(rays_per_revolution=90, layers=6)

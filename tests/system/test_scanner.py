@@ -12,11 +12,11 @@ from lidarpool import (
     Scene,
     Survey,
     Track,
+    box,
     load_sensor,
     simulate,
 )
 from lidarsim.columns.table import OPTIONAL
-from lidarsim.scene.actors import box
 
 OPTIONS = {
     "columns": [column.name for column in OPTIONAL],

@@ -16,14 +16,13 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.killed_drivers import drive
 
-from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, merge, sweeps
+from lidarpool import Campaign, Job, LidarError, Noise, Scene, Sensor, Survey, box, merge, sweeps
 from lidarpool.base.sealed import sealed, unsealed
 from lidarpool.base.shard import Shard
 from lidarpool.clouds.format_table import DATA_SETS
 from lidarpool.datasets.job_seconds import read_seconds
 from lidarpool.report.campaign_output import verify
 from lidarsim.base.storage import Storage
-from lidarsim.scene.actors import box
 
 CAMPAIGN = """
 base: base.yaml

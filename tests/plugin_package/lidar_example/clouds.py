@@ -4,7 +4,8 @@ import io
 
 import numpy as np
 
-from lidarpool.plugins import Cloud, FormatRow, Pieces, Recording, RecordingSource
+from lidarpool import Cloud
+from lidarpool.plugins import FormatRow, Pieces, Recording, RecordingSource
 
 ROW = FormatRow(
     "npy",  # name of the folder in a result

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarsim.plugins import Content, MeshFileError, MeshFormat, ReadOptions, SceneMesh
+from lidarpool import SceneMesh
+from lidarsim.plugins import Content, MeshFileError, MeshFormat, ReadOptions
 
 CORNERS = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 SIDES = np.array(
