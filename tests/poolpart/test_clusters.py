@@ -3,6 +3,7 @@
 `tests/system/test_queues.py` has a real one.
 """
 
+import os
 from collections.abc import Iterator
 
 import pytest
@@ -12,6 +13,7 @@ from tests.poolpart.job_queue import SCHEDULER, Queue
 
 from poolpart import PoolError
 from poolpart.deploy import start_partitions
+from poolpart.deploy.clusters import JobLogs
 
 
 @pytest.fixture
@@ -79,6 +81,20 @@ def test_logs_tell_why_workers_are_missing(queue, tmp_path, wait_until):
     first, second = said
     assert first == f"The log {tmp_path}/gpu-1.err ends: no such file: job 1"
     assert second.endswith("gpu-3.err ends: out of memory")
+
+
+def test_the_end_of_a_log_is_reported_once_and_after_the_log_is_complete(tmp_path):
+    logs = JobLogs([{"log_directory": str(tmp_path)}, {}])
+    log = tmp_path / "gpu-1.err"
+    log.write_text("loading modules\n")
+    (tmp_path / "deleted.err").write_text("no space left\n")
+    assert list(logs.endings()) == [], "the files may be incomplete"
+    (tmp_path / "deleted.err").unlink()
+    log.write_text("loading modules\nno such file\n")
+    os.utime(log, (1, 1))
+    assert list(logs.endings()) == [], "the log has changed"
+    assert list(logs.endings()) == [f"The log {log} ends: no such file"]
+    assert list(logs.endings()) == []
 
 
 def test_a_job_that_is_refused(cluster, queue):

@@ -210,7 +210,7 @@ class _JobStarter:
             part.describe(cluster, "", part.name, 1, 0, part.options)
             for part in partition_jobs.values()
         )
-        self._logs = _JobLogs(sample["options"] for sample in samples)
+        self._logs = JobLogs(sample["options"] for sample in samples)
         self._messages: set[str] = set()  # messages so far, without numbers
         self._logs_read_at = time.monotonic()
 
@@ -302,7 +302,7 @@ async def _start(cluster: SpecCluster) -> None:
         raise
 
 
-class _JobLogs:
+class JobLogs:
     """Logs of jobs, which say why workers are missing.
 
     Dask does not notice a job that ends before its worker has connected.
