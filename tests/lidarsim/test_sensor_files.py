@@ -63,6 +63,11 @@ def test_rays_of_a_revolution_are_in_the_order_of_their_times():
     assert rays.azimuths_deg[1] == pytest.approx(-360 * 10 * 2304e-9, abs=1e-9), "clockwise"
     assert rays.cycle_ns == 1809 * 55_296, "the last firing ends after 0.1 s"
     assert fired_rays(load_sensor("ouster/os1-64")).cycle_ns == 1e8
+    # A beam that leaves after the start of the next firing, every 100 µs.
+    overlapping = Beams(np.array([-1.0, 1.0]), time_ns=np.array([0.0, 250_000.0]))
+    late = fired_rays(Sensor(overlapping, Spin(firings_per_turn=1000, rate_hz=10)))
+    assert late.times_ns[-1] == 99_900_000 + 250_000
+    assert late.cycle_ns == late.times_ns[-1] + 1
     half = fired_rays(Sensor.grid(360, 2, 10), seconds=0.05)
     assert len(half) == 360 and not half.repeats
 
