@@ -332,6 +332,27 @@ def test_radial_velocities_are_of_the_triangle_and_its_actor(backend):
     assert np.abs(found.positions[own, 0] - low).min() < 1e-3
 
 
+def test_radial_velocities_on_a_triangle_are_interpolated_between_its_corners():
+    """A box of 1 m that grows to twice its height in a second: speeds rise with the height."""
+    mesh = box("Lift", (1, 1, 1))
+    animation = Animation(np.stack([mesh.vertices, mesh.vertices * [1, 1, 2]]), 1.0)
+    actor = Actor(replace(mesh, animation=animation), Track([0, 1], [[6, 0, 0.2]] * 2))
+    scanner = Scanner(
+        Scene.from_meshes([FLOOR]).with_actors([actor]),
+        Sensor.grid(720, 40),
+        columns=["radial_velocity", "object", "time"],
+        precision_m=1e-6,
+    )
+    found = scanner.sweep((0, 0, 1), start_s=0.3)
+    own = found["object"] == 1
+    points = found.positions[own]
+    ways = points - [0, 0, 1]
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    speeds = (points[:, 2] - 0.2) / (1 + found["time"][own] / 1e9)
+    assert own.sum() > 50 and np.ptp(speeds) > 0.5
+    np.testing.assert_allclose(found["radial_velocity"][own], ways[:, 2] * speeds, atol=1e-5)
+
+
 def test_normals_are_those_of_the_moment():
     """A door that opens: its light fades with the cosine."""
     flat = SceneMesh("Door", np.array([[0, 0, -1], [0, 1, -1], [0, 1, 1.0], [0, 0, 1]]),
@@ -583,6 +604,9 @@ def test_wheels_turn_by_speed_over_radius():
     flat = replace(parts[1], name="wheel_flat", vertices=parts[1].vertices * [1, 1, 0.5])
     rolling([*parts, flat], ["wheel*"], notes.append)
     assert notes == ["wheel_flat is not round about y (0.6 m long, 0.3 m high) and does not rotate"]
+    oval = replace(parts[1], name="wheel_oval", vertices=parts[1].vertices * [1, 1, 0.97])
+    rolling([*parts, oval], ["wheel*"], notes.append)
+    assert len(notes) == 1, "3 % off round still rotates"
     nut = ring("wheel_nut", 0.01, [1.2, 0.9, 0.3])
     rolling([*parts, nut], ["wheel*"], notes.append)
     assert notes[1:] == ["wheel_nut is 60 times smaller than the largest wheel and does not rotate"]
