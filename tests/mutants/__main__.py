@@ -5,14 +5,15 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import Queue
@@ -52,7 +53,7 @@ class Outcome:
     fault
         The fault.
     noticed
-        "by" and the first test that failed, "hangs", or "" if all tests passed.
+        "by" and the first test that failed, "hangs", "crashes", or "" if all tests passed.
     tests
         Number of the tests that were run.
     seconds
@@ -91,7 +92,7 @@ def main() -> None:
     out = options.out or FOLDER / f"{options.seed}.json"
     with _places(options.jobs) as places, ThreadPoolExecutor(options.jobs) as pool:
         tasks = [pool.submit(_try, places, lines, fault, options.budget) for fault in faults]
-        for task in tasks:
+        for task in as_completed(tasks):
             outcomes.append(task.result())
             print(outcomes[-1], flush=True)
             out.write_text(json.dumps([asdict(outcome) for outcome in outcomes], indent=1))
@@ -217,36 +218,38 @@ def _groups(lines: Lines, tests: list[str], budget_s: float) -> Iterator[list[st
 
 
 def _failure(copy: Path, fault: Fault, lines: Lines, tests: list[str]) -> str:
-    """Plant a fault in a copy, and return which test failed first, "hangs", or ""."""
+    """Plant a fault in a copy, and return `Outcome.noticed`."""
     path = copy / fault.path
     path.write_text(fault.plant((ROOT / fault.path).read_text()))
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join(str(copy / root) for root in (*ROOTS, ".")),
         "PYTEST_TIMEOUT": str(int(_EXTRA_S)),
     }
-    try:
-        done = subprocess.run(
-            [sys.executable, "-m", "pytest", *PYTEST, *tests],
-            cwd=copy,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=_limit_s(lines, tests),
-            check=False,
+    command = [sys.executable, "-m", "pytest", *PYTEST, *tests]
+    with tempfile.TemporaryFile("w+") as output:
+        process = subprocess.Popen(
+            command, cwd=copy, env=environment, stdout=output, stderr=output, start_new_session=True
         )
-    except subprocess.TimeoutExpired:
-        return "hangs"
-    finally:
-        shutil.copy2(ROOT / fault.path, path)
-        _restore_loops(copy)
-    if done.returncode in PASSED:
+        try:
+            status = process.wait(_limit_s(lines, tests))
+        except subprocess.TimeoutExpired:
+            return "hangs"
+        finally:
+            with suppress(ProcessLookupError):  # processes that the tests started
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            shutil.copy2(ROOT / fault.path, path)
+            _restore_loops(copy)
+        output.seek(0)
+        printed = output.read()
+    if status in PASSED:
         return ""
-    failed = re.search(
-        r"^(FAILED|ERROR) (?=\S+\.py)(?P<test>.+?)( - .*)?$", done.stdout, re.MULTILINE
-    )
+    failed = re.search(r"^(FAILED|ERROR) (?=\S+\.py)(?P<test>.+?)( - .*)?$", printed, re.MULTILINE)
     if failed:
         return f"by {failed['test']}"
-    raise RuntimeError(f"pytest ended with status {done.returncode}: {done.stdout[-2000:]}")
+    if status < 0:
+        return "crashes"
+    raise RuntimeError(f"pytest ended with status {status}: {printed[-2000:]}")
 
 
 def _restore_loops(copy: Path) -> None:
