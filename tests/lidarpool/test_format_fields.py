@@ -85,7 +85,7 @@ class Drive:
     @property
     def survey(self) -> Survey:
         sensor = load_sensor(self.model, max_range_m=60)
-        beam = {"subrays": 7, "divergence_mrad": 10.0} if self.mode == "dual" else {}
+        beam = {"subrays": 7, "divergence_mrad": 10.0} if self.mode in ("dual", "all") else {}
         return Survey(
             sensors=[Mounted(sensor, Pose((1.0, 0.2, 0.5), 20.0, 4.0), "lidar")],
             trajectory=drive(), steps=108, columns=COLUMNS, precision_m=1e-6,
@@ -333,6 +333,23 @@ def test_autoware_has_the_types_of_two_returns(tmp_path):
     light = made.cloud().intensity
     strong = rows["return_type"][first] == 9
     np.testing.assert_array_equal(light[first] > light[first + 1], strong)
+
+
+def test_autoware_has_the_types_of_all_returns(tmp_path):
+    cloud = Drive("velodyne/vlp16", "all").cloud()
+    assert cloud.returns.max() > 2
+    save_cloud(cloud, tmp_path / "a.mcap", layout="autoware")
+    rows = np.concatenate([rows_of(message) for message in messages_of(tmp_path / "a.mcap")])
+    expected = []
+    for number, count in zip(cloud.return_number, cloud.returns, strict=True):
+        if count == 1:
+            expected.append(6)  # IDENTICAL
+        elif number == count:
+            expected.append(1)  # LAST
+        else:
+            expected.append({1: 2, 2: 7}.get(number, 0))  # FIRST, SECOND, UNKNOWN
+    assert {1, 2, 7} <= set(expected)
+    np.testing.assert_array_equal(rows["return_type"], expected)
 
 
 @pytest.mark.parametrize(("mode", "kind"), [("strongest", 3), ("first", 2), ("last", 1)])

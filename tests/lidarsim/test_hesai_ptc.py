@@ -77,6 +77,8 @@ def test_inventory_names_the_model(asked, model, code, size):
         status, content = asked(port, 0x07)
     assert (status, len(content)) == (0, size)
     assert content[:3] == b"SIM" and content[106] == code
+    serial = int(content[3:13])
+    assert content[34:40] == b"\2" + serial.to_bytes(5, "big"), "a MAC address of its own"
     assert content[108] == {"xt32": 32, "pandar40p": 40, "ot128": 128}[model]
 
 
