@@ -84,7 +84,10 @@ class LoopFiles(IndexDataCacheFile):
         file = io.BytesIO(pickled)
         if pickle.load(file) != self._version:  # noqa: S301 - fits its checksum
             return {}  # another version of numba may not unpickle the rest
-        stamp, entries = pickle.load(file)  # noqa: S301 - fits its checksum
+        try:
+            stamp, entries = pickle.load(file)  # noqa: S301 - fits its checksum
+        except (AttributeError, ImportError):
+            return {}  # after an update, signatures may contain types that no longer exist
         return entries if stamp == self._source_stamp else {}
 
     def _save_index(self, entries: dict[Any, tuple[str, bytes]]) -> None:

@@ -319,12 +319,12 @@ def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
 
 
 @pytest.mark.extended
-def test_points_that_are_not_in_metres_are_refused(recording):
+def test_points_that_are_not_in_meters_are_refused(recording):
     def scaled(number):
         points, columns, pose = recording.read(number)
         return points * 1000, columns, pose
 
-    with pytest.raises(LidarError, match=r"ranges that change by .* give points in metres"):
+    with pytest.raises(LidarError, match=r"ranges that change by .* give points in meters"):
         fit(replace(recording, read=scaled))
 
 
@@ -540,7 +540,10 @@ def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
         (replace(recording, read=lambda number: nothing), "has no points: there is nothing to fit"),
         (replace(recording, count=0), "has no sweeps"),
         (replace(recording, thinned=True, notes=("one of 5 hits",)), "one of 5 hits"),
-        (replace(recording, read=lambda k: (*recording.read(k)[:1], {}, None)), "has no rings"),
+        (
+            replace(recording, read=lambda k: (*recording.read(k)[:1], {}, None)),
+            "has no column with rings",
+        ),
     ):
         with pytest.raises(LidarError, match=says) as raised:
             fit(made)

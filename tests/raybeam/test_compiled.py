@@ -38,11 +38,11 @@ def package(tmp_path):
     return package
 
 
-def start(package):
+def start(package, module="loops.more"):
     """Run the loop in a process, which prints what it adds and how often it compiled."""
     path = {**os.environ, "PYTHONPATH": str(Path(compiled.__file__).parents[1])}
     return subprocess.Popen(
-        [sys.executable, "-m", "loops.more"],
+        [sys.executable, "-m", module],
         cwd=package.parent, env=path, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
 
@@ -169,6 +169,24 @@ def test_code_of_an_earlier_version_of_a_loop_is_not_loaded(
     assert compilations(function_in(earlier, monkeypatch, "2.0 * x - 5.0")) == 1
     file_of(package, "nbc").write_bytes(file_of(earlier, "nbc").read_bytes())
     assert compilations(function) == 1
+
+
+@pytest.mark.extended
+def test_signatures_with_types_that_no_longer_exist_are_compiled_again(package):
+    """As after an update that renames a named tuple."""
+    loop = LOOP.partition("if __name__")[0]
+    (package / "more.py").write_text(
+        loop.replace('"f8(f8)"', "").replace("x + MORE", "x.one + MORE")
+    )
+    types = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    one: float\n"
+    types += "    two: float\n\nMORE = 2.0\n"
+    call = "from loops.more import more\nfrom loops.numbers import Pair\n\n"
+    call += "print(more(Pair(1.0, 2.0)), len(more.stats.cache_misses))\n"
+    for name in ("Pair", "Two"):
+        (package / "numbers.py").write_text(types.replace("Pair", name))
+        (package / "__main__.py").write_text(call.replace("Pair", name))
+        assert printed(start(package, "loops")) == ["3.0", "1"]
+        assert printed(start(package, "loops")) == ["3.0", "0"]
 
 
 def test_a_loop_that_cannot_be_kept_runs_with_a_note(package, function, caplog):
