@@ -4,8 +4,7 @@ import io
 
 import numpy as np
 
-from lidarpool import Cloud
-from lidarpool.plugins import FormatRow, Pieces, Recording, RecordingSource
+from lidarpool.plugins import Cloud, FormatRow, Pieces, Recording, RecordingSource
 
 ROW = FormatRow(
     "npy",  # name of the folder in a result

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpool import SceneMesh
-from lidarsim.plugins import Content, MeshFileError, MeshFormat, ReadOptions
+from lidarsim.plugins import Content, MeshFileError, MeshFormat, ReadOptions, SceneMesh
 
 CORNERS = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
 SIDES = np.array(
