@@ -682,7 +682,9 @@ def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise
         tab.wait_for(lambda _, tab=tab: colourful(tab.picture(tmp_path / "a.png")) > 3000)
         corner = tab.picture(tmp_path / "a.png")[5:40, 300:335].mean()
         assert (corner > 200) == (name == "light")
-        tab.value("document.querySelector('button[title=\"Switch between light and dark mode\"]').click()")
+        tab.value(
+            "document.querySelector('button[title=\"Switch between light and dark mode\"]').click()"
+        )
         assert tab.value(theme) == other
         tab.value("localStorage.clear()")
 
