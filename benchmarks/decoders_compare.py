@@ -37,7 +37,7 @@ def greatest(differences: AnyArray) -> float:
     return float(np.abs(differences).max(initial=0))
 
 
-def metres(length_m: float) -> str:
+def meters(length_m: float) -> str:
     """Return a length in words."""
     for factor, unit in ((1, "m"), (1e3, "mm"), (1e6, "µm")):
         if factor * length_m >= 0.1:
@@ -47,7 +47,7 @@ def metres(length_m: float) -> str:
 
 def apart(first: Any, second: Any) -> str:
     """Return the greatest distance between points (n, 3) in words."""
-    return metres(greatest(np.linalg.norm(np.asarray(first) - np.asarray(second), axis=1)))
+    return meters(greatest(np.linalg.norm(np.asarray(first) - np.asarray(second), axis=1)))
 
 
 def equality(first: Any, second: Any) -> str:
@@ -76,10 +76,10 @@ def compare_velodyne(drive: Drive, model: str, arrays: Arrays) -> Iterator[Row]:
         yield Row(file, "points", len(rows), {"number": f"{len(ring):,} in the cloud"})
         return
     off_m = np.linalg.norm(rows[:, :3] - drive.as_fired[sent], axis=1)
-    half = metres(float(np.median(off_m)))
+    half = meters(float(np.median(off_m)))
     lag_us = 1e6 * greatest(times_s[by_ring_and_time] - cloud["time"][sent] / 1e9)
     differences = {
-        "position": f"{metres(greatest(off_m))} (half: {half})",
+        "position": f"{meters(greatest(off_m))} (half: {half})",
         "ring, reflectivity": equality(rows[:, 3], cloud["reflectivity"][sent]),
         "time": f"{lag_us:.1f} µs",
     }
@@ -151,18 +151,18 @@ def _joined_sweeps(drive: Drive, arrays: Arrays) -> Row:
         truth = poses.inward(number, np.concatenate(parts))
         off_m.append(np.linalg.norm(arrays[f"joined/{number}"][:, :3] - truth, axis=1))
     total = np.concatenate(off_m)
-    differences = {"position (`from_file_multisweep`)": metres(greatest(total))}
+    differences = {"position (`from_file_multisweep`)": meters(greatest(total))}
     return Row("`nuscenes`", f"points, {_JOINED} sweeps joined", len(total), differences)
 
 
 def _actors_of(drive: Drive, arrays: Arrays) -> Ints:
     """Return the actors (n,) of annotations: of the same type, the nearest."""
     actors = []
-    columns = (arrays[f"boxes/{name}"] for name in ("names", "times_s", "centres"))
-    for name, time_s, centre in zip(*columns, strict=True):
+    columns = (arrays[f"boxes/{name}"] for name in ("names", "times_s", "centers"))
+    for name, time_s, center in zip(*columns, strict=True):
         candidates = [k for k, mover in enumerate(drive.movers) if mover.kind == name]
-        expected = drive.centres(np.full(len(candidates), time_s), np.array(candidates))
-        nearest = np.linalg.norm(expected - centre, axis=1).argmin()
+        expected = drive.centers(np.full(len(candidates), time_s), np.array(candidates))
+        nearest = np.linalg.norm(expected - center, axis=1).argmin()
         actors.append(candidates[nearest])
     return np.array(actors)
 
@@ -178,8 +178,8 @@ def _annotations(drive: Drive, arrays: Arrays, actors: Ints) -> Row:
     size_m = arrays["boxes/sizes"] - drive.sizes(actors)
     turned_deg = np.degrees(greatest(np.angle(np.exp(1j * headings))))
     differences = {
-        "centre": apart(arrays["boxes/centres"], drive.centres(times_s, actors)),
-        "size": metres(greatest(size_m)),
+        "center": apart(arrays["boxes/centers"], drive.centers(times_s, actors)),
+        "size": meters(greatest(size_m)),
         "heading": f"{turned_deg:.0e}°",
         "`box_velocity`": f"{100 * greatest(off):.1g} %",
         "`num_lidar_pts`": equality(arrays["boxes/points"], _point_counts(drive, times_s, actors)),
@@ -211,9 +211,9 @@ def _boxes_of_key_frames(drive: Drive, arrays: Arrays) -> Row:
     rows = arrays["boxes/in_sensor"]
     sweep = rows[:, 0].astype(np.int64)
     pose = drive.sweeps.pose
-    expected = drive.centres(drive.sweeps.begins_ns[sweep] / 1e9, rows[:, 1].astype(np.int64))
+    expected = drive.centers(drive.sweeps.begins_ns[sweep] / 1e9, rows[:, 1].astype(np.int64))
     rotated = np.einsum("nij,ni->nj", pose.rotations[sweep], expected - pose.positions[sweep])
-    differences = {"centre (`get_sample_data`)": apart(rows[:, 2:], rotated)}
+    differences = {"center (`get_sample_data`)": apart(rows[:, 2:], rotated)}
     return Row("`nuscenes`", "boxes of key frames, in the lidar's axes", len(rows), differences)
 
 
@@ -225,8 +225,8 @@ def _interpolated_boxes(drive: Drive, arrays: Arrays, actors: Ints) -> Row:
     numbers = range(len(drive.movers))
     first_s = np.array([times_s[actors == number].min(initial=np.inf) for number in numbers])
     between = (first_s[actor] < rows[:, 0]) & (rows[:, 0] < times_s.max())
-    expected = drive.centres(rows[between, 0], actor[between])
-    differences = {"centre (`get_boxes`)": apart(rows[between, 2:], expected)}
+    expected = drive.centers(rows[between, 0], actor[between])
+    differences = {"center (`get_boxes`)": apart(rows[between, 2:], expected)}
     return Row("`nuscenes`", "boxes between samples", len(expected), differences)
 
 
@@ -309,7 +309,7 @@ def compare_bag(drive: Drive, arrays: Arrays) -> Iterator[Row]:
     actors = boxes[:, 1].astype(np.int64)
     times_s = boxes[:, 0] + (arrays["bag/first_ns"].item() - start_ns) / 1e9
     differences = {
-        "centre": apart(boxes[:, 2:5], drive.centres(times_s, actors)),
-        "size": metres(greatest(boxes[:, 5:] - drive.sizes(actors))),
+        "center": apart(boxes[:, 2:5], drive.centers(times_s, actors)),
+        "size": meters(greatest(boxes[:, 5:] - drive.sizes(actors))),
     }
     yield Row("`mcap`", "boxes of `/actors`", len(boxes), differences)

@@ -59,8 +59,8 @@ def read_nuscenes(path: Path) -> Arrays:
     """Yield points, classes, boxes and velocities of a data set, by functions of the devkit."""
     from nuscenes.nuscenes import NuScenes
 
-    grey = defaultdict(lambda: (160, 160, 160))
-    tables = NuScenes("v1.0-lidarpool", str(path), verbose=False, colormap=grey)
+    gray = defaultdict(lambda: (160, 160, 160))
+    tables = NuScenes("v1.0-lidarpool", str(path), verbose=False, colormap=gray)
     yield from _nuscenes_points(tables)
     yield from _annotations(tables)
     yield from _boxes_of_sweeps(tables)
@@ -94,7 +94,7 @@ def _annotations(tables: Any) -> Arrays:
         box = tables.get_box(row["token"])
         columns["names"].append(box.name)
         columns["times_s"].append(tables.get("sample", row["sample_token"])["timestamp"] / 1e6)
-        columns["centres"].append(box.center)
+        columns["centers"].append(box.center)
         columns["sizes"].append(box.wlh[[1, 0, 2]])
         columns["rotations"].append(box.rotation_matrix)
         columns["velocities"].append(tables.box_velocity(row["token"]))
@@ -107,7 +107,7 @@ def _boxes_of_sweeps(tables: Any) -> Arrays:
     """Yield boxes of key frames in the sensor's axes, and of further sweeps in the world.
 
     Rows have the number of the sweep, or the time of the sweep in seconds, and the box's instance
-    and centre.
+    and center.
     """
 
     def instance(box: Any) -> int:
@@ -142,8 +142,8 @@ def _check_lists(tables: Any) -> None:
     for sample in tables.sample:
         tables.list_sample(sample["token"])
         tables.get_sample_lidarseg_stats(sample["token"])
-        centre = (0, 0, 0)
-        box = DetectionBox(sample["token"], translation=centre, detection_name="car")
+        center = (0, 0, 0)
+        box = DetectionBox(sample["token"], translation=center, detection_name="car")
         boxes.add_boxes(sample["token"], [box])
     add_center_dist(tables, boxes)  # distances from LIDAR_TOP
 
@@ -226,10 +226,10 @@ def _bag_points(topic: str, message: Any) -> Arrays:
 
 
 def _bag_box(marker: Any) -> tuple[int, tuple[float, ...]]:
-    """Return the stamp of a marker, ns, and its number, centre and size."""
-    centre = marker.pose.position
+    """Return the stamp of a marker, ns, and its number, center and size."""
+    center = marker.pose.position
     size = marker.scale
-    row = (marker.id, centre.x, centre.y, centre.z, size.x, size.y, size.z)
+    row = (marker.id, center.x, center.y, center.z, size.x, size.y, size.z)
     return _stamp_ns(marker), row
 
 

@@ -35,7 +35,7 @@ class Mover(NamedTuple):
     """An actor that moves evenly."""
 
     mesh: SceneMesh
-    start: tuple[float, float, float]  # position at time 0, metres
+    start: tuple[float, float, float]  # position at time 0, meters
     velocity: tuple[float, float, float]  # m/s
     present_s: tuple[float, float] = (-1.0, 60.0)
 
@@ -51,8 +51,8 @@ class Mover(NamedTuple):
         positions = np.array(self.start) + np.outer(times_s, self.velocity)
         return Actor(self.mesh, Track(times_s, positions, start_s=0.0, beyond="absent"))
 
-    def centre(self, time_s: float) -> Floats:
-        """Return the middle (3,) of the box at a time, by closed form, metres."""
+    def center(self, time_s: float) -> Floats:
+        """Return the middle (3,) of the box at a time, by closed form, meters."""
         x, y, z = self.actor.bounds.mean(axis=0)
         heading = np.arctan2(self.velocity[1], self.velocity[0])
         cos, sin = np.cos(heading), np.sin(heading)
@@ -89,21 +89,21 @@ class Drive:
 
     @cached_property
     def as_fired(self) -> Floats:
-        """Points (n, 3) in the sensor's axes at their firings, metres."""
+        """Points (n, 3) in the sensor's axes at their firings, meters."""
         sweeps = enumerate(self.points)
         return np.concatenate([self.sweeps.as_fired(number, points) for number, points in sweeps])
 
     def in_world(self, sweep: int) -> Floats:
-        """Return the points (n, 3) of a sweep in the world, metres."""
+        """Return the points (n, 3) of a sweep in the world, meters."""
         return self.points[sweep].positions.astype(np.float64)
 
-    def centres(self, times_s: Floats, actors: Ints) -> Floats:
-        """Return the middles (n, 3) of boxes of actors (n,) at times (n,), metres."""
+    def centers(self, times_s: Floats, actors: Ints) -> Floats:
+        """Return the middles (n, 3) of boxes of actors (n,) at times (n,), meters."""
         rows = zip(times_s.tolist(), actors.tolist(), strict=True)
-        return np.array([self.movers[int(actor)].centre(time_s) for time_s, actor in rows])
+        return np.array([self.movers[int(actor)].center(time_s) for time_s, actor in rows])
 
     def sizes(self, actors: Ints) -> Floats:
-        """Return the sizes (n, 3) of boxes of actors (n,), metres."""
+        """Return the sizes (n, 3) of boxes of actors (n,), meters."""
         bounds = np.array([mover.actor.bounds for mover in self.movers])
         return np.ptp(bounds, axis=1)[actors]
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from docs.pictures.effects._catalogue import load_effects
+from docs.pictures.effects._catalog import load_effects
 from docs.pictures.effects._street import survey_without
 
 from lidarscenes.procedural.city import city

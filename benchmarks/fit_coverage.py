@@ -45,7 +45,7 @@ def street() -> Scene:
 
 
 def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
-    """Make a box between two corners, metres."""
+    """Make a box between two corners, meters."""
     x, y, z = np.transpose([lower_m, upper_m]).astype(float)
     corners = np.array([(a, b, c) for a in x for b in y for c in z])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -54,7 +54,7 @@ def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
 
 
 def place(name: str, seed: int) -> tuple[Scene, tuple[float, float, float]]:
-    """Make a scene of `PLACES`; return the scene, and the position of a sensor, metres."""
+    """Make a scene of `PLACES`; return the scene, and the position of a sensor, meters."""
     rng = np.random.default_rng(seed)
     if name == "street":
         return city(30_000, seed=seed), (0.0, 0.0, 1.8)
@@ -87,7 +87,7 @@ def furnished_box(
     count: int,
     max_size: tuple[float, float, float],
 ) -> Scene:
-    """Make a closed room of a size with `count` boxes of up to `max_size` in it, metres."""
+    """Make a closed room of a size with `count` boxes of up to `max_size` in it, meters."""
     x, y, z = size
     meshes = [box("shell", (-x / 2, -y / 2, 0), (x / 2, y / 2, z))]
     for number in range(count):
@@ -107,7 +107,7 @@ def recorded(
     columns: int = COLUMNS,
     cache: Path | None = None,
 ) -> Recording:
-    """Record sweeps of a standing sensor, with an error of each channel in metres."""
+    """Record sweeps of a standing sensor, with an error of each channel in meters."""
     if cache is None or not cache.exists():
         sensor = Sensor.grid(columns, LAYERS, vertical_fov_deg=40, max_range_m=FARTHEST_M)
         scanner = Scanner(

@@ -30,7 +30,7 @@ from lidarsim.simulator.steps.angle_noise import angle_errors
 from lidarsim.simulator.steps.detection import detected
 from lidarsim.simulator.steps.range_noise import noisy_ranges
 
-COLOURS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
+COLORS = {"recorded": "#1c2430", "data sheet": "#ee7733", "fitted": "#4477aa"}
 
 
 def every_second_sweep(recording: Recording, first: int) -> Recording:
@@ -42,7 +42,7 @@ def every_second_sweep(recording: Recording, first: int) -> Recording:
 
 
 def simulate_ranges(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
-    """Simulate the ranges of rays in sweeps, (s, k) metres; NaN where a pulse is lost."""
+    """Simulate the ranges of rays in sweeps, (s, k) meters; NaN where a pulse is lost."""
     keys = np.arange(len(rays.row))
     result = np.full((sweeps, len(keys)), np.nan)
     for scan in range(sweeps):
@@ -55,7 +55,7 @@ def simulate_ranges(noise: Noise, rays: Any, energy: Any, sweeps: int) -> Any:
 
 
 def deviations(ranges: Any) -> Any:
-    """Return differences of successive sweeps divided by √2, millimetres."""
+    """Return differences of successive sweeps divided by √2, millimeters."""
     steps = np.diff(ranges, axis=0) / np.sqrt(2)
     return 1000 * steps[np.isfinite(steps)]
 
@@ -93,7 +93,7 @@ def compare_halves(recording: Recording, model: str | None, white: float | None)
 
 
 def flattened_ranges(stack: SweepStack, rays: Any) -> Any:
-    """Return recorded ranges of rays, (s, k) metres, without the effect of azimuth offsets."""
+    """Return recorded ranges of rays, (s, k) meters, without the effect of azimuth offsets."""
     with warnings.catch_warnings(action="ignore"):  # of cells without a return
         median_ranges = np.nanmedian(stack.ranges, axis=0)
     azimuth_slope = find_surfaces(stack, median_ranges, stack.rough_sigma).azimuth_slope
@@ -134,7 +134,7 @@ def draw_deviations(axes: Any, comparison: Comparison) -> None:
                 range=(-limit, limit),
                 weights=share,
                 histtype="step",
-                color=COLOURS[source],
+                color=COLORS[source],
                 label=source,
             )
 

@@ -30,21 +30,21 @@ def placed(name: str, mesh: Faces, origin: Any = (0, 0, 0)) -> Placed:
 def scenes(sizes: Sizes) -> Iterator[Placed]:
     """Yield 20 scenes: of all sizes, nested, masked, far from the origin, and degenerate."""
     vertices, faces = six_objects()
-    centre = np.array([0, 0, 2.0])
-    yield placed("six objects", (vertices, faces), centre)
-    yield placed("six objects in millimetres", (1e-3 * vertices, faces), 1e-3 * centre)
-    yield placed("six objects in kilometres", (1e3 * vertices, faces), 1e3 * centre)
-    yield placed("six objects on a map", (vertices + _FAR_M, faces), centre + _FAR_M)
+    center = np.array([0, 0, 2.0])
+    yield placed("six objects", (vertices, faces), center)
+    yield placed("six objects in millimeters", (1e-3 * vertices, faces), 1e-3 * center)
+    yield placed("six objects in kilometers", (1e3 * vertices, faces), 1e3 * center)
+    yield placed("six objects on a map", (vertices + _FAR_M, faces), center + _FAR_M)
     for kind in _SOUPS:
         yield placed(f"{kind} triangles", soup(kind))
     points, sides = ball(5.0)
     yield placed("inside a ball", (points, sides), [1, 0.5, -2])
     yield placed("inside a ball on a map", (points + _FAR_M, sides), [_FAR_M + 1] * 3)
     ground, cells = flat_ground(9, 5.0)
-    yield placed("ground that lies double", joined([(ground, cells), (ground, cells)]), centre)
+    yield placed("ground that lies double", joined([(ground, cells), (ground, cells)]), center)
     yield placed("in the plane of the ground", (ground, cells))
     for kind, shear in {"turned": 0.0, "sheared": 0.5}.items():
-        yield f"instances, {kind}", list(scattered_instances(shear)), centre
+        yield f"instances, {kind}", list(scattered_instances(shear)), center
     crown = np.array([0.3, 0.2, 6.0])
     for words, masked in {"": False, ", masked": True}.items():
         yield f"forest{words}", forest(25, 2000, masked), crown

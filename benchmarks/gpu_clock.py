@@ -130,7 +130,7 @@ class Split:
         self._pairs.append((name, start, stream.record()))
 
     def milliseconds(self) -> dict[str, float]:
-        """Synchronise the device, and return the sums by name, milliseconds."""
+        """Synchronize the device, and return the sums by name, milliseconds."""
         self._cupy.cuda.Device().synchronize()
         sums: Counter[str] = Counter()
         for name, start, stop in self._pairs:

@@ -89,7 +89,7 @@ def merged_forest(tree_mesh: TreeMesh, transforms: Float, backend: str) -> RayCa
 
 
 def _reach(trees: int) -> float:
-    """Half the side of the ground, metres."""
+    """Half the side of the ground, meters."""
     return float(_APART * np.sqrt(trees) + 50)
 
 

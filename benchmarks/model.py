@@ -147,12 +147,12 @@ def draw(costs: Costs, read: dict[str, dict[str, float]], path: Path) -> None:
 
     figure = Figure(figsize=(8, 4), layout="constrained")
     axes = figure.subplots()
-    for seconds, colour in zip(SECONDS, ("#e4752e", "#2a6fb0", "#3b8f5a"), strict=True):
+    for seconds, color in zip(SECONDS, ("#e4752e", "#2a6fb0", "#3b8f5a"), strict=True):
         shares = [100 * busy(gpus, seconds, costs) for gpus in GPUS]
-        axes.plot(GPUS, shares, color=colour, label=f"batches of {seconds:g} s")
+        axes.plot(GPUS, shares, color=color, label=f"batches of {seconds:g} s")
         runs = [run for run in read.values() if run["seconds"] == seconds and run["shards"] == 1]
         points = [run["gpus"] for run in runs], [100 * run["busy"] for run in runs]
-        axes.plot(*points, "o", color=colour)
+        axes.plot(*points, "o", color=color)
     axes.plot([], [], "o", color="0.4", label="read")
     axes.set(xscale="log", xlabel="GPU workers of one scheduler", ylim=(0, 105))
     axes.set_ylabel("time that they cast, %")

@@ -45,7 +45,7 @@ WARM_UP = 6  # sweeps in which KISS-ICP knows no motion yet
 
 
 class Distances(NamedTuple):
-    """Distances of deskewed points from their true positions, metres."""
+    """Distances of deskewed points from their true positions, meters."""
 
     median: float
     percentile_95: float

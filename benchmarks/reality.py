@@ -12,10 +12,10 @@ each in the folder of its repository:
 
 Sweeps are held out by two rules: `easy` holds out every second sweep, `hard` blocks of 20. The
 static mask does not come from the twin: a point is static if other sweeps, a second away, have
-points in its neighbourhood. `next` compares each held-out sweep with the following recorded one,
+points in its neighborhood. `next` compares each held-out sweep with the following recorded one,
 pulse by pulse: a scale, since the sensor moved between the two.
 
-The recordings are not part of lidarpool, and none states a licence: fetch them yourself.
+The recordings are not part of lidarpool, and none states a license: fetch them yourself.
 """
 
 from __future__ import annotations

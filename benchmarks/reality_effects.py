@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from lidarpool.places.alignment import AlignedSweeps
-from lidarpool.places.building import NO_RETURN, coloured, fit_sensor
+from lidarpool.places.building import NO_RETURN, colored, fit_sensor
 from lidarpool.places.lost_pulses import Answering
 from lidarpool.places.motion import Motion
 from lidarpool.places.place import Place
@@ -38,7 +38,7 @@ from lidarpool.places.reflectances import Reflectances
 from lidarpool.places.surfels import surfel_mesh
 from lidarsim import Material, Noise, Returns, Scanner, Scene
 from lidarsim.base.arrays import Bools, Floats, Ints
-from lidarsim.motion.trajectory import CENTRE
+from lidarsim.motion.trajectory import CENTER
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.beams import Spin
 from lidarsim.sensor.models import SensorModel, read_model
@@ -65,20 +65,20 @@ class Rays:
     Attributes
     ----------
     origins, directions
-        float64 (n, 3): in the place, metres, and of length 1.
+        float64 (n, 3): in the place, meters, and of length 1.
     recorded_m
         float64 (n,): NaN of a lost pulse.
     standing
         bool (n,): whether the recorded point stands.
-    neighbours
-        bool (n - 2,): whether three successive rays are neighbours on a ring.
+    neighbors
+        bool (n - 2,): whether three successive rays are neighbors on a ring.
     """
 
     origins: Floats
     directions: Floats
     recorded_m: Floats
     standing: Bools
-    neighbours: Bools
+    neighbors: Bools
 
     @classmethod
     def of_sweeps(
@@ -107,7 +107,7 @@ class Rays:
         ring, azimuth = joined[4:]
         order = np.lexsort((azimuth, ring))
         return cls(
-            *(values[order] for values in joined[:4]), _neighbours(ring[order], azimuth[order])
+            *(values[order] for values in joined[:4]), _neighbors(ring[order], azimuth[order])
         )
 
     def sensor(self) -> ListedSensor:
@@ -122,8 +122,8 @@ class Rays:
         )
 
 
-def _neighbours(ring: Ints, azimuth: Floats) -> Bools:
-    """Mark successive three of rays, sorted by ring and azimuth, that are neighbours."""
+def _neighbors(ring: Ints, azimuth: Floats) -> Bools:
+    """Mark successive three of rays, sorted by ring and azimuth, that are neighbors."""
     gap = np.diff(azimuth)
     step = np.median(gap[(gap > 0) & (np.diff(ring) == 0)])
     return (ring[2:] == ring[:-2]) & (azimuth[2:] - azimuth[:-2] < _MAX_STEPS * step)
@@ -185,7 +185,7 @@ class Effects:
             noise=self.noise,
         )
         frames = -(-len(rays.recorded_m) // _SWEEP_RAYS)
-        ranges_m = [scanner.ranges(CENTRE, number=number).ravel() for number in range(frames)]
+        ranges_m = [scanner.ranges(CENTER, number=number).ravel() for number in range(frames)]
         found_m = np.concatenate(ranges_m)[: len(rays.recorded_m)].astype(np.float64)
         return np.where(found_m <= max_range_m, found_m, np.nan)
 
@@ -199,7 +199,7 @@ def figures(rays: Rays, simulated_m: Floats) -> dict[str, float]:
     rough = []
     mixed = []
     bends = [np.abs(np.diff(ranges_m, 2)) for ranges_m in (simulated_m, rays.recorded_m)]
-    same = rays.neighbours & np.isfinite(bends[0] + bends[1])
+    same = rays.neighbors & np.isfinite(bends[0] + bends[1])
     same &= rays.standing[1:-1] & rays.standing[:-2] & rays.standing[2:]
     for ranges_m, bend_m in zip((simulated_m, rays.recorded_m), bends, strict=True):
         rough.append(float(np.median(bend_m[same])))
@@ -207,7 +207,7 @@ def figures(rays: Rays, simulated_m: Floats) -> dict[str, float]:
         between = (ranges_m[1:-1] > sides[0] + _OFF_EDGE_M) & (
             ranges_m[1:-1] < sides[1] - _OFF_EDGE_M
         )
-        edges = rays.neighbours & (sides[1] - sides[0] > _MIN_EDGE_M)
+        edges = rays.neighbors & (sides[1] - sides[0] > _MIN_EDGE_M)
         mixed.append(float((between & edges).sum() / np.isfinite(ranges_m).sum()))
     return {
         "median_size_m": float(np.median(size_m)),
@@ -223,11 +223,11 @@ def figures(rays: Rays, simulated_m: Floats) -> dict[str, float]:
 
 
 def meshes(place: Place, reflectances: Reflectances | None) -> tuple[SceneMesh, list[SceneMesh]]:
-    """Return the surfels that return light, with colours, and those that return nothing, if any."""
+    """Return the surfels that return light, with colors, and those that return nothing, if any."""
     dark = place.surfels.dark
     lit = place.surfels.part(~dark).mesh
     if reflectances is not None:
-        lit = coloured(lit, replace(reflectances, surfels=reflectances.surfels[~dark]))
+        lit = colored(lit, replace(reflectances, surfels=reflectances.surfels[~dark]))
     corners = place.surfels.mesh.vertices.reshape(-1, 4, 3)[dark]
     return lit, [surfel_mesh(NO_RETURN, corners)] if len(corners) else []
 

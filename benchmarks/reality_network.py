@@ -35,7 +35,7 @@ _KINDS = ("recorded", "simulated", "next")
 class Sweep(NamedTuple):
     """Points of a sweep, as the network reads them."""
 
-    points: Floats  # (n, 3): sensor frame, metres
+    points: Floats  # (n, 3): sensor frame, meters
     intensity: Floats  # (n,): 0 to 1
     standing: Bools  # (n,)
 

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 # Middle of the block, EPSG:25832.
 EAST = 691_000.0
 NORTH = 5_334_000.0
-# Of the street around the block, metres.
+# Of the street around the block, meters.
 HALF = 100.0
 CORNER = 14.0
 WIDTH = 8.0
@@ -106,7 +106,7 @@ def street_image() -> Image.Image:
 
 
 def crossing_image() -> Image.Image:
-    """Paint a crossing: half-metre bars."""
+    """Paint a crossing: half-meter bars."""
     image = np.full((400, 200), 84, np.uint8)
     for begin in range(20, 380, 50):
         image[begin : begin + 25, 15:185] = 238
@@ -126,7 +126,7 @@ def facade_image() -> Image.Image:
 
 
 class Block:
-    """A stage with meshes, textures and point instancers, in metres and Z-up."""
+    """A stage with meshes, textures and point instancers, in meters and Z-up."""
 
     def __init__(self, path: Path) -> None:
         self.stage = Usd.Stage.CreateInMemory()
@@ -149,14 +149,14 @@ class Block:
             st.Set(Vt.Vec2fArray.FromNumpy(uv.astype(np.float32)))
         return mesh.GetPrim()
 
-    def colour(self, prim: Usd.Prim, colours: list[tuple[float, ...]]) -> None:
-        """Colour a mesh, or each of its polygons, in linear light."""
+    def color(self, prim: Usd.Prim, colors: list[tuple[float, ...]]) -> None:
+        """Color a mesh, or each of its polygons, in linear light."""
         primvar = UsdGeom.Gprim(prim).CreateDisplayColorPrimvar(
-            UsdGeom.Tokens.uniform if len(colours) > 1 else UsdGeom.Tokens.constant
+            UsdGeom.Tokens.uniform if len(colors) > 1 else UsdGeom.Tokens.constant
         )
-        table = sorted(set(colours))
-        primvar.Set([Gf.Vec3f(*colour) for colour in table])
-        primvar.SetIndices([table.index(colour) for colour in colours])
+        table = sorted(set(colors))
+        primvar.Set([Gf.Vec3f(*color) for color in table])
+        primvar.SetIndices([table.index(color) for color in colors])
 
     def texture(self, prim: Usd.Prim, image: Image.Image, name: str) -> None:
         """Give a mesh an image, which is written beside the scene."""
@@ -278,7 +278,7 @@ def maple_tree(stage: Block) -> Usd.Prim:
     wood = len(shape.faces) - 13 * 10 * 40
     brown = (0.10, 0.06, 0.04)
     green = (0.09, 0.22, 0.04)
-    stage.colour(maple, [brown] * wood + [green] * (len(shape.faces) - wood))
+    stage.color(maple, [brown] * wood + [green] * (len(shape.faces) - wood))
     return maple
 
 

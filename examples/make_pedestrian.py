@@ -17,15 +17,15 @@ SPEED_M_S = 1.4
 CYCLE_S = 1.05
 KEYS = 36  # of the animation
 STANCE = 0.62  # share of the cycle
-LEG = 0.43  # length of thigh and shank, metres
+LEG = 0.43  # length of thigh and shank, meters
 ANKLE_M = 0.08  # height
-# Of a foot, ahead of its ankle, metres.
+# Of a foot, ahead of its ankle, meters.
 HEEL = -0.05
 BALL = 0.13
 STRIKE_M = 0.27  # where heels strike, ahead of the hips
 HIP_M = 0.90  # height of the hips
 LIFT_M = 0.08  # by which a foot in the air is lifted
-# Joints: name, parent, place in the figure as it is modelled. L is at positive y.
+# Joints: name, parent, place in the figure as it is modeled. L is at positive y.
 JOINTS = [("hips", None, (0, 0, 0.94)), ("spine", "hips", (0, 0, 1.08)),
           ("head", "spine", (0, 0, 1.5))]  # fmt: skip
 for _side, _y in (("L", 1), ("R", -1)):
@@ -191,13 +191,13 @@ def ankle(phase):
     phase = np.asarray(phase) % 1
 
     def standing(phase):
-        travelled = SPEED_M_S * CYCLE_S * phase
+        traveled = SPEED_M_S * CYCLE_S * phase
         up = np.radians(20) * np.clip(1 - phase / 0.1, 0, 1)
         rises = np.clip((phase - 0.32) / (STANCE - 0.32), 0, 1)
         down = np.radians(60) * rises**1.6
         pitch = up - down
         pivot = np.where(phase < 0.2, HEEL, BALL)
-        x = STRIKE_M - HEEL + pivot - travelled - (pivot * np.cos(pitch) + ANKLE_M * np.sin(pitch))
+        x = STRIKE_M - HEEL + pivot - traveled - (pivot * np.cos(pitch) + ANKLE_M * np.sin(pitch))
         return np.stack([x, ANKLE_M * np.cos(pitch) - pivot * np.sin(pitch), pitch])
 
     # In the air: on a cubic from where and how the foot leaves to where and how it strikes.

@@ -36,7 +36,7 @@ def main() -> None:
     next_state = model.state()
     collisions = newton.CollisionPipeline(model)
     contacts = collisions.contacts()
-    # Frames of Newton's boxes are at their centres, of `box` in the middle below.
+    # Frames of Newton's boxes are at their centers, of `box` in the middle below.
     mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).moved("Box", np.eye(3), np.array([0, 0, -0.3]))
     follower = Follower(
         [mesh] * len(positions),

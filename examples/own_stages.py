@@ -16,7 +16,7 @@ from poolpart import Pipe, Pool
 
 SCANS = 36
 RAYS = 500
-ROOM = np.array([8.0, 6.0, 3.0])  # metres, around the sensor in its middle
+ROOM = np.array([8.0, 6.0, 3.0])  # meters, around the sensor in its middle
 TRIALS = 100
 
 

@@ -30,7 +30,7 @@ def main() -> None:
     shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[SIZE_M / 2] * 3)
     positions = np.random.default_rng(7).uniform((2, -3, 1), (8, 3, 4), (12, 3))
     boxes = [bullet.createMultiBody(5, shape, basePosition=p) for p in positions.tolist()]
-    # Frames of PyBullet's boxes are at their centres, of `box` in the middle below.
+    # Frames of PyBullet's boxes are at their centers, of `box` in the middle below.
     mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).moved("Box", np.eye(3), np.array([0, 0, -0.3]))
     follower = Follower(
         [mesh] * len(boxes),

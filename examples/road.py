@@ -28,17 +28,15 @@ def markings() -> Image.Image:
     middle = len(image) // 2
     for begin in range(0, image.shape[1], 180):  # 3 m of every 9 m
         image[middle - 2 : middle + 2, begin : begin + 60] = YELLOW
-    for begin in range(16, len(image) - 20, 20):  # 50 cm of every metre
+    for begin in range(16, len(image) - 20, 20):  # 50 cm of every meter
         image[begin : begin + 10, 560:620] = WHITE
     return Image.fromarray(image)
 
 
-def slab(
-    lower: tuple[float, ...], upper: tuple[float, ...], colour: list[float]
-) -> trimesh.Trimesh:
-    """Make a box of a colour, linear light."""
+def slab(lower: tuple[float, ...], upper: tuple[float, ...], color: list[float]) -> trimesh.Trimesh:
+    """Make a box of a color, linear light."""
     box = trimesh.creation.box(bounds=[lower, upper])
-    box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*colour, 1.0]))
+    box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*color, 1.0]))
     return box
 
 

@@ -23,7 +23,7 @@ GOAL = (-30.0, -20.0)
 class RobotEnv(gymnasium.Env):
     """Observes 64 ranges and the goal; acts by speed, 0 to 2 m/s, and rate of turning.
 
-    The reward is the way towards the goal, in metres; an episode ends at the goal or a wall.
+    The reward is the way towards the goal, in meters; an episode ends at the goal or a wall.
     """
 
     def __init__(self, scene=None):

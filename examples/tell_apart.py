@@ -17,8 +17,8 @@ import lidarpool as lp
 from lidarscenes.procedural.city import city
 
 CLASSES = ("ground", "building", "car", "tree or lamp")  # 1 to 4 in the column `class`
-COLOURS = ListedColormap(("#aab2bb", "#4477aa", "#ee7733", "#44aa77"))
-SIDES = (0.4, 2.0)  # of cells around a point, metres
+COLORS = ListedColormap(("#aab2bb", "#4477aa", "#ee7733", "#44aa77"))
+SIDES = (0.4, 2.0)  # of cells around a point, meters
 WIDTHS = (64, 32)  # of the hidden layers
 BATCH = 1024  # points
 EPOCHS = 6
@@ -73,9 +73,9 @@ def column_features(points, side):
     highest = np.full(rows * columns, -np.inf)
     np.minimum.at(lowest, cell, z)
     np.maximum.at(highest, cell, z)
-    neighbours = cell + np.add.outer((-columns, 0, columns), (-1, 0, 1)).reshape(9, 1)
-    ground = lowest[neighbours].min(axis=0)
-    top = highest[neighbours].max(axis=0)
+    neighbors = cell + np.add.outer((-columns, 0, columns), (-1, 0, 1)).reshape(9, 1)
+    ground = lowest[neighbors].min(axis=0)
+    top = highest[neighbors].max(axis=0)
     return [z - ground, top - ground, highest[cell] - z, highest[cell] - lowest[cell]]
 
 
@@ -173,7 +173,7 @@ def main(folder="cities"):
     figure = Figure((14, 7.4), layout="constrained")
     shown = {"What it is": sweep.classes - 1, "What it says": network.says(features(sweep))}
     for axes, (title, rows) in zip(figure.subplots(1, 2), shown.items(), strict=True):
-        dots = axes.scatter(*sweep.points[:, :2].T, s=1, c=rows, cmap=COLOURS, vmin=-0.5, vmax=3.5)
+        dots = axes.scatter(*sweep.points[:, :2].T, s=1, c=rows, cmap=COLORS, vmin=-0.5, vmax=3.5)
         axes.set(xlim=(-40, 40), ylim=(-40, 40), aspect="equal", title=title, xlabel="m")
     figure.legend(dots.legend_elements()[0], CLASSES, loc="outside lower center", ncols=4)
     figure.savefig("tell-apart.png", dpi=120)

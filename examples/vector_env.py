@@ -36,7 +36,7 @@ def world(robots: int) -> str:
 class LidarVectorEnv(gymnasium.vector.VectorEnv):
     """Observes velocities and ranges (channels, firings); acts by speed and rate of turning.
 
-    The reward is the distance driven, in metres; an episode ends at a column or a wall.
+    The reward is the distance driven, in meters; an episode ends at a column or a wall.
     """
 
     def __init__(self, num_envs=8):

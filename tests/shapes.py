@@ -9,16 +9,16 @@ import numpy as np
 import trimesh
 
 from lidarpool import Beams, Optics, Pose, Scene, SceneMesh, Sensor, Spin, Survey
-from lidarsim.scene.colours import Colours
+from lidarsim.scene.colors import Colors
 from lidarsim.simulator.rig import Rig
 from raybeam import available_backends
 
 CPU = [name for name in ("numpy", "tiles") if not available_backends()[name]]
 BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
-COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
+COLORS = Colors.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
 PLATE = SceneMesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))
 BALL_AROUND = Scene.from_meshes(
-    [SceneMesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS), PLATE]
+    [SceneMesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colors=COLORS), PLATE]
 )
 DELAYS = 300.0 * np.arange(128)
 SPIN_OF_128_BEAMS = Sensor(Beams(np.radians(np.linspace(-22, 22, 128)), time_ns=DELAYS), Spin(2048))
@@ -57,12 +57,12 @@ def block(name, size, middle=(0, 0, 0)):
     return solid(name, trimesh.creation.box(size), middle)
 
 
-def ball(name, radius, centre=(0, 0, 0), fineness=4):
-    return solid(name, trimesh.creation.icosphere(fineness, radius), centre)
+def ball(name, radius, center=(0, 0, 0), fineness=4):
+    return solid(name, trimesh.creation.icosphere(fineness, radius), center)
 
 
 def room(offset=(0, 0, 0)):
-    """A closed room of 10 by 8 by 6 metres around the offset, each side an object."""
+    """A closed room of 10 by 8 by 6 meters around the offset, each side an object."""
     low = np.array([-5.0, -4.0, -3.0])
     high = np.array([5.0, 4.0, 3.0])
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -107,7 +107,7 @@ def cast(meshes, sensor=None, at=(0, 0, 0), backend="numpy", *, steps=1, **optio
 class Cart:
     """Drives along x while it turns about z, in lanes that lie side by side."""
 
-    speed: float = 5.0  # metres a second
+    speed: float = 5.0  # meters a second
     yaw_rate_deg: float = 90.0  # a second
     stations: int = 2
     moves: bool = True

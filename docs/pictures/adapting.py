@@ -126,18 +126,18 @@ def draw(samples: Sequence[Sample]) -> Page:
     page = Page((1600, 1240))
     unit = page.unit
     times = [sample["t"] for sample in samples]
-    colours = dict(zip(NAMES, theme.OBJECT_COLOURS, strict=False))
+    colors = dict(zip(NAMES, theme.OBJECT_COLORS, strict=False))
     limits = {"xlim": (0, END_S)}
     heights = (0.25, 0.26, 0.22)
     bottoms = (0.625, 0.335, 0.085)
     tasks = page.chart((0.085, bottoms[0], 0.70, heights[0]), **limits)
     for name in NAMES:
         counts = [sample[name]["tasks"] for sample in samples]
-        tasks.step(times, counts, where="post", color=colours[name], lw=1.6 * unit)
-        tasks.fill_between(times, counts, step="post", color=colours[name], alpha=0.12, lw=0)
+        tasks.step(times, counts, where="post", color=colors[name], lw=1.6 * unit)
+        tasks.fill_between(times, counts, step="post", color=colors[name], alpha=0.12, lw=0)
         for start_s, partition, count, _ in WORK:
             if partition == name:
-                _annotate(page, tasks, f"{count} tasks of {name}", (start_s, count), colours[name])
+                _annotate(page, tasks, f"{count} tasks of {name}", (start_s, count), colors[name])
     tasks.set_ylabel("tasks to do")
     tasks.set_ylim(0, 1.22 * max(count for _, _, count, _ in WORK))
     for name, bottom, height in zip(NAMES, bottoms[1:], heights[1:], strict=True):
@@ -148,8 +148,8 @@ def draw(samples: Sequence[Sample]) -> Page:
         )
         jobs = [a + b for a, b in zip(running, waiting, strict=True)]
         axes.fill_between(times, running, jobs, step="post", color=theme.UNSEEN, lw=0)
-        axes.fill_between(times, running, step="post", color=colours[name], alpha=0.28, lw=0)
-        axes.fill_between(times, busy, step="post", color=colours[name], alpha=0.75, lw=0)
+        axes.fill_between(times, running, step="post", color=colors[name], alpha=0.28, lw=0)
+        axes.fill_between(times, busy, step="post", color=colors[name], alpha=0.75, lw=0)
         axes.step(times, slots, where="post", color=theme.INK, lw=1.3 * unit)
         axes.set_ylabel(f"{name}: jobs, slots")
         axes.set_ylim(0, MAX_WORKERS[name] + 0.45)
@@ -166,10 +166,10 @@ def draw(samples: Sequence[Sample]) -> Page:
     tasks.tick_params(labelbottom=False)
     page.key(
         [
-            *(Line2D([], [], color=colours[n], lw=2.4 * unit, label=f"{n}") for n in NAMES),
+            *(Line2D([], [], color=colors[n], lw=2.4 * unit, label=f"{n}") for n in NAMES),
             _square(theme.UNSEEN, 1.0, "job in the queue", unit),
-            _square(colours["GPU"], 0.28, "job that runs", unit),
-            _square(colours["GPU"], 0.8, "slot with a task", unit),
+            _square(colors["GPU"], 0.28, "job that runs", unit),
+            _square(colors["GPU"], 0.8, "slot with a task", unit),
             Line2D([], [], color=theme.INK, lw=1.3 * unit, label="slots"),
         ],
         7.0,
@@ -183,9 +183,9 @@ def draw(samples: Sequence[Sample]) -> Page:
     return page
 
 
-def _square(colour: str, alpha: float, label: str, unit: float) -> Line2D:
+def _square(color: str, alpha: float, label: str, unit: float) -> Line2D:
     mark = {"marker": "s", "ms": 6.5 * unit, "mec": "none", "alpha": alpha}
-    return Line2D([], [], ls="", color=colour, label=label, **mark)
+    return Line2D([], [], ls="", color=color, label=label, **mark)
 
 
 def _annotate(
@@ -193,12 +193,12 @@ def _annotate(
     axes: Any,
     words: str,
     position: tuple[float, float],
-    colour: str,
+    color: str,
     mark: bool = False,
 ) -> None:
     unit = page.unit
     if mark:
-        axes.axvline(position[0], color=colour, lw=0.9 * unit, ls=(0, (3, 2)))
+        axes.axvline(position[0], color=color, lw=0.9 * unit, ls=(0, (3, 2)))
     axes.annotate(
         words,
         position,
@@ -206,7 +206,7 @@ def _annotate(
         textcoords="offset points",
         family=FONT,
         fontsize=6.8 * unit,
-        color=colour,
+        color=color,
         va="bottom",
     )
 

@@ -21,7 +21,7 @@ from PIL import Image
 
 from lidarscenes.procedural.city import city
 from lidarview.render.camera import Camera
-from lidarview.render.colouring import TURBO
+from lidarview.render.coloring import TURBO
 from lidarview.render.pictures import splat
 from lidarview.render.surface import unit
 
@@ -29,7 +29,7 @@ SIZE = (720, 405)
 BACK = np.array([14, 17, 22, 255]) / 255
 EYE = np.array([-38.0, -30.0, 34.0])
 TARGET = np.array([4.0, 4.0, 0.0])
-RAISED = 12.0  # metres above the ground with the last colour
+RAISED = 12.0  # meters above the ground with the last color
 
 
 def cast(sweeps: int, triangles: int, connection: Connection) -> None:

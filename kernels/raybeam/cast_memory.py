@@ -14,18 +14,18 @@ from .pattern import Pattern
 from .poses import Poses
 
 # A cast: addresses of arrays that the loops read or write, and numbers. Address 0: no array. A ray
-# belongs to a row of the pattern, which is a beam, or a sub-ray of a beam. Local: centred and
+# belongs to a row of the pattern, which is a beam, or a sub-ray of a beam. Local: centered and
 # scaled, as `Frame` describes.
 CAST = np.dtype(
     [
         ("mesh", "i8"),  # `MESH` records
         ("instances", "i8"),  # `INSTANCE` records; 0 for a single mesh without a transform
         ("directions", "i8"),  # float64 (3, rows): unit vectors of beams
-        ("origins", "i8"),  # float64 (3, rows): origins of beams, relative to the sensor, metres
-        ("positions", "i8"),  # float64 (3, poses), metres
+        ("origins", "i8"),  # float64 (3, rows): origins of beams, relative to the sensor, meters
+        ("positions", "i8"),  # float64 (3, poses), meters
         ("rotations", "i8"),  # float64 (9, poses): matrices to the scene's axes, by rows
         ("delays", "i8"),  # float64 (rays_per_pose,), seconds after the pose's time
-        ("velocities", "i8"),  # float64 (3, poses), metres a second
+        ("velocities", "i8"),  # float64 (3, poses), meters a second
         ("rates", "i8"),  # float64 (3, poses): angular rates, radians a second
         ("beam_count", "i8"),  # number of beams
         ("poses", "i8"),  # number of poses
@@ -38,7 +38,7 @@ CAST = np.dtype(
         ("has_axis", "i8"),  # whether `axis` defines the directions across and up of sub-rays
         ("has_starts", "i8"),  # whether sub-rays start off their beam's origin
         ("axis", "f8", 3),
-        ("centre", "f8", 3),  # the next two fields are of the scene's `Frame`
+        ("center", "f8", 3),  # the next two fields are of the scene's `Frame`
         ("scale", "f8"),
         ("shares_origin", "i8"),  # whether all rays start at the position of a single pose
         ("tile", "i8"),  # memory of a tile, at a multiple of 64
@@ -55,10 +55,10 @@ CAST = np.dtype(
         ("hits", "i8"),  # float64, then int64: distances and keys of a call's rays, and one more
         ("first_ray", "i8"),  # the ray whose number is written as 0
         ("ray", "i8"),  # output of hits: uint32
-        ("distance", "i8"),  # float64, metres
+        ("distance", "i8"),  # float64, meters
         ("triangle", "i8"),  # int32
         ("instance", "i8"),  # int32
-        ("origins_out", "i8"),  # output of rays, float64 (3, ray_count): origins, metres
+        ("origins_out", "i8"),  # output of rays, float64 (3, ray_count): origins, meters
         ("directions_out", "i8"),  # output of rays, float64 (3, ray_count): directions
         ("ray_count", "i8"),  # number of rays of `origins_out` and `directions_out`
     ]
@@ -138,7 +138,7 @@ class Cast:
     ) -> None:
         """Write the beams, the poses and the row of ray 0 to the record.
 
-        Directions and origins (n, 3), metres, are in the sensor's axes; None for no origins.
+        Directions and origins (n, 3), meters, are in the sensor's axes; None for no origins.
         `first` is the row of ray 0, counted in sub-rays.
         """
         record = self.record
@@ -164,7 +164,7 @@ class Cast:
     def set_pattern(self, pattern: Pattern, poses: Poses, first: int) -> float:
         """Write a pattern, poses and the row of ray 0, and return the maximum offset of a start.
 
-        The offset, metres, is the largest component of the vectors from a beam's origin to the
+        The offset, meters, is the largest component of the vectors from a beam's origin to the
         starts of its sub-rays; 0 without such starts.
         """
         self.set_beams(pattern.directions, pattern.origins, poses, first)

@@ -32,7 +32,7 @@ class RayCaster:
     Parameters
     ----------
     vertices
-        (v, 3) real numbers, metres. Large coordinates lose no precision: they are made local.
+        (v, 3) real numbers, meters. Large coordinates lose no precision: they are made local.
     faces
         (f, 3) integers, rows of `vertices`. A triangle without an area is never hit.
     backend
@@ -165,7 +165,7 @@ class RayCaster:
         """Put rays `start` to `stop` (n) of a scan on the device, without hits on bodies.
 
         `time_index` (n,) are the numbers of the rays' times; hits count before distance `end`,
-        metres. BackendUnavailable if this backend has no device.
+        meters. BackendUnavailable if this backend has no device.
         """
         return self.engine.device_nearest(scan, start, stop, time_index, end)
 
@@ -244,11 +244,11 @@ class RayCaster:
         Parameters
         ----------
         origins
-            (n, 3) or (3,), metres.
+            (n, 3) or (3,), meters.
         directions
             (n, 3), any length but zero.
         t_min, t_max
-            Hits with ``t_min <= distance <= t_max`` count, metres. With `t_min` 0 a surface
+            Hits with ``t_min <= distance <= t_max`` count, meters. With `t_min` 0 a surface
             that the ray starts on is a hit at distance 0.
 
         Raises
@@ -285,7 +285,7 @@ class RayCaster:
             Rays in the sensor's axes, checked once; the cuda backend keeps and rotates the
             directions on the device.
         positions
-            (3,) or (k, 3), metres; or poses from `check_poses`, which replace the next arguments.
+            (3,) or (k, 3), meters; or poses from `check_poses`, which replace the next arguments.
         rotations
             (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are equal.
         window
@@ -295,7 +295,7 @@ class RayCaster:
             Ray i is cast from pose ``i // rays_per_pose``: the number of beams, if a moving
             lidar has a pose for each firing. A single pose applies to all rays.
         t_min, t_max
-            Hits with ``t_min <= distance <= t_max`` count, metres.
+            Hits with ``t_min <= distance <= t_max`` count, meters.
         keep_every
             Keep the first and then every n-th hit of each group, in ray order.
         groups

@@ -18,7 +18,7 @@ class Crossing(NamedTuple):
     Attributes
     ----------
     rays
-        float64 (6, n): origins, metres, and directions of all rays of the cast.
+        float64 (6, n): origins, meters, and directions of all rays of the cast.
     row
         int64 (m,): row in `rays` of each pair's ray; the pairs of a body follow each other.
     body
@@ -26,11 +26,11 @@ class Crossing(NamedTuple):
     pose
         int64 (m,): column in `poses` of the body's pose at the time of the ray.
     poses
-        float64 (12, p): positions, metres, and rotations from the body's axes by rows.
+        float64 (12, p): positions, meters, and rotations from the body's axes by rows.
     box
-        float64 (6,): lower and upper corner of the shape, in its axes, metres.
+        float64 (6,): lower and upper corner of the shape, in its axes, meters.
     limits
-        Closest and farthest distance of a hit, metres.
+        Closest and farthest distance of a hit, meters.
     frame
         float64 (m,): frame of a deforming shape at the time of the ray; (0,) for a rigid shape.
     """
@@ -61,15 +61,15 @@ class TimedBodies(NamedTuple):
     body
         int64 (b,): numbers of the bodies.
     poses
-        float64 (t, b, 12): position, metres, and rotation from the body's axes by rows; NaN while
+        float64 (t, b, 12): position, meters, and rotation from the body's axes by rows; NaN while
         a body is absent.
     boxes
         float64 (t / SPAN, b, 6): lower and upper corner of the box around a body's boxes during
-        `SPAN` times, metres.
+        `SPAN` times, meters.
     first_time
         Number of the first of the t times among the times of the rays.
     limits
-        Closest and farthest distance of a hit, metres.
+        Closest and farthest distance of a hit, meters.
     """
 
     body: Ints
@@ -90,7 +90,7 @@ class BodyHits(NamedTuple):
     ray
         int64 (k,): number of the ray, ascending.
     distance
-        float64 (k,): metres.
+        float64 (k,): meters.
     body
         int64 (k,): number of the body; of equal distances, the lowest.
     instance, triangle
@@ -112,7 +112,7 @@ class Nearest(NamedTuple):
     Attributes
     ----------
     distance
-        float64 (n,): metres; the distance before which hits count for a ray without a hit.
+        float64 (n,): meters; the distance before which hits count for a ray without a hit.
     body
         int64 (n,): number of the body, -1 for no hit.
     instance, triangle
@@ -126,7 +126,7 @@ class Nearest(NamedTuple):
 
     @classmethod
     def without_hits(cls, limits: Floats) -> Nearest:
-        """Create rays without a hit, for hits before distances `limits` (n,), metres."""
+        """Create rays without a hit, for hits before distances `limits` (n,), meters."""
         n = len(limits)
         return cls(limits, np.full(n, -1), np.zeros(n, np.int32), np.zeros(n, np.int32))
 

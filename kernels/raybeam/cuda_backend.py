@@ -316,14 +316,14 @@ class CudaBackend(Backend):
             return self._no_other_hits
         span = slice(*np.searchsorted(other_hits.ray, [start, start + n]))
         tables = (other_hits.ray[span], other_hits.distance[span], other_hits.triangle[span])
-        ray, metres, triangle = map(self._cupy.asarray, tables)
+        ray, meters, triangle = map(self._cupy.asarray, tables)
         count = np.int64(len(ray))
         scale = np.float64(self._scene.frame.scale)
-        self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *hits[:2])
-        return metres, triangle, np.int32(len(self._scene.mesh))
+        self._run("replace", len(ray), ray, meters, count, np.int64(start), scale, *hits[:2])
+        return meters, triangle, np.int32(len(self._scene.mesh))
 
     def _make_rays(self, scan: Scan, start: int, stop: int) -> Any:
-        """Return origins, metres, and directions of rays `start` to `stop` of a scan.
+        """Return origins, meters, and directions of rays `start` to `stop` of a scan.
 
         They are float64 (6, n) on the device, with the bits of `pattern_rays`. Rays that are read
         from memory cost the cast fewer registers and operations in double than rays that are
@@ -400,7 +400,7 @@ class CudaBackend(Backend):
     ) -> tuple[Any, Any, Any]:
         """Return local distance, table row and instance of closest hits, on the device.
 
-        `table` has origins and directions of n rays; `limits` are limits of the distance, metres.
+        `table` has origins and directions of n rays; `limits` are limits of the distance, meters.
         """
         t = self._cupy.empty(n)
         row = self._cupy.empty(n, np.int32)

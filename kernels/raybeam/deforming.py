@@ -34,7 +34,7 @@ class Deforming:
     Attributes
     ----------
     vertices
-        float64 (f, v, 3): vertices at each frame, metres; at least two frames.
+        float64 (f, v, 3): vertices at each frame, meters; at least two frames.
     faces
         int64 (t, 3): rows of the vertices of each triangle.
     """
@@ -45,7 +45,7 @@ class Deforming:
 
     @property
     def box(self) -> Floats:
-        """Lower and upper corner of the box around all frames: (2, 3), metres."""
+        """Lower and upper corner of the box around all frames: (2, 3), meters."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:

@@ -28,7 +28,7 @@ class DeformingTree(NamedTuple):
     Attributes
     ----------
     vertices
-        float64 (f, v, 3): vertices at each frame, metres.
+        float64 (f, v, 3): vertices at each frame, meters.
     faces
         int64 (t, 3): rows of the vertices of each triangle.
     order, child
@@ -37,7 +37,7 @@ class DeformingTree(NamedTuple):
         ``~(first << LEAF_BITS | count - 1)`` for a leaf of ``order[first : first + count]``.
     boxes
         float32 (f - 1, m, 6, `WIDTH`): boxes of the children of each node, from each frame to the
-        next: lower x, y, z, upper x, y, z, metres.
+        next: lower x, y, z, upper x, y, z, meters.
     """
 
     vertices: Floats
@@ -61,7 +61,7 @@ _TREE = named_tuple_type(
 def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
     """Write the boxes of all nodes from each frame to the next to `boxes`, for a `DeformingTree`.
 
-    Boxes are larger than the triangles by `pad`, metres.
+    Boxes are larger than the triangles by `pad`, meters.
     """
     for i in range(len(boxes)):
         for node in range(len(child) - 1, -1, -1):  # children come after their parents
@@ -122,7 +122,7 @@ def _inverse(d):  # type: ignore[no-untyped-def]
 def _corner(vertices, frame, share, vertex, axis):  # type: ignore[no-untyped-def]
     """Return a vertex at a share of the time from a frame to the next, 0 to 1.
 
-    Returns three coordinates, metres, with `axis` last.
+    Returns three coordinates, meters, with `axis` last.
     """
     x = axis + 1 if axis < 2 else 0
     y = x + 1 if x < 2 else 0

@@ -45,7 +45,7 @@ class DeviceHits:
         return len(self.ray)
 
     def rays(self) -> tuple[Any, Any]:
-        """Compute origins, metres, and unit directions of the rays: float64 (3, k) on the device.
+        """Compute origins, meters, and unit directions of the rays: float64 (3, k) on the device.
 
         Both have the bits of `pattern_rays`.
         """
@@ -65,7 +65,7 @@ class OtherHits:
     ray
         uint32 (k,): number of the ray, ascending, each at most once.
     distance
-        float64 (k,): metres.
+        float64 (k,): meters.
     triangle
         int32 (k,): any number of a triangle.
     """
@@ -82,7 +82,7 @@ class DeviceNearest:
     Attributes
     ----------
     rays
-        float64 (6, n): origins, metres, and directions.
+        float64 (6, n): origins, meters, and directions.
     time_index
         int32 (n,): number of each ray's time.
     distance, body, instance, triangle

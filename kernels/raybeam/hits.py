@@ -22,7 +22,7 @@ class Hits:
     Attributes
     ----------
     distance
-        float64 (n,): metres from the ray's origin, whatever the length of its direction; inf for
+        float64 (n,): meters from the ray's origin, whatever the length of its direction; inf for
         a miss.
     triangle
         int32 (n,): row of the `faces` of the mesh that is hit; -1 for a miss. Of triangles at
@@ -58,7 +58,7 @@ class ScanReturns:
     ray
         uint32 (k,): number of the ray, ascending, from 0 at the window's start.
     distance
-        float64 (k,): as in `Hits`, metres.
+        float64 (k,): as in `Hits`, meters.
     triangle
         int32 (k,): as in `Hits`.
     hit_counts

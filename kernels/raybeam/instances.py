@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import AnyArray, Floats, Indices, Integers, Ints, Ints32
-from .mesh import Frame, LocalMesh, centre_and_scale, local_mesh
+from .mesh import Frame, LocalMesh, center_and_scale, local_mesh
 from .opacity import Opacity
 from .poses import determinants
 from .tree import PAD
@@ -36,7 +36,7 @@ class Mesh:
     Parameters
     ----------
     vertices
-        (v, 3) real numbers, metres. Large coordinates lose no precision: they are made local.
+        (v, 3) real numbers, meters. Large coordinates lose no precision: they are made local.
     faces
         (f, 3) integers, rows of `vertices`. A triangle without an area is never hit.
     opacity
@@ -73,7 +73,7 @@ class Instance:
         The mesh, shared by any number of instances, which take hardly any memory.
     transform
         (3, 4), or (4, 4) with the last row 0, 0, 0, 1: from the mesh's coordinates to the
-        scene's, metres. It may rotate, move, mirror, shear and scale, also unevenly; None for the
+        scene's, meters. It may rotate, move, mirror, shear and scale, also unevenly; None for the
         identity.
     """
 
@@ -89,16 +89,16 @@ class MeshFrames:
     ----------
     scale
         float64 (n,): `Frame.scale`.
-    centre
-        float64 (n, 3): `Frame.centre`, metres.
+    center
+        float64 (n, 3): `Frame.center`, meters.
     middle
-        float64 (n, 3): middle of the mesh's box, relative to `centre`, metres.
+        float64 (n, 3): middle of the mesh's box, relative to `center`, meters.
     half
-        float64 (n, 3): halves of the sides of the mesh's box, metres.
+        float64 (n, 3): halves of the sides of the mesh's box, meters.
     """
 
     scale: Floats
-    centre: Floats
+    center: Floats
     middle: Floats
     half: Floats
 
@@ -109,8 +109,8 @@ class MeshFrames:
         scale = np.array([frame.scale for frame in frames])[mesh]
         lower = np.array([frame.lower for frame in frames])[mesh] / scale[:, None]
         upper = np.array([frame.upper for frame in frames])[mesh] / scale[:, None]
-        centre = np.array([frame.centre for frame in frames])[mesh]
-        return cls(scale, centre, (lower + upper) / 2, (upper - lower) / 2)
+        center = np.array([frame.center for frame in frames])[mesh]
+        return cls(scale, center, (lower + upper) / 2, (upper - lower) / 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,12 +330,12 @@ def _nested_scene(
     """
     rotation_scale = transforms[:, :, :3]
     scale = mesh_frames.scale
-    # Centre of each mesh's coordinates in the scene, metres: large numbers are subtracted first.
-    centre = _product(rotation_scale, mesh_frames.centre) + transforms[:, :, 3]
+    # Center of each mesh's coordinates in the scene, meters: large numbers are subtracted first.
+    center = _product(rotation_scale, mesh_frames.center) + transforms[:, :, 3]
     shift = _product(rotation_scale, mesh_frames.middle)
     half = _product(np.abs(rotation_scale), mesh_frames.half)
-    frame, boxes = _scene_frame(centre, shift, half)
-    offset = frame.centre - centre
+    frame, boxes = _scene_frame(center, shift, half)
+    offset = frame.center - center
     inverse = _inverse(rotation_scale)
     matrices = np.empty((len(mesh), 3, 4))
     matrices[:, :, :3] = inverse * (scale / frame.scale)[:, None, None]
@@ -354,15 +354,15 @@ def _nested_scene(
     )
 
 
-def _scene_frame(centre: Floats, shift: Floats, half: Floats) -> tuple[Frame, Floats]:
+def _scene_frame(center: Floats, shift: Floats, half: Floats) -> tuple[Frame, Floats]:
     """Return the frame of a scene, and its boxes (n, 2, 3) of instances, local.
 
-    Boxes have their centres at ``centre + shift``, and halves of their sides `half`: (n, 3) each.
+    Boxes have their centers at ``center + shift``, and halves of their sides `half`: (n, 3) each.
     """
-    lower = (centre + shift - half).min(axis=0)
-    upper = (centre + shift + half).max(axis=0)
-    origin, unit = centre_and_scale(lower, upper)
-    local = ((centre - origin) + shift) * unit
+    lower = (center + shift - half).min(axis=0)
+    upper = (center + shift + half).max(axis=0)
+    origin, unit = center_and_scale(lower, upper)
+    local = ((center - origin) + shift) * unit
     boxes = np.stack([local - half * unit, local + half * unit], axis=1)
     lower = boxes[:, 0].min(axis=0) - PAD
     upper = boxes[:, 1].max(axis=0) + PAD

@@ -27,7 +27,7 @@
 //   corners    9 doubles a triangle, in the same order.
 //   faces      the caller's number of each triangle.
 //   uvs, masks, opacity  as in `Masks` of opacity.py.
-//   frame      10 doubles: centre (3), scale, lower corner of the scene's box (3), upper corner (3).
+//   frame      10 doubles: center (3), scale, lower corner of the scene's box (3), upper corner (3).
 //   top        as nodes, over the instances: a leaf holds the number of an instance.
 //   instances  20 doubles each: matrix from the scene to the mesh, by rows (12), lower corner of the
 //              mesh's box (3), upper corner (3), the mesh's first node, its number.
@@ -101,7 +101,7 @@ __device__ __forceinline__ void place_origin(const Scene& scene, const double* o
     ray.oz = (origin[2] - f[2]) * f[3];
 }
 
-// Rays from memory: origins in metres, (3, origin_count), shared by all rays if origin_count is 1, and
+// Rays from memory: origins in meters, (3, origin_count), shared by all rays if origin_count is 1, and
 // directions, (3, count).
 struct TableRays {
     const double* origins;
@@ -135,7 +135,7 @@ struct PatternRays {
     int turned, shifted;
     // Motion of the lidar within a pose; neither is read where `moving` is 0.
     const double* delays;  // of each ray of a pose, seconds
-    const double* rates;   // 6 a pose: metres a second, radians a second
+    const double* rates;   // 6 a pose: meters a second, radians a second
     int moving;
 
     __device__ __forceinline__ static void turn(
@@ -158,7 +158,7 @@ struct PatternRays {
         z = c;
     }
 
-    // Compute the origin of a ray, metres, and its direction.
+    // Compute the origin of a ray, meters, and its direction.
     __device__ __forceinline__ void make(int i, double* at, double* to) const
     {
         Count row = first + i;
@@ -200,7 +200,7 @@ struct PatternRays {
 // Rays in the axes of a moving body at the ray's time: row `row` of `poses` is the position of the
 // body, and the rotation from the body's axes, by rows. A row takes fewer registers than a pointer.
 struct BodyRays {
-    const double* rays;  // 6 rows of `count`: origins in metres, and directions
+    const double* rays;  // 6 rows of `count`: origins in meters, and directions
     Count count;
     const double* poses;  // 12 a row
     int row;
@@ -701,7 +701,7 @@ KERNEL cast_bodies(
     const Count* __restrict__ bodies, int body_count,
     const double* __restrict__ poses, const double* __restrict__ boxes,
     int first_time, int times, double t_min, double t_max,
-    double* __restrict__ nearest_metres, Count* __restrict__ nearest_body,
+    double* __restrict__ nearest_meters, Count* __restrict__ nearest_body,
     int* __restrict__ nearest_instance, int* __restrict__ nearest_triangle)
 {
     const int i = (int)(blockIdx.x * blockDim.x + threadIdx.x);
@@ -713,7 +713,7 @@ KERNEL cast_bodies(
 #pragma unroll 1
     for (int k = 0; k < body_count; ++k) {
         const double* low = boxes + 6 * ((Count)(time / SPAN) * body_count + k);
-        double enters = 0.0, leaves = nearest_metres[i] * (1.0 + SLACK);
+        double enters = 0.0, leaves = nearest_meters[i] * (1.0 + SLACK);
         for (int axis = 0; axis < 3; ++axis) {
             const double o = rays[axis * count + i], d = rays[(3 + axis) * count + i];
             clip(low[axis], low[3 + axis], o, d, enters, leaves);
@@ -723,14 +723,14 @@ KERNEL cast_bodies(
         if (!(enters <= leaves) || absent != absent) continue;
         const BodyRays own = {rays, count, poses, row};
         Ray ray;
-        const double reach = nearest_metres[i] * frame[3] * (1.0 + SLACK);
+        const double reach = nearest_meters[i] * frame[3] * (1.0 + SLACK);
         Closest best(fmin(t_max, reach * own.make(scene, i, ray)));
         walk(scene, own, i, t_min, best);
         if (best.place < 0) continue;
-        const double metres = best.t / frame[3] / own.make(scene, i, ray);
-        const bool first = metres == nearest_metres[i] && bodies[k] < nearest_body[i];
-        if (!(metres < nearest_metres[i] || first)) continue;
-        nearest_metres[i] = metres;
+        const double meters = best.t / frame[3] / own.make(scene, i, ray);
+        const bool first = meters == nearest_meters[i] && bodies[k] < nearest_body[i];
+        if (!(meters < nearest_meters[i] || first)) continue;
+        nearest_meters[i] = meters;
         nearest_body[i] = bodies[k];
         nearest_instance[i] = NESTED ? best.instance : 0;
         nearest_triangle[i] = faces[best.place];
@@ -766,16 +766,16 @@ KERNEL weigh_table(
 // Hits of other surfaces, at most one a ray, take the place of those that are farther, divided by
 // `scale`: place becomes -2 - k for hit k.
 KERNEL replace(
-    const unsigned int* __restrict__ ray, const double* __restrict__ metres, Count count,
+    const unsigned int* __restrict__ ray, const double* __restrict__ meters, Count count,
     Count start, double scale, const double* __restrict__ distance, int* __restrict__ place)
 {
     const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (k >= count) return;
     const Count i = (Count)ray[k] - start;
-    if (place[i] < 0 || metres[k] < distance[i] / scale) place[i] = -2 - (int)k;
+    if (place[i] < 0 || meters[k] < distance[i] / scale) place[i] = -2 - (int)k;
 }
 
-// Add 1 to a row of a tally for each thread that counts; all threads of a warp call. Neighbouring rays
+// Add 1 to a row of a tally for each thread that counts; all threads of a warp call. Neighboring rays
 // often hit the same triangle: the threads of a warp that count the same row add once.
 __device__ __forceinline__ void count_row(unsigned long long* tally, Count row, bool counts)
 {
@@ -787,7 +787,7 @@ __device__ __forceinline__ void count_row(unsigned long long* tally, Count row, 
 }
 
 // Close up the hits that are kept, in ray order: number of the ray, from `start` on, distance in
-// metres, the caller's triangle, instance. `other_…` are those of `replace`.
+// meters, the caller's triangle, instance. `other_…` are those of `replace`.
 //
 // `ends` are the inclusive sums of hits up to each ray. Of each group of rays, the first kept hit
 // and every n-th after it are kept. `groups` has three rows of `group_count`: the first ray of each,
@@ -798,11 +798,11 @@ KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
     const int* __restrict__ place, const int* __restrict__ instance,
     const int* __restrict__ ends, Count count, double scale, Count start,
-    const double* __restrict__ other_metres, const int* __restrict__ other_triangle,
+    const double* __restrict__ other_meters, const int* __restrict__ other_triangle,
     int other_instance,
     const int* __restrict__ groups, int group_count, int every,
     const Count* __restrict__ counters, int counting, unsigned long long* __restrict__ tally,
-    unsigned int* __restrict__ ray, double* __restrict__ metres, int* __restrict__ triangle,
+    unsigned int* __restrict__ ray, double* __restrict__ meters, int* __restrict__ triangle,
     int* __restrict__ which)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
@@ -830,12 +830,12 @@ KERNEL pack(
         k = groups[2 * group_count + group] + k / every;
     }
     ray[k] = (unsigned int)(start + i);
-    metres[k] = place[i] < 0 ? other_metres[-2 - place[i]] : distance[i] / scale;
+    meters[k] = place[i] < 0 ? other_meters[-2 - place[i]] : distance[i] / scale;
     triangle[k] = face;
     which[k] = in;
 }
 
-// Rays of a pattern, from one pose after another, as a table: 6 rows of `count`, origins in metres and
+// Rays of a pattern, from one pose after another, as a table: 6 rows of `count`, origins in meters and
 // directions, with the bits of `pattern_rays`.
 KERNEL make_rays(
     const double* __restrict__ positions, const double* __restrict__ rotations,

@@ -26,35 +26,35 @@ _BLOCK = 1 << 16  # triangles that are processed together
 
 @dataclass(frozen=True)
 class Frame:
-    """Local coordinates: moved to the centre of a box and scaled into [-1, 1].
+    """Local coordinates: moved to the center of a box and scaled into [-1, 1].
 
-    The translation makes coordinates of hundreds of kilometres accurate enough in float32; the
+    The translation makes coordinates of hundreds of kilometers accurate enough in float32; the
     scale is a power of two, so it rounds nothing, and makes every error bound of the
     single-precision parts a plain number.
 
     Attributes
     ----------
-    centre
-        float64 (3,), metres: subtracted from points.
+    center
+        float64 (3,), meters: subtracted from points.
     scale
-        Local units in a metre, a power of two.
+        Local units in a meter, a power of two.
     lower, upper
         float64 (3,): corners of the box around the triangles, local, padded as in the tree.
     """
 
-    centre: Floats
+    center: Floats
     scale: float
     lower: Floats
     upper: Floats
 
     def to_local(self, points: Floats) -> Floats:
-        """Convert points (n, 3), metres, to local coordinates."""
-        return (points - self.centre) * self.scale
+        """Convert points (n, 3), meters, to local coordinates."""
+        return (points - self.center) * self.scale
 
     @property
     def table(self) -> Floats:
-        """Centre, scale, lower and upper, as read by compiled code: float64 (10,)."""
-        return np.concatenate([self.centre, [self.scale], self.lower, self.upper])
+        """Center, scale, lower and upper, as read by compiled code: float64 (10,)."""
+        return np.concatenate([self.center, [self.scale], self.lower, self.upper])
 
 
 def clip(
@@ -118,7 +118,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     Parameters
     ----------
     vertices
-        (v, 3) real and finite, metres.
+        (v, 3) real and finite, meters.
     faces
         (f, 3) integers: rows of `vertices`.
     opacity
@@ -130,8 +130,8 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     points = points.astype(np.float64)
     is_used = np.zeros(len(points), np.bool_)
     is_used[rows.reshape(-1)] = True
-    centre, scale = centre_and_scale(points[is_used].min(axis=0), points[is_used].max(axis=0))
-    points = (points - centre) * scale
+    center, scale = center_and_scale(points[is_used].min(axis=0), points[is_used].max(axis=0))
+    points = (points - center) * scale
     corners = points[rows]
     has_area = np.concatenate(
         [_has_area(corners[start : start + _BLOCK]) for start in range(0, len(corners), _BLOCK)]
@@ -145,7 +145,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     by_triangle = corners.reshape(-1, 9)
     lower = by_triangle.min(axis=0).reshape(3, 3).min(axis=0) - PAD
     upper = by_triangle.max(axis=0).reshape(3, 3).max(axis=0) + PAD
-    frame = Frame(centre, scale, lower, upper)
+    frame = Frame(center, scale, lower, upper)
     checked = None if opacity is None else check_opacity(opacity, face_count, index)
     return LocalMesh(
         frame=frame,
@@ -156,11 +156,11 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     )
 
 
-def centre_and_scale(lower: Floats, upper: Floats) -> tuple[Floats, float]:
-    """Return centre (3,) and scale of the frame of a box with corners (3,), metres."""
-    centre = lower / 2 + upper / 2
-    half = float(np.maximum(upper - centre, centre - lower).max())
-    return centre, math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
+def center_and_scale(lower: Floats, upper: Floats) -> tuple[Floats, float]:
+    """Return center (3,) and scale of the frame of a box with corners (3,), meters."""
+    center = lower / 2 + upper / 2
+    half = float(np.maximum(upper - center, center - lower).max())
+    return center, math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
 
 
 def _has_area(corners: Floats) -> Bools:

@@ -51,14 +51,14 @@ class Moving:
         Casters of the rigid shapes, and meshes that deform; each in the axes of its bodies.
     boxes
         float64 (s, 2, 3): lower and upper corner of each shape, over all frames, in the shape's
-        axes, metres.
+        axes, meters.
     shape
         intp (b,): number of each body's shape.
     presence
         float64 (b, 2): first and last time at which each body is present, seconds.
     poses
         Function of numbers of bodies (m,) and times (m,) that returns poses (12, m): positions,
-        metres, and rotations from the body's axes, by rows.
+        meters, and rotations from the body's axes, by rows.
     frames
         Function of numbers of deforming bodies (m,) and times (m,) that returns the frame of each
         body's shape, float64 (m,): 1.5 is halfway between frames 1 and 2 (`Deforming`). None
@@ -79,17 +79,17 @@ class Moving:
 
     @cached_property
     def middle(self) -> Floats:
-        """Centres of the shapes' boxes (s, 3), in the shapes' axes, metres."""
+        """Centers of the shapes' boxes (s, 3), in the shapes' axes, meters."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
     def half(self) -> Floats:
-        """Halves of the sides of the shapes' boxes (s, 3), metres."""
+        """Halves of the sides of the shapes' boxes (s, 3), meters."""
         return (self.boxes[:, 1] - self.boxes[:, 0]) / 2
 
     @cached_property
     def radius(self) -> Floats:
-        """Radii of the spheres around the shapes' boxes (s,), metres."""
+        """Radii of the spheres around the shapes' boxes (s,), meters."""
         return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:
@@ -110,7 +110,7 @@ def hits_on(
     times
         Function of numbers of rays (m,) that returns their times (m,), seconds.
     limits
-        float64 (n,): distance before which a hit of each ray counts, metres; None for the limit of
+        float64 (n,): distance before which a hit of each ray counts, meters; None for the limit of
         the scan.
 
     Raises
@@ -155,7 +155,7 @@ def listed_hits_on(moving: Moving, scan: Scan, times: Callable[[Ints], Floats]) 
 
 
 def _end(scan: Scan) -> float:
-    """Return the distance before which hits of a scan count, metres: its limit counts."""
+    """Return the distance before which hits of a scan count, meters: its limit counts."""
     return float(np.nextafter(scan.t_max, np.inf))
 
 
@@ -227,7 +227,7 @@ def _poses_and_boxes(moving: Moving, bodies: Ints, times: Floats) -> tuple[Float
 def _corners(moving: Moving, shape: Indices, poses: Floats) -> Floats:
     """Return the lower and upper corners (2, 3, m) of boxes around shapes (m,) at poses (12, m).
 
-    The boxes are along the axes of the scene, metres, with a margin for rounding errors.
+    The boxes are along the axes of the scene, meters, with a margin for rounding errors.
     """
     from .moving_loops import PADS_M
 
@@ -236,10 +236,10 @@ def _corners(moving: Moving, shape: Indices, poses: Floats) -> Floats:
     corners = np.empty((2, *middle.shape))
     for axis in range(3):
         x, y, z = poses[3 + 3 * axis : 6 + 3 * axis]
-        centre = poses[axis] + (x * middle[0] + y * middle[1] + z * middle[2])
+        center = poses[axis] + (x * middle[0] + y * middle[1] + z * middle[2])
         reach = np.abs(x) * half[0] + np.abs(y) * half[1] + np.abs(z) * half[2] + PADS_M
-        np.subtract(centre, reach, out=corners[0, axis])
-        np.add(centre, reach, out=corners[1, axis])
+        np.subtract(center, reach, out=corners[0, axis])
+        np.add(center, reach, out=corners[1, axis])
     return corners
 
 
@@ -251,15 +251,15 @@ def near_boxes(
     Parameters
     ----------
     rays
-        float64 (6, n): origins, metres, and directions.
+        float64 (6, n): origins, meters, and directions.
     times
         float64 (n,): time of each ray, seconds.
     boxes
-        float64 (b, 12): centres, and halves of the sides as vectors, metres.
+        float64 (b, 12): centers, and halves of the sides as vectors, meters.
     presence
         float64 (b, 2): first and last time at which each box is present.
     reach
-        Greatest distance at which a ray ends, metres.
+        Greatest distance at which a ray ends, meters.
 
     Returns
     -------
@@ -296,9 +296,9 @@ class _CellPoses(NamedTuple):
     pose
         int64 (m,): column in `poses` of the body's pose at the first time of the cell.
     poses
-        float64 (12, p): positions, metres, and rotations from the bodies' axes by rows.
+        float64 (12, p): positions, meters, and rotations from the bodies' axes by rows.
     pads
-        float64 (m,): margin around the body's box for its motion during the cell, metres.
+        float64 (m,): margin around the body's box for its motion during the cell, meters.
     straddles
         bool (m,): whether the rays of the cell have different times.
     """
@@ -317,7 +317,7 @@ class _RayPairs(NamedTuple):
     row: Ints  # (m,), number of the ray in the chunk
     body: Ints  # (m,), number of the body
     pose: Ints  # (m,), column in `poses` of the body's pose at the time of the ray
-    poses: Floats  # (12, p), positions, metres, and rotations from the bodies' axes by rows
+    poses: Floats  # (12, p), positions, meters, and rotations from the bodies' axes by rows
 
 
 class _Chunk:
@@ -346,8 +346,8 @@ class _Chunk:
         cells = loops.cells_of(self._rays, self._times, loops.CELL)
         wide_cells = loops.cells_of(self._rays, self._times, loops.CELL * loops.WIDE)
         samples = self._samples(bodies, cells)
-        centres = samples.boxes[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
-        order = np.argsort((centres**2).sum(axis=1), kind="stable")
+        centers = samples.boxes[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
+        order = np.argsort((centers**2).sum(axis=1), kind="stable")
         samples = samples._replace(boxes=samples.boxes[order], spheres=samples.spheres[order])
         reach = float(self._nearest.distance.max())
         cell, sampled_body = loops.cells_near_bodies(wide_cells, cells, samples, reach)
@@ -384,10 +384,10 @@ class _Chunk:
         table = moving.poses(body, times.ravel())
         rotations = _rotations(table)
         shape = moving.shape[body]
-        centres = table[:3].T + _rotated(rotations, moving.middle[shape])
+        centers = table[:3].T + _rotated(rotations, moving.middle[shape])
         halves = rotations.transpose(0, 2, 1) * moving.half[shape][..., None]
         boxes = np.empty((*times.shape, 12))
-        boxes[..., :3] = centres.reshape(len(bodies), -1, 3)
+        boxes[..., :3] = centers.reshape(len(bodies), -1, 3)
         boxes[..., 3:] = halves.reshape(len(bodies), -1, 9)
         return boxes
 

@@ -1,7 +1,7 @@
 """Loops of moving.py, which compare rays with the boxes and spheres around moving bodies.
 
-Rays are float64 (6, n): origins, metres, and directions of about unit length. Times are in
-seconds. A pose is a column of a table (12, p): position, metres, and rotation from the body's axes
+Rays are float64 (6, n): origins, meters, and directions of about unit length. Times are in
+seconds. A pose is a column of a table (12, p): position, meters, and rotation from the body's axes
 by rows.
 """
 
@@ -21,7 +21,7 @@ CELL = 64  # rays of a cell
 WIDE = 16  # cells of a wide cell
 PADS_M = 1e-3  # margin around boxes, besides 2e-6 of the distance: far more than rounding
 # Columns of cells: axis, and cosine and sine of the half angle, of the cone around the directions;
-# centre and radius of the sphere around the origins, metres; first and last time; normal of the
+# center and radius of the sphere around the origins, meters; first and last time; normal of the
 # plane that the directions lie near, and the sine of the greatest angle between a direction and
 # the plane.
 AXIS = 0
@@ -50,11 +50,11 @@ class BodySamples(NamedTuple):
         int64 (c, 2): number of the last sample up to the first time, and up to the last time of
         each cell of rays.
     boxes
-        float64 (b, s, 12): centres of the bodies' boxes, and halves of their sides as vectors,
-        metres.
+        float64 (b, s, 12): centers of the bodies' boxes, and halves of their sides as vectors,
+        meters.
     spheres
-        float64 (b, 4): radius of the sphere around the box, metres; slack: how far the box may be
-        from its sample during a step of time, metres; first and last time of the body's presence.
+        float64 (b, 4): radius of the sphere around the box, meters; slack: how far the box may be
+        from its sample during a step of time, meters; first and last time of the body's presence.
     """
 
     sample_of_cell: Ints
@@ -74,7 +74,7 @@ class CellPairs(NamedTuple):
     shape
         int64 (m,): number of the body's shape.
     pads
-        float64 (m,): margin around the body's box, metres.
+        float64 (m,): margin around the body's box, meters.
     """
 
     cell: Ints
@@ -176,7 +176,7 @@ def _may_meet(cell, box, sphere, reach):  # type: ignore[no-untyped-def]  # noqa
     """Return whether rays of a cell may meet a body in its box.
 
     `cell` points to a row of `cells_of`, `box` and `sphere` point to rows of `BodySamples`. `reach`
-    is the greatest distance at which a ray ends, metres.
+    is the greatest distance at which a ray ends, meters.
     """
     radius = sphere[0]
     slack = sphere[1]
@@ -262,7 +262,7 @@ def cells_near_bodies(
     samples
         The bodies.
     reach
-        Greatest distance at which a ray ends, metres.
+        Greatest distance at which a ray ends, meters.
 
     Returns
     -------
@@ -311,7 +311,7 @@ def _clip_axis(slab, o, d, interval):  # type: ignore[no-untyped-def]
 def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyped-def]
     """Return whether a ray passes through a box, enlarged by `pad`, before the distance `reach`.
 
-    The ray and the corners of the box are in the axes of the body, metres.
+    The ray and the corners of the box are in the axes of the body, meters.
     """
     (a, b, c), (d, e, f) = corners
     x, y, z = origin
@@ -324,9 +324,9 @@ def passes_box(corners, pad, reach, origin, direction):  # type: ignore[no-untyp
 
 @inlined
 def _sphere_around(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa: PLR0914 - a compiled loop
-    """Return the centre (3), in the scene, and the radius of a sphere around a box at a pose.
+    """Return the center (3), in the scene, and the radius of a sphere around a box at a pose.
 
-    The sphere encloses what `passes_box` adds to the box for a ray from the sphere's centre;
+    The sphere encloses what `passes_box` adds to the box for a ray from the sphere's center;
     `_near_sphere` adds what grows with the distance.
     """
     (a, b, c), (d, e, f) = corners
@@ -338,12 +338,12 @@ def _sphere_around(corners, pose, pad):  # type: ignore[no-untyped-def]  # noqa:
     v = (e - b) / 2
     w = (f - c) / 2
     radius = np.sqrt(u * u + v * v + w * w) + 2 * pad + 4e-6 * (abs(x) + abs(y) + abs(z))
-    centre = (
+    center = (
         px + (row_1[0] * x + row_1[1] * y + row_1[2] * z),
         py + (row_2[0] * x + row_2[1] * y + row_2[2] * z),
         pz + (row_3[0] * x + row_3[1] * y + row_3[2] * z),
     )
-    return centre, radius
+    return center, radius
 
 
 @stage
@@ -351,7 +351,7 @@ def _near_sphere(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def
     """Write which rays of a cell pass through the sphere around a body, and return their number.
 
     `rays` is the address of the cell's first ray in (6, n). `x`, `y`, `z` and `radius` are of the
-    sphere, metres. The output `near`, 0 or 1, is the address of int64 (`CELL`,).
+    sphere, meters. The output `near`, 0 or 1, is the address of int64 (`CELL`,).
     """
     ray = float64s(rays)
     is_near = int64s(near)
@@ -422,15 +422,15 @@ def rays_through_boxes(
     Parameters
     ----------
     rays
-        float64 (6, n): origins, metres, and directions.
+        float64 (6, n): origins, meters, and directions.
     reaches
-        float64 (n,): distance at which each ray ends, metres.
+        float64 (n,): distance at which each ray ends, meters.
     pairs
         Pairs of a cell and a body.
     poses
-        float64 (12, p): positions, metres, and rotations from the bodies' axes by rows.
+        float64 (12, p): positions, meters, and rotations from the bodies' axes by rows.
     boxes
-        float64 (s, 6): lower and upper corner of the box of each shape, metres.
+        float64 (s, 6): lower and upper corner of the box of each shape, meters.
 
     Returns
     -------

@@ -28,14 +28,14 @@ _ROUGH = 0.1
 class Pattern:
     """Rays that are cast repeatedly, for example a revolution of a lidar.
 
-    Rays are checked and normalised once; a backend may keep a copy on its device.
+    Rays are checked and normalized once; a backend may keep a copy on its device.
 
     Parameters
     ----------
     directions
         (n, 3), any length but zero, in the sensor's axes.
     origins
-        (n, 3), metres, in the sensor's axes: start of each ray relative to the sensor's position;
+        (n, 3), meters, in the sensor's axes: start of each ray relative to the sensor's position;
         (3,) for all rays; None if all start at that position.
     sub_rays
         Sub-rays of each direction, in sequence: these become the rays, computed during a cast.
@@ -44,7 +44,7 @@ class Pattern:
         (n, 2): angles across and up, radians, added to the angles of the sub-rays of each
         direction.
     step
-        Rows from one firing of a channel to its next, that is from a ray to its neighbour along a
+        Rows from one firing of a channel to its next, that is from a ray to its neighbor along a
         ring: the number of channels if each firing has all channels, 1 for ring after ring. None to
         guess the step, which may fail above 256. A wrong step makes casting slower, and changes no
         hit.
@@ -77,7 +77,7 @@ class Pattern:
         self._directions = unit_directions(directions).T
         self._directions.flags.writeable = False
         self._origins: Floats | None = None
-        self.max_origin = 0.0  # upper bound of the coordinates of origins, metres
+        self.max_origin = 0.0  # upper bound of the coordinates of origins, meters
         rows = self._directions.shape[1]
         if origins is not None:
             self._origins = np.empty((3, rows))
@@ -128,7 +128,7 @@ class Pattern:
 
     @property
     def origins(self) -> Floats | None:
-        """Origins of the beams (n, 3), metres, read-only, contiguous when transposed, or None."""
+        """Origins of the beams (n, 3), meters, read-only, contiguous when transposed, or None."""
         return None if self._origins is None else self._origins.T
 
     @cached_property
@@ -147,7 +147,7 @@ class Pattern:
 
 
 def _repetition(directions: Floats) -> int:
-    """Return the step after which the distances between neighbouring rows are the same, or 0.
+    """Return the step after which the distances between neighboring rows are the same, or 0.
 
     `directions` (3, n) are unit vectors. Where a firing has all rings, the head has turned after
     as many rows, and all distances are the same. Where rings follow each other, those within a ring

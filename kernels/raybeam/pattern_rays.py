@@ -45,7 +45,7 @@ def pattern_rays(
     Returns
     -------
     origins
-        float64 (m, 3), or (1, 3) if all rays share an origin, metres.
+        float64 (m, 3), or (1, 3) if all rays share an origin, meters.
     directions
         float64 (m, 3), unit vectors.
 
@@ -117,7 +117,7 @@ def _sensor_rays(pattern: Pattern, row: Ints) -> tuple[Floats, Floats | None]:
     """Return directions (3, m), and offsets of origins (3, m), in the sensor's axes.
 
     `row` (m,) are rows of rays, which may be beyond the end of the pattern. Offsets are relative
-    to the sensor's position, metres; None for zero.
+    to the sensor's position, meters; None for zero.
     """
     row = row - row // len(pattern) * len(pattern)  # takes half as long as the remainder
     beam = row // pattern.subrays_per_beam

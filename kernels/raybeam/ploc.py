@@ -1,9 +1,9 @@
 """A binary bounding volume hierarchy: clustered below, swept at the top.
 
 Parallel locally-ordered clustering, Meister and Bittner (2018): boxes are sorted along a space
-filling curve; then each box is compared with its neighbours in that order, and pairs of mutual
+filling curve; then each box is compared with its neighbors in that order, and pairs of mutual
 best partners (least area of the common box) are merged. Every step is a few operations on whole
-arrays. Near the root, few clusters are left and neighbours on the curve are seldom the best:
+arrays. Near the root, few clusters are left and neighbors on the curve are seldom the best:
 clustering to the end cost rays a fifth to a half more nodes in cities. So the last clusters are
 divided from the root down, by a full sweep with the surface area heuristic (sweep.py), which takes
 a tenth of a second.
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from .arrays import Floats32, Indices, Ints32
 from .sweep import divide
 
-_RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % of the tree's cost
+_RADIUS = 8  # neighbors looked at on either side; twice as many gain 1 to 2 % of the tree's cost
 # Clusters that are left to the sweep: an eighth of all boxes, within these limits. Four times the
 # maximum gains nothing, a quarter loses a twentieth.
 _MAX_CLUSTERS = 1 << 14
@@ -233,13 +233,13 @@ def _find_best_partners(lower: Floats32, upper: Floats32, best: Indices) -> None
             np.maximum(upper[:, :-step], upper[:, step:])
             - np.minimum(lower[:, :-step], lower[:, step:])
         )
-        for cluster, neighbour in (
+        for cluster, neighbor in (
             (position[:-step], position[step:]),
             (position[step:], position[:-step]),
         ):
             cheaper = area < cost[cluster]
             cost[cluster[cheaper]] = area[cheaper]
-            best[cluster[cheaper]] = neighbour[cheaper]
+            best[cluster[cheaper]] = neighbor[cheaper]
 
 
 def _half_area(size: Floats32) -> Floats32:
@@ -249,11 +249,11 @@ def _half_area(size: Floats32) -> Floats32:
 
 
 def _morton(lower: Floats32, upper: Floats32) -> NDArray[np.uint64]:
-    """Return the position of each box's centre along a Z-order curve."""
-    centre = lower.astype(np.float64) + upper
-    start = centre.min(axis=1, keepdims=True)
-    extent = float((centre - start).max()) or 1.0
-    cell = ((centre - start) * ((2**_GRID_BITS - 1) / extent)).astype(np.uint64)
+    """Return the position of each box's center along a Z-order curve."""
+    center = lower.astype(np.float64) + upper
+    start = center.min(axis=1, keepdims=True)
+    extent = float((center - start).max()) or 1.0
+    cell = ((center - start) * ((2**_GRID_BITS - 1) / extent)).astype(np.uint64)
     return _spread(cell[0]) << np.uint64(2) | _spread(cell[1]) << np.uint64(1) | _spread(cell[2])
 
 

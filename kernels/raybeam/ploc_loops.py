@@ -23,7 +23,7 @@ def _common_area(lower, upper, i, j):  # type: ignore[no-untyped-def]
 def best_partners(lower, upper, radius, best):  # type: ignore[no-untyped-def]
     """Write the position of each cluster's best partner to `best`, int64 (m,).
 
-    The best partner is the cluster, among `radius` neighbours on either side, whose common box has
+    The best partner is the cluster, among `radius` neighbors on either side, whose common box has
     the least area. Ties are as in `ploc._find_best_partners`.
     """
     n = lower.shape[1]

@@ -23,7 +23,7 @@ class PoseMotion:
     delays
         float64 (m,): delay of each of the m rays of a pose after the pose's time, seconds.
     velocities
-        float64 (k, 3): velocity at each pose, metres a second along the mesh's axes.
+        float64 (k, 3): velocity at each pose, meters a second along the mesh's axes.
     rates
         float64 (k, 3): angular rate at each pose, radians a second about the mesh's axes. A
         vector v becomes ``v + delay * cross(rate, v)``: off by (delay * rate)^2 / 2, which is 2e-9
@@ -42,7 +42,7 @@ class Poses:
     Attributes
     ----------
     positions
-        float64 (k, 3), metres.
+        float64 (k, 3), meters.
     rotations
         float64 (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are the same. Each
         matrix entry is contiguous over the poses, as are the components of positions and motion.
@@ -94,7 +94,7 @@ class RayPoses:
     Attributes
     ----------
     positions
-        float64 (3, m), metres.
+        float64 (3, m), meters.
     rotations
         float64 (9, m): matrices by rows, from the sensor's axes to the mesh's; None if equal.
     delay

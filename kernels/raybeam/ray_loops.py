@@ -385,7 +385,7 @@ def _clear_origins(tile, rays):  # type: ignore[no-untyped-def]
 
 @stage
 def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
-    """Write the origins of a tile's rays in the scene, metres.
+    """Write the origins of a tile's rays in the scene, meters.
 
     If sub-rays have starts, the rows of the origins hold these.
     """
@@ -409,7 +409,7 @@ def _write_origins(tile, rays, cast):  # type: ignore[no-untyped-def]
 
 @stage
 def _localise(tile, rays, x, y, z, scale):  # type: ignore[no-untyped-def]
-    """Convert the origins of a tile's rays, metres, to local coordinates."""
+    """Convert the origins of a tile's rays, meters, to local coordinates."""
     floats = float64s(tile)
     target = row_at(OX, rays)
     factor = splat(scale)
@@ -454,7 +454,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
     """Compute the rays of a tile in local coordinates, by their numbers in the call.
 
     `address` is of the `CAST`, `start` the number of the call's first ray in the scan, and `count`
-    the number of the call's rays. Rays outside the call are neighbours of its rays, if these have
+    the number of the call's rays. Rays outside the call are neighbors of its rays, if these have
     one pose. An origin that all rays share is in the tile already: `share_origin`. Rays are also
     written to the outputs of rays of the cast, if any.
     """
@@ -483,7 +483,7 @@ def make_rays(address, start, rays, count):  # type: ignore[no-untyped-def]
         if cast.origins_out != 0:
             out = cast.origins_out + 8 * first.ray
             _copy_out(tile, rays, OX, out, cast.ray_count, count)
-        _localise(tile, rays, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
+        _localise(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
 
 
 @stage
@@ -494,7 +494,7 @@ def share_origin(cast, tile, rays):  # type: ignore[no-untyped-def]
     the origin is written once, before the first tile.
     """
     _write_origins(tile, rays, cast)
-    _localise(tile, rays, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
+    _localise(tile, rays, cast.center[0], cast.center[1], cast.center[2], cast.scale)
 
 
 @inlined
@@ -565,7 +565,7 @@ def compiled_rays(
     cast = memory.Cast(np.zeros(1, memory.CAST))
     record = cast.record
     cast.set_pattern(pattern, poses, first)
-    record["scale"] = 1.0  # local coordinates are metres, about the origin of the scene
+    record["scale"] = 1.0  # local coordinates are meters, about the origin of the scene
     lanes = _BEAMS * int(record["lanes_per_beam"][0])
     record["tile_rays"] = lanes
     record["tile"] = thread_tiles.address(lanes, 0, 0)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from .arrays import AnyArray, Bools, Floats
 
 # A vector with a squared length this close to 1 is a unit vector up to rounding, and is left as it
-# is, so that the last bits of normalised directions do not change.
+# is, so that the last bits of normalized directions do not change.
 UNIT_SLACK = 1e-14
 
 # Rows that are checked at a time, so that extra memory does not grow with the rays.
@@ -25,11 +25,11 @@ class Rays:
     Attributes
     ----------
     origins
-        (n, 3), or (1, 3) if all rays share an origin, metres.
+        (n, 3), or (1, 3) if all rays share an origin, meters.
     directions
         (n, 3), of any length but zero.
     t_min, t_max
-        Closest and farthest distance of a reported hit, metres; both limits count.
+        Closest and farthest distance of a reported hit, meters; both limits count.
     """
 
     origins: Floats
@@ -47,7 +47,7 @@ class Rays:
         """
         origins = self.origins if len(self.origins) == 1 else self.origins[start:stop]
         directions = _float64(self.directions[start:stop])
-        return Rays(_float64(origins), _normalised(directions), self.t_min, self.t_max)
+        return Rays(_float64(origins), _normalized(directions), self.t_min, self.t_max)
 
 
 def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: float) -> Rays:
@@ -58,11 +58,11 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
     Parameters
     ----------
     origins
-        (3,) or (n, 3), metres.
+        (3,) or (n, 3), meters.
     directions
         (n, 3), or (3,) for a single ray.
     t_min, t_max
-        Metres, ``0 <= t_min <= t_max``.
+        Meters, ``0 <= t_min <= t_max``.
     """
     table = _check_directions(directions)
     return Rays(check_origins(origins, len(table)), table, *check_interval(t_min, t_max))
@@ -115,12 +115,12 @@ def unit_directions(directions: ArrayLike) -> Floats:
     _refuse_directions(table)
     result = np.empty((3, len(table))).T
     for start in range(0, len(table), _BLOCK):
-        result[start : start + _BLOCK] = _normalised(_float64(table[start : start + _BLOCK]))
+        result[start : start + _BLOCK] = _normalized(_float64(table[start : start + _BLOCK]))
     return result
 
 
-def _normalised(table: Floats) -> Floats:
-    """Normalise checked directions (n, 3), or return the same array if all are unit vectors."""
+def _normalized(table: Floats) -> Floats:
+    """Normalize checked directions (n, 3), or return the same array if all are unit vectors."""
     x, y, z = table.T
     # No einsum or norm, which may fuse multiply and add, so the last bit would depend on the
     # machine.

@@ -34,7 +34,7 @@ class Scan:
     poses
         Poses of all rays.
     t_min, t_max
-        Closest and farthest distance of a reported hit, metres; both limits count.
+        Closest and farthest distance of a reported hit, meters; both limits count.
     keep_every
         Number n: the first and then every n-th hit of each group is kept.
     groups
@@ -126,7 +126,7 @@ def check_scan(
 
 
 def host_rays(scan: Scan, start: int, stop: int) -> Floats:
-    """Return origins, metres, and directions of rays `start` to `stop` (n) of a scan: (6, n)."""
+    """Return origins, meters, and directions of rays `start` to `stop` (n) of a scan: (6, n)."""
     if scan.room is not None:  # the caster has written the rays
         return np.ascontiguousarray(scan.room[:, start:stop])
     scan_rays = scan.rays(start, stop)

@@ -18,7 +18,7 @@ class SubRays:
     angles
         float64 (k, 2): tangents of the angles off the beam's direction, across and up.
     starts
-        float64 (k, 2): origin of each sub-ray, across and up from the beam's origin, metres; None
+        float64 (k, 2): origin of each sub-ray, across and up from the beam's origin, meters; None
         if sub-rays start at the beam's origin.
     axis
         float64 (3,): the axis about which "across" points counter-clockwise, and towards which "up"
@@ -85,7 +85,7 @@ def spread(
     directions
         (3, m), unit vectors.
     starts
-        (3, m), metres; None if sub-rays start at the beam's origin.
+        (3, m), meters; None if sub-rays start at the beam's origin.
     """
     straight, across, up = sub_rays.shares(subray, offsets)
     axis = sub_rays.axis

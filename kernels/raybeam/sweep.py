@@ -27,7 +27,7 @@ class _Level:
     Attributes
     ----------
     orders
-        Three arrays (m,): the boxes, node by node, sorted by their centres along each axis.
+        Three arrays (m,): the boxes, node by node, sorted by their centers along each axis.
     start, stop
         (k,): range of each node's boxes in these arrays.
     """

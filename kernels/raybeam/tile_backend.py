@@ -1,4 +1,4 @@
-"""Ray casting by tiles of neighbouring rays, in loops that numba compiles: on every processor."""
+"""Ray casting by tiles of neighboring rays, in loops that numba compiles: on every processor."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class TileBackend(Backend):
     def missing(cls) -> str:
         """Return why numba cannot be used and the remedy, or "" if it can be used."""
         if importlib.util.find_spec("numba") is None:
-            return f"numba is not installed: {install_command('numba')}"
+            return f"numba is not installed; run {install_command('numba')}"
         return ""
 
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
@@ -104,7 +104,7 @@ class TileBackend(Backend):
         super().update_scene(scene)
         frame = scene.frame
         base = self._base
-        base["centre"] = frame.centre
+        base["center"] = frame.center
         base["scale"] = frame.scale
         if scene.nested:
             self._top, top_stack = self._top_nodes(scene.boxes)
@@ -207,14 +207,14 @@ class TileBackend(Backend):
         return cast
 
     def _set_limits(self, cast: Cast, limits: tuple[float, float]) -> None:
-        """Write the limits of distances, metres, to a cast."""
+        """Write the limits of distances, meters, to a cast."""
         record = cast.record
         record["t_min"], record["t_max"] = self._reach(limits, self._scene.frame.scale)
 
     def _cast(self, cast: Cast, start: int, stop: int, plan: TilePlan) -> Part:
         """Return the hits of rays `start` to `stop`, in ray order, numbered from `start`.
 
-        Distances are in metres; `triangle` is the row in the caller's faces, or the row of the
+        Distances are in meters; `triangle` is the row in the caller's faces, or the row of the
         corners if `index` of the record is 0.
         """
         n = stop - start

@@ -97,7 +97,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
     rays = cast.tile_rays
     instances = cast.instances
     firing = cast.firing
-    metre = 1.0 / cast.scale
+    meter = 1.0 / cast.scale
     index = int32s(cast.index)
     indexed = cast.index != 0
     shifts = int64s(cast.shifts)
@@ -136,7 +136,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
             triangle += record[FIRST_ROW_FIELD]
             instance_out[hit_count] = number
         ray_out[hit_count] = start - cast.first_ray + k
-        distance_out[hit_count] = distances[k] * metre
+        distance_out[hit_count] = distances[k] * meter
         triangle_out[hit_count] = index[triangle] if indexed else triangle
         hit_count += 1
     return hit_count
@@ -146,11 +146,11 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]  # noqa: PLR0914,
 def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untyped-def]
     """Write a ray to a lane of a tile, in local coordinates, and return its direction's length.
 
-    `origin`, metres, and `direction` are in the axes of the body. The length is 1 but for a sensor
+    `origin`, meters, and `direction` are in the axes of the body. The length is 1 but for a sensor
     that turns during a pose.
     """
     scale = cast.scale
-    centre = cast.centre
+    center = cast.center
     u, v, w = direction
     squared = (u * u + v * v) + w * w
     length = np.sqrt(squared)
@@ -164,9 +164,9 @@ def _write_ray(cast, floats, lane, origin, direction):  # type: ignore[no-untype
         v = v / norm
         w = w / norm
     k = row_at(OX, _TILE_RAYS) + lane
-    floats[k] = (origin[0] - centre[0]) * scale
-    floats[k + _TILE_RAYS] = (origin[1] - centre[1]) * scale
-    floats[k + 2 * _TILE_RAYS] = (origin[2] - centre[2]) * scale
+    floats[k] = (origin[0] - center[0]) * scale
+    floats[k + _TILE_RAYS] = (origin[1] - center[1]) * scale
+    floats[k + 2 * _TILE_RAYS] = (origin[2] - center[2]) * scale
     floats[k + 3 * _TILE_RAYS] = u
     floats[k + 4 * _TILE_RAYS] = v
     floats[k + 5 * _TILE_RAYS] = w
@@ -198,7 +198,7 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
     numbers = int64s(cast.tile)
     floats = float64s(cast.tile)
     index = int32s(cast.index)
-    metre = 1.0 / cast.scale
+    meter = 1.0 / cast.scale
     distance, bodies, instance, triangle = nearest
     t_at = row_at(T, _TILE_RAYS)
     key_at = row_at(KEY, _TILE_RAYS)
@@ -209,8 +209,8 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
         pair = numbers[pair_at + lane]
         ray = crossing.row[pair]
         body = crossing.body[pair]
-        metres = floats[t_at + lane] * metre / floats[norm_at + lane]
-        nearer = metres < distance[ray] or (metres == distance[ray] and body < bodies[ray])
+        meters = floats[t_at + lane] * meter / floats[norm_at + lane]
+        nearer = meters < distance[ray] or (meters == distance[ray] and body < bodies[ray])
         if key < 0 or not nearer:
             continue
         row = key & (KEYS_PER_INSTANCE - 1)
@@ -219,7 +219,7 @@ def _write_hits(cast, crossing, nearest, filled):  # type: ignore[no-untyped-def
             number = key // KEYS_PER_INSTANCE
             instance[ray] = number
             row += int64s(cast.instances + INSTANCE_BYTES * number)[FIRST_ROW_FIELD]
-        distance[ray] = metres
+        distance[ray] = meters
         bodies[ray] = body
         triangle[ray] = index[row]
 

@@ -68,7 +68,7 @@ _FEW = 6  # rays that are cast one by one
 def _cast_in_mesh(tile, rays, first_row, mesh, instance, mask):  # type: ignore[no-untyped-def]
     """Cast the rays of the subtiles of a mask in a mesh, as a tile or one by one.
 
-    After a tile that was too wide or met too many leaves, its neighbours are cast one by one; then
+    After a tile that was too wide or met too many leaves, its neighbors are cast one by one; then
     tiles are tried again. The shear of the rays is written. `first_row` is the first row of the
     rays in the mesh's coordinates.
     """

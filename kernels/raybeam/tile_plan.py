@@ -1,4 +1,4 @@
-"""Which rays of a scan form tiles: neighbours, whatever their order within a firing.
+"""Which rays of a scan form tiles: neighbors, whatever their order within a firing.
 
 A pattern's rays are numbered firing after firing. Rings of a firing need not follow each other by
 elevation, and their beams may point in other azimuths, by whole degrees. So rings are sorted by
@@ -85,7 +85,7 @@ def plan_tiles(scan: Scan) -> TilePlan:
 
 
 def _sorted_rings(first: Floats, second: Floats) -> tuple[Ints, Ints, tuple[float, float]]:
-    """Return how the rings of two successive firings (n, 3) neighbour each other.
+    """Return how the rings of two successive firings (n, 3) neighbor each other.
 
     Returns
     -------

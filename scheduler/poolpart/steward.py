@@ -2,7 +2,7 @@
 
 The steward has the rules by partition, and a seat for each worker with the worker's partition.
 Requests of clients (`division.py`) and workers that join and leave change it. After any change,
-one loop for each worker (`Steward._settle`) synchronises three things with the seat:
+one loop for each worker (`Steward._settle`) synchronizes three things with the seat:
 
 1. the resources that the worker declares, which its tasks must find there;
 2. the resources that the scheduler places tasks by: removed before a worker leaves a partition,

@@ -124,7 +124,7 @@ def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
     assert tab.value("document.title") == "yard - lidarpool"
     assert tab.value("document.querySelector('#panel h1').textContent") == "yard"
     other.wait_for(lambda text: "done" in text and total in text)
-    tab.wait_for(lambda _: len(colours(tab.picture(tmp_path / "live.png"))) > 200)
+    tab.wait_for(lambda _: len(colors(tab.picture(tmp_path / "live.png"))) > 200)
     assert tab.errors == []
     own = (live.page.url, "data:", "blob:")
     assert [request for request in tab.requests if not request.startswith(own)] == []
@@ -145,6 +145,6 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
     assert not run.points.complete
 
 
-def colours(picture):
-    """Colours left of the panel."""
+def colors(picture):
+    """Colors left of the panel."""
     return np.unique(picture[100:, :900].reshape(-1, 3), axis=0)

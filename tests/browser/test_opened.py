@@ -128,12 +128,12 @@ def test_a_large_cloud_is_drawn_by_a_sample_until_all_points_are_read(kinds, new
     with page_server(view.answer, port=0) as page:
         tab = new_tab(page.url)
         tab.wait_for(lambda text: drawn(tab) > 0 and "Loading points … 0 %" in text)
-        tab.choose("colour", "intensity")
+        tab.choose("color", "intensity")
         is_drawn.set()
         total = f"{view.total:,} points"
         tab.wait_for(lambda text: text.count(total) == 1 and drawn(tab) == view.total)
         tab.wait_for(lambda text: "Reading" not in text and "intensity" in text)
-        assert tab.value("lidarpool.chosen.colour") == "intensity" and tab.errors == []
+        assert tab.value("lidarpool.chosen.color") == "intensity" and tab.errors == []
 
 
 def test_jobs_of_a_data_set_are_listed_and_each_is_opened(kinds, new_tab):

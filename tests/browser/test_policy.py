@@ -54,7 +54,7 @@ def test_a_page_is_opened_played_measured_and_exported(own_pages, new_tab, tmp_p
         tab.value("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
         tab.click("Download")
         tab.wait_for(lambda _: (tmp_path / "cloud.ply").exists())
-    tab.choose("colour", "wetness")
+    tab.choose("color", "wetness")
     tab.wait_for(lambda text: "wetness, %" in text)
     for key in "b?":
         tab.key(key)

@@ -65,12 +65,12 @@ def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
     tab = opened(new_tab, served)
     tab.wait_for(lambda text: "30,000 points" in text and "z, m" in text)
     assert tab.value("document.title") == "a spiral"
-    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+    tab.wait_for(lambda _: colorful(tab.picture(tmp_path / "a.png")) > 3000)
     own = (served.url, "data:", "blob:")
     assert [request for request in tab.requests if not request.startswith(own)] == []
-    tab.choose("colour", "wetness")
+    tab.choose("color", "wetness")
     tab.wait_for(lambda text: "wetness, %" in text and "z, m" not in text)
-    tab.choose("colour", "hidden")
+    tab.choose("color", "hidden")
     tab.wait_for(lambda _: drawn(tab) == 0)
     assert tab.errors == []
 
@@ -129,7 +129,7 @@ def test_a_player_of_stations_counts_them(new_tab, tmp_path):
         tab.key(" ")
         tab.wait_for(lambda text: "station 3 of 3" in text)
         tab.key(" ")
-        tab.choose("colour", "station")
+        tab.choose("color", "station")
         tab.wait_for(lambda text: all(f"station {k}\n" in text for k in (1, 2, 3)))
         assert tab.errors == []
 
@@ -222,7 +222,7 @@ def test_a_page_that_loads_says_so_and_its_heading_is_whole(view, new_tab):
     assert tab.value(f"{heading}.scrollWidth <= {heading}.clientWidth")
 
 
-def test_points_in_their_own_colours(new_tab, tmp_path):
+def test_points_in_their_own_colors(new_tab, tmp_path):
     kinds = [*((axis, "<f4") for axis in "xyz"), *((c, "|u1") for c in ("red", "green", "blue"))]
     rows = np.zeros(40_000, kinds)
     rows["x"], rows["y"] = np.random.default_rng(0).uniform(-9, 9, (2, 40_000))
@@ -233,7 +233,7 @@ def test_points_in_their_own_colours(new_tab, tmp_path):
         tab = opened(new_tab, page)
         tab.tick("depth shading", on=False)
         tab.key("t")
-        tab.choose("colour", "rgb")
+        tab.choose("color", "rgb")
         tab.wait_for(lambda text: "z, m" not in text)
 
         def halves(_):
@@ -244,8 +244,8 @@ def test_points_in_their_own_colours(new_tab, tmp_path):
             return enough and red.nonzero()[1].mean() < blue.nonzero()[1].mean()
 
         tab.wait_for(halves)
-        other = opened(new_tab, page, "#colour=rgb")
-        other.wait_for(lambda _: other.value("lidarpool.chosen.colour") == "rgb")
+        other = opened(new_tab, page, "#color=rgb")
+        other.wait_for(lambda _: other.value("lidarpool.chosen.color") == "rgb")
         assert tab.errors == other.errors == []
 
 
@@ -382,7 +382,7 @@ def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, 
     for row, shift, words in ((10_000, False, "wetness"), (12_000, True, "distance")):
         tab.press(*tab.value(f"{place}({row})"), shift=shift)
         tab.wait_for(lambda text, words=words: re.search(rf"\b{words}\s\d", text))
-    tab.open(served.url + "#filter=scan,100,149&colour=wetness&camera=20,-20,9;0,0,4")
+    tab.open(served.url + "#filter=scan,100,149&color=wetness&camera=20,-20,9;0,0,4")
     tab.wait_for(lambda text: re.search("4,16. points of 30,000", text) and "wetness, %" in text)
     tab.key("t")  # from the top, without perspective
     tab.wait_for(lambda _: tab.value(f"{PICTURE}.isParallel"))
@@ -454,15 +454,15 @@ def test_distances_angles_and_areas_are_measured_with_mouse_and_fingers(served, 
     assert tab.errors == other.errors == []
 
 
-def test_colour_limits_are_set_by_hand_and_the_clip_box_is_dragged(served, new_tab):
-    tab = opened(new_tab, served, "#colour=wetness")
+def test_color_limits_are_set_by_hand_and_the_clip_box_is_dragged(served, new_tab):
+    tab = opened(new_tab, served, "#color=wetness")
     inputs = "document.querySelectorAll('.limits input')"
     tab.wait_for(lambda _: tab.value(f"{inputs}.length") == 2)
     low = f"{inputs}[0]"
     tab.value(f"{{ const low = {low}; low.value = 50; low.onchange(); }}")
     tab.wait_for(lambda text: re.search(r"50\s+75\s+100", text))
-    first = f"[...{PICTURE}.layers.base.told.arrays.colours.slice(0, 4)]"
-    colours = {str(tab.value(first))}
+    first = f"[...{PICTURE}.layers.base.told.arrays.colors.slice(0, 4)]"
+    colors = {str(tab.value(first))}
     assert tab.value(f"{PICTURE}.layers.base.told.legend.limits[0]") == 50
     tab.key("f")  # from the front, z is up in the picture
     tab.key("b")
@@ -488,7 +488,7 @@ def test_colour_limits_are_set_by_hand_and_the_clip_box_is_dragged(served, new_t
     )
     other = opened(new_tab, served, link)
     other.wait_for(lambda text: re.search(r"50\s+75\s+100", text))
-    assert {str(other.value(first))} == colours
+    assert {str(other.value(first))} == colors
     assert other.value(f"{handles}.length") == 6
     tab.click("Auto")
     tab.wait_for(lambda text: re.search(r"\n1\s+50\s+100", text))
@@ -523,15 +523,15 @@ def test_walls_before_points_are_faint_until_a_user_wants_otherwise(view, new_ta
     view.pictured = replace(view.pictured, scene=wall, hit_counts=np.zeros(12, np.int64))
     with page_server(view.answer, port=0) as page:
         tab = opened(new_tab, page, "#camera=0,-60,30;0,0,4&clip=,;,;,")
-        tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+        tab.wait_for(lambda _: colorful(tab.picture(tmp_path / "a.png")) > 3000)
         set_opacity = (
             "const row = [...document.querySelectorAll('.row')].find(r =>"
             " r.firstChild.textContent === 'opacity').querySelector('input');"
         )
         tab.value(f"{{ {set_opacity} row.value = 1; row.oninput(); }}")
-        tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "b.png")) < 300)
+        tab.wait_for(lambda _: colorful(tab.picture(tmp_path / "b.png")) < 300)
         tab.value(f"{{ {set_opacity} row.value = 0; row.oninput(); }}")
-        tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "c.png")) > 3000)
+        tab.wait_for(lambda _: colorful(tab.picture(tmp_path / "c.png")) > 3000)
         assert tab.errors == []
 
 
@@ -574,7 +574,7 @@ def classed(view):
     rows = view.points
     view.columns["class"] = TABLE["class"]
     # A spiral has no classes, and a view takes columns only from its file.
-    view._coloured["class"] = TABLE["class"]
+    view._colored["class"] = TABLE["class"]
     values = rows.values
     rows.values = lambda name, some: (
         (values("scan", some) > 179).astype(np.uint16) if name == "class" else values(name, some)
@@ -584,7 +584,7 @@ def classed(view):
 
 
 def test_a_legend_of_classes_has_names_and_is_used_by_keyboard(classed, new_tab):
-    tab = opened(new_tab, classed, "#colour=class")
+    tab = opened(new_tab, classed, "#color=class")
     tab.wait_for(lambda text: re.search(r"class 0\s+15,000\s+car\s", text))
     tab.value("document.querySelectorAll('.legend button')[1].focus({ focusVisible: true })")
     press = {"key": "Enter", "code": "Enter", "text": "\r", "windowsVirtualKeyCode": 13}
@@ -627,7 +627,7 @@ def test_several_results_have_a_switch(cloud, new_tab, tmp_path):
     with page_server(open_results([cloud, tmp_path / "other.ply"]).answer, port=0) as page:
         tab = opened(new_tab, page)
         tab.wait_for(lambda text: "60,000 points" in text and "cloud.ply\nother.ply" in text)
-        assert tab.value("lidarpool.chosen.colour") == "result"
+        assert tab.value("lidarpool.chosen.color") == "result"
         for pressed in ("[true,false]", "[false,true]"):
             tab.key("r")
             tab.wait_for(lambda text: "30,000 points of 60,000" in text)
@@ -647,7 +647,7 @@ def test_the_points_that_are_filtered_and_clipped_are_downloaded(view, new_tab, 
 
 
 def check_download(new_tab, page, tmp_path):
-    tab = opened(new_tab, page, "#filter=scan,100,299&clip=,;,;,3&colour=wetness")
+    tab = opened(new_tab, page, "#filter=scan,100,299&clip=,;,;,3&color=wetness")
     tab.call("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path / "kept"))
     summaries = "[...document.querySelectorAll('summary')]"
     tab.value(f"{summaries}.find(one => one.textContent === 'Export').click()")
@@ -663,9 +663,9 @@ def check_download(new_tab, page, tmp_path):
 
 def test_what_is_cut_off_is_not_drawn(served, new_tab, tmp_path):
     tab = opened(new_tab, served)
-    before = tab.wait_for(lambda _: max(0, colourful(tab.picture(tmp_path / "a.png")) - 3000))
+    before = tab.wait_for(lambda _: max(0, colorful(tab.picture(tmp_path / "a.png")) - 3000))
     tab.value(f"{PICTURE}.setClip([[null, null], [null, null], [null, -1]])")
-    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "b.png")) < before / 2)
+    tab.wait_for(lambda _: colorful(tab.picture(tmp_path / "b.png")) < before / 2)
 
 
 def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise(
@@ -679,7 +679,7 @@ def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise
         tab.open(served.url)
         tab.wait_for(lambda text: "30,000 points" in text)
         assert tab.value(theme) == name
-        tab.wait_for(lambda _, tab=tab: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+        tab.wait_for(lambda _, tab=tab: colorful(tab.picture(tmp_path / "a.png")) > 3000)
         corner = tab.picture(tmp_path / "a.png")[5:40, 300:335].mean()
         assert (corner > 200) == (name == "light")
         tab.value(
@@ -728,8 +728,8 @@ def test_actors_deform_with_the_time(view, new_tab, tmp_path):
             assert tab.errors == []
 
 
-def colourful(picture):
-    """Count the pixels left of the panel that are of a colour."""
+def colorful(picture):
+    """Count the pixels left of the panel that are of a color."""
     part = picture[60:560, 80:900].astype(int)
     return int((part.max(axis=2) - part.min(axis=2) > 60).sum())
 
@@ -775,7 +775,7 @@ def test_an_exported_page_opens_from_disk_and_asks_nobody(view, new_tab, tmp_pat
     tab = opened(new_tab, file)
     tab.wait_for(lambda text: "30,000 points" in text and "z, m" in text)
     assert tab.value("lidarpool.state.actors[0].name") == "Van"
-    tab.wait_for(lambda _: colourful(tab.picture(tmp_path / "a.png")) > 3000)
+    tab.wait_for(lambda _: colorful(tab.picture(tmp_path / "a.png")) > 3000)
     own = (file.url, "data:", "blob:")
     assert [request for request in tab.requests if not request.startswith(own)] == []
     tab.key("ArrowRight")  # one sweep of ten
@@ -783,7 +783,7 @@ def test_an_exported_page_opens_from_disk_and_asks_nobody(view, new_tab, tmp_pat
     tab.key(" ")
     tab.wait_for(lambda _: tab.value("lidarpool.chosen.time") > 0.5)
     assert "Range image" not in tab.text
-    link = "#filter=scan,100,149;z,2,2.5&colour=wetness&scene=hits"
+    link = "#filter=scan,100,149;z,2,2.5&color=wetness&scene=hits"
     other = opened(new_tab, file, link)
     kept = "1,21[56] points of 30,000"  # from z, 2 m to 2.5 m; the scans begin at 2.2 m
     other.wait_for(lambda text: re.search(kept, text) and "wetness, %" in text)

@@ -147,10 +147,10 @@ def shown(place: Path) -> str:
     view = open_result(place)
     header, _ = view.answer("state", {}, lambda: False)
     for column in view.columns:
-        view.answer("points", {"colour": column, "most": "1000"}, lambda: False)
+        view.answer("points", {"color": column, "most": "1000"}, lambda: False)
         view.answer("column", {"name": column}, lambda: False)
     if view.pictured is not None:
-        view.answer("surface", {"colour": "object"}, lambda: False)
+        view.answer("surface", {"color": "object"}, lambda: False)
     if view.sweeps is not None and len(view.sweeps):
         view.answer("range", {"sweep": "0"}, lambda: False)
     view.answer("point", {"row": "0"}, lambda: False) if header["points"] else None

@@ -49,7 +49,7 @@ PLANNING = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=12, particles=60
 
 
 def room() -> Scene:
-    """A room of 10 by 8 by 6 metres around the sensor, and what moves in it: every ray hits."""
+    """A room of 10 by 8 by 6 meters around the sensor, and what moves in it: every ray hits."""
     ways = [[(-3, -3, -2), (-3, 3, 2)], [(4, 3, 0), (4, -3, 1)]]
     moving = [
         Actor(block(f"block {k}", (1, 1, 1)), Track([0, 9], way, beyond="hold"))

@@ -102,37 +102,37 @@ def poses_of(sweeps, sensor):
 
 
 class Labels:
-    """Boxes of each actor in a file: times, s, centres in the world, m, sizes, m."""
+    """Boxes of each actor in a file: times, s, centers in the world, m, sizes, m."""
 
     def __init__(self):
         self.rows = {name: [] for name in LABELS}
 
-    def add(self, name, time_s, centre, size):
-        self.rows[name.split()[0]].append((time_s, centre, size))
+    def add(self, name, time_s, center, size):
+        self.rows[name.split()[0]].append((time_s, center, size))
 
     def check(self, place_m, size_m=1e-6, counts=(10, 7)):
         """Check all boxes by closed form, to an accuracy of the file."""
         for actor, name in enumerate(LABELS):
-            times_s, centres, sizes = map(np.array, zip(*self.rows[name], strict=True))
+            times_s, centers, sizes = map(np.array, zip(*self.rows[name], strict=True))
             order = np.argsort(times_s, kind="stable")
-            times_s, centres, sizes = times_s[order], centres[order], sizes[order]
+            times_s, centers, sizes = times_s[order], centers[order], sizes[order]
             ahead = 0.1 if name == "Walker" else 0.0  # of the middle of the box, horizontally
             heading = np.arctan2(*VELOCITIES[actor, 1::-1])
             middle = [ahead * np.cos(heading), ahead * np.sin(heading), SIZES[actor, 2] / 2]
             expected = STARTS[actor] + middle + np.outer(times_s, VELOCITIES[actor])
-            np.testing.assert_allclose(centres, expected, atol=place_m)
+            np.testing.assert_allclose(centers, expected, atol=place_m)
             np.testing.assert_allclose(sizes, np.tile(SIZES[actor], (len(sizes), 1)), atol=size_m)
             assert len(times_s) == counts[name == "Guest"]
-            speeds = devkit_velocities(times_s, centres)
+            speeds = devkit_velocities(times_s, centers)
             assert (np.linalg.norm(speeds - VELOCITIES[actor], axis=1)
                     < 0.02 * np.linalg.norm(VELOCITIES[actor])).all()  # fmt: skip
 
 
-def devkit_velocities(times_s, centres):
+def devkit_velocities(times_s, centers):
     """Return velocities by the rule of nuscenes-devkit: from the box before to the next."""
     last = np.minimum(np.arange(len(times_s)) + 1, len(times_s) - 1)
     first = np.maximum(np.arange(len(times_s)) - 1, 0)
-    return (centres[last] - centres[first]) / (times_s[last] - times_s[first])[:, None]
+    return (centers[last] - centers[first]) / (times_s[last] - times_s[first])[:, None]
 
 
 def nuscenes_tables(folder):
@@ -253,9 +253,9 @@ def test_webdataset_has_boxes_at_the_times_of_sweeps(cloud, tmp_path):
             continue
         boxes = np.load(io.BytesIO(files[f"{key}.boxes.npy"]))
         pose = np.load(io.BytesIO(files[f"{key}.pose.npy"]))
-        centres = boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-        for name, centre, row in zip(about["box_types"], centres, boxes, strict=True):
-            labels.add(name, about["time_ns"] / 1e9, centre, row[3:6])
+        centers = boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+        for name, center, row in zip(about["box_types"], centers, boxes, strict=True):
+            labels.add(name, about["time_ns"] / 1e9, center, row[3:6])
     labels.check(5e-6, 1e-6)
 
 
@@ -465,7 +465,7 @@ def outside(boxes, objects, points):
     """Return the distances (n,) of points to the boxes of their actors, m."""
     rotations = matrices(boxes.quaternions)
     index = np.searchsorted(boxes.objects, objects)
-    inside = np.einsum("nji,nj->ni", rotations[index], points - boxes.centres[index])
+    inside = np.einsum("nji,nj->ni", rotations[index], points - boxes.centers[index])
     return np.linalg.norm(np.maximum(np.abs(inside) - boxes.sizes[index] / 2, 0), axis=1)
 
 

@@ -194,7 +194,7 @@ def test_rows_of_a_table_become_entries(campaign):
     [
         'name;box.0;box.1;box.2;at\nA;1;2;3;"[[1, 2]]"\n',
         'name\tbox\tat\nA\t"[1, 2, 3]"\t[[1, 2]]\n',
-        '\n# Crates, in metres\nname,box,at.0.position\nA,"[1, 2, 3]","[1, 2]"\n\n',
+        '\n# Crates, in meters\nname,box,at.0.position\nA,"[1, 2, 3]","[1, 2]"\n\n',
     ],
 )
 def test_tables_may_be_written_in_several_ways(campaign, folder, text):

@@ -142,7 +142,7 @@ def test_kitti_has_them_as_semantic_kitti_api_reads_them(saved):
     told = yaml.safe_load((saved("kitti") / "semantic-kitti.yaml").read_text())
     assert told["labels"] == {0: "unlabeled", **NAMES}
     assert told["color_map"].keys() == told["labels"].keys()
-    assert len({tuple(colour) for colour in told["color_map"].values()}) == 5
+    assert len({tuple(color) for color in told["color_map"].values()}) == 5
 
 
 @pytest.mark.extended
@@ -276,7 +276,7 @@ def test_the_page_names_them_in_legend_and_filter(saved, scene, sweeps, tmp_path
         told, _ = view.answer("column", {"name": "class"}, lambda: False)
         labels = {value: name for name, value in told["labels"]}
         assert labels[3] == "road" and labels[7] == "Straße" and labels[4] == "class 4"
-        asked = {"colour": "class", "most": "100000"}
+        asked = {"color": "class", "most": "100000"}
         told, _ = view.answer("points", asked, lambda: False)
         assert "road" in [name for name, *_ in told["legend"]["labels"]]
     assert PictureContent.load(tmp_path / PICTURE_FILE).classes[3] == "road"

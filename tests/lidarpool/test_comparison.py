@@ -567,7 +567,7 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
         ({"sweeps": [3]}, r"there is no sweep 3: 3 pairs of sweeps, from 0"),
         ({"sensor_a": "roof"}, r"does not have 'roof'. It has no names of sensors"),
         ({"sensor_b": "/points"}, "does not have '/points'"),
-        ({"distances_m": [0.0]}, "it must be lengths in metres"),
+        ({"distances_m": [0.0]}, "it must be lengths in meters"),
     ):
         with pytest.raises(LidarError, match=says):
             compare(folder, folder, **options)

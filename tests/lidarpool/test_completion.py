@@ -17,7 +17,7 @@ from lidarpool.showing.playback.bridge_table import BRIDGES
 from lidarsim.base.model_names import model_names
 from lidarsim.base.vocabulary import ALWAYS_COLUMNS, COMPOSED_COLUMNS, OPTIONAL_COLUMNS
 from lidarsim.columns.table import OPTIONAL, TABLE
-from lidarview.render.colouring import NORMALS, RGB
+from lidarview.render.coloring import NORMALS, RGB
 
 
 def items(line: str) -> list[CompletionItem]:
@@ -55,8 +55,8 @@ OS1 = ["ouster/os1-128", "ouster/os1-32", "ouster/os1-64"]
         ("lidarpool fit a.pcap --model ouster/os1", OS1),
         ("lidarpool run hall.glb --columns ra", ["ray", "range", "radial_velocity"]),
         ("lidarpool run hall.glb --columns range,ray,ra", ["range,ray,radial_velocity"]),
-        ("lidarpool plot out --colour inc", ["incidence_deg"]),
-        ("lidarpool plot out --colour rg", ["rgb"]),
+        ("lidarpool plot out --color inc", ["incidence_deg"]),
+        ("lidarpool plot out --color rg", ["rgb"]),
         ("lidarpool export out --format ", [*EXPORTS]),
         ("lidarpool export out -f la", ["las", "laz"]),
         ("lidarpool export out --layout ", [*LAYOUTS]),
@@ -72,7 +72,7 @@ OS1 = ["ouster/os1-128", "ouster/os1-32", "ouster/os1-64"]
         ("lidarpool sensors vlp16 --out a.XML --as ", ["mjcf", "helios"]),
         ("lidarpool sensors vlp16 --out out/a.p", ["out/a.py", "out/a.parquet", "out/a.png"]),
         ("lidarpool sensors vlp16 --as livox --out a.", ["a.csv"]),
-        ("lidarpool scene points a.ply b.glb --colour i", ["intensity"]),
+        ("lidarpool scene points a.ply b.glb --color i", ["intensity"]),
     ],
 )
 def test_values_are_completed(line, values):

@@ -247,7 +247,7 @@ def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
     assert len(only) == 1 and only.actors
     DataSet(Storage.at(tmp_path), "parquet").write_job(JobRow(0, "0"), cloud, only)
     with np.load(tmp_path / "boxes/0.npz") as kept:
-        np.testing.assert_allclose(kept["centres"][0], Boxes.from_points(only, 0, cloud).centres)
+        np.testing.assert_allclose(kept["centers"][0], Boxes.from_points(only, 0, cloud).centers)
 
 
 def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):

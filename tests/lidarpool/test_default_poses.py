@@ -238,7 +238,7 @@ def test_a_card_seen_from_behind_is_no_body(far):
         ("screw.stl", 13.0, True),
         ("screw.stl", 4.0, False),
         ("screw.stl", 0.05, False),
-        ("engine.glb", 700.0, True),  # of an exporter that writes millimetres
+        ("engine.glb", 700.0, True),  # of an exporter that writes millimeters
         ("engine.glb", 40.0, False),
     ],
 )

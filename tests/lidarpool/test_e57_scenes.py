@@ -58,7 +58,7 @@ def reds(scene):
     """Return the mean red of the surfels, and their x."""
     centers = scene.vertices[scene.faces].mean(axis=1) + scene.origin
     (mesh,) = scene.meshes()
-    return mesh.colours.means()[:, 0].astype(int), centers[:, 0]
+    return mesh.colors.means()[:, 0].astype(int), centers[:, 0]
 
 
 @pytest.fixture
@@ -109,7 +109,7 @@ def test_invalid_intensities_do_not_darken(path):
 def test_colors_that_are_all_invalid_are_no_colors(path):
     fields = wall() | colors(np.zeros(COUNT)) | {"isColorInvalid": (np.ones(COUNT), (0, 1))}
     scene, notes = scene_and_notes(path, [{"fields": fields}])
-    assert scene.meshes()[0].colours is None and notes == []
+    assert scene.meshes()[0].colors is None and notes == []
 
 
 @pytest.mark.parametrize(

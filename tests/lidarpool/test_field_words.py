@@ -55,7 +55,7 @@ def test_a_long_list_that_differs_has_other_content():
 
 
 def test_a_plan_is_of_the_fields():
-    plans = [Planning((0, 0), (10, 0), centres=[(5, 0)], radii=r) for r in (1, 2)]
+    plans = [Planning((0, 0), (10, 0), centers=[(5, 0)], radii=r) for r in (1, 2)]
     fields = [dict(fields_in_words(plan, "planning")) for plan in plans]
     assert differences(*fields) == "planning.radii is [2.0], was [1.0]"
 

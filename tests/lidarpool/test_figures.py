@@ -21,9 +21,9 @@ def varied(values: list[object]) -> Varied:
     return found
 
 
-def names_of(labelled: Varied) -> list[str | None]:
+def names_of(labeled: Varied) -> list[str | None]:
     """Return the label of each job, or None."""
-    return [None if np.isnan(value) else labelled.labels[int(value)] for value in labelled.values]
+    return [None if np.isnan(value) else labeled.labels[int(value)] for value in labeled.values]
 
 
 @pytest.mark.parametrize("count", [11, 12, 13, 20])

@@ -319,12 +319,12 @@ def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
 
 
 @pytest.mark.extended
-def test_points_that_are_not_in_metres_are_refused(recording):
+def test_points_that_are_not_in_meters_are_refused(recording):
     def scaled(number):
         points, columns, pose = recording.read(number)
         return points * 1000, columns, pose
 
-    with pytest.raises(LidarError, match=r"ranges that change by .* give points in metres"):
+    with pytest.raises(LidarError, match=r"ranges that change by .* give points in meters"):
         fit(replace(recording, read=scaled))
 
 

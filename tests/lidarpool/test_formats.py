@@ -52,7 +52,7 @@ from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
 from lidarsim.columns.cloud_file import CloudFile
-from lidarsim.columns.table import COLOURS, TABLE
+from lidarsim.columns.table import COLORS, TABLE
 from lidarsim.motion.rotations import matrices
 from lidarsim.packets.encoders import START_NS
 from lidarsim.sweeps.sweeps import Sweeps
@@ -362,12 +362,12 @@ def test_bags_have_points_frames_and_a_clock(bag, cloud, survey, sweeps, name, l
 
 
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 26), ("autoware", 36), ("ouster", 48)])
-def test_bags_have_colours_as_rviz_and_foxglove_read_them(cloud, sweeps, layout, step, tmp_path):
+def test_bags_have_colors_as_rviz_and_foxglove_read_them(cloud, sweeps, layout, step, tmp_path):
     decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
     rng = np.random.default_rng(6)
-    colours = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLOURS}
-    coloured = Cloud(cloud.positions, {**cloud.columns, **colours}, sweeps=lambda: sweeps)
-    assert not {*COLOURS} & {*save_cloud(coloured, tmp_path / "c.mcap", layout=layout)}
+    colors = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLORS}
+    colored = Cloud(cloud.positions, {**cloud.columns, **colors}, sweeps=lambda: sweeps)
+    assert not {*COLORS} & {*save_cloud(colored, tmp_path / "c.mcap", layout=layout)}
     with (tmp_path / "c.mcap").open("rb") as file:
         reader = pytest.importorskip("mcap.reader").make_reader(file, decoder_factories=[decoder])
         topics = [(channel.topic, read) for _, channel, _, read in reader.iter_decoded_messages()]
@@ -376,7 +376,7 @@ def test_bags_have_colours_as_rviz_and_foxglove_read_them(cloud, sweeps, layout,
     (field,) = (field for field in first.fields if field.name == "rgb")
     assert (field.datatype, field.count) == (7, 1)  # FLOAT32
     packed = np.frombuffer(first.data, np.uint8).reshape(-1, step)[:, field.offset :][:, :4]
-    wanted = of_sweep(coloured, 0)
+    wanted = of_sweep(colored, 0)
     expected = [wanted[name] for name in ("blue", "green", "red")] + [np.zeros(len(wanted))]
     np.testing.assert_array_equal(packed, np.stack(expected, axis=1))
     (before,) = (field.offset for field in first.fields if field.name == "x")
@@ -482,35 +482,35 @@ def test_e57_has_limits_of_the_cloud_and_bounds_in_the_frame_of_the_points(writt
             np.testing.assert_allclose(bounds, [values.min(), values.max()], atol=1e-5)
 
 
-def test_colours_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
+def test_colors_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
     rng = np.random.default_rng(6)
-    colours = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLOURS}
-    coloured = Cloud(cloud.positions, {**cloud.columns, **colours})
+    colors = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLORS}
+    colored = Cloud(cloud.positions, {**cloud.columns, **colors})
     for name in ("las", "e57", "pcd"):
         one = Format(name, "velodyne")
-        one.write(tmp_path / one.row.file, coloured, sweeps)
+        one.write(tmp_path / one.row.file, colored, sweeps)
     las = laspy.read(tmp_path / "cloud.las")
     assert las.header.point_format.id == 7
-    assert not {*COLOURS} & {*las.point_format.extra_dimension_names}
+    assert not {*COLORS} & {*las.point_format.extra_dimension_names}
     with pye57.E57(str(tmp_path / "cloud.e57")) as file:
         found = file.read_scan(0, colors=True, ignore_missing_fields=True)
-    first = of_sweep(coloured, 0)
-    rgb = np.stack([first[name] for name in COLOURS], axis=1)
+    first = of_sweep(colored, 0)
+    rgb = np.stack([first[name] for name in COLORS], axis=1)
     path = tmp_path / "pcd" / "000000.pcd"
     pcd = PointCloud.from_path(path)
-    assert pcd.fields.count("rgb") == 1 and not {*COLOURS} & {*pcd.fields}
+    assert pcd.fields.count("rgb") == 1 and not {*COLORS} & {*pcd.fields}
     np.testing.assert_array_equal(PointCloud.decode_rgb(pcd.pc_data["rgb"]), rgb)
     read = load_open3d().t.io.read_point_cloud(str(path)).point
     np.testing.assert_array_equal(read["colors"].numpy(), rgb)
-    for name in COLOURS:
-        np.testing.assert_array_equal(las[name], colours[name].astype(int) * 257)
+    for name in COLORS:
+        np.testing.assert_array_equal(las[name], colors[name].astype(int) * 257)
         np.testing.assert_array_equal(found[f"color{name.capitalize()}"], first[name])
     # One of them alone is a column like others.
-    alone = Cloud(cloud.positions, {**cloud.columns, "red": colours["red"]})
+    alone = Cloud(cloud.positions, {**cloud.columns, "red": colors["red"]})
     Format("laz", "velodyne").write(tmp_path / "red.laz", alone, sweeps)
     las = laspy.read(tmp_path / "red.laz")
     assert las.header.point_format.id == 6
-    np.testing.assert_array_equal(las["red"], colours["red"])
+    np.testing.assert_array_equal(las["red"], colors["red"])
 
 
 @pytest.mark.parametrize("name", OF_ANY_SENSOR)
@@ -645,8 +645,8 @@ def test_other_coordinate_systems_come_from_rasterio(monkeypatch):
         wkt(2056)
 
 
-def inside_box(points, centre, axes, size, tolerance_m):
-    return (np.abs((points - centre) @ axes) <= np.array(size) / 2 + tolerance_m).all(axis=1)
+def inside_box(points, center, axes, size, tolerance_m):
+    return (np.abs((points - center) @ axes) <= np.array(size) / 2 + tolerance_m).all(axis=1)
 
 
 def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
@@ -661,7 +661,7 @@ def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
         points = Cloud(np.zeros((1, 3)), {"scan": [scan], "object": [car]})
         boxes = Boxes.from_points(sweeps, sweep, points)
         assert boxes.points.tolist() == [1]
-        np.testing.assert_allclose(boxes.centres, [[10 * start_s, 0, 0.75]], atol=1e-9)
+        np.testing.assert_allclose(boxes.centers, [[10 * start_s, 0, 0.75]], atol=1e-9)
 
 
 def test_boxes_of_tilted_sensors_hold_what_was_there_when_the_sweep_began(scene, tmp_path):
@@ -690,8 +690,8 @@ def test_boxes_of_tilted_sensors_hold_what_was_there_when_the_sweep_began(scene,
     save_cloud(cloud, tmp_path / "kitti", format="kitti")
     for sequence in ("00", "01"):
         folder = tmp_path / "kitti/sequences" / sequence
-        camera, centre, turn, size = in_camera(folder, 0, len(sweeps.objects) + 1)
-        assert inside_box(camera, centre, turn, size, 0.001).all()
+        camera, center, turn, size = in_camera(folder, 0, len(sweeps.objects) + 1)
+        assert inside_box(camera, center, turn, size, 0.001).all()
     seen = cloud[200:400]  # by the second sensor alone
     save_cloud(seen, tmp_path / "nuscenes", format="nuscenes")
     (table,) = (tmp_path / "nuscenes").glob("v1.0-*/sample_annotation.json")
@@ -713,8 +713,8 @@ def in_camera(folder, sweep, instance):
     height, width, length, *place, around = map(float, labels[instance - first].split()[8:])
     turn = np.array([[np.cos(around), 0, np.sin(around)], [0, 1, 0],
                      [-np.sin(around), 0, np.cos(around)]])  # fmt: skip
-    centre = np.array(place) - [0, height / 2, 0]
-    return points[instances == instance] @ back.T, centre, turn, (length, height, width)
+    center = np.array(place) - [0, height / 2, 0]
+    return points[instances == instance] @ back.T, center, turn, (length, height, width)
 
 
 @pytest.mark.extended
@@ -763,7 +763,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
         ("layout must be 'velodyne', .* but is 'sick'", "x.mcap", {"layout": "sick"}),
         ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
         ("is a folder", "result", {"format": "laz"}),
-        ("precision_m is -1; it must be a length in metres", "x.las", {"precision_m": -1}),
+        ("precision_m is -1; it must be a length in meters", "x.las", {"precision_m": -1}),
     ):
         with pytest.raises(LidarError, match=told):
             save_cloud(known, tmp_path / path, **more)

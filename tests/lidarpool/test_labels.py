@@ -102,7 +102,7 @@ def test_the_scenario_of_the_page_labels_its_points():
         ([{"objects": "*", "class": 4}], []),
     ],
 )
-def test_labelled_formats_without_classes_are_noted(materials, notes):
+def test_labeled_formats_without_classes_are_noted(materials, notes):
     data = {"scene": "seed", "output": {"write": ["kitti", "las"]}, "materials": materials}
     told = [note for note in advice(build(Scenario.from_data(data))) if "class" in note]
     assert len(told) == len(notes) and all(map(str.startswith, told, notes))

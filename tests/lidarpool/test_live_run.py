@@ -43,7 +43,7 @@ WETNESS = Column("wetness", "float32", "%", "how wet it is", source="intensity")
 
 
 def make_job(scans: int) -> OneJob:
-    """Make a survey from two poses, 1 m and 5 m up, in cells of half a metre."""
+    """Make a survey from two poses, 1 m and 5 m up, in cells of half a meter."""
     poses = [(0, 0, 1), (0, 0, 5)]
     return OneJob(Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5)))
 
@@ -72,7 +72,7 @@ def wait_for(condition):
 def displayed(live: LivePage) -> int:
     """Count the points on the page."""
     news(live)  # or nobody looks
-    return len(ask(live.page.url, "points", colour="z", most=1_000_000)["arrays"]["rows"])
+    return len(ask(live.page.url, "points", color="z", most=1_000_000)["arrays"]["rows"])
 
 
 def test_frames_and_their_parts_are_shown_in_order_at_the_pace(monkeypatch):
@@ -170,10 +170,10 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
         state = ask(live.page.url, "state")
         assert state["path"]["corners"] == result.plan.path.tolist()
         assert len(state["arrays"]["rays"]) > 0
-        hits = ask(live.page.url, "surface", colour="hits")
-        assert "hits per square metre" in hits["legend"]["title"]
+        hits = ask(live.page.url, "surface", color="hits")
+        assert "hits per square meter" in hits["legend"]["title"]
         wet, energy = (
-            ask(live.page.url, "points", colour=name, most=1_000_000)["arrays"]["colours"]
+            ask(live.page.url, "points", color=name, most=1_000_000)["arrays"]["colors"]
             for name in ("wetness", "intensity")
         )
     assert busy == {"GPU", "LIDAR", "OTHER"}
@@ -358,7 +358,7 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
         assert ask(viewer, "state")["title"].startswith(f"job {name}")
         for job in told["ended"]:  # the newest as it was read, the others as they are written
             assert job["opens"]
-            shown = ask(f"{live.page.url}job/{job['number']}/", "points", colour="z", most=10**6)
+            shown = ask(f"{live.page.url}job/{job['number']}/", "points", color="z", most=10**6)
             assert len(shown["arrays"]["rows"]) == job["points"]
         assert not any(job["opens"] for job in told["failures"])
         with pytest.raises(urllib.error.HTTPError, match="404"):

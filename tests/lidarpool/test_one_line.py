@@ -48,7 +48,7 @@ TRACK = Track(np.arange(100.0), np.ones((100, 3)))
 POSES = [Pose((0, 0, i), yaw_deg=i) for i in range(24)]
 SURVEY = Survey(SENSOR, poses=POSES, materials=[Material("hall")] * 9, noise=Noise(range_m=0.01))
 SCENE = Scene.from_meshes([MESH])
-PLANNING = Planning((0, 0), (10, 0), centres=[(5, 0)] * 100, radii=2.0)
+PLANNING = Planning((0, 0), (10, 0), centers=[(5, 0)] * 100, radii=2.0)
 THINGS = [
     Actor(MESH, TRACK),
     Beams.even(128, 40),
@@ -109,7 +109,7 @@ def test_every_public_class_is_among_them():
 def test_it_says_what_differs_from_the_defaults():
     assert repr(Pose((0, 0, 1))) == "Pose(position=(0.0, 0.0, 1.0))"
     assert repr(Stations(tuple(POSES))) == "Stations(at=[24 Pose])"
-    assert repr(PLANNING).endswith("centres=float64(100, 2), radii=float64(100,))")
+    assert repr(PLANNING).endswith("centers=float64(100, 2), radii=float64(100,))")
     assert repr(SURVEY).startswith("Survey(sensor=Sensor('Velodyne VLP-16'), poses=[24 Pose], ")
     assert repr(Mounted(SENSOR, noise=Noise(range_m=0.01))) == (
         "Mounted(sensor=Sensor('Velodyne VLP-16'), noise=Noise(range_m=0.01))"

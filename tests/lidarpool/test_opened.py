@@ -115,7 +115,7 @@ def test_a_recording_is_played_sweep_by_sweep(exported, name):
     assert state_of(view)["duration"] == pytest.approx(0.3, abs=0.01)
     assert len(view.sensors) == 2 and view.sweeps.begins_ns.max() == pytest.approx(2e8, rel=0.01)
     counts = [
-        view.answer("points", {"colour": "z", "most": "100000", "scans": f"{k}-{k}"}, bool)[0][
+        view.answer("points", {"color": "z", "most": "100000", "scans": f"{k}-{k}"}, bool)[0][
             "count"
         ]
         for k in range(6)
@@ -157,7 +157,7 @@ def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypat
     view = growing_view(folder / name)
     state = state_of(view)
     assert state["growing"] and state["points"] == len(cloud) and not state["exports"]
-    asked = {"colour": "z", "most": "100000"}
+    asked = {"color": "z", "most": "100000"}
     assert view.answer("points", asked, bool)[0]["count"] == 4000
     growth = growth_of(view)
     assert (growth["complete"], growth["error"], growth["share"]) == (True, "", 1.0)
@@ -188,7 +188,7 @@ def test_more_points_of_a_large_cloud_are_shown_while_it_is_read(exported, monke
         seen.append((growth["share"], len(points)))
 
     monkeypatch.setattr(View, "show", record)
-    view.answer("points", {"colour": "z", "most": "100000"}, bool)
+    view.answer("points", {"color": "z", "most": "100000"}, bool)
     assert growth_of(view)["version"] > 1
     half = -(-len(cloud) // 2)
     assert seen[:2] == [(0.5, 400 + half), (1.0, 400 + len(cloud))]
@@ -219,7 +219,7 @@ def test_scans_of_stations_are_named_and_do_not_move(tmp_path):
         assert [sensor["moves"] for sensor in state["sensors"]] == [False]
         numbers = view.shown_points.values("station", slice(None))
         assert np.unique(numbers).tolist() == list(range(1, len(stations)))
-        assert "station" in state["colours"]
+        assert "station" in state["colors"]
 
 
 def test_files_of_other_programs(tmp_path):
@@ -235,7 +235,7 @@ def test_files_of_other_programs(tmp_path):
     las.classification = np.array([2, 2, 6, 5], np.uint8)
     las.write(tmp_path / "flown.las")
     legend = open_view(tmp_path / "flown.las").answer(
-        "points", {"colour": "class", "most": "9"}, bool
+        "points", {"color": "class", "most": "9"}, bool
     )[0]["legend"]
     assert [label[0] for label in legend["labels"]] == ["ground", "high vegetation", "building"]
 
@@ -273,7 +273,7 @@ actors: [{name: Van, box: [1, 1, 1], at: [3, 1, 0.5]}]
     assert len(view.sweeps) > 10, "all sweeps can be played"
     mesh = open_view(tmp_path / "wall.obj")
     assert state_of(mesh)["preview"] and len(mesh.pictured.scene.faces) == 2
-    assert len(page_of(mesh)) > 10_000  # in all colours, also of hits, of which there are none
+    assert len(page_of(mesh)) > 10_000  # in all colors, also of hits, of which there are none
     (tmp_path / "campaign.yaml").write_text(
         """base: drive.yaml
 count: 3

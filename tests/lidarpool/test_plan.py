@@ -44,12 +44,12 @@ scene = st.lists(
 @given(discs=scene)
 def test_random_scenes(discs):
     array = np.array(discs, float)
-    centres = array[:, :2]
+    centers = array[:, :2]
     radii = array[:, 2]
     ends = np.array([DEFAULT.start, DEFAULT.target])
-    assume((segment_distances(ends, ends, centres) > radii + 0.1).all())
-    planning = Planning(DEFAULT.start, DEFAULT.target, centres, radii)
-    shortest = shortest_path_length(planning.start, planning.target, centres, radii)
+    assume((segment_distances(ends, ends, centers) > radii + 0.1).all())
+    planning = Planning(DEFAULT.start, DEFAULT.target, centers, radii)
+    shortest = shortest_path_length(planning.start, planning.target, centers, radii)
     assume(shortest < np.inf)
     plan = best([run_trial(planning, number) for number in range(4)], planning)
     assert plan.collision_free
@@ -75,7 +75,7 @@ def test_georeferenced_and_tiny_scenes_give_the_same_plan():
 @pytest.mark.parametrize("waypoints", [1, 4])
 def test_any_number_of_particles_runs(particles, waypoints):
     planning = Planning(
-        centres=SEED_SCENE, radii=2, particles=particles, iterations=3, waypoints=waypoints
+        centers=SEED_SCENE, radii=2, particles=particles, iterations=3, waypoints=waypoints
     )
     trial = run_trial(planning, 0)
     assert trial.waypoints.shape == (waypoints, 2)
@@ -89,7 +89,7 @@ def test_a_trial_does_not_claim_a_path_that_collides():
     for number in range(60):
         trial = run_trial(planning, number)
         path = np.vstack([planning.start, trial.waypoints, planning.target])
-        rooms.append(clearance(path, planning.centres, planning.radii))
+        rooms.append(clearance(path, planning.centers, planning.radii))
         assert trial.collision_free == (rooms[-1] >= 0)
     assert max(rooms) > 0
     assert any(-0.5 < room < 0 for room in rooms)
@@ -158,12 +158,12 @@ coordinate = st.floats(-50, 50)
 point = st.tuples(coordinate, coordinate)
 
 
-@given(first=point, last=point, centre=point)
-def test_distance_is_below_and_close_to_that_of_any_sample(first, last, centre):
+@given(first=point, last=point, center=point)
+def test_distance_is_below_and_close_to_that_of_any_sample(first, last, center):
     share = np.linspace(0, 1, 401)[:, None]
     samples = np.array(first) * (1 - share) + np.array(last) * share
-    sampled = np.hypot(*(samples - centre).T).min()
-    found = segment_distances(np.array([first]), np.array([last]), np.array([centre]))[0, 0]
+    sampled = np.hypot(*(samples - center).T).min()
+    found = segment_distances(np.array([first]), np.array([last]), np.array([center]))[0, 0]
     spacing = math.dist(first, last) / 400
     assert found <= sampled + 1e-9
     assert found >= sampled - spacing / 2 - 1e-9
@@ -176,19 +176,19 @@ def test_a_disc_between_samples_is_not_missed():
 
 
 BAD = {
-    "start within": ({"centres": [(25, 24)], "radii": 2}, r"start \(25, 25\) lies within disc 0"),
-    "target within": ({"centres": [(0, 0), (-30, -21)], "radii": 2}, "target .* within disc 1"),
+    "start within": ({"centers": [(25, 24)], "radii": 2}, r"start \(25, 25\) lies within disc 0"),
+    "target within": ({"centers": [(0, 0), (-30, -21)], "radii": 2}, "target .* within disc 1"),
     "no way to go": ({"start": (1, 2), "target": (1, 2)}, "nothing to plan"),
     "start not finite": (
         {"start": (np.nan, 0)},
         "start\\[0\\] must be a finite number, but is nan",
     ),
     "target in space": ({"target": (0, 0, 0)}, "target must have at most 2 items"),
-    "centres not finite": ({"centres": [(0, np.inf)], "radii": 1}, "centres is .*inf"),
-    "centres in space": ({"centres": [(0, 0, 0)], "radii": 1}, r"centres is .*\(m, 2\)"),
-    "radii too many": ({"centres": [(0, 0)], "radii": [1, 2]}, "one for each disc or one for all"),
-    "radius below 0": ({"centres": [(0, 0)], "radii": -1}, "above 0"),
-    "radius not finite": ({"centres": [(0, 0)], "radii": np.inf}, "radii is inf; it must be fin"),
+    "centers not finite": ({"centers": [(0, np.inf)], "radii": 1}, "centers is .*inf"),
+    "centers in space": ({"centers": [(0, 0, 0)], "radii": 1}, r"centers is .*\(m, 2\)"),
+    "radii too many": ({"centers": [(0, 0)], "radii": [1, 2]}, "one for each disc or one for all"),
+    "radius below 0": ({"centers": [(0, 0)], "radii": -1}, "above 0"),
+    "radius not finite": ({"centers": [(0, 0)], "radii": np.inf}, "radii is inf; it must be fin"),
     "no trials": ({"trials": 0}, "trials must be from 1 to"),
 }
 
@@ -218,7 +218,7 @@ def over(rise: float, radius: float) -> float:
     return 2 * (math.sqrt(apart**2 - radius**2) + radius * bend)
 
 
-# Each case has a start, a target, the centres of discs, their radii, and the length of the way.
+# Each case has a start, a target, the centers of discs, their radii, and the length of the way.
 CASES = {
     "no disc": ((0, 0), (3, 4), [], [], 5),
     "nowhere to go": ((1, 1), (1, 1), [], [], 0),

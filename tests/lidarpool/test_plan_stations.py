@@ -93,7 +93,7 @@ def test_each_side_of_a_thin_wall_counts_by_itself():
 
 
 @pytest.mark.extended
-def test_a_hall_may_be_modelled_by_its_outside_alone():
+def test_a_hall_may_be_modeled_by_its_outside_alone():
     scene = Scene.from_meshes([box("Hall", (8, 6, 3)), placed("Case", (1, 1, 2.5), (2.1, 1.1, 0))])
     plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
     # Inner sides of the hall, less what the case stands on; and the sides of the case.

@@ -71,7 +71,7 @@ from lidarsim.plugins import Content, MeshFormat, SceneMesh, about, checked_fiel
 @dataclass(frozen=True)
 @checked_fields
 class SizedOptions:
-    size_m: Annotated[float, about("length of the edges, metres", gt=0, le=100)] = 1.0
+    size_m: Annotated[float, about("length of the edges, meters", gt=0, le=100)] = 1.0
 
 def read(data, path, wanted):
     mesh = SceneMesh("Triangle", wanted.own.size_m * np.eye(3), np.array([[0, 1, 2]]))

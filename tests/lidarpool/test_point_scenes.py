@@ -56,9 +56,9 @@ def written(path, points):
     return path
 
 
-def written_with_columns(path, points, classes, intensities, colours):
-    """Write points with classes, intensities and colours, as programs of each format do."""
-    red, green, blue = colours.T.copy()
+def written_with_columns(path, points, classes, intensities, colors):
+    """Write points with classes, intensities and colors, as programs of each format do."""
+    red, green, blue = colors.T.copy()
     if path.suffix == ".las":
         laspy = pytest.importorskip("laspy", reason="laspy is an extra")
         las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=7))
@@ -66,7 +66,7 @@ def written_with_columns(path, points, classes, intensities, colours):
         las.x, las.y, las.z = points.T
         las.classification = classes
         las.intensity = intensities
-        las.red, las.green, las.blue = 257 * colours.T.astype(np.uint16)
+        las.red, las.green, las.blue = 257 * colors.T.astype(np.uint16)
         las.gps_time = np.arange(len(points))
         las.write(str(path))
     elif path.suffix == ".e57":
@@ -194,27 +194,27 @@ def test_stray_points_make_no_large_surfels(tmp_path):
 # Three points in each voxel: two of class 2, and a third that is brighter.
 CLASSES = np.tile([2, 2, 5], len(GRID))
 INTENSITIES = np.tile([10, 20, 60], len(GRID))
-COLOURS = np.tile([[100, 0, 0], [100, 0, 50], [100, 0, 100]], (len(GRID), 1)).astype(np.uint8)
+COLORS = np.tile([[100, 0, 0], [100, 0, 50], [100, 0, 100]], (len(GRID), 1)).astype(np.uint8)
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.pcd", "text.pcd", "a.las", "a.e57"])
-def test_classes_colours_and_intensities_stay_in_the_scene(tmp_path, name):
+def test_classes_colors_and_intensities_stay_in_the_scene(tmp_path, name):
     points = plane().repeat(3, axis=0)
-    path = written_with_columns(tmp_path / name, points, CLASSES, INTENSITIES, COLOURS)
+    path = written_with_columns(tmp_path / name, points, CLASSES, INTENSITIES, COLORS)
     notes = []
     scene_of_points(path, voxel_m=0.01, tell=notes.append)
-    for colour in ("rgb", "intensity"):
-        scene = scene_of_points(path, voxel_m=0.01, colour=colour, tell=notes.append)
+    for color in ("rgb", "intensity"):
+        scene = scene_of_points(path, voxel_m=0.01, color=color, tell=notes.append)
         write_scene(tmp_path / "b.glb", scene)
-        again = Scene.load(tmp_path / "b.glb", colours=True, materials=True)
+        again = Scene.load(tmp_path / "b.glb", colors=True, materials=True)
         assert again.triangles == 2 * len(GRID)
-        (means,) = np.unique(again.colours.means(), axis=0)
+        (means,) = np.unique(again.colors.means(), axis=0)
         # Half of a white surface's light, and the mean of 0, 50 and 100 in linear light.
-        expected = [100, 0, 64] if colour == "rgb" else 3 * [188]
+        expected = [100, 0, 64] if color == "rgb" else 3 * [188]
         assert np.abs(means.astype(int) - expected).max() <= 1
         assert scene.material_names == (() if name == "a.e57" else ("class 2",))
         assert name == "a.e57" or again.material_names == ("class 2",)
-    assert f"{path}: intensities are not kept, because surfels have a colour" in notes[0] + notes[1]
+    assert f"{path}: intensities are not kept, because surfels have a color" in notes[0] + notes[1]
     left_out = {"a.las": "gps_time", "a.e57": ""}.get(name, "curvature")
     assert any(note.endswith(f": {left_out}") for note in notes) == bool(left_out)
 
@@ -230,9 +230,9 @@ def test_the_most_frequent_class_of_each_surfel_counts(tmp_path):
     scene = scene_of_points(path, voxel_m=1e-3)
     names = np.array(scene.material_names)
     materials = scene.meshes()[0].materials
-    centres = scene.vertices[scene.faces].mean(axis=1) + scene.origin
+    centers = scene.vertices[scene.faces].mean(axis=1) + scene.origin
     assert names.tolist() == ["class 2", "class 5"]
-    assert ((materials.index == 1) == (centres[:, 0] < 2)).all()
+    assert ((materials.index == 1) == (centers[:, 0] < 2)).all()
 
 
 def test_scans_of_an_e57_are_joined_and_face_their_scanners(tmp_path):
@@ -253,13 +253,13 @@ def test_scans_of_an_e57_are_joined_and_face_their_scanners(tmp_path):
     write_scene(tmp_path / "b.glb", scene_of_points(path, voxel_m=1e-3))
     scene = Scene.load(tmp_path / "b.glb")
     quads = scene.vertices.reshape(-1, 4, 3)
-    centres = quads.mean(axis=1) + scene.origin - corner
+    centers = quads.mean(axis=1) + scene.origin - corner
     half_thickness = np.array([1.0, 0, 0])
     expected = np.concatenate([wall - half_thickness, wall + half_thickness])
-    order = np.lexsort(np.round(centres, 3).T)
-    assert np.abs(centres[order] - expected[np.lexsort(np.round(expected, 3).T)]).max() < 1e-5
+    order = np.lexsort(np.round(centers, 3).T)
+    assert np.abs(centers[order] - expected[np.lexsort(np.round(expected, 3).T)]).max() < 1e-5
     normals = np.cross(quads[:, 1] - quads[:, 0], quads[:, 2] - quads[:, 0])
-    assert (normals[:, 0] * centres[:, 0] > 0).all(), "fronts face the scanners"
+    assert (normals[:, 0] * centers[:, 0] > 0).all(), "fronts face the scanners"
 
 
 def facing(scene, at):
@@ -285,10 +285,10 @@ def pcd_with_viewpoint(path, columns=()):
 def test_the_viewpoint_of_a_pcd_places_and_orients_surfels(tmp_path):
     path, points = pcd_with_viewpoint(tmp_path / "a.pcd")
     scene = scene_of_points(path, voxel_m=1e-3)
-    centres = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
-    order = np.lexsort(np.round(centres, 3).T)
+    centers = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
+    order = np.lexsort(np.round(centers, 3).T)
     expected = points[np.lexsort(np.round(points, 3).T)]
-    np.testing.assert_allclose(centres[order], expected, atol=1e-4)
+    np.testing.assert_allclose(centers[order], expected, atol=1e-4)
     assert facing(scene, STATION).all()
 
 
@@ -340,16 +340,16 @@ def test_scans_of_a_ptx_are_joined_and_face_their_scanners(tmp_path):
         text += "".join(f"{x:.9f} {y:.9f} {z:.9f} 0.5\n" for x, y, z in local)
     (tmp_path / "a.ptx").write_text(text)
     scene = scene_of_points(tmp_path / "a.ptx", voxel_m=1e-3)
-    centres = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
-    assert len(centres) == 2 * len(GRID) and np.abs(np.abs(centres[:, 0]) - 1).max() < 1e-4
-    sides = np.where(centres[:, :1] < 0, [[-3.0, 2, 1.5]], [[3.0, 2, 1.5]])
+    centers = scene.vertices.reshape(-1, 4, 3).mean(axis=1) + scene.origin
+    assert len(centers) == 2 * len(GRID) and np.abs(np.abs(centers[:, 0]) - 1).max() < 1e-4
+    sides = np.where(centers[:, :1] < 0, [[-3.0, 2, 1.5]], [[3.0, 2, 1.5]])
     assert facing(scene, sides).all()
 
 
 def reds(scene):
     """Return the red of surfels, and their x."""
-    centres = scene.vertices[scene.faces].mean(axis=1) + scene.origin
-    return scene.meshes()[0].colours.means()[:, 0].astype(int), centres[:, 0]
+    centers = scene.vertices[scene.faces].mean(axis=1) + scene.origin
+    return scene.meshes()[0].colors.means()[:, 0].astype(int), centers[:, 0]
 
 
 def ptx_scan(x, cells):
@@ -363,7 +363,7 @@ def ptx_scan(x, cells):
     [("0.5 200 200 200", "0.5", "color"), ("0.5 200 200 200", "0.5 0 0 0", "color"),
      ("0.5", "0", "intensity")],
 )  # fmt: skip
-def test_what_one_of_two_scans_lacks_is_grey(tmp_path, first, second, quantity):
+def test_what_one_of_two_scans_lacks_is_gray(tmp_path, first, second, quantity):
     path = tmp_path / "a.ptx"
     path.write_text(ptx_scan(1, first) + ptx_scan(50, second))
     notes = []
@@ -465,9 +465,9 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
     notes = []
     scene = scene_of_points(path, tell=notes.append)
     np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
-    assert "was converted to metres: its header names units of 0.001, 0.001, 0.001 m" in notes[0]
-    metres = scene_of_points(path, unit="cm", tell=notes.append)
-    np.testing.assert_allclose(metres.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
+    assert "was converted to meters: its header names units of 0.001, 0.001, 0.001 m" in notes[0]
+    meters = scene_of_points(path, unit="cm", tell=notes.append)
+    np.testing.assert_allclose(meters.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
     np.testing.assert_allclose(open_recording(path).read_points(0).points.max(axis=0), [4, 3, 2])
     points = open_recording(path, unit="m").read_points(0).points
     np.testing.assert_allclose(points.max(axis=0), [4000, 3000, 2000])
@@ -475,11 +475,11 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("a.ply", "has no intensities: leave out colour intensity"), ("a.xyz", "has no intensities")],
+    [("a.ply", "has no intensities: leave out color intensity"), ("a.xyz", "has no intensities")],
 )
 def test_missing_intensities_are_an_error(tmp_path, name, words):
     with pytest.raises(LidarError, match=words):
-        scene_of_points(written(tmp_path / name, plane()), colour="intensity")
+        scene_of_points(written(tmp_path / name, plane()), color="intensity")
 
 
 def test_columns_without_names_are_noted(tmp_path):
@@ -576,9 +576,9 @@ def test_only_generated_scenes_are_painted(tmp_path, name):
     path = written(tmp_path / f"{name}.ply", plane())
     out = tmp_path / "b.glb"
     CliRunner().invoke(command, ["points", str(path), str(out)], catch_exceptions=False)
-    scene = Scene.load(out, colours=True)
+    scene = Scene.load(out, colors=True)
     assert scene.names == (name,)
-    assert not scene.has_colours.any(), "grey, 188"
+    assert not scene.has_colors.any(), "gray, 188"
     city = tmp_path / "city.glb"
     CliRunner().invoke(command, ["city", str(city), "--triangles", "5000"], catch_exceptions=False)
-    assert Scene.load(city, colours=True).has_colours.all()
+    assert Scene.load(city, colors=True).has_colors.all()

@@ -202,7 +202,7 @@ def test_sensors_within_the_points_are_marked_from_above(write):
     assert page.xpath("//g[@class='stations']/text/text()") == ["1", "2"]
     (size,) = page.xpath("//image")
     rows = int(size.get("height"))
-    pixels = 1 / 0.256  # per metre; the first row and column are of points 1 m from the marks
+    pixels = 1 / 0.256  # per meter; the first row and column are of points 1 m from the marks
     (first, y), (second, other_y) = marks
     assert second - first == pytest.approx(pixels, abs=0.11)
     assert pixels - 0.1 <= first <= pixels + 1.1
@@ -334,7 +334,7 @@ def test_hits_on_nothing_are_told_from_those_on_surfaces(write):
     text, report = write(cloud=cloud, _hit_counts=lambda: on)
     assert report["hits_on_surfaces"] == on.sum() < report["hits"] == 2500
     assert f"2,500 hit ({2500 - on.sum():,} of them no surface), and" in text
-    assert f"The {on.sum():,} hits on surfaces per square metre" in text
+    assert f"The {on.sum():,} hits on surfaces per square meter" in text
 
 
 def test_points_by_object_are_all_accounted_for(write):

@@ -36,7 +36,7 @@ from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
 from lidarpool.clouds.writing import Format
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
-from lidarsim.columns.table import COLOURS, SCAN
+from lidarsim.columns.table import COLORS, SCAN
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
@@ -142,7 +142,7 @@ def driven() -> tuple[Survey, Cloud]:
         "radial_velocity": rng.normal(0, 9, count).astype(np.float32),
         "incidence_deg": rng.uniform(0, 90, count).astype(np.float32),
         "material": rng.integers(-1, 9, count).astype(np.int32),
-        **{name: rng.integers(0, 256, count).astype(np.uint8) for name in COLOURS},
+        **{name: rng.integers(0, 256, count).astype(np.uint8) for name in COLORS},
     }
     return survey, Cloud(points.positions, columns, sweeps=lambda: sweeps)
 
@@ -230,7 +230,7 @@ def check_row(rows: np.ndarray, points: Cloud, inside: np.ndarray, layout: str) 
     for name, _, column in FURTHER[1:]:
         np.testing.assert_array_equal(rows[name], points[column])
     packed = np.ascontiguousarray(rows["rgb"]).view("<u4")
-    red, green, blue = (points[name].astype(np.uint32) for name in COLOURS)
+    red, green, blue = (points[name].astype(np.uint32) for name in COLORS)
     np.testing.assert_array_equal(packed, red << 16 | green << 8 | blue)
 
 

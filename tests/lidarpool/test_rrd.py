@@ -79,7 +79,7 @@ def check(rows, sweeps, points_of_sweeps, origin):
             assert np.array_equal(np.array(values, expected.dtype), expected), name
         boxes = Boxes.from_points(sweeps, sweep, points)
         for part, expected in (
-            ("centers", boxes.centres - origin),
+            ("centers", boxes.centers - origin),
             ("half_sizes", boxes.sizes / 2),
             ("quaternions", boxes.quaternions),
         ):

@@ -34,7 +34,7 @@ def newest(view, version=0, **asked):
     while (news := ask(view.url, "news"))["version"] <= version:
         assert time.monotonic() < give_up_at
         time.sleep(0.02)
-    return news, ask(view.url, "points", colour="z", most=100_000, **asked)
+    return news, ask(view.url, "points", color="z", most=100_000, **asked)
 
 
 @pytest.mark.parametrize("coordinates", ["world", "sensor"])

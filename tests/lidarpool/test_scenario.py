@@ -75,8 +75,8 @@ def test_the_survey_of_the_demo(source):
     assert (survey.scan_count, survey.ray_count, len(scene.faces)) == (108, 120_000, 76_800)
     assert (planning.start, planning.target) == ((25, 25), (-30, -20))
     np.testing.assert_allclose(planning.radii, 2.0, atol=1e-12)
-    centres = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
-    np.testing.assert_allclose(planning.centres, centres, atol=1e-12)
+    centers = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
+    np.testing.assert_allclose(planning.centers, centers, atol=1e-12)
     numbers = (planning.trials, planning.particles, planning.iterations, planning.seed)
     assert numbers == (100, 1000, 300, 0)
     pool = loaded.pool
@@ -215,7 +215,7 @@ def test_georeferenced_poses_and_plans_are_local(scenario, crate):
     assert world == [[500010.5, 4000000.25, 101], [500000, 4000010, 102]]
     assert np.abs([pose.position for pose in survey.poses]).max() < 20
     assert survey.poses[1].yaw_deg == 45
-    np.testing.assert_allclose(planning.centres + scene.origin[:2], [[500000.5, 4000000.25]])
+    np.testing.assert_allclose(planning.centers + scene.origin[:2], [[500000.5, 4000000.25]])
     np.testing.assert_allclose(planning.radii, np.hypot(1, 2) + 0.5)
     assert np.add(planning.start, scene.origin[:2]).tolist() == [500010, 4000000]
 
@@ -229,8 +229,8 @@ def test_obstacles(scenario):
     assert len(plan("obstacles: auto").radii) == 6
     assert len(plan("obstacles: []").radii) == 0
     assert len(plan('obstacles: ["*e*", {object: Vase}]').radii) == 4  # Vase once
-    disc = plan("obstacles: [{centre: [1, 2], radius_m: 3}], clearance_m: 0.5")
-    assert (disc.centres.tolist(), disc.radii.tolist()) == ([[1, 2]], [3.5])
+    disc = plan("obstacles: [{center: [1, 2], radius_m: 3}], clearance_m: 0.5")
+    assert (disc.centers.tolist(), disc.radii.tolist()) == ([[1, 2]], [3.5])
     assert plan("enabled: false") is None
 
 
@@ -334,7 +334,7 @@ BAD = [
     ("noise: {range_mm: 20}", r"Write range_m: 0\.02\.$"),
     ("returns: {divergence_deg: [0.18, 0.09]}", r"mrad: \[3\.14159265359, 1\.57079632679\]\.$"),
     ("poses: [{position: [0, 0, 1], yaw_rad: 1}]", r"Write yaw_deg: 57\.2957795131\.$"),
-    ("cloud: {precision_metres: 0.01}", r"Did you mean 'precision_m'\?$"),
+    ("cloud: {precision_meters: 0.01}", r"Did you mean 'precision_m'\?$"),
     ("weather: {rain_in_h: 1}", r"Write rain_mm_h: 25\.4\.$"),
     ("weather: {dust_g_m3: 0.1}", r"Write dust_mg_m3: 100\.$"),
     ("points: [[0, 0, 1]]", r"Unknown field 'points'\.$"),
@@ -375,7 +375,7 @@ BAD = [
     ("scene: seed\nplanning: {trials: 5}", r"planning needs a start and a target: give planning"),
     ("scene: seed\nplanning: {start: [5, 5]}", r"give planning\.start and planning\.target\."),
     ("scene: {preset: none}", r"preset must be 'seed', but is 'none'"),
-    ("planning: {obstacles: [{centre: [0, 0]}]}", "both centre and radius_m"),
+    ("planning: {obstacles: [{center: [0, 0]}]}", "both center and radius_m"),
     ("scene: a.stl\nplanning: {enabled: true}", r"give planning\.start and planning\.target"),
     ("pool: {backend: opengl}", "must be 'auto', 'cuda', 'tiles' or 'numpy'"),
     ("", "is empty. A scenario is a mapping with sections"),
@@ -788,12 +788,12 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         (3857, [0, 0, 0], r"Pseudo-Mercator\), a world map projection"),
         (3395, [1_000_000, 6_000_000, 0], "a world map projection"),
         (2056, [0, 0, 0], r"The scene is at x 0, y 0, outside the area of use of EPSG:2056"),
-        (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*EPSG:32617 has true metres"),
-        (2263, [0, 0, 0], "which is not in metres"),
-        (4326, [8, 47, 0], "which is not in metres"),
+        (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*EPSG:32617 has true meters"),
+        (2263, [0, 0, 0], "which is not in meters"),
+        (4326, [8, 47, 0], "which is not in meters"),
     ],
 )
-def test_the_coordinate_system_has_true_metres(tmp_path, epsg, place, words):
+def test_the_coordinate_system_has_true_meters(tmp_path, epsg, place, words):
     mesh_file(tmp_path / "hall.stl", (8, 6, 2), 2)
     entries = [{"file": "hall.stl", "up_axis": "z", "translation": place}]
     data = {"scene": {"files": entries}, "world": {"epsg": epsg}}
@@ -815,7 +815,7 @@ WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in r
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("cloud: {columns: [red]}", "needs colours"),
+        ("cloud: {columns: [red]}", "needs colors"),
         (
             f"navigation: {{imu: {{}}}}\ntrajectory: {{interpolation: linear, points: {WAY}}}",
             "interpolation: smooth",

@@ -1,4 +1,4 @@
-"""Coordinate systems that clouds state: true metres, a refusal that helps, or another system."""
+"""Coordinate systems that clouds state: true meters, a refusal that helps, or another system."""
 
 import contextlib
 import struct
@@ -33,7 +33,7 @@ VERT_CS = 'VERT_CS["h",VERT_DATUM["d",2005],UNIT["foot",0.3048],AXIS["Up",UP]]'
 
 
 def ground(target):
-    """Return a level grid of 29 x 29 m in a system, with heights in metres."""
+    """Return a level grid of 29 x 29 m in a system, with heights in meters."""
     (x,), (y,) = transform("EPSG:4326", "EPSG:32632", [LONGITUDE], [LATITUDE])
     points = np.column_stack([STEPS + np.array([x, y]), np.full(len(STEPS), HEIGHT_M)])
     if target == "EPSG:4978":
@@ -95,12 +95,12 @@ STRETCHED = {  # {case: (system of the coordinates, records, what the message sa
         wkt(f'COMPD_CS["c",{CRS.from_epsg(3857).to_wkt(version="WKT1_GDAL")},{VERT_CS}]'),
         "EPSG:3857",
     ),
-    "equal areas": ("EPSG:6933", wkt("EPSG:6933"), r"metre is 0\.783 to 1\.28 m long"),
+    "equal areas": ("EPSG:6933", wkt("EPSG:6933"), r"meter is 0\.783 to 1\.28 m long"),
 } if find_spec("rasterio") else {}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", STRETCHED)
-def test_stretched_metres_are_refused_with_what_helps(tmp_path, case):
+def test_stretched_meters_are_refused_with_what_helps(tmp_path, case):
     system, records, message = STRETCHED[case]
     points = ground(system)
     path = written(tmp_path / "a.las", points, records)
@@ -115,7 +115,7 @@ def test_stretched_metres_are_refused_with_what_helps(tmp_path, case):
 
 
 @pytest.mark.parametrize("case", ["Web Mercator", "Mercator of keys", "compound"])
-def test_clouds_are_brought_to_true_metres(tmp_path, case):
+def test_clouds_are_brought_to_true_meters(tmp_path, case):
     system, records, _ = STRETCHED[case]
     path = written(tmp_path / "a.las", ground(system), records)
     (lower, upper), notes = bounds_of(path, epsg=32632)
@@ -161,7 +161,7 @@ def test_feet_are_converted_on_the_way(tmp_path):
 
 
 @pytest.mark.parametrize("system", ["EPSG:32632", "EPSG:2056", "EPSG:25832", "EPSG:3035"])
-def test_true_metres_stay_as_they_are(tmp_path, system):
+def test_true_meters_stay_as_they_are(tmp_path, system):
     points = ground(system)
     path = written(tmp_path / "a.las", points, wkt(system))
     (lower, upper), notes = bounds_of(path)
@@ -175,8 +175,8 @@ def test_what_cannot_be_brought_is_refused(tmp_path):
     path = written(tmp_path / "a.las", ground("EPSG:3857"), wkt("EPSG:3857"))
     for epsg, message in (
         (3857, r"cannot be brought to EPSG:3857 \(.*, a world map projection"),
-        (2263, r"cannot be brought to EPSG:2263 \(.*, which is not in metres"),
-        (32640, r"cannot be brought to EPSG:32640 .*EPSG:32632 has true metres"),
+        (2263, r"cannot be brought to EPSG:2263 \(.*, which is not in meters"),
+        (32640, r"cannot be brought to EPSG:32640 .*EPSG:32632 has true meters"),
         (1025, "EPSG:1025 is not known to PROJ"),
     ):
         with pytest.raises(LidarError, match=message):
@@ -225,7 +225,7 @@ def test_without_rasterio_names_and_codes_count(tmp_path, monkeypatch):
     paths = {name: written(tmp_path / f"{name}.las", *row) for name, row in files.items()}
     monkeypatch.setattr(coordinate_systems, "find_spec", lambda name: None)
     for name in ("wkt", "code", "code and unit", "keys"):
-        with pytest.raises(LidarError, match=r"whose metres are not true to scale.*--epsg CODE"):
+        with pytest.raises(LidarError, match=r"whose meters are not true to scale.*--epsg CODE"):
             open_recording(paths[name])
     for name in ("zone", "zone by code", "grid"):
         assert open_recording(paths[name]).notes == ()
@@ -340,10 +340,10 @@ def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
     assert scene_of_points(true_one, voxel_m=0.3).epsg == 32632
     definition = "+proj=merc +datum=WGS84"
     by_proj = e57_with(monkeypatch, tmp_path / "d.e57", definition, ground("EPSG:3395"))
-    with pytest.raises(LidarError, match=r"whose metre is 0\.67.*--epsg 32632"):
+    with pytest.raises(LidarError, match=r"whose meter is 0\.67.*--epsg 32632"):
         open_recording(by_proj)
     vague = e57_with(monkeypatch, tmp_path / "c.e57", "site 7", ground("EPSG:32632"))
-    assert "states the coordinate system 'site 7', and is taken in metres" in bounds_of(vague)[1][0]
+    assert "states the coordinate system 'site 7', and is taken in meters" in bounds_of(vague)[1][0]
 
 
 def test_the_command_brings_a_cloud_to_another_system(tmp_path):

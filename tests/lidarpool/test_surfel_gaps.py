@@ -12,7 +12,7 @@ from lidarpool.scenario.surfel_gaps import expected_loss
 pytest.importorskip("open3d", reason="Open3D is not there")
 
 OPTIONS = {
-    "size": 1.0, "unit": None, "epsg": None, "keep_noise": False, "colour": None,
+    "size": 1.0, "unit": None, "epsg": None, "keep_noise": False, "color": None,
     "tell": lambda note: None,
 }  # fmt: skip
 RINGS = Sensor.grid(rays_per_revolution=1800, layers=16, step_deg=0.2, vertical_fov_deg=40)

@@ -146,7 +146,7 @@ def test_slopes_and_edges_of_a_room_are_those_of_its_planes():
     rows = np.arange(len(face))
     shifted += [face[np.clip(rows + shift, 0, rows[-1])] for shift in (-1, 1)]
     inside = np.all([other == face for other in shifted], axis=0)
-    inside[[0, -1]] = False  # rings at the ends have one neighbour
+    inside[[0, -1]] = False  # rings at the ends have one neighbor
     assert np.all(found.smooth[inside]) and inside.mean() > 0.7
     next_to_corner = (shifted[1] != face) | (shifted[2] != face)
     assert not found.smooth[next_to_corner & (np.abs(elevation) < 0.05)].any()

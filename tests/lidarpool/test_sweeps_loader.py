@@ -106,8 +106,8 @@ def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
         assert sweep.boxes.types == tuple(("Car", "Van")[k] for k in there)
         np.testing.assert_array_equal(sweep.boxes.points, boxes.points[there])
         np.testing.assert_allclose(sweep.boxes.sizes, boxes.sizes[there])
-        centres = sweep.boxes.centres @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
-        np.testing.assert_allclose(centres, boxes.centres[there], atol=1e-6)
+        centers = sweep.boxes.centers @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
+        np.testing.assert_allclose(centers, boxes.centers[there], atol=1e-6)
         # Cars look along x of the world; their yaw is the sensor's, turned back.
         heading = np.arctan2(sweep.pose[1, 0], sweep.pose[0, 0])
         if 0 in there:

@@ -40,7 +40,7 @@ from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
-from lidarsim.scene.colours import LINEAR
+from lidarsim.scene.colors import LINEAR
 from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.rig import Rig
 from lidarsim.sweeps.sweeps import Sweeps
@@ -249,8 +249,8 @@ def test_what_moved_is_no_part_of_the_place(place):
 def test_surfaces_are_as_bright_as_they_were(place):
     scene = place.scene
     middles = scene.vertices[scene.faces].mean(axis=1)
-    (colours,) = scene.coloured
-    light = LINEAR[colours.means()].mean(axis=1)
+    (colors,) = scene.colored
+    light = LINEAR[colors.means()].mean(axis=1)
     floor = np.median(light[middles[:, 2] < 0.05])
     walls = np.median(light[(np.abs(middles[:, 1]) > 7.3) & (middles[:, 2] > 1)])
     np.testing.assert_allclose(floor / walls, FLOOR / WALLS, rtol=0.15)
@@ -363,7 +363,7 @@ def test_few_points_and_unknown_intensities_change_no_others(drive):
     relative = np.linalg.inv(found.poses[4]) @ found.poses[5]
     expected = np.linalg.inv(truth[4]) @ truth[5]
     np.testing.assert_allclose(relative[:3, 3], expected[:3, 3], atol=0.01)
-    assert found.scene.has_colours.any()
+    assert found.scene.has_colors.any()
     assert abs(found.figures["held_out"]["standing"]["intensity_error"]) < 0.1
     assert list(found._classes()) == [50]
 
@@ -433,11 +433,11 @@ def test_labels_of_exports_are_labels_of_simulated_points(street, survey, file, 
         for number, name in CLASSES.items()
     ]
     columns = ["time", "intensity", "class", "reflectivity"]
-    labelled = replace(survey, columns=columns, materials=materials, classes=CLASSES)
-    part = columns_of(list(Rig(street, labelled, "auto").cast(0, labelled.scan_count)))
-    table = (SCAN, *labelled.stored_columns[3:])
-    sweeps = Sweeps.from_survey(labelled, street)
-    cloud = part.cloud(table, labelled.precision_m, street.origin)
+    labeled = replace(survey, columns=columns, materials=materials, classes=CLASSES)
+    part = columns_of(list(Rig(street, labeled, "auto").cast(0, labeled.scan_count)))
+    table = (SCAN, *labeled.stored_columns[3:])
+    sweeps = Sweeps.from_survey(labeled, street)
+    cloud = part.cloud(table, labeled.precision_m, street.origin)
     recorded = replace(cloud, sweeps=lambda: sweeps)
     save_cloud(recorded, tmp_path / file, format=file)
     # Sweeps of KITTI are compensated and have no rings.
@@ -617,7 +617,7 @@ def test_a_drive_far_from_zero_with_an_empty_sweep_and_a_trajectory(drive, place
     steps = np.diff(found.poses[:, :3, 3], axis=0)
     np.testing.assert_allclose(steps[:, 1], SPEED_M_S * PERIOD_S, atol=0.01)
     assert found.figures["held_out"]["standing"]["median_size_m"] < 0.01
-    assert not found.scene.has_colours.any()
+    assert not found.scene.has_colors.any()
     found.save(tmp_path / "twin")
     scenario = yaml.safe_load((tmp_path / "twin" / "scenario.yaml").read_text())
     np.testing.assert_allclose(scenario["world"]["origin"], far, atol=10)

@@ -158,7 +158,7 @@ def test_sweeps_arrive_with_all_columns_where_they_were_measured(bridge, played)
             "type": "Car",
             "points": str(boxes.points[0]),
         }
-        assert np.allclose(numbers(cube["pose"]["position"], "xyz"), boxes.centres[0])
+        assert np.allclose(numbers(cube["pose"]["position"], "xyz"), boxes.centers[0])
         assert np.allclose(numbers(cube["pose"]["orientation"], "xyzw"), boxes.quaternions[0])
         assert np.allclose(numbers(cube["size"], "xyz"), boxes.sizes[0])
     (scene,) = client.of("/scene")[0]["entities"]

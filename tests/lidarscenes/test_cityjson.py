@@ -1,4 +1,4 @@
-"""CityJSON: the finest geometry of each object, once, with its name, place, colour and class."""
+"""CityJSON: the finest geometry of each object, once, with its name, place, color and class."""
 
 import json
 from importlib.util import find_spec
@@ -142,7 +142,7 @@ def test_a_sequence_is_read_like_a_file(tmp_path):
         load_meshes(path)
 
 
-def test_surfaces_that_are_not_there_and_colours(tmp_path):
+def test_surfaces_that_are_not_there_and_colors(tmp_path):
     semantics = {
         "surfaces": [{"type": "WallSurface"}, {"type": "ClosureSurface"}],
         "values": [[0, 0, None, 0, 0, 1]],
@@ -151,10 +151,10 @@ def test_surfaces_that_are_not_there_and_colours(tmp_path):
     appearance = {"materials": [{"name": "red", "diffuseColor": [1, 0, 0]}, {"name": "plain"}]}
     one = thing(geometry(semantics=semantics, material=material, texture={"": {}}), kind="Tunnel")
     notes = []
-    (tube,) = load(tmp_path, city({"a": one}, appearance=appearance), notes, colours=True)
+    (tube,) = load(tmp_path, city({"a": one}, appearance=appearance), notes, colors=True)
     assert area(tube) == pytest.approx(5)
     assert "1 texture, 1 ClosureSurface" in notes[-1]
-    shown = tube.colours.means()
+    shown = tube.colors.means()
     assert (shown == [255, 0, 0]).all(axis=1).sum() == 8, "four sides"
     assert (shown == 188).all(axis=1).sum() == 2, "one without a material"
 
@@ -232,16 +232,16 @@ URL = "https://www.opengis.net/def/crs/EPSG/0/"
 @pytest.mark.parametrize(
     ("reference", "words"),
     [
-        (URN + "3857", r"uses EPSG:3857, whose metre is 0\.678 m long.*crs_reproject 32632 save"),
+        (URN + "3857", r"uses EPSG:3857, whose meter is 0\.678 m long.*crs_reproject 32632 save"),
         (URL + "3857", r"EPSG:3857.*crs_reproject 32632"),
         (URL + "3395", r"EPSG:3395.*crs_reproject 32632"),
-        ("https://www.opengis.net/def/crs/ESRI/0/102100", r"ESRI:102100, whose metre.* 32632"),
-        ("urn:ogc:def:crs,crs:EPSG::3857,crs:EPSG::5773", r"EPSG:3857, whose metre.* 32632 save"),
+        ("https://www.opengis.net/def/crs/ESRI/0/102100", r"ESRI:102100, whose meter.* 32632"),
+        ("urn:ogc:def:crs,crs:EPSG::3857,crs:EPSG::5773", r"EPSG:3857, whose meter.* 32632 save"),
         (URN + "4978", r"in degrees \(EPSG:4978\)|geocentric"),
         ("http://www.opengis.net/def/crs/OGC/1.3/CRS84", "in degrees"),
     ],
 )
-def test_systems_without_true_metres_are_refused(tmp_path, reference, words):
+def test_systems_without_true_meters_are_refused(tmp_path, reference, words):
     with pytest.raises(LidarError, match=words):
         load(tmp_path, placed(1e6, 6e6, reference))
 
@@ -251,7 +251,7 @@ def test_systems_without_true_metres_are_refused(tmp_path, reference, words):
     ("code", "x", "y", "words"),
     [
         (32632, 500_000, 5_300_000, None),
-        (32632, 2_000_000, 5_300_000, r"whose metre is 0\.973 m long.*crs_reproject 32635 "),
+        (32632, 2_000_000, 5_300_000, r"whose meter is 0\.973 m long.*crs_reproject 32635 "),
         (2056, 2_600_000, 1_200_000, None),
     ],
 )
@@ -278,8 +278,8 @@ def test_feet_of_a_system_are_converted(tmp_path):
     np.testing.assert_allclose(np.ptp(cube.bounds, axis=0), 2 * foot_m)
     np.testing.assert_allclose(cube.bounds[0, :2], [984_250 * foot_m, 200_000 * foot_m])
     assert any("uses EPSG:2263" in note and "were converted to meters" in note for note in notes)
-    heights_in_metres = "urn:ogc:def:crs,crs:EPSG::2263,crs:EPSG::5703"
-    (cube,) = load(tmp_path, placed(984_250, 200_000, heights_in_metres, (1, 1, 1)))
+    heights_in_meters = "urn:ogc:def:crs,crs:EPSG::2263,crs:EPSG::5703"
+    (cube,) = load(tmp_path, placed(984_250, 200_000, heights_in_meters, (1, 1, 1)))
     np.testing.assert_allclose(np.ptp(cube.bounds, axis=0), [2 * foot_m, 2 * foot_m, 2])
     (cube,) = load(tmp_path, placed(984_250, 200_000, URN + "2263", (1, 1, 1)), unit="ft")
     np.testing.assert_allclose(np.ptp(cube.bounds, axis=0), 2 * 0.3048)
@@ -287,7 +287,7 @@ def test_feet_of_a_system_are_converted(tmp_path):
 
 def test_without_rasterio_systems_of_the_world_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(coordinate_systems, "find_spec", lambda name: None)
-    with pytest.raises(LidarError, match="EPSG:3857, whose metres are not true to scale"):
+    with pytest.raises(LidarError, match="EPSG:3857, whose meters are not true to scale"):
         load(tmp_path, placed(1e6, 6e6, URN + "3857"))
     notes = []
     load(tmp_path, placed(84_600, 447_000, URN + "7415"), notes)
@@ -340,7 +340,7 @@ def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
 
 
 def block(x, y, side, z0=0):
-    """Corners, in units of half a metre, and boundaries of a solid around x, y."""
+    """Corners, in units of half a meter, and boundaries of a solid around x, y."""
     corners = (np.array(CUBE) - [1, 1, 0]) * [side, side, 8] + [x, y, z0]
     return corners.tolist()
 

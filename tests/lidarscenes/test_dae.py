@@ -70,7 +70,7 @@ def test_names_unit_axis_and_digits(tmp_path):
     assert meshes[1].vertices[:, 0].max() == pytest.approx(1000000.345, rel=1e-15)
 
 
-def test_what_states_nothing_is_in_metres_and_stands_by_its_standard(tmp_path):
+def test_what_states_nothing_is_in_meters_and_stands_by_its_standard(tmp_path):
     # COLLADA 1.4.1: up_axis is Y_UP where it is left out.
     (mesh,) = load(tmp_path, asset="")
     assert np.ptp(mesh.vertices, axis=0).tolist() == [4, 0, 4]
@@ -156,8 +156,8 @@ CONTROLLER = (
         ({"accessor": 'count="9" stride="3"'}, "id='p'> declares 9 x 3 numbers but contains 24"),
         ({"numbers": "nan " + SQUARES[2:]}, "1 of the 4 vertices .* NaN"),
         *[
-            ({"asset": f'<unit meter="{metres}"/>'}, "the unit|could not convert")
-            for metres in ("0,01", "0", "nan")
+            ({"asset": f'<unit meter="{meters}"/>'}, "the unit|could not convert")
+            for meters in ("0,01", "0", "nan")
         ],
         ({"doctype": '<!DOCTYPE C [<!ENTITY i SYSTEM "file:///etc/passwd">]>', "numbers": "&i;"},
          "declares the XML entity"),

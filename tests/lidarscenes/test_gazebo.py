@@ -71,7 +71,7 @@ def bounds(item):
     return item.bounds.round(6).tolist()
 
 
-def centre(item):
+def center(item):
     return item.bounds.mean(axis=0)
 
 
@@ -166,11 +166,11 @@ def test_links_are_where_their_frames_put_them(tmp_path, pose):
     ]
     turned = "<pose>10 0 0 0 0 0</pose>"
     objects, _, _ = load(tmp_path, world(model("m", turned, *others, link("p", pose=pose))))
-    assert np.allclose(centre(objects["m/p"]) - [10, 0, 0], FRAMES[pose])
-    assert np.allclose(centre(objects["m/n/inner"]), [17, 1, 0])
+    assert np.allclose(center(objects["m/p"]) - [10, 0, 0], FRAMES[pose])
+    assert np.allclose(center(objects["m/n/inner"]), [17, 1, 0])
     visual = f"<visual name='v'><pose relative_to='f'>1 0 0 0 0 0</pose>{BOX}</visual>"
     objects, _, _ = load(tmp_path, world(model("m", *others, link("p", inside=visual, pose=pose))))
-    assert np.allclose(centre(objects["m/p"]), (0, 3, 0))
+    assert np.allclose(center(objects["m/p"]), (0, 3, 0))
 
 
 def test_included_models_take_name_pose_and_the_newest_version(tmp_path):
@@ -193,10 +193,10 @@ def test_included_models_take_name_pose_and_the_newest_version(tmp_path):
     )
     objects, _, notes = load(tmp_path / "worlds", text)
     assert not notes
-    assert centre(objects["crate/link"])[2] == 2  # of the newest version that is known
+    assert center(objects["crate/link"])[2] == 2  # of the newest version that is known
     assert bounds(objects["second/top"]) == [[4.5, -0.5, -0.5], [5.5, 0.5, 0.5]]
     assert "crate_0/link" in objects and "merging/top" in objects
-    assert centre(objects["outer/crate/link"]).tolist() == [0, 9, 2]
+    assert center(objects["outer/crate/link"]).tolist() == [0, 9, 2]
     assert bounds(objects["ground_plane/link"]) == [[-50, -50, 0], [50, 50, 0]]
 
 
@@ -219,7 +219,7 @@ def test_models_are_looked_for_in_variables_and_downloads(tmp_path, monkeypatch)
     monkeypatch.setenv("GAZEBO_MODEL_PATH", str(tmp_path / "b"))
     objects, _, notes = load(tmp_path / "worlds", text)
     assert not notes
-    heights = {name: centre(item)[2] for name, item in objects.items()}
+    heights = {name: center(item)[2] for name, item in objects.items()}
     assert heights == {"one/link": 0, "two/link": 0, "cone/link": 10, "older/link": 2, "t/link": 10}
     monkeypatch.delenv("GAZEBO_MODEL_PATH")
     _, _, notes = load(tmp_path / "worlds", text)
@@ -341,7 +341,7 @@ def test_a_state_of_gazebo_classic_replaces_poses(tmp_path):
     )
     objects, _, notes = load(tmp_path, text)
     assert not notes
-    assert {name: centre(item).tolist() for name, item in objects.items()} == {
+    assert {name: center(item).tolist() for name, item in objects.items()} == {
         "a/kept": [1, 0, 0],
         "a/moved": [0, 0, 9],
         "outer/link": [3, 0, 0],
@@ -379,7 +379,7 @@ def test_meshes_keep_the_axes_of_their_file(tmp_path):
         assert len(str(caught.value).splitlines()) == 1
 
 
-def test_colours_materials_and_retro_are_those_of_visuals(tmp_path):
+def test_colors_materials_and_retro_are_those_of_visuals(tmp_path):
     red = "<material><diffuse>1 0.5 0 1</diffuse></material>"
     named = "<material><script><name>Gazebo/Blue</name></script></material>"
     retro = "<laser_retro>127.5</laser_retro>"
@@ -391,13 +391,13 @@ def test_colours_materials_and_retro_are_those_of_visuals(tmp_path):
         model("bright", link(inside=shape(SHAPE) + bright)),
         model("glass", link(inside=shape(SHAPE, more="<transparency>1</transparency>"))),
     )
-    objects, _, notes = load(tmp_path, text, colours=True, materials=True)
-    colours = {name: item.colours.means()[0].tolist() for name, item in objects.items()}
-    assert colours["red/link"] == [255, 128, 0] and colours["blue/link"] == [0, 0, 255]
-    assert colours["retro/link"] == [188] * 3 and colours["bright/link"] == [255] * 3
+    objects, _, notes = load(tmp_path, text, colors=True, materials=True)
+    colors = {name: item.colors.means()[0].tolist() for name, item in objects.items()}
+    assert colors["red/link"] == [255, 128, 0] and colors["blue/link"] == [0, 0, 255]
+    assert colors["retro/link"] == [188] * 3 and colors["bright/link"] == [255] * 3
     assert objects["blue/link"].materials.names == ("Gazebo/Blue",)
     assert "glass/link" not in objects and len(notes) == 2
-    assert load(tmp_path, text)[0]["red/link"].colours is None
+    assert load(tmp_path, text)[0]["red/link"].colors is None
 
 
 def test_images_of_meshes_are_in_the_folder_of_textures(tmp_path):
@@ -410,9 +410,9 @@ def test_images_of_meshes_are_in_the_folder_of_textures(tmp_path):
     write(tmp_path / "chair" / "meshes" / "chair.obj", text)
     textures.mkdir(parents=True)
     Image.new("RGB", (4, 4), (200, 100, 50)).save(textures / "wood.png")
-    objects, _, notes = load(tmp_path, world(include("model://chair")), colours=True)
+    objects, _, notes = load(tmp_path, world(include("model://chair")), colors=True)
     assert not notes
-    assert objects["chair/link"].colours.means().tolist() == [[200, 100, 50]]
+    assert objects["chair/link"].colors.means().tolist() == [[200, 100, 50]]
 
 
 def test_actors_follow_their_waypoints(tmp_path):
@@ -463,7 +463,7 @@ def test_skins_of_actors_are_at_rest(tmp_path):
     write(tmp_path / "walk.dae", text.replace('url="#g"', 'url="#c"'))
     actor = "<actor name='a'><skin><filename>walk.dae</filename></skin></actor>"
     objects, _, _ = load(tmp_path, world(actor))
-    assert bounds(objects["a"]) == [[0, 0, 0.005], [1, 0, 3.005]]  # its unit is a centimetre
+    assert bounds(objects["a"]) == [[0, 0, 0.005], [1, 0, 3.005]]  # its unit is a centimeter
     mesh = model("m", link(inside=shape("<mesh><uri>walk.dae</uri></mesh>")), link("box"))
     _, _, (note,) = load(tmp_path, world(mesh))
     assert "walk.dae, which was skipped: walk.dae deforms vertices with a skin" in note
@@ -786,7 +786,7 @@ def test_garbled_worlds_give_objects_or_a_line(tmp_path):
             data[at] = rng.integers(32, 127)
         path.write_bytes(data[: rng.integers(0, len(data))] if rng.random() < 0.2 else data)
         try:
-            read += bool(load_objects(path, colours=True, tell=lambda line: None).static)
+            read += bool(load_objects(path, colors=True, tell=lambda line: None).static)
         except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 2 < read < 95

@@ -167,7 +167,7 @@ def test_lines_wider_than_the_scanner_end_where_it_does(imported):
     assert of.carried[0].sensor.head.firings_per_turn == len(kept)
 
 
-def test_a_swinging_mirror_and_fibres_are_those_of_helios(imported, tmp_path):
+def test_a_swinging_mirror_and_fibers_are_those_of_helios(imported, tmp_path):
     settings = 'pulseFreq_hz="1000" scanAngle_deg="30" scanFreq_hz="10"'
     _, _, of = imported(scanner("oscillating", scanProduct=200), legs(settings))
     there = [about(X, 20 * (abs(4 * (k % 100) / 100 - 2) * -1 + 1)) for k in PULSES]

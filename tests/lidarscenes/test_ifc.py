@@ -46,7 +46,7 @@ class Model:
     schema
         Version of IFC.
     prefix
-        Prefix of the unit, such as MILLI; None for metres, "" for no unit at all.
+        Prefix of the unit, such as MILLI; None for meters, "" for no unit at all.
     """
 
     def __init__(self, schema="IFC4", prefix=None):
@@ -145,11 +145,11 @@ class Model:
             )
         return element
 
-    def paint(self, element, name, colour, transparency=0.0):
+    def paint(self, element, name, color, transparency=0.0):
         create = self.file.create_entity
         shading = create(
             "IfcSurfaceStyleRendering",
-            SurfaceColour=create("IfcColourRgb", None, *colour),
+            SurfaceColour=create("IfcColourRgb", None, *color),
             Transparency=transparency,
             ReflectanceMethod="FLAT",
         )
@@ -239,14 +239,14 @@ def test_a_scenario_takes_a_storey_and_has_classes(house, forked):
     assert built.survey.classes == {73: "wall", 74: "slab", 78: "door"}
 
 
-def test_styles_are_colours_and_materials(house, forked):
+def test_styles_are_colors_and_materials(house, forked):
     notes = []
-    objects = load_objects(house, colours=True, materials=True, tell=notes.append)
+    objects = load_objects(house, colors=True, materials=True, tell=notes.append)
     meshes = {mesh.name: mesh for mesh in objects.static}
     wall = meshes["IfcWall South"]
     assert wall.materials.names == ("Brick",)
-    assert wall.colours.images[0].tolist() == [[[153, 51, 51]]]
-    assert meshes["IfcSlab Floor"].colours is None
+    assert wall.colors.images[0].tolist() == [[[153, 51, 51]]]
+    assert meshes["IfcSlab Floor"].colors is None
     [note] = notes
     assert "has transparent materials without holes, which are treated as opaque: Glass" in note
 
@@ -297,7 +297,7 @@ def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
     system.Name = "EPSG:3857"
     load_meshes(model.write(path), tell=notes.append)
     if find_spec("rasterio") is not None:
-        assert "to EPSG:3857, whose metre is 0.72" in notes[1]
+        assert "to EPSG:3857, whose meter is 0.72" in notes[1]
         assert "long on the ground here, unlike the meter of the building, use" in notes[1]
     system.Name = "EPSG:25832"
     del notes[1]
@@ -493,12 +493,12 @@ def test_styles_of_edges_are_not_styles_of_triangles(forked, tmp_path):
     shape = geometric_set(model, ((0, 0), (3, 0), (3, 4), (0, 0)))
     model.paint(model.element("IfcBeam", "B", solid=shape), "Steel", (0.2, 0.4, 0.6))
     (mesh,) = load_meshes(
-        model.write(tmp_path / "a.ifc"), colours=True, materials=True, tell=[].append
+        model.write(tmp_path / "a.ifc"), colors=True, materials=True, tell=[].append
     )
     assert len(mesh.faces) == 1
     assert mesh.bounds == pytest.approx(np.array([(0, 0, 0), (3, 4, 0)]))
     assert mesh.materials.names == ("Steel",)
-    assert mesh.colours.images[0].tolist() == [[[51, 102, 153]]]
+    assert mesh.colors.images[0].tolist() == [[[51, 102, 153]]]
 
 
 def test_a_shape_of_edges_with_styles_is_noted(forked, tmp_path):

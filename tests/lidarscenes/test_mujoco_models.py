@@ -144,18 +144,18 @@ def test_geoms_are_where_they_are_for_the_scanner_of_mujoco(room, keyframe):
 
 
 def test_objects_are_bodies_and_named_geoms_of_the_world(room):
-    objects, notes = load(room, colours=True, materials=True)
+    objects, notes = load(room, colors=True, materials=True)
     assert [*objects] == ["floor", "world", "robot", "arm", "ball"]
     assert objects["robot"].bounds.round(3).tolist() == [[0.777, 0.313, 0.9], [1.223, 0.687, 1.1]]
     assert objects["floor"].bounds[1].tolist() == [200, 200, 0]
-    assert np.unique(objects["arm"].colours.corners).tolist() == [188]  # the mean of its texture
+    assert np.unique(objects["arm"].colors.corners).tolist() == [188]  # the mean of its texture
     assert objects["arm"].materials.names == ("paint",)
     (note,) = notes
     assert "glass" in note and "unused" not in note
     with_hull, _ = load(room, groups=[0, 3], exclude=["floor", "trunk"])
     assert [*with_hull] == ["world", "robot", "arm", "ball"]
     assert np.allclose(with_hull["robot"].bounds[1], [1.5, 1, 1.5], atol=1e-3)
-    assert with_hull["robot"].colours is None and with_hull["arm"].materials is None
+    assert with_hull["robot"].colors is None and with_hull["arm"].materials is None
 
 
 def test_a_scenario_takes_the_options(room):
@@ -348,7 +348,7 @@ def test_garbled_models_give_objects_or_a_line(room):
             data[at] = rng.integers(32, 127)
         path.write_bytes(data[: rng.integers(0, len(data))] if rng.random() < 0.2 else data)
         try:
-            read += bool(load(path, colours=True)[0])
+            read += bool(load(path, colors=True)[0])
         except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 2 < read < 95

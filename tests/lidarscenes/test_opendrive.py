@@ -135,8 +135,8 @@ def section(left="", right="", middle="", s=0):
     )
 
 
-def width(metres, s=0):
-    return f'<width sOffset="{s}" a="{metres}" b="0" c="0" d="0"/>'
+def width(meters, s=0):
+    return f'<width sOffset="{s}" a="{meters}" b="0" c="0" d="0"/>'
 
 
 def road(
@@ -354,8 +354,8 @@ def test_lanes_that_end_have_no_empty_triangles(tmp_path):
     assert len(meshes["driving lane 1/-1"].faces) == 1
 
 
-def mark(inside="", kind="solid", colour="white", metres=0.2, s=0):
-    head = f'<roadMark sOffset="{s}" type="{kind}" color="{colour}" width="{metres}">'
+def mark(inside="", kind="solid", color="white", meters=0.2, s=0):
+    head = f'<roadMark sOffset="{s}" type="{kind}" color="{color}" width="{meters}">'
     return f"{head}{inside}</roadMark>"
 
 
@@ -582,13 +582,13 @@ def test_notes_on_coordinate_systems(tmp_path, header, note):
 
 @pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
 @pytest.mark.parametrize("system", ["EPSG:3857", "+proj=merc +a=6378137 +b=6378137"])
-def test_stretched_metres_are_noted_with_the_scale_that_helps(tmp_path, system):
+def test_stretched_meters_are_noted_with_the_scale_that_helps(tmp_path, system):
     notes = []
     roads = road(at=(1e6, 6e6, 0))  # 47.35 degrees north
     header = f'<header revMajor="1"><geoReference><![CDATA[{system}]]></geoReference></header>'
     load(tmp_path, document(roads, header=header), notes)
     (note,) = notes
-    assert "whose metre is 0.67" in note
+    assert "whose meter is 0.67" in note
     scale, again = re.search(r"here: scale \[(0\.67\d+), (0\.67\d+), 1\] makes", note).groups()
     assert scale == again and float(scale) == pytest.approx(0.678, abs=1e-3)
     assert "world.epsg" not in note
@@ -650,7 +650,7 @@ def test_broken_files(tmp_path, text, message):
 
 
 def test_a_comment_before_the_declaration(tmp_path):
-    assert load(tmp_path, "<!-- licence -->\n" + document(road()))
+    assert load(tmp_path, "<!-- license -->\n" + document(road()))
 
 
 def test_replaced_numbers_are_read_or_refused(tmp_path):

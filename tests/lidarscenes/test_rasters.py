@@ -1,4 +1,4 @@
-"""Rasters of heights: a vertex at the middle of each pixel, in metres, and nothing made up."""
+"""Rasters of heights: a vertex at the middle of each pixel, in meters, and nothing made up."""
 
 import re
 from importlib.util import find_spec
@@ -132,7 +132,7 @@ def test_pixels_without_height_are_holes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "unit", "metres", "said"),
+    ("options", "unit", "meters", "said"),
     [
         ({}, None, 1, ""),
         ({"units": "ft"}, None, 0.3048, ""),
@@ -150,14 +150,14 @@ def test_pixels_without_height_are_holes(tmp_path):
         ({"scale": (0.5, 100)}, None, 0.5, ""),
     ],
 )
-def test_units_of_heights(tmp_path, options, unit, metres, said):
+def test_units_of_heights(tmp_path, options, unit, meters, said):
     path = write(tmp_path / "m.tif", np.repeat([[1000.0], [2000.0]], 8, 0).repeat(20, 1), **options)
     mesh, taken, notes = read(path, unit=unit)
     above = 100 if "scale" in options else 0
     z = mesh.vertices[:, 2]
-    np.testing.assert_allclose([z.min(), z.max()], np.array([1000, 2000]) * metres + above)
+    np.testing.assert_allclose([z.min(), z.max()], np.array([1000, 2000]) * meters + above)
     assert said in "".join(notes) and bool(said) == bool(notes)
-    # Feet on the ground become metres, too, in a zone of UTM.
+    # Feet on the ground become meters, too, in a zone of UTM.
     feet = options.get("crs") == "EPSG:2263"
     assert taken.epsg == (32618 if feet else 25832)
     assert feet == (" from EPSG:2263" in taken.summary)
@@ -205,7 +205,7 @@ def test_local_systems_have_units(tmp_path, crs, unit_m, height_m, noted, suffix
     )
 
 
-def test_degrees_become_metres_of_the_utm_zone(tmp_path):
+def test_degrees_become_meters_of_the_utm_zone(tmp_path):
     east, south = np.meshgrid(np.arange(40), np.arange(60))
     place = from_origin(-58.5, -34.5, 1 / 1200, 1 / 1200)
     heights = 3.0 * east - 2.0 * south
@@ -233,7 +233,7 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     assert read(wide, epsg=3035)[1].epsg == 3035
     with pytest.raises(LidarError, match="EPSG:1024, a code that rasterio does not know"):
         read(wide, epsg=1024)
-    with pytest.raises(LidarError, match=r"EPSG:2263 \(.*not in metres"):
+    with pytest.raises(LidarError, match=r"EPSG:2263 \(.*not in meters"):
         read(wide, epsg=2263)
 
 
@@ -417,7 +417,7 @@ def test_the_scene_has_one_coordinate_system(tmp_path):
     assert epsg_of(tmp_path, "west.tif", "east.tif", epsg=25832) == 25832
 
 
-STRETCHED = {  # {system: (x and y of its corner, metres on the ground in a metre)}
+STRETCHED = {  # {system: (x and y of its corner, meters on the ground in a meter)}
     "EPSG:3857": ((1e6, 6e6), 0.678, "0.678 m"),  # 47.35 degrees north
     "EPSG:3395": ((1e6, 6e6), 0.676, "0.676 m"),
     "EPSG:5041": ((2e6, -1e6), 0.953, "0.953 m"),  # at 63 degrees north
@@ -426,7 +426,7 @@ STRETCHED = {  # {system: (x and y of its corner, metres on the ground in a metr
 
 
 @pytest.mark.parametrize("crs", STRETCHED)
-def test_stretched_metres_become_true_ones(tmp_path, crs):
+def test_stretched_meters_become_true_ones(tmp_path, crs):
     corner, scale, words = STRETCHED[crs]
     path = write(tmp_path / "m.tif", crs=crs, place=from_origin(*corner, 2, 2))
     mesh, taken, (note,) = read(path)
@@ -446,7 +446,7 @@ def test_stretched_metres_become_true_ones(tmp_path, crs):
     assert upward_area(mesh) == pytest.approx(14 * 10 * scale**2, rel=0.01)
 
 
-def test_true_metres_stay_and_chosen_ones_are_checked(tmp_path):
+def test_true_meters_stay_and_chosen_ones_are_checked(tmp_path):
     for crs, corner in (("EPSG:3857", (1e6, 0)), ("EPSG:5041", (2e6, 2.1e6))):
         mesh, taken, notes = read(
             write(tmp_path / "a.tif", crs=crs, place=from_origin(*corner, 2, 2))
@@ -457,13 +457,13 @@ def test_true_metres_stay_and_chosen_ones_are_checked(tmp_path):
     for epsg, message in (
         (3857, r"cannot be reprojected to world\.epsg EPSG:3857 \(.*a world map projection"),
         (3395, "a world map projection"),
-        (3994, r"EPSG:3994 \(.*\), whose metre is 0\.898 m long.*EPSG:32632 has true metres"),
+        (3994, r"EPSG:3994 \(.*\), whose meter is 0\.898 m long.*EPSG:32632 has true meters"),
     ):
         with pytest.raises(LidarError, match=message):
             read(path, epsg=epsg)
 
 
-def test_a_wide_raster_of_stretched_metres_asks_for_a_system(tmp_path):
+def test_a_wide_raster_of_stretched_meters_asks_for_a_system(tmp_path):
     place = from_origin(1e6, 6e6, 300_000, 50_000)
     path = write(tmp_path / "m.tif", crs="EPSG:3857", place=place)
     with pytest.raises(LidarError, match=r"spans 21\.\d+ degrees.*Set world\.epsg"):
@@ -499,9 +499,9 @@ def test_systems_without_axes_along_the_ground_are_refused(tmp_path):
 def test_rasters_near_the_poles_are_in_polar_coordinates(tmp_path):
     place = from_origin(10, 86, 1e-4, 1e-5)
     mesh, taken, _ = read(write(tmp_path / "m.tif", crs="EPSG:4326", place=place))
-    metres = 1e-4 * 111_320 * np.cos(np.radians(86)), 1e-5 * 111_660
+    meters = 1e-4 * 111_320 * np.cos(np.radians(86)), 1e-5 * 111_660
     assert taken.epsg == 5041
-    assert upward_area(mesh) == pytest.approx(7 * 5 * metres[0] * metres[1], rel=0.015)
+    assert upward_area(mesh) == pytest.approx(7 * 5 * meters[0] * meters[1], rel=0.015)
 
 
 LOWEST = float(np.finfo(np.float32).min)

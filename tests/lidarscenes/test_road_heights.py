@@ -1,4 +1,4 @@
-"""OpenDRIVE: heights by closed forms within a millimetre, and steps of whatever is along a road."""
+"""OpenDRIVE: heights by closed forms within a millimeter, and steps of whatever is along a road."""
 
 import numpy as np
 import pytest
@@ -156,19 +156,19 @@ def test_heights_are_those_of_the_closed_form(tmp_path_factory, kind, coefficien
 def test_slopes_of_curves_cost_what_they_need(tmp_path):
     """Level curves need 10 mm in plan, and parts of sloped curves shrink with slope and width."""
     counts = {}
-    for grade, metres in ((0, 3.5), (0.02, 3.5), (0.2, 3.5), (0.2, 7)):
-        lanes = section(lane(1, width(metres)), lane(-1, width(metres)))
+    for grade, meters in ((0, 3.5), (0.02, 3.5), (0.2, 3.5), (0.2, 7)):
+        lanes = section(lane(1, width(meters)), lane(-1, width(meters)))
         up = f"<elevationProfile>{cubic('elevation', 0.0, grade, 0.0, 0.0)}</elevationProfile>"
         text = document(road(lanes, shape='<arc curvature="0.02"/>', profiles=up))
         meshes = load(tmp_path, text)
-        counts[grade, metres] = len(meshes["driving lane 1/1"].faces) // 2
+        counts[grade, meters] = len(meshes["driving lane 1/1"].faces) // 2
     level = 100 / np.sqrt(8 * 0.01 * (50 + 3.5))  # chords of the outer edge
     assert level < counts[0, 3.5] < 1.2 * level
     assert counts[0.02, 3.5] == counts[0, 3.5]
     # The twist of the inner lane, of a width w at a radius R - w / 2, on parts of a length d.
-    for metres in (3.5, 7):
-        twist = 0.2 * metres / 50 / (1 - metres / 2 / 50) / 4 * 100 / TOLERANCE_M
-        assert twist < counts[0.2, metres] < 1.4 * twist
+    for meters in (3.5, 7):
+        twist = 0.2 * meters / 50 / (1 - meters / 2 / 50) / 4 * 100 / TOLERANCE_M
+        assert twist < counts[0.2, meters] < 1.4 * twist
 
 
 STEP = 20.0
@@ -356,8 +356,8 @@ def test_marks_step_with_the_road(tmp_path, kind):
     assert area == pytest.approx(0.2 * 50 if kind == "solid" else 0.2 * (5 * 3 + 3))
 
 
-def heights_are(mesh, metres):
-    return np.abs(mesh.vertices[:, 2] - metres) < 1e-9
+def heights_are(mesh, meters):
+    return np.abs(mesh.vertices[:, 2] - meters) < 1e-9
 
 
 def test_a_dash_over_a_step_has_two_parts(tmp_path):
@@ -365,8 +365,8 @@ def test_a_dash_over_a_step_has_two_parts(tmp_path):
     inner = width(4) + mark(kind="broken")
     meshes = load(tmp_path, stepped(inner=inner, elevation=entries("elevation", 1.0, 3.0)))
     paint = meshes["road mark 1"]
-    centres = paint.vertices[paint.faces].mean(axis=1)
-    third = centres[(centres[:, 0] > 17) & (centres[:, 0] < 22)]
+    centers = paint.vertices[paint.faces].mean(axis=1)
+    third = centers[(centers[:, 0] > 17) & (centers[:, 0] < 22)]
     assert sorted({*third[:, 2].round(6)}) == [1.003, 3.003]
     x = paint.vertices[(paint.vertices[:, 0] > 17) & (paint.vertices[:, 0] < 22), 0]
     assert sorted({*x.round(9)}) == [18, 20, 21]
@@ -507,7 +507,7 @@ def test_a_shape_steps_at_a_border(tmp_path):
 
 
 def test_lanes_end_where_their_widths_turn_negative(tmp_path):
-    """A width of 2 m that shrinks by 8 cm a metre, on a road of a single piece."""
+    """A width of 2 m that shrinks by 8 cm a meter, on a road of a single piece."""
     outer = cubic("width", 2.0, -0.08, 0.0, 0.0, name="sOffset")
     meshes = load(tmp_path, stepped(outer=outer))
     for x in (5, 20, 24.9, 25.1, 40):
@@ -538,7 +538,7 @@ def test_samples_of_large_files_are_refused_before_they_are_taken(tmp_path):
 
 
 def test_roads_that_turn_inside_their_lanes_are_read(tmp_path):
-    """A lane that reaches over the centre of its arc is folded, and takes no more than others."""
+    """A lane that reaches over the center of its arc is folded, and takes no more than others."""
     lanes = section(lane(1, width(4)) + lane(2, width(6), "none"), lane(-1, width(4)))
     up = f"<elevationProfile>{cubic('elevation', 0.0, 0.05, 0.0, 0.0)}</elevationProfile>"
     text = document(road(lanes, length=12, shape='<arc curvature="0.125"/>', profiles=up))

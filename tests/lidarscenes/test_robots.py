@@ -146,7 +146,7 @@ def test_links_that_are_fixed_to_one_another_are_one_actor(tmp_path):
     assert near.path("b").pose(0) == Pose((0.2, 0.0, 0.0))
 
 
-def test_shapes_and_their_colours(tmp_path):
+def test_shapes_and_their_colors(tmp_path):
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
     red = '<material name="red"/>'
     shapes = {
@@ -162,13 +162,13 @@ def test_shapes_and_their_colours(tmp_path):
         for name, (shape, _) in shapes.items()
     ]
     joints = [joint(name, "fixed", "box", name) for name in list(shapes)[1:]]
-    colour = '<material name="red"><color rgba="1 0.5 0 1"/></material>'
-    robot = robot_of(tmp_path, *links, *joints, colour, colours=True)
+    color = '<material name="red"><color rgba="1 0.5 0 1"/></material>'
+    robot = robot_of(tmp_path, *links, *joints, color, colors=True)
     for name, (_, (x, y, z)) in shapes.items():
         mesh = robot.meshes[name]
         assert np.allclose(np.ptp(mesh.bounds, axis=0), (y, x, z), rtol=2e-3), name
-        assert mesh.colours.means()[0].tolist() == [255, 128, 0]
-    assert robot_of(tmp_path, *links, *joints, colour).meshes["box"].colours is None
+        assert mesh.colors.means()[0].tolist() == [255, 128, 0]
+    assert robot_of(tmp_path, *links, *joints, color).meshes["box"].colors is None
     # Mirrored by a negative scale: faces still look the same way.
     corners = robot.meshes["mesh"].vertices[robot.meshes["mesh"].faces]
     assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] > 0).all()
@@ -213,7 +213,7 @@ def test_mesh_files_of_packages(tmp_path, packages):
         "package://other/leg.dae",
         f"file://{package}/meshes/leg.dae",
     ):
-        # In metres by its unit; with the axes of the file, as RViz takes it.
+        # In meters by its unit; with the axes of the file, as RViz takes it.
         robot = leg_of(package / "urdf", name)
         assert robot.meshes["leg"].bounds[1].tolist() == [1, 0, 3], name
     outside = f"is outside the package, {package}. Name a folder that contains the mesh as assets"
@@ -343,7 +343,7 @@ def test_xacro_other_files_and_garbled_copies(tmp_path):
             data[at] = rng.integers(32, 127)
         path.write_bytes(data[: rng.integers(0, len(data))] if rng.random() < 0.2 else data)
         try:
-            read += bool(load_robot(path, colours=True, tell=lambda line: None).actors())
+            read += bool(load_robot(path, colors=True, tell=lambda line: None).actors())
         except LidarError as error:
             assert len(str(error).splitlines()) == 1
     assert 5 < read < 140
@@ -637,7 +637,7 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     at_zero, turned = (scene.bounds + scene.origin for scene in (alone.scene, placed))
     np.testing.assert_allclose(turned[:, 0], 5 - at_zero[::-1, 1], atol=1e-6)
     np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
-    with pytest.raises(LidarError, match="is a robot, which is in metres and Z-up: leave out"):
+    with pytest.raises(LidarError, match="is a robot, which is in meters and Z-up: leave out"):
         build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
     with pytest.raises(
         LidarError, match=r"is not read: it describes a robot\. Read it with load_robot"

@@ -16,7 +16,7 @@ from lidarpool.cli.scenario_commands import scene as command
 from lidarscenes.procedural.city import city
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim import SceneInstance, box
-from lidarsim.scene.colours import WHITE, Colours
+from lidarsim.scene.colors import WHITE, Colors
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.scene_mesh import Cutout
 
@@ -40,8 +40,8 @@ def test_round_trip(tmp_path, suffix):
     assert [path.name for path in tmp_path.iterdir()] == [f"town{suffix}"]
 
 
-def test_colours_come_back_from_a_glb_file(tmp_path):
-    """A texture, colours of corners, a plain colour, none; instances; and a mask with a colour."""
+def test_colors_come_back_from_a_glb_file(tmp_path):
+    """A texture, colors of corners, a plain color, none; instances; and a mask with a color."""
     rng = np.random.default_rng(3)
     cube = box("Cube", (1, 1, 1))
     faces = np.zeros(12, np.int32)
@@ -49,18 +49,18 @@ def test_colours_come_back_from_a_glb_file(tmp_path):
     uv = rng.uniform(-1, 2, (12, 3, 2)).astype(np.float32)
     corners = rng.integers(0, 256, (12, 3, 3)).astype(np.uint8)
     red = np.uint8([[[200, 10, 3]]])
-    several = Colours((red, image), (np.arange(12) % 2).astype(np.int32), uv)
+    several = Colors((red, image), (np.arange(12) % 2).astype(np.int32), uv)
     kinds = {
-        "Textured": Colours((image,), faces, uv),
-        "Tinted": Colours((image,), faces, uv, corners),
-        "Corners": Colours((WHITE,), faces, None, corners),
-        "Plain": Colours.plain(red, 12),
+        "Textured": Colors((image,), faces, uv),
+        "Tinted": Colors((image,), faces, uv, corners),
+        "Corners": Colors((WHITE,), faces, None, corners),
+        "Plain": Colors.plain(red, 12),
         "Both": several,
         "Bare": None,
     }
-    meshes = [replace(cube, name=name, colours=own) for name, own in kinds.items()]
+    meshes = [replace(cube, name=name, colors=own) for name, own in kinds.items()]
     mask = rng.random((4, 4)) < 0.5
-    card = replace(cube, name="Card", cutouts=(Cutout(mask, uv),), colours=Colours.plain(red, 12))
+    card = replace(cube, name="Card", cutouts=(Cutout(mask, uv),), colors=Colors.plain(red, 12))
     copies = np.tile(np.eye(4), (3, 1, 1))
     copies[:, 0, 3] = 5, 9, 13
     placed = SceneInstance.from_matrices(replace(meshes[4], name="Copy"), copies, "Copy")
@@ -69,19 +69,19 @@ def test_colours_come_back_from_a_glb_file(tmp_path):
     names = ("Copy", "Copy.2", "Copy.3")
     wanted |= {n: (meshes[4], one.matrix[:3, 3]) for n, one in zip(names, placed, strict=True)}
     read = {}
-    for one in load_meshes(path, colours=True):
+    for one in load_meshes(path, colors=True):
         mesh = one.flat() if isinstance(one, SceneInstance) else one
         read.setdefault(mesh.name, []).append(mesh)
     assert {*read} == {*wanted}
     for name, (mesh, shift) in wanted.items():
         found = {}
         for part in read[name]:
-            own = part.colours
+            own = part.colors
             shades = np.full((len(part.faces), 3), 188) if own is None else own.means()
             for triangle, shade in zip(part.vertices[part.faces], shades, strict=True):
                 key = tuple(triangle.mean(axis=0).round(3) + 0.0)
                 found[key] = shade.astype(int)
-        expected = np.full((12, 3), 188) if mesh.colours is None else mesh.colours.means()
+        expected = np.full((12, 3), 188) if mesh.colors is None else mesh.colors.means()
         for triangle, shade in zip(mesh.vertices[mesh.faces] + shift, expected, strict=True):
             key = tuple(triangle.mean(axis=0).round(3) + 0.0)
             assert np.abs(found[key] - shade.astype(int)).max() <= 1, name

@@ -52,10 +52,10 @@ def assembly(number, of, count, more=""):
 
 
 def test_units_and_names(tmp_path):
-    for unit, metres in (('unit="inch"', 0.0254), ("", 0.001)):
+    for unit, meters in (('unit="inch"', 0.0254), ("", 0.001)):
         (leaf,) = load(tmp_path, unit=unit)
         assert leaf.name == "leaf"
-        np.testing.assert_allclose(np.ptp(leaf.vertices, axis=0), [metres, metres, 0])
+        np.testing.assert_allclose(np.ptp(leaf.vertices, axis=0), [meters, meters, 0])
 
 
 def test_nested_components_and_copies_are_all_there(tmp_path):
@@ -65,7 +65,7 @@ def test_nested_components_and_copies_are_all_there(tmp_path):
     assert [mesh.name for mesh in load(tmp_path, items=items)] == ["A", "A"]
 
 
-def test_colours_of_base_materials_and_colour_groups(tmp_path):
+def test_colors_of_base_materials_and_color_groups(tmp_path):
     """Of triangles, of the object, of corners; and some that are not there."""
     triangles = "".join(
         f'<triangle v1="0" v2="1" v3="2" {more}/>'
@@ -82,20 +82,20 @@ def test_colours_of_base_materials_and_colour_groups(tmp_path):
     path = tmp_path / "m.3mf"
     path.write_bytes(packed({"3D/3dmodel.model": model('<item objectid="2"/>', objects=objects)}))
     notes = []
-    (mesh,) = load_meshes(path, colours=True, tell=notes.append)
+    (mesh,) = load_meshes(path, colors=True, tell=notes.append)
     first = [1, 2, 3]
     last = [255, 254, 253]
     base = [255, 128, 0]
     expected = [[base] * 3, [last] * 3, [first, last, first], [[10, 20, 30]] * 3]
-    grey = [[[188] * 3] * 3] * 2
-    assert mesh.colours.corners.tolist() == expected + grey
+    gray = [[[188] * 3] * 3] * 2
+    assert mesh.colors.corners.tolist() == expected + gray
     assert notes == [
         f"{path} contains textures, which are not supported, or lacks colors. As a result, "
         "2 triangles became gray."
     ]
-    assert load_meshes(path)[0].colours is None
+    assert load_meshes(path)[0].colors is None
     (leaf,) = load(tmp_path)
-    assert leaf.colours is None
+    assert leaf.colors is None
 
 
 @pytest.mark.parametrize(

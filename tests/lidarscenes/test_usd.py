@@ -1,4 +1,4 @@
-"""OpenUSD scenes: what is shown is read, in its colours, and nothing vanishes in silence."""
+"""OpenUSD scenes: what is shown is read, in its colors, and nothing vanishes in silence."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from lidarpool.scenario.scenario import Scenario
 from lidarscenes.files import child_process, usd
 from lidarsim import LidarError, SceneInstance
 from lidarsim.base import allowance
-from lidarsim.columns.table import COLOURS
-from lidarsim.scene.colours import LINEAR, as_srgb
+from lidarsim.columns.table import COLORS
+from lidarsim.scene.colors import LINEAR, as_srgb
 from lidarsim.scene.files import scene_graph as nodes
 from lidarsim.scene.files.meshfile import load_meshes, load_objects
 from lidarsim.scene.transform import Transform
@@ -46,7 +46,7 @@ def server():
         yield server
 
 
-METRES = 'metersPerUnit = 1\nupAxis = "Z"'
+METERS = 'metersPerUnit = 1\nupAxis = "Z"'
 QUAD = """
     uniform token subdivisionScheme = "none"
     int[] faceVertexCounts = [4]
@@ -60,7 +60,7 @@ def prim(name, kind="Mesh", text=QUAD, meta=""):
     return f'def {kind} "{name}" ({meta}\n) {{\n{text}\n}}\n'
 
 
-def write(path, *prims, stage=METRES):
+def write(path, *prims, stage=METERS):
     path.write_text(f"#usda 1.0\n({stage}\n)\n" + "".join(prims))
     return path
 
@@ -92,7 +92,7 @@ def test_polygons_places_and_names(tmp_path):
 @pytest.mark.parametrize(
     ("stage", "options", "size", "words"),
     [
-        (METRES, {}, [2, 3, 0], []),
+        (METERS, {}, [2, 3, 0], []),
         ('metersPerUnit = 1\nupAxis = "Y"', {}, [2, 0, 3], ["to Z-up, as the file states"]),
         ("", {}, [0.02, 0, 0.03], ["Centimeters, the default", "to Z-up, the default of OpenUSD"]),
         ("", {"unit": "m", "up_axis": "z"}, [2, 3, 0], []),
@@ -160,7 +160,7 @@ def order(*ops):
 
 
 DRIVE = sampled("translate", t2="(1, 0, 0)", t6="(9, 0, 0)") + order("translate")
-STAGE = METRES + "\nstartTimeCode = 2\nendTimeCode = 4\ntimeCodesPerSecond = 2"
+STAGE = METERS + "\nstartTimeCode = 2\nendTimeCode = 4\ntimeCodesPerSecond = 2"
 
 
 def vertices(path, seconds, **options):
@@ -287,7 +287,7 @@ def test_skeletons_bend_their_meshes_but_in_instances(tmp_path):
     man = prim(
         "Man", "SkelRoot", prim("Bones", "Skeleton", bones) + prim("Skin", text=skin, meta=api)
     )
-    objects, lines = told(write(tmp_path / "man.usda", man, stage=METRES + '\ndefaultPrim = "Man"'))
+    objects, lines = told(write(tmp_path / "man.usda", man, stage=METERS + '\ndefaultPrim = "Man"'))
     assert bounds(objects)[:, 2].tolist() == [5, 5] and lines == []
     placed = prim("A", "", "", "references = @man.usda@\ninstanceable = true")
     objects, [line] = told(write(tmp_path / "m.usda", placed))
@@ -332,7 +332,7 @@ def clip(name, turn):
     """)  # fmt: skip
 
 
-def person(path, extra="", stage=METRES + "\ntimeCodesPerSecond = 24", bones="", skin=""):
+def person(path, extra="", stage=METERS + "\ntimeCodesPerSecond = 24", bones="", skin=""):
     still = "((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,{},1))".format
     rest = f"""uniform token[] joints = ["a", "a/b"]
     uniform matrix4d[] bindTransforms = [{still(0)}, {still(1)}]
@@ -405,7 +405,7 @@ def test_what_moves_too_far_away_is_left_out(tmp_path):
 
 
 def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
-    path = person(tmp_path / "m.usda", stage=METRES + "\nstartTimeCode = 7.3\nendTimeCode = 19")
+    path = person(tmp_path / "m.usda", stage=METERS + "\nstartTimeCode = 7.3\nendTimeCode = 19")
     objects, lines = told(path)
     np.testing.assert_allclose(objects[0].vertices, evaluated(path, 7.3), atol=1e-6)
     assert lines == [
@@ -432,7 +432,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
     )
     wheel = prim("Wheel", text=QUAD + sampled("rotateZ", t1=0, t25=360) + order("rotateZ"))
     men = [prim(f"M{x}", "", MOVED.format((x, 0, 0)), meta) for x in (0, 5)]
-    stage = METRES + "\ntimeCodesPerSecond = 24"
+    stage = METERS + "\ntimeCodesPerSecond = 24"
     path = write(tmp_path / "m.usda", prim("Flag", text=text), wheel, *men, stage=stage)
     found = load_objects(path, animation="Walk")
     assert not found.actors
@@ -463,7 +463,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
 )  # fmt: skip
 def test_unusable_animations_are_refused_in_a_line(tmp_path, stage, text, name, message):
     path = tmp_path / "m.usda"
-    stage = f"{METRES}\n{stage}"
+    stage = f"{METERS}\n{stage}"
     if text is None:
         person(path, stage=stage)
     else:
@@ -529,13 +529,13 @@ def test_prims_alike_share_one_mesh(tmp_path, monkeypatch):
     write(
         tmp_path / "tree.usda",
         prim("Tree", "Xform", prim("Crown")),
-        stage=METRES + '\ndefaultPrim = "Tree"',
+        stage=METERS + '\ndefaultPrim = "Tree"',
     )
     tree = "references = @./tree.usda@\ninstanceable = {}"
     grove = prim("Grove", "Xform", "".join(
         prim(f"T{i}", "Xform", MOVED.format((i, 0, 0)), tree.format("true")) for i in range(2)
     ))  # fmt: skip
-    write(tmp_path / "grove.usda", grove, stage=METRES + '\ndefaultPrim = "Grove"')
+    write(tmp_path / "grove.usda", grove, stage=METERS + '\ndefaultPrim = "Grove"')
     inner = "references = @grove.usda@\ninstanceable = true"  # instances in instances
     path = write(
         tmp_path / "m.usda",
@@ -597,7 +597,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     with pytest.raises(LidarError, match="only files in its own folder"):
         load_meshes(
             write(
-                folder / "m.usda", prim("Quad"), stage=METRES + "\nsubLayers = [@../outside.usda@]"
+                folder / "m.usda", prim("Quad"), stage=METERS + "\nsubLayers = [@../outside.usda@]"
             )
         )
 
@@ -702,7 +702,7 @@ RED = [200, 0, 0]
 GREEN = [0, 200, 0]
 BLUE = [0, 0, 200]
 DARK = [90, 90, 90]
-GREY = [188] * 3
+GRAY = [188] * 3
 PIXELS = np.array([[[*RED, 255], [*GREEN, 0]], [[*BLUE, 255], [*DARK, 0]]], np.uint8)
 PICTURE = [BLUE, DARK, RED, GREEN]  # at the spots
 
@@ -747,14 +747,14 @@ def material(inputs, image="", place="", name="M", kind="UsdPreviewSurface"):
 
 
 def seen(path, **options):
-    """Colours below the spots, None where light passes; and notes."""
-    objects, lines = told(path, colours=True, up_axis="z", **options)
-    scanner = Scanner(Scene.from_meshes(objects), SENSOR, columns=list(COLOURS), backend="numpy")
+    """Colors below the spots, None where light passes; and notes."""
+    objects, lines = told(path, colors=True, up_axis="z", **options)
+    scanner = Scanner(Scene.from_meshes(objects), SENSOR, columns=list(COLORS), backend="numpy")
     found = []
     for x, y in SPOTS:
         cloud = scanner.sweep(Pose((x, y, 5), pitch_deg=90))
-        colour = np.stack([cloud[name] for name in COLOURS], axis=1).tolist()
-        found.append(colour[0] if colour else None)
+        color = np.stack([cloud[name] for name in COLORS], axis=1).tolist()
+        found.append(color[0] if color else None)
     return found, lines
 
 
@@ -799,7 +799,7 @@ def test_masks_let_light_pass(folder):
     path = write(folder / "m.usda", material(IMAGE + HOLES), quad)
     assert seen(path) == ([BLUE, None, RED, None], [])
     assert seen(path, opacity="ignore")[0] == PICTURE
-    assert Scene.load(path).masked == ("Q",)  # also where no colours are asked for
+    assert Scene.load(path).masked == ("Q",)  # also where no colors are asked for
     assert not Scene.load(path, opacity="ignore").instances
     glass = write(folder / "m.usda", material("float inputs:opacity = 0.2"), quad)
     assert "without holes, which are treated as opaque: M." in seen(glass)[1][0]
@@ -819,7 +819,7 @@ def test_masks_let_light_pass(folder):
          '(interpolation = "faceVarying")', [(0, 0, 0)] * 2 + [(0.2, 0, 0), (0.6, 0, 0)]),
     ],
 )  # fmt: skip
-def test_display_colours_are_linear_light(tmp_path, values, expected):
+def test_display_colors_are_linear_light(tmp_path, values, expected):
     halves = QUAD.replace("[4]", "[4, 4]").replace("[0, 1, 2, 3]", "[0, 1, 4, 5, 5, 4, 2, 3]")
     halves = halves.replace("(0, 3, 0)]", "(0, 3, 0), (2, 1.5, 0), (0, 1.5, 0)]")
     quad = prim("Q", text=halves + f"color3f[] primvars:displayColor {values}\n")
@@ -850,22 +850,22 @@ def test_materials_of_subsets_parents_collections_and_instances(folder):
     )
     text = f'def Xform "W" ({bound}{prim("Q")}}}\n'
     assert seen(write(folder / "m.usda", *two, text))[0][0] == upper
-    # Instances share a mesh, and have the colours that are bound outside of them.
-    write(folder / "quad.usda", prim("A", "Xform", prim("Q")), stage=METRES + '\ndefaultPrim = "A"')
+    # Instances share a mesh, and have the colors that are bound outside of them.
+    write(folder / "quad.usda", prim("A", "Xform", prim("Q")), stage=METERS + '\ndefaultPrim = "A"')
     place = "double3 xformOp:translate = ({}, 0, 0)\nuniform token[] xformOpOrder = "
     place += '["xformOp:translate"]\n'
     meta = "references = @./quad.usda@\ninstanceable = true\n"
     one = prim("I", "Xform", place.format(0) + "rel material:binding = </G>", meta + BIND)
     other = prim("J", "Xform", place.format(9), meta)
-    objects, _ = told(write(folder / "m.usda", *two, one, other), colours=True)
-    colours = [one.colours and one.colours.images[0].ravel().tolist() for one in objects]
-    assert colours == [upper, None]
+    objects, _ = told(write(folder / "m.usda", *two, one, other), colors=True)
+    colors = [one.colors and one.colors.images[0].ravel().tolist() for one in objects]
+    assert colors == [upper, None]
 
 
 def test_packed_images_and_shapes(folder):
     sphere = prim(
         "Ball", "Cube", "double size = 10\nrel material:binding = </M>", BIND
-    )  # its colour is even
+    )  # its color is even
     red = material("color3f inputs:diffuseColor = (1, 0, 0)")
     assert seen(write(folder / "ball.usda", red, sphere))[0] == [[255, 0, 0]] * 4
     main = write(folder / "main.usda", material(IMAGE), prim("Q", text=QUAD + ST, meta=BIND))
@@ -882,29 +882,29 @@ def test_packed_images_and_shapes(folder):
 
 @pytest.mark.extended(every=3)
 @pytest.mark.parametrize(
-    ("inputs", "image", "kind", "colour", "why"),
+    ("inputs", "image", "kind", "color", "why"),
     [
-        (IMAGE, "asset inputs:file = @no.png@", "UsdPreviewSurface", GREY, "'no.png' does not"),
-        (IMAGE, "asset inputs:file = @m.usda@", "UsdPreviewSurface", GREY, "is no PNG"),
+        (IMAGE, "asset inputs:file = @no.png@", "UsdPreviewSurface", GRAY, "'no.png' does not"),
+        (IMAGE, "asset inputs:file = @m.usda@", "UsdPreviewSurface", GRAY, "is no PNG"),
         (IMAGE, "asset inputs:file = @no.png@\nfloat4 inputs:fallback = (1, 0, 0, 1)",
          "UsdPreviewSurface", [255, 0, 0], "does not exist"),
-        (IMAGE, "asset inputs:file = @../out.png@", "UsdPreviewSurface", GREY,
+        (IMAGE, "asset inputs:file = @../out.png@", "UsdPreviewSurface", GRAY,
          "outside the scene's folder; name the folder that"),
-        (IMAGE, "asset inputs:file = @t.<UDIM>.png@", "UsdPreviewSurface", GREY, "UDIM tiles"),
-        ("", "", "MyShader", GREY, "M (its shader MyShader is not supported)"),
-        (IMAGE.replace("T.outputs:rgb", "X.outputs:result"), "", "UsdPreviewSurface", GREY,
+        (IMAGE, "asset inputs:file = @t.<UDIM>.png@", "UsdPreviewSurface", GRAY, "UDIM tiles"),
+        ("", "", "MyShader", GRAY, "M (its shader MyShader is not supported)"),
+        (IMAGE.replace("T.outputs:rgb", "X.outputs:result"), "", "UsdPreviewSurface", GRAY,
          "computed by UsdTransform2d"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, colour, why):
+def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, color, why):
     Image.fromarray(PIXELS).save(folder.parent / "out.png")
     text = material(inputs, image, kind=kind)
     if image:
         text = text.replace("asset inputs:file = @./picture.png@", "")
     path = write(folder / "m.usda", text, prim("Q", text=QUAD + ST, meta=BIND))
     found, lines = seen(path)
-    assert found == [colour] * 4 and len(lines) == 1 and why in lines[0]
-    assert told(path)[1] == []  # colours are not asked for
+    assert found == [color] * 4 and len(lines) == 1 and why in lines[0]
+    assert told(path)[1] == []  # colors are not asked for
     if "out.png" in image:
         assert seen(path, assets=folder.parent) == (PICTURE, [])
 

@@ -425,7 +425,7 @@ def test_reflectivities_in_the_thickest_dust_are_finite():
 # -- bytes -----------------------------------------------------------------------------------------
 
 
-def test_what_is_no_surface_is_grey_and_of_no_class():
+def test_what_is_no_surface_is_gray_and_of_no_class():
     material = [Material("*", reflectance=0.2, semantic_class=7)]
     found = cast(
         [wall("W", 9)], snow_mm_h=1.0, materials=material, columns=(*COLUMNS, "red", "triangle")

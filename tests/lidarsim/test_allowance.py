@@ -90,7 +90,7 @@ BOMBS = {
     "vertices.3mf": (model(thousands=12_000), "would unpack to 308.99 MiB"),
     "objects.3mf": (model(b"<object id='2'/>" * 300_000), "would unpack to 256"),
     "lzma.3mf": (model(b" " * 10_000_000, method=zipfile.ZIP_LZMA), "a method other than Deflate"),
-    "colours.3mf": (model(b"<base/>" * 3_000_000), "would unpack to 256"),
+    "colors.3mf": (model(b"<base/>" * 3_000_000), "would unpack to 256"),
     "attribute.3mf": (model(b"<a b='%s'/>" % (b"1" * 20_000_000)), "a tag or comment of more"),
     "entities.3mf": (None, "declares the XML entity"),
     "count.gltf": (gltf({"bufferView": 0, "count": 60_000_000}), "would unpack to 457.76 MiB"),

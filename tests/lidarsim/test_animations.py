@@ -368,8 +368,8 @@ def test_normals_are_those_of_the_moment():
     )
     scene = Scene.from_meshes([FLOOR]).with_actors([actor])
     columns = ["reflectance", "object", "time"]
-    grey = Material("*", reflectance=0.5)
-    scanner = Scanner(scene, Sensor.grid(720, 3), columns=columns, materials=[grey])
+    gray = Material("*", reflectance=0.5)
+    scanner = Scanner(scene, Sensor.grid(720, 3), columns=columns, materials=[gray])
     for start in (0.05, 0.3, 0.55):
         found = scanner.sweep((0, 0, 0), start_s=start)
         own = found["object"] == 1
@@ -436,7 +436,7 @@ def test_copies_share_their_poses_and_backends_agree(walker):
 def points_in(boxes, actor, points, slack):
     """Whether points are within the box of an actor."""
     turn = matrices(boxes.quaternions[[actor]])[0]
-    local = (points - boxes.centres[actor]) @ turn
+    local = (points - boxes.centers[actor]) @ turn
     return (np.abs(local) <= boxes.sizes[actor] / 2 + slack).all(axis=1)
 
 

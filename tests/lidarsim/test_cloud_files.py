@@ -48,7 +48,7 @@ TWO = [[1.5, 2, 3], [4, 5.25, 6]]
         "# z y x\n3 2 1.5\n6 5.25 4\n",
         "//X Y Z\n2\n1.5 2 3\n4 5.25 6\n",
         "# made by a program\n#x,y,z\n1.5,2,3\n4,5.25,6\n# the end\n",
-        "# x y z in metres, from the east\n1.5 2 3\n4 5.25 6\n",
+        "# x y z in meters, from the east\n1.5 2 3\n4 5.25 6\n",
         "2\n1.5 2 3\n4 5.25 6\n",
         "Easting;Northing;Height\n1.5;2;3\n4;5.25;6\n",
         # Decimal commas, beside another separator.
@@ -250,8 +250,8 @@ def test_ptx_has_poses_and_intensities(tmp_path):
     assert world.tolist() == [[10, 21, 5], [10, 22, 5], [7, 20, 6]]
     assert columns_of(first) == {"intensity": [0.5, 0.25, 1]}
     assert first.scanner.tolist() == [10, 20, 5] and second.scanner.tolist() == [0, 0, 1]
-    colours = "\n".join(line + " 1 2 3" * (k >= 10) for k, line in enumerate(PTX.splitlines()))
-    (scan,) = read_all(tmp_path, "b.ptx", colours)
+    colors = "\n".join(line + " 1 2 3" * (k >= 10) for k, line in enumerate(PTX.splitlines()))
+    (scan,) = read_all(tmp_path, "b.ptx", colors)
     assert scan.columns["blue"].tolist() == [3, 3, 3] and scan.columns["blue"].dtype == np.uint8
 
 

@@ -20,7 +20,7 @@ from lidarsim.scene.files.coordinate_systems import (
     target_problem,
     transformed,
     zone_in_area,
-    zone_in_metres,
+    zone_in_meters,
 )
 
 needs_registry = pytest.mark.skipif(find_spec("rasterio") is None, reason="rasterio is an extra")
@@ -86,15 +86,15 @@ def test_national_grids_are_true_where_they_are_meant_to_be(epsg, longitude, lat
     scale = ground_scale(crs_of_code(epsg), x, y)
     assert scale.is_true == is_true
     code = suggested_epsg(crs_of_code(epsg), x, y)
-    assert code == zone_in_metres(longitude, latitude)
+    assert code == zone_in_meters(longitude, latitude)
     assert ground_scale(crs_of_code(code), *place(code, longitude, latitude)).is_true
 
 
 @needs_registry
-def test_zones_cover_the_earth_with_true_metres():
+def test_zones_cover_the_earth_with_true_meters():
     for latitude in (-89.9, -84, -83.9, -45, 0, 60, 83.9, 84, 89.9):
         for longitude in (-180, -177.1, -0.1, 0, 5.9, 179.9):
-            code = zone_in_metres(longitude, latitude)
+            code = zone_in_meters(longitude, latitude)
             assert ground_scale(crs_of_code(code), *place(code, longitude, latitude)).is_true
 
 
@@ -112,18 +112,18 @@ def test_scales_are_those_of_the_system_s_own_body():
     [
         (32632, 0, 0, ""),
         (25832, 5e5, 5e6, ""),
-        (25832, 5e6, 0, r"whose metre is 0\.793 m long at x 5000000, y 0: EPSG:32638 has"),
+        (25832, 5e6, 0, r"whose meter is 0\.793 m long at x 5000000, y 0: EPSG:32638 has"),
         (2056, 2.6e6, 1.2e6, ""),
         (7415, 84600, 447000, ""),
         (3857, 0, 0, r"EPSG:3857 \(WGS 84 / Pseudo-Mercator\), a world map projection"),
         (3395, 1e6, 6e6, "a world map projection"),
-        (3994, 0, 0, r"\(WGS 84 / Mercator 41\), whose metre is"),
-        (2263, 0, 0, "which is not in metres"),
-        (4326, 8, 47, "which is not in metres"),
+        (3994, 0, 0, r"\(WGS 84 / Mercator 41\), whose meter is"),
+        (2263, 0, 0, "which is not in meters"),
+        (4326, 8, 47, "which is not in meters"),
         (1024, 0, 0, "a code that rasterio does not know"),
     ],
 )
-def test_chosen_systems_have_true_metres(epsg, x, y, message):
+def test_chosen_systems_have_true_meters(epsg, x, y, message):
     problem = target_problem(epsg, x, y)
     assert re.search(message, problem) if message else problem == ""
 
@@ -141,7 +141,7 @@ def test_without_the_registry_systems_of_the_world_are_known(monkeypatch):
 def test_meshes_in_a_stretched_system_are_told_the_factor():
     assert scale_problem("EPSG:25832", 5e5, 5e6) == scale_problem("no system", 0, 0) == ""
     problem = scale_problem("+proj=merc +datum=WGS84", 1e6, 6e6)
-    assert problem.startswith("whose metre is 0.676 m") and ": scale [0.676" in problem
+    assert problem.startswith("whose meter is 0.676 m") and ": scale [0.676" in problem
 
 
 @needs_registry

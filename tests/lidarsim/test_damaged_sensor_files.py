@@ -209,7 +209,7 @@ PARQUET = {
         "channel must contain real numbers, .* struct<",
     ),
     "missing": (lambda: parquet(channel=[None, *[1] * 8]), "channel of ray 1 is NaN or infinite"),
-    "unknown column": (lambda: parquet(colour=[1] * 9), "unknown columns: colour"),
+    "unknown column": (lambda: parquet(color=[1] * 9), "unknown columns: color"),
 }
 
 

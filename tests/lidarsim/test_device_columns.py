@@ -32,7 +32,7 @@ from lidarpool import (
 )
 from lidarsim import Material, Returns, box, load_sensor
 from lidarsim.motion.trajectory import Stations
-from lidarsim.scene.colours import Colours
+from lidarsim.scene.colors import Colors
 from lidarsim.scene.shapes import seed_objects
 from lidarsim.simulator.memory import cast_bytes
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -91,8 +91,8 @@ def scenes():
     """The same objects as parts of the scene, and as instances: all, or beside others."""
     objects = []
     for k, mesh in enumerate(seed_objects(rings=8, segments=12)):
-        colours = np.random.default_rng(k).integers(0, 256, (len(mesh.faces), 3), np.uint8)
-        objects.append(replace(mesh, colours=Colours.of_faces(colours)))
+        colors = np.random.default_rng(k).integers(0, 256, (len(mesh.faces), 3), np.uint8)
+        objects.append(replace(mesh, colors=Colors.of_faces(colors)))
     copies = []
     for k, stretch in enumerate((1, 2, -1, 1, 1, 0.5)):
         matrix = np.diag([stretch, 1, 1, 1.0])
@@ -180,7 +180,7 @@ MORE = {
     "haze": {"visibility_km": 2.0},
     "the sensor's axes": {"coordinates": "sensor"},
     "only angles": {"columns": ("elevation",), "keep_every": 4},
-    "colours": {"columns": ("red", "blue", "time")},
+    "colors": {"columns": ("red", "blue", "time")},
     "textures": {"materials": [Material("*", "texture", scale=0.7)]},
     "gloss": {"materials": [Material("*", 0.4, roughness=0.3)]},
     "velocities": {"columns": ("radial_velocity",), "noise": Noise(velocity_m_s=0.1)},

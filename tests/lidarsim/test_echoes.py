@@ -158,7 +158,7 @@ def test_modes(mode):
 
 def test_a_surface_that_continues_takes_hits_between_its_hits():
     """The example of `continue_surfaces`: a drop, ground at three sub-rays, and a post."""
-    from lidarsim.simulator.steps.pulse_loops import Neighbours
+    from lidarsim.simulator.steps.pulse_loops import Neighbors
     from lidarsim.simulator.steps.random_loops import RandomKeys
     from lidarsim.simulator.steps.separation_loops import (
         ALL,
@@ -181,7 +181,7 @@ def test_a_surface_that_continues_takes_hits_between_its_hits():
         air=SubrayHits(
             np.zeros(1, np.int64), np.array([8.0]), np.array([0.4]), np.zeros(0), np.zeros(0, bool)
         ),
-        neighbours=Neighbours(4, pairs, normals.T.copy(), directions.T.copy()),
+        neighbors=Neighbors(4, pairs, normals.T.copy(), directions.T.copy()),
         receiver=Receiver(4, 0.3, ALL, False, 0.0, 0.0, 0.0, np.zeros(0)),
         keys=RandomKeys(np.zeros(0, np.uint64), 0, np.zeros(1, np.int64), 0),
         output=found,
@@ -229,7 +229,7 @@ def test_a_pane_has_two_surfaces_from_whatever_side(backend, away_m, angle_deg):
 def test_glass_reflects_by_fresnel():
     assert fresnel(np.array([1.0, 0.0])) == pytest.approx([0.04, 1.0])
     brewster = math.atan(1.5)
-    along = (math.sin(2 * brewster - math.pi / 2)) ** 2 / 2  # one polarisation is not reflected
+    along = (math.sin(2 * brewster - math.pi / 2)) ** 2 / 2  # one polarization is not reflected
     assert fresnel(np.array([math.cos(brewster)])) == pytest.approx([along])
 
 

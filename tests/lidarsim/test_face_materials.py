@@ -342,15 +342,15 @@ def usd(folder):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("colours", [False, True])
+@pytest.mark.parametrize("colors", [False, True])
 @pytest.mark.parametrize("write", [gltf, dae, threemf, cityjson, usd])
-def test_faces_of_files_have_their_materials(write, colours, tmp_path):
-    scene = Scene.load(write(tmp_path), materials=True, colours=colours)
+def test_faces_of_files_have_their_materials(write, colors, tmp_path):
+    scene = Scene.load(write(tmp_path), materials=True, colors=colors)
     assert sorted(scene.material_names) == ["Brick", "Glass"]
     assert len(scene.names) == 1 and len(scene.surface_kinds.object) == 2
     cloud = cloud_of(scene, survey([ENTRIES[0], Material("*", 0.8, semantic_class=2)]))
     check_house(cloud, ("Brick", "Glass"))
-    plain = Scene.load(write(tmp_path), colours=colours)
+    plain = Scene.load(write(tmp_path), colors=colors)
     assert plain.materials is None and len(plain.faces) == len(scene.faces)
 
 

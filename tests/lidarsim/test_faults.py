@@ -293,7 +293,7 @@ def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
         assert stamps[1] - stamps[0] == (number > 0) * -7_500_000_000
         assert number == 0 or np.array_equal(right.data, wrong.data)  # times since the stamp
     for one, other in zip(*boxes, strict=True):
-        np.testing.assert_allclose(one.centres, other.centres, atol=0.005)
+        np.testing.assert_allclose(one.centers, other.centers, atol=0.005)
 
 
 WRONG = {

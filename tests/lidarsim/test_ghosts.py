@@ -10,7 +10,7 @@ from tests.shapes import CPU, beam_along_x, cast, level, made, quad, wall
 from lidarpool import Beams, LidarError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
 from lidarsim.columns.table import CAUSES
 from lidarsim.media.materials import WATER_INDEX, below_water, fresnel
-from lidarsim.scene.colours import Colours
+from lidarsim.scene.colors import Colors
 
 COLUMNS = ("range", "reflectance", "class", "cause", "return_number")
 GHOST = CAUSES.index("ghost")
@@ -115,11 +115,11 @@ def test_light_is_mirrored_twice_and_not_three_times():
     assert found["reflectance"] == pytest.approx([0.5, 0.5 / 4**2, 0.5 / 4**4])
 
 
-def test_ghosts_of_textures_take_what_the_colours_leave():
+def test_ghosts_of_textures_take_what_the_colors_leave():
     """A black wall absorbs what it does not mirror, and a white one has nothing to mirror."""
     for bright, share in ((0, 1 - 1e-3), (255, 0.0)):
-        colours = Colours.of_faces(np.full((2, 3), bright, np.uint8))
-        slanted = replace(SLANTED, colours=colours)
+        colors = Colors.of_faces(np.full((2, 3), bright, np.uint8))
+        slanted = replace(SLANTED, colors=colors)
         paint = Material("Slanted", "texture", specular_reflectance=0.2)
         found = cast([slanted, CEILING], materials=[paint, Material("*", 1.0)], **ALL)
         ghosts = found["reflectance"][found["cause"] == GHOST]

@@ -108,7 +108,7 @@ def test_strips_and_fans(tmp_path, mode):
     np.testing.assert_array_equal(np.cross(b - a, c - a), [[0, 0, 1]] * 2)
 
 
-def test_normalised_and_interleaved_positions(tmp_path):
+def test_normalized_and_interleaved_positions(tmp_path):
     rows = np.zeros((3, 5), "<i2")
     rows[:, 2:] = [[0, 0, 0], [32767, 0, 0], [0, -32768, 0]]
     header = triangle(rows.tobytes(), componentType=5122, normalized=True, byteOffset=4)

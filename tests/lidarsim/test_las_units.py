@@ -1,4 +1,4 @@
-"""Units of LAS and LAZ: what a file's coordinate system states is converted to metres."""
+"""Units of LAS and LAZ: what a file's coordinate system states is converted to meters."""
 
 import struct
 
@@ -17,7 +17,7 @@ laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 FOOT = 0.3048
 US_FOOT = 12 / 39.37
 EAST, NORTH = np.mgrid[300:304:40j, 200:203:30j].reshape(2, -1)
-PLACE = np.column_stack([EAST, NORTH, (EAST - 300) / 2 + 10])  # metres
+PLACE = np.column_stack([EAST, NORTH, (EAST - 300) / 2 + 10])  # meters
 
 GEOGCS = (
     'GEOGCS["NAD83",DATUM["North_American_Datum_1983",SPHEROID["GRS 1980",6378137,298.257222101]],'
@@ -30,7 +30,7 @@ PROJCS = (
 VERT_CS = 'VERT_CS["NAVD88",VERT_DATUM["NAVD 1988",2005],UNIT["%s",%s],AXIS["Up",UP]]'
 US_UNIT = ("US survey foot", "0.304800609601219")
 FOOT_UNIT = ("foot", "0.3048")
-METRE_UNIT = ("metre", "1")
+METER_UNIT = ("metre", "1")
 WKT2 = (
     'COMPOUNDCRS["of two",PROJCRS["plane",BASEGEOGCRS["NAD83",DATUM["NAD83",ELLIPSOID["GRS 1980",'
     '6378137,298.257222101,LENGTHUNIT["metre",1]]],PRIMEM["Greenwich",0,ANGLEUNIT["degree",'
@@ -77,15 +77,15 @@ def written(path, points, records=(), extended=False, wkt_bit=False):
     return path
 
 
-STATED = {  # {case: (records, metres in the units of x and y, of z)}
+STATED = {  # {case: (records, meters in the units of x and y, of z)}
     "no system": ([], 1.0, 1.0),
     "WKT 1, US survey foot": (wkt(PROJCS % US_UNIT), US_FOOT, US_FOOT),
-    "WKT 1, metre": (wkt(PROJCS % METRE_UNIT), 1.0, 1.0),
-    "compound WKT 1, metres and feet": (
-        wkt(f'COMPD_CS["c",{PROJCS % METRE_UNIT},{VERT_CS % FOOT_UNIT}]'), 1.0, FOOT,
+    "WKT 1, meter": (wkt(PROJCS % METER_UNIT), 1.0, 1.0),
+    "compound WKT 1, meters and feet": (
+        wkt(f'COMPD_CS["c",{PROJCS % METER_UNIT},{VERT_CS % FOOT_UNIT}]'), 1.0, FOOT,
     ),
-    "compound WKT 1, feet and metres": (
-        wkt(f'COMPD_CS["c",{PROJCS % US_UNIT},{VERT_CS % METRE_UNIT}]'), US_FOOT, 1.0,
+    "compound WKT 1, feet and meters": (
+        wkt(f'COMPD_CS["c",{PROJCS % US_UNIT},{VERT_CS % METER_UNIT}]'), US_FOOT, 1.0,
     ),
     "round brackets": (
         wkt((PROJCS % FOOT_UNIT).replace("[", "(").replace("]", ")")), FOOT, FOOT,
@@ -98,7 +98,7 @@ STATED = {  # {case: (records, metres in the units of x and y, of z)}
     "keys of both units": (
         keys((1024, 1), (3072, 32618), (3076, 9001), (4099, 9002)), 1.0, FOOT,
     ),
-    "keys of feet and metres": (keys((1024, 1), (3076, 9002), (4099, 9001)), FOOT, 1.0),
+    "keys of feet and meters": (keys((1024, 1), (3076, 9002), (4099, 9001)), FOOT, 1.0),
     "size of a unit": (
         keys((1024, 1), (3072, 32767), (3076, 32767), doubles=[(3077, 0.5)]), 0.5, 0.5,
     ),
@@ -112,15 +112,15 @@ BY_EPSG = {
 }
 
 
-def check_conversion(folder, records, metres, height_m, **options):
-    factors = np.array([metres, metres, height_m])
+def check_conversion(folder, records, meters, height_m, **options):
+    factors = np.array([meters, meters, height_m])
     path = written(folder / "a.las", PLACE / factors, records, **options)
     notes = []
     scene = scene_of_points(path, voxel_m=0.01, tell=notes.append)
     low, high = scene.bounds
     np.testing.assert_allclose((low + high) / 2, (302, 201.5, 11), atol=0.01)
-    assert bool(notes) == ((metres, height_m) != (1.0, 1.0)), notes
-    other = written(folder / "metres.laz", PLACE)
+    assert bool(notes) == ((meters, height_m) != (1.0, 1.0)), notes
+    other = written(folder / "meters.laz", PLACE)
     figures = compare(path, other).figures
     assert figures["distances"]["a_to_b"]["mean_m"] < 1e-5
     return notes
@@ -178,23 +178,23 @@ def test_what_cannot_be_known_is_refused_unless_the_unit_is_given(
         compare(path, path)
     low, _ = scene_of_points(path, voxel_m=0.01, unit="ft").bounds
     np.testing.assert_allclose(low, PLACE.min(axis=0), atol=0.1)
-    other = written(tmp_path / "metres.las", PLACE)
+    other = written(tmp_path / "meters.las", PLACE)
     assert compare(path, other, unit_a="ft").figures["distances"]["a_to_b"]["mean_m"] < 1e-5
 
 
-def test_equal_numbers_of_feet_and_metres_are_apart(tmp_path):
+def test_equal_numbers_of_feet_and_meters_are_apart(tmp_path):
     feet = written(tmp_path / "feet.las", PLACE, wkt(PROJCS % FOOT_UNIT))
-    metres = written(tmp_path / "metres.las", PLACE)
-    found = compare(feet, metres)
+    meters = written(tmp_path / "meters.las", PLACE)
+    found = compare(feet, meters)
     assert found.figures["distances"]["a_to_b"]["mean_m"] > 100
     assert any("feet.las is in the unit foot" in note for note in found.figures["notes"])
-    same = compare(feet, metres, unit_a="m").figures["distances"]["a_to_b"]
+    same = compare(feet, meters, unit_a="m").figures["distances"]["a_to_b"]
     assert same["mean_m"] < 1e-5
 
 
-def test_what_is_in_metres_has_no_unit_to_give(tmp_path):
+def test_what_is_in_meters_has_no_unit_to_give(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"0")
-    with pytest.raises(LidarError, match=r"a\.mcap is in metres: leave out its unit, 'ft'"):
+    with pytest.raises(LidarError, match=r"a\.mcap is in meters: leave out its unit, 'ft'"):
         compare(tmp_path / "a.mcap", tmp_path / "a.mcap", unit_a="ft")
 
 

@@ -50,9 +50,9 @@ def test_a_channels_error_is_constant_and_its_own():
     count = made.size
     assert abs(made.mean()) < 4.5 * 0.05 / np.sqrt(count)
     assert abs(made.std() / 0.05 - 1) < 4.5 / np.sqrt(2 * count)
-    neighbours = np.corrcoef(made[:, :-1].ravel(), made[:, 1:].ravel())[0, 1]
+    neighbors = np.corrcoef(made[:, :-1].ravel(), made[:, 1:].ravel())[0, 1]
     units = np.corrcoef(made[:-1].ravel(), made[1:].ravel())[0, 1]
-    assert max(abs(neighbours), abs(units)) < 4.5 / np.sqrt(count)
+    assert max(abs(neighbors), abs(units)) < 4.5 / np.sqrt(count)
 
 
 def test_biases_may_be_those_of_a_calibration():

@@ -162,7 +162,7 @@ def test_velodyne_tells_its_state_and_sends_where_a_client_asks():
         assert asked[-1] == Destination("127.0.0.6", {2368: 0, 8308: 0})
         assert ask(service, "GET", "/cgi/snapshot.hdl")[1]["config"]["laser"] == "Off"
         for path, body in (
-            ("setting", "rpm=300"), ("setting", "colour=red"), ("setting/host", "addr=x"),
+            ("setting", "rpm=300"), ("setting", "color=red"), ("setting/host", "addr=x"),
             ("setting/host", "dport=99999"), ("setting/host", "mask=1"), ("setting/net", "addr=x"),
         ):  # fmt: skip
             assert ask(service, "POST", f"/cgi/{path}", body)[0] in (400, 404)

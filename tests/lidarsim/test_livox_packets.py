@@ -261,7 +261,7 @@ def synthetic_shots(model, kind=1):
 
 
 # What livox_ros_driver2 reads of the synthetic shots: points that are not zeros; sums of
-# reflectivity, lines, and x, y and z in millimetres; and the start of the SHA-256 of the packets.
+# reflectivity, lines, and x, y and z in millimeters; and the start of the SHA-256 of the packets.
 RECORDED = {
     ("mid360", 1): (152, 14356, 228, -741857, -1243000, 1714207, "577f4a59a66befb3"),
     ("mid360", 2): (152, 14356, 228, -741880, -1243060, 1714130, "b3a876832028afe8"),

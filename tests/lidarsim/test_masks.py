@@ -39,7 +39,7 @@ def image(mask=MASK, kind="png", mode="RGBA"):
 
 
 def card(texture=None, *, uv=UV, faces=FACES, mode=4, info=None, sampler=None, **material):
-    """Header and buffer of a .glb with a card at x = 5, four metres wide and high."""
+    """Header and buffer of a .glb with a card at x = 5, four meters wide and high."""
     texture = image() if texture is None else texture
     pieces = [CORNERS.tobytes(), uv.tobytes(), faces.tobytes(), texture]
     starts = np.cumsum([0, *(-(-len(piece) // 4) * 4 for piece in pieces)]).tolist()
@@ -80,7 +80,7 @@ def load(path, header, body, **options):
 
 
 def seen(scene, backend="numpy"):
-    """Points of a sweep, millimetres."""
+    """Points of a sweep, millimeters."""
     sensor = Sensor.grid(360, 31, 60.0)
     cloud = Scanner(scene, sensor, backend=backend, precision_m=1e-4).sweep(Pose((0.0, 0.0, 0.0)))
     return np.asarray(cloud.positions, np.float64)

@@ -52,8 +52,8 @@ SURVEYS = {
     "one beam, on the move": Survey(ONE, **WAY),
     "rays that never repeat": Survey(load_sensor("livox/mid40", step_deg=30), **STILL),
     "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
-    "colours": Survey(MANY, **STILL, **PAINT),
-    "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
+    "colors": Survey(MANY, **STILL, **PAINT),
+    "noise and colors": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
     "velocities of sub-rays": Survey(
         MANY, **WAY, columns=["radial_velocity"], returns=Returns("strongest", 7, 3.0)
     ),

@@ -149,7 +149,7 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
         ("v 0 0 0\nf 1 1 1\n".encode("utf-16"), "text in UTF-16: save it as UTF-8"),
     ],
 )
-def test_what_is_no_mesh_is_recognised(tmp_path, content, message):
+def test_what_is_no_mesh_is_recognized(tmp_path, content, message):
     with pytest.raises(LidarError, match=message):
         load_meshes(write(tmp_path / "m.obj", content))
 

@@ -84,7 +84,7 @@ def test_poses_between_knots_are_on_straight_lines():
 
 @pytest.mark.extended(every=3)
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "velodyne/hdl64e-s2", "ouster/os0-32"])
-def test_raw_points_are_off_by_metres_and_deskewed_ones_on_the_wall(wall, model):
+def test_raw_points_are_off_by_meters_and_deskewed_ones_on_the_wall(wall, model):
     sensor = load_sensor(model, max_range_m=30)
     common = {"trajectory": DRIVE, "keep_every": 1, "precision_m": PRECISION_M, "columns": ["time"]}
     common["sensors"] = [Mounted(sensor, MOUNT)]

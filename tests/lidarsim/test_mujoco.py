@@ -10,7 +10,7 @@ from lidarpool import LidarError, Material, Mounted, MujocoScanner, Pose, Sensor
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install mujoco")
 
 VLP16 = load_sensor("velodyne/vlp16")
-CENTRED = Sensor.grid(1800, 16, vertical_fov_deg=30, max_range_m=130)  # beams start at a point
+CENTERED = Sensor.grid(1800, 16, vertical_fov_deg=30, max_range_m=130)  # beams start at a point
 
 GRID = Sensor.grid(rays_per_revolution=360, layers=16, step_deg=30, max_range_m=60)
 GROUPS = np.array([1, 1, 1, 0, 0, 0], np.uint8)
@@ -19,8 +19,8 @@ WORLD = """
   <asset>
     <hfield name="hills" nrow="15" ncol="17" size="3 2 1 0.3"/>
     <mesh name="wedge" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>
-    <texture name="grey" type="2d" builtin="flat" rgb1=".5 .5 .5" width="4" height="4"/>
-    <material name="paint" texture="grey" rgba="1 .5 0 1"/>
+    <texture name="gray" type="2d" builtin="flat" rgb1=".5 .5 .5" width="4" height="4"/>
+    <material name="paint" texture="gray" rgba="1 .5 0 1"/>
     <material name="glass" rgba="1 1 1 0"/>
   </asset>
   <worldbody>
@@ -60,8 +60,8 @@ WORLD = """
 </mujoco>
 """
 TYPES = {
-    1e-5: (0, 1, 6, 7),  # planes, height fields, boxes, meshes: metres along the ray
-    1e-3: (2, 3, 4, 5),  # round: metres along the normal
+    1e-5: (0, 1, 6, 7),  # planes, height fields, boxes, meshes: meters along the ray
+    1e-3: (2, 3, 4, 5),  # round: meters along the normal
 }
 
 
@@ -106,12 +106,12 @@ def rays_of(model, data, sensor, firings):
 @pytest.mark.parametrize("objects", ["body", "geom"])
 def test_ranges_are_those_of_mujoco(world, objects):
     model, data = world
-    scanner = MujocoScanner(model, CENTRED, site="lidar", objects=objects)
+    scanner = MujocoScanner(model, CENTERED, site="lidar", objects=objects)
     seen = set()
     for seed in range(3):
         shuffle(model, data, seed)
         image = scanner.ranges(data)
-        distance, geom, cosines = rays_of(model, data, CENTRED, len(image))
+        distance, geom, cosines = rays_of(model, data, CENTERED, len(image))
         ranges = image.reshape(-1)
         assert (
             np.isfinite(ranges) != np.isfinite(distance)
@@ -164,8 +164,8 @@ def test_beams_leave_while_the_world_moves(world):
         on_ball = cloud.object == scanner.names.index("ball")
         assert on_ball.sum() > 20
         height = np.interp(cloud.time[on_ball] / 1e9 + times[0], times, heights)
-        centres = np.column_stack([np.full(len(height), 2.0), np.zeros(len(height)), height])
-        radius = np.linalg.norm(cloud.positions[on_ball] - centres, axis=1)
+        centers = np.column_stack([np.full(len(height), 2.0), np.zeros(len(height)), height])
+        radius = np.linalg.norm(cloud.positions[on_ball] - centers, axis=1)
         assert np.abs(radius - 0.4).max() < 1e-3
     mujoco.mj_resetData(model, data)
     mujoco.mj_forward(model, data)

@@ -71,7 +71,7 @@ def allan(values, size):
 def agrees(values, rate_hz, expected, spread=1.5):
     """Whether Allan variances agree with a formula of the averaging time, within 4.5 sigmas.
 
-    The variance of a mean of n squared normal deviates is 2 / n; neighbouring differences share a
+    The variance of a mean of n squared normal deviates is 2 / n; neighboring differences share a
     cluster, which makes that of white noise 1.5 times as large, and for others less than 2.
     """
     for size in (1, 8, 64, 512, 4096):
@@ -296,13 +296,13 @@ def test_latitudes_of_east_north_and_up():
     found = geodetic(enu, origin)
     np.testing.assert_allclose(found[0], origin, atol=1e-9)
     latitude, longitude, height = (column.tolist() for column in found.T)
-    centred = np.array(warp.transform("EPSG:4979", "EPSG:4978", longitude, latitude, height)).T
-    centred -= np.array(warp.transform("EPSG:4979", "EPSG:4978", *([v] for v in (
+    centered = np.array(warp.transform("EPSG:4979", "EPSG:4978", longitude, latitude, height)).T
+    centered -= np.array(warp.transform("EPSG:4979", "EPSG:4978", *([v] for v in (
         origin[1], origin[0], origin[2],
     )))).T  # fmt: skip
     (sp, cp), (sl, cl) = ((np.sin(a), np.cos(a)) for a in np.radians(origin[:2]))
     axes = np.array([[-sl, cl, 0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
-    np.testing.assert_allclose(centred @ axes.T, enu, atol=1e-5)
+    np.testing.assert_allclose(centered @ axes.T, enu, atol=1e-5)
 
 
 def of_drive(**options):

@@ -49,7 +49,7 @@ LEGACY = "LEGACY"
 SINGLE = "RNG19_RFL8_SIG16_NIR16"
 DUAL = "RNG19_RFL8_SIG16_NIR16_DUAL"
 LOW_RATE = "RNG15_RFL8_NIR8"
-# {profile: bytes of a pixel}, and what the manual says of ranges: millimetres
+# {profile: bytes of a pixel}, and what the manual says of ranges: millimeters
 PIXEL_BYTES = {LEGACY: 12, SINGLE: 12, DUAL: 16, LOW_RATE: 4}
 UNIT_MM = {LEGACY: 1, SINGLE: 1, DUAL: 1, LOW_RATE: 8}
 MAX_MM = {LEGACY: 1_048_575, SINGLE: 524_287, DUAL: 524_287, LOW_RATE: 262_136}
@@ -145,7 +145,7 @@ def plain_frames(payloads, metadata) -> Frames:
 
 
 def plain_xyz(range_mm, metadata):
-    """Points (…, h, w, 3), metres in the sensor frame, by the formulas of the sensor manual."""
+    """Points (…, h, w, 3), meters in the sensor frame, by the formulas of the sensor manual."""
     beams = metadata["beam_intrinsics"]
     width = metadata["lidar_data_format"]["columns_per_frame"]
     offset = beams["lidar_origin_to_beam_origin_mm"]

@@ -132,15 +132,15 @@ def test_coordinates_of_text_keep_their_digits(tmp_path):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("kind", ["u4", "f4"])
-def test_colours_are_the_bits_of_rgb(tmp_path, encoding, kind):
-    colours = RNG.integers(0, 256, (COUNT, 3))
-    packed = (colours @ [1 << 16, 1 << 8, 1]).astype("u4")
+def test_colors_are_the_bits_of_rgb(tmp_path, encoding, kind):
+    colors = RNG.integers(0, 256, (COUNT, 3))
+    packed = (colors @ [1 << 16, 1 << 8, 1]).astype("u4")
     values = packed if kind == "u4" else packed.view("f4")
     scan = read(
         tmp_path, encoded(encoding, [*"xyz", "rgb"], ["f4"] * 3 + [kind], [X, Y, Z, values])
     )
     found = np.stack([scan.columns[name] for name in ("red", "green", "blue")], axis=1)
-    np.testing.assert_array_equal(found, colours)
+    np.testing.assert_array_equal(found, colors)
     assert "rgb" not in scan.columns and "alpha" not in scan.columns
 
 
@@ -151,10 +151,10 @@ def test_alpha_is_kept_where_it_differs(tmp_path):
     assert scan.columns["alpha"].tolist() == [128, 255] and scan.columns["red"].tolist() == [255, 0]
 
 
-def test_the_first_files_of_pcl_have_colours_as_rounded_numbers(tmp_path):
+def test_the_first_files_of_pcl_have_colors_as_rounded_numbers(tmp_path):
     text = header([*"xyz", "rgb"], ["f4"] * 4, 2, "ascii")
     scan = read(tmp_path, text + b"0.93 0.34 0 4.2108e+06\n0.91 0.35 0 4.2108e+06\n")
-    assert scan.columns["red"].tolist() == [0x40, 0x40]  # a grey, 0x404040, in five digits
+    assert scan.columns["red"].tolist() == [0x40, 0x40]  # a gray, 0x404040, in five digits
 
 
 def test_the_viewpoint_is_the_pose_and_the_scanner(tmp_path):

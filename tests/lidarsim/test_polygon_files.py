@@ -224,7 +224,7 @@ def test_whatever_it_is_each_polygon_gives_triangles(points, scale):
     faces = cut(vertices)
     assert 1 <= len(faces) <= len(points) - 2
     assert all(len(set(face)) == 3 for face in faces.tolist())
-    # Its neighbours stay what they are.
+    # Its neighbors stay what they are.
     square = placed(SHAPES["square"])
     among = cut(np.concatenate([square, vertices, square]), 4, len(points), 4)
     np.testing.assert_array_equal(among[:2], [[0, 1, 2], [0, 2, 3]])

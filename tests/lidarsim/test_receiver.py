@@ -96,7 +96,7 @@ def test_what_is_measured_by_the_threshold_needs_one(field):
 # -- saturation ----------------------------------------------------------------------------------
 
 FULL = Noise(detection_range_m=FAR, saturation=50)  # as by a white wall at 44.7 m
-QUARTER = LIGHT_M_S * 1e-9 / 4  # metres of range by which an edge is off, for each ns of width
+QUARTER = LIGHT_M_S * 1e-9 / 4  # meters of range by which an edge is off, for each ns of width
 PULSES = ("ray", "range", "intensity", "amplitude", "pulse_width", "object")
 
 
@@ -195,7 +195,7 @@ def test_recorded_samples_are_clipped():
 
 # -- false alarms --------------------------------------------------------------------------------
 
-GATE = 150.0  # metres
+GATE = 150.0  # meters
 RATE = 1e5  # a second: 0.1 in a gate of 1 µs
 
 

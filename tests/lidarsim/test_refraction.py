@@ -216,7 +216,7 @@ def test_water_may_touch_its_basin(nadir_deg, backend):
 
 @pytest.mark.parametrize(("max_range_m", "count"), [(2.6, 0), (2.7, 1)])
 def test_greatest_ranges_are_optical(max_range_m, count):
-    """Two metres of water take as long as 2.66 m of air."""
+    """Two meters of water take as long as 2.66 m of air."""
     sensor = ray(max_range_m=max_range_m)
     water = box("Water", (-9, -9, -9), (9, 9, 9))
     floor = box("Floor", (-5, -5, -3), (5, 5, -2))

@@ -30,15 +30,15 @@ def world(scene):
     st.tuples(*[st.floats(-6e6, 6e6)] * 3),
     st.lists(st.tuples(*[st.floats(-500, 500)] * 3), min_size=1, max_size=5),
 )
-def test_world_coordinates_come_back(centre, offsets):
-    given = [triangle(at=np.add(centre, offset)) for offset in offsets]
+def test_world_coordinates_come_back(center, offsets):
+    given = [triangle(at=np.add(center, offset)) for offset in offsets]
     scene = Scene.from_meshes(given)
     expected = np.concatenate([mesh.vertices[mesh.faces] for mesh in given])
     np.testing.assert_allclose(world(scene), expected, rtol=0, atol=2e-9)
     np.testing.assert_array_equal(scene.origin, np.round(scene.origin))
-    if np.abs(centre).max() > 11_000:
+    if np.abs(center).max() > 11_000:
         assert np.abs(scene.vertices).max() < 1001
-    elif np.abs(centre).max() < 9_000:
+    elif np.abs(center).max() < 9_000:
         assert not scene.origin.any()
 
 

@@ -87,7 +87,7 @@ def test_tables_of_rays_come_back_as_the_same_rays(ending, tmp_path):
     assert np.array_equal(back.times_ns(later)[:, 0], file.rays.times_ns + round(back.cycle_ns))
 
 
-def test_starts_beside_the_centre_come_back(tmp_path):
+def test_starts_beside_the_center_come_back(tmp_path):
     sensor = load_sensor("velodyne/hdl64e-s2")
     file = export_sensor(sensor, tmp_path / "rays.npz", seconds=0.001)
     assert np.abs(file.rays.origins).max() > 0.01
@@ -492,7 +492,7 @@ def test_scanners_of_helios_come_back_as_the_same_sensor(name, tmp_path):
         expected *= 1e6 / 55.296 / 18_084
     assert np.abs(times - expected).max() < 500, "a line of the polygon lasts 5,000 pulses"
     assert (back.min_range_m, back.max_range_m) == (sensor.min_range_m, sensor.max_range_m)
-    if name == "channels":  # which start on the axis, above and below the centre
+    if name == "channels":  # which start on the axis, above and below the center
         heights = back.origins(firings)[..., 2] + mount.position[2]
         assert np.allclose(heights, sensor.origins(firings)[..., 2], atol=1e-9)
 
@@ -581,7 +581,7 @@ print(mid360.NAME, mid360.RATE_HZ, mid360.FRAMES, mid360.MAX_RANGE_M)
 
 @pytest.mark.parametrize("model", ["livox/mid360", "velodyne/hdl64e-s2"])
 def test_warp_casts_the_rays_of_a_python_file_as_we_do(model, tmp_path):
-    """On its CPU device, in one mesh; the origins of the second sensor are beside its centre."""
+    """On its CPU device, in one mesh; the origins of the second sensor are beside its center."""
     warp = pytest.importorskip("warp", reason="Warp is not installed: pip install warp-lang")
     from tests.warp_kernels import first_distances
 
@@ -598,7 +598,7 @@ def test_warp_casts_the_rays_of_a_python_file_as_we_do(model, tmp_path):
     arguments = [mesh.id, starts, rays, distances]
     warp.launch(first_distances, dim=len(origins), inputs=arguments, device="cpu")
     ours = RayCaster(vertices, faces, backend="numpy").cast(
-        file.rays.origins_or_centre, file.rays.directions
+        file.rays.origins_or_center, file.rays.directions
     )
     assert np.abs(distances.numpy() - ours.distance).max() < 1e-3  # no ray leaves the room
 
@@ -700,7 +700,7 @@ def test_rgl_rays_are_matrices_that_take_z_to_the_ray(tmp_path):
         }
         assert np.array_equal(arrays["ring_ids"], file.rays.channels)
         assert np.abs(arrays["time_offsets"] - file.rays.times_ns / 1e6).max() < 1e-5
-    ends = matrices @ [0, 0, 5, 1]  # five metres along the z axis
+    ends = matrices @ [0, 0, 5, 1]  # five meters along the z axis
     expected = file.rays.origins + 5 * file.rays.directions
     assert np.abs(ends - expected).max() < 1e-5
     rotations = matrices[:, :, :3]

@@ -1,4 +1,4 @@
-"""Planes of hundreds of kilometres: what no sensor can reach is left out, and no point changes."""
+"""Planes of hundreds of kilometers: what no sensor can reach is left out, and no point changes."""
 
 from __future__ import annotations
 

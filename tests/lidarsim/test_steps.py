@@ -214,7 +214,7 @@ class Aside(Everywhere):
 
 
 class Farther(Everywhere):
-    """Reports all ranges a metre longer."""
+    """Reports all ranges a meter longer."""
 
     role = Role.ON_REPORTED
 
@@ -259,7 +259,7 @@ def test_a_foreign_step_that_adds_returns_acts_before_some_are_selected(mode, ra
     echoes = points(Echo, mode=mode, subrays=subrays)
     assert echoes["range"] == pytest.approx(ranges * BEAMS, abs=1e-4)
     causes = {ADDED_M: 2, WALL_M: 0}
-    assert echoes["cause"].tolist() == [causes[metres] for metres in ranges] * BEAMS
+    assert echoes["cause"].tolist() == [causes[meters] for meters in ranges] * BEAMS
 
 
 @pytest.mark.parametrize("subrays", [1, 7])

@@ -144,7 +144,7 @@ def test_a_smooth_carrier_spins_and_turns_by_large_angles(degrees):
 
 
 def test_a_smooth_carrier_stays_where_a_log_pauses():
-    # At 200 Hz, 1 cm of noise is 2 m/s: a minute of that would be metres.
+    # At 200 Hz, 1 cm of noise is 2 m/s: a minute of that would be meters.
     times = np.append(np.arange(100) * 0.005, 60 + np.arange(100) * 0.005)
     noise = np.random.default_rng(1).normal(0, 0.01, (200, 3))
     track = Track(times, noise, np.tile([0, 0, 0, 1.0], (200, 1)), smooth=True)

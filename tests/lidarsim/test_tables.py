@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from lidarsim.base.tables import DEGREES, METRES, SECONDS, Quantity, column_name, read_table
+from lidarsim.base.tables import DEGREES, METERS, SECONDS, Quantity, column_name, read_table
 
 TIME = Quantity("time_s", ("time", "t"), SECONDS, None)
-RANGE = Quantity("range_m", ("range", "distance"), METRES, "m")
+RANGE = Quantity("range_m", ("range", "distance"), METERS, "m")
 JOINT = Quantity("Arm_1", (), DEGREES, "deg", exact=True)
 
 

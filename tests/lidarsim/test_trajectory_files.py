@@ -305,7 +305,7 @@ def test_ground_truth_of_euroc(tmp_path, first):
     ],
 )
 @pytest.mark.parametrize("name", ["drive.tum", "drive.txt", "drive.csv"])
-def test_tum_honours_the_order_of_its_header(tmp_path, remarks, columns, name):
+def test_tum_honors_the_order_of_its_header(tmp_path, remarks, columns, name):
     turn = dict(zip("xyzw", (0, 0, SINE, COSINE), strict=True))
     numbers = " ".join(str(turn[axis]) for axis in columns)
     (tmp_path / name).write_text("\n".join([*remarks, f"5 1 2 3 {numbers}", f"6 2 2 3 {numbers}"]))

@@ -269,7 +269,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     scene = Scene.from_meshes([quad(name, *corners) for name in ("Wall", "Pane")])
     surfaces = Surfaces(scene, survey.materials)
     caster = WeatherStep(setup_of(scene, survey, 0), None, surfaces)
-    # Sub-rays hit nothing, a wall, a pane, or a pane a metre before a wall.
+    # Sub-rays hit nothing, a wall, a pane, or a pane a meter before a wall.
     rng = np.random.default_rng(7)
     count = 1500
     what = rng.integers(0, 4, count * each)

@@ -231,7 +231,7 @@ ALL_ON = {
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("order", [1, -1])
 def test_layers_that_touch_each_other(backend, order):
-    """As voxels do: six of them side by side are one of six metres."""
+    """As voxels do: six of them side by side are one of six meters."""
     layers = [box(f"Voxel{x}", (x, -9, -9), (x + 1, 9, 9)) for x in range(2, 8)][::order]
     wall = box("Wall", (8, -9, -9), (10, 9, 9))
     materials = [Material("Voxel*", leaf_area_density=0.4), GROUND]
@@ -257,14 +257,14 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
     materials = []
     crowns = []
     for number in range(24):
-        centre = rng.uniform(-5, 5, 3)
+        center = rng.uniform(-5, 5, 3)
         radii = rng.uniform(0.8, 3, 3)
         inwards = np.array(unit.faces)[:, :: -1 if number % 4 == 0 else 1]
-        meshes.append(SceneMesh(f"C{number}", np.array(unit.vertices) * radii + centre, inwards))
+        meshes.append(SceneMesh(f"C{number}", np.array(unit.vertices) * radii + center, inwards))
         thick = float(rng.uniform(0.05, 0.4))
         kind = kinds[number % 3]
         materials.append(Material(f"C{number}", leaf_area_density=thick, leaf_angle=kind))
-        crowns.append((centre, radii, thick, kind))
+        crowns.append((center, radii, thick, kind))
     meshes.append(ball("Sky", 60.0, fineness=2))
     sensor = Sensor(Beams(np.radians(np.linspace(-75, 75, 30))), Spin(100, 360))
     places = rng.uniform(-6, 6, (8, 3))
@@ -275,8 +275,8 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
     variance = 0.0
     for place, batch in zip(places, rig.cast(0, 8), strict=True):
         tau = np.zeros(len(ahead))
-        for centre, radii, thick, kind in crowns:
-            start = (place - centre) / radii
+        for center, radii, thick, kind in crowns:
+            start = (place - center) / radii
             way = ahead / radii
             a = (way**2).sum(axis=1)
             b = way @ start

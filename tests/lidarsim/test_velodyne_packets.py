@@ -214,7 +214,7 @@ def decoded(groups, tmp_path):
     return points
 
 
-# Metres from the axis to the point ahead of it where all beams cross, by the makers' drawings.
+# Meters from the axis to the point ahead of it where all beams cross, by the makers' drawings.
 CROSSING_M = {
     "vlp16": 0.04191, "vlp16-hires": 0.04191, "vlp32c": 0.0424, "hdl32e": 0.02883,
     "vls128": 0.05863,

@@ -68,7 +68,7 @@ class Grid(NamedTuple):
 
     density: np.ndarray  # (nx, ny, nz): leaf area, 1/m
     low: np.ndarray  # (3,): corner with the least coordinates
-    size: float  # edge of a voxel, metres
+    size: float  # edge of a voxel, meters
 
 
 def optical_depth(grid, start, way, kind="spherical", steps=200_000, reach=60.0):

@@ -31,7 +31,7 @@ from lidarsim.simulator.points.batch_columns import columns_of
 from lidarsim.simulator.returns import PulseReturns
 from lidarsim.simulator.rig import Rig
 from lidarsim.simulator.steps.waveform import Digitizer, returns_in
-from lidarsim.simulator.steps.waveform_samples import digitised
+from lidarsim.simulator.steps.waveform_samples import digitized
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM
@@ -114,7 +114,7 @@ def test_a_slanted_wall_stretches_the_echo(waveform, degrees):
     spread_ns = 20 * math.tan(math.radians(degrees)) * 0.020 / 4 * 2 / LIGHT_M_NS
     width = FWHM * math.hypot(SIGMA_NS, spread_ns)
     assert len(echo["range"]) == 1
-    # The near side returns more, which moves the peak by some centimetres.
+    # The near side returns more, which moves the peak by some centimeters.
     assert echo["range"] == pytest.approx([20], abs=0.06 if degrees == 75 else 0.01)
     assert echo["pulse_width"] == pytest.approx([width], rel=0.02)
     energy = math.cos(math.radians(degrees)) / 4
@@ -278,13 +278,13 @@ def test_samples_are_rounded_to_the_smallest_step_that_holds_them(power):
     random = np.random.default_rng(7)
     samples = np.ldexp(random.uniform(-0.02, 1, (20, 16)) * random.uniform(1, 4, (20, 1)), power)
     samples[:3] *= -1  # noise below zero decides
-    steps, exponents = digitised(samples)
+    steps, exponents = digitized(samples)
     step = np.ldexp(1.0, exponents.astype(int))[:, None]
     assert np.all(np.abs((steps - 2048.0) * step - samples) <= step / 2)
     halves = samples / (step / 2)
     outside = (halves.max(axis=1) >= 65_535 - 2048) | (halves.min(axis=1) <= -2048)
     assert np.all(outside | (exponents == -126))
-    assert digitised(np.zeros((1, 4)))[0].tolist() == [[2048] * 4]
+    assert digitized(np.zeros((1, 4)))[0].tolist() == [[2048] * 4]
 
 
 @pytest.mark.extended

@@ -94,7 +94,7 @@ def normal(seed: int, purpose: Purpose, key: Key, number: int = 0) -> float:
 
 
 @cache
-def neighbours(subrays: int) -> list[tuple[int, int]]:
+def neighbors(subrays: int) -> list[tuple[int, int]]:
     """Pairs of sub-rays with no other in their circle: none sees them at an obtuse angle."""
     places = [complex(*place) for place in Beam.from_divergences(subrays, (2.0, 2.0)).angles]
     return [
@@ -119,7 +119,7 @@ def continues(one: Hit, other: Hit, gap: float) -> bool:
 def bridged(hits: list[Hit], gap: float, subrays: int) -> set[int]:
     """Hits that are one return with the hit before, as a surface continues across them.
 
-    Neighbouring sub-rays are compared where their light has passed equally many panes.
+    Neighboring sub-rays are compared where their light has passed equally many panes.
     """
     placed: dict[tuple[int, int], int] = {}  # {(sub-ray, panes): number of the hit}
     met: Counter[int] = Counter()
@@ -128,7 +128,7 @@ def bridged(hits: list[Hit], gap: float, subrays: int) -> set[int]:
             placed[hit.subray, met[hit.subray]] = number
             met[hit.subray] += 1
     within: set[int] = set()
-    for one, other in neighbours(subrays):
+    for one, other in neighbors(subrays):
         for panes in range(min(met[one], met[other])):
             i, j = sorted((placed[one, panes], placed[other, panes]))
             if continues(hits[i], hits[j], gap):
@@ -331,8 +331,8 @@ def veiled(distance: float, boxes: Boxes, extinction: float) -> float:
 class FogCells(NamedTuple):
     """Cells of fog along a beam."""
 
-    begin: float  # range of the first cell, metres
-    cell: float  # length of a cell, metres
+    begin: float  # range of the first cell, meters
+    cell: float  # length of a cell, meters
     # Rows are the probabilities, cumulative, that the highest of so many cells is each.
     peaks: Floats
 

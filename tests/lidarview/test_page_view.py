@@ -30,7 +30,7 @@ from lidarpool.showing.pages.opened import open_views
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import header, row_type
 from lidarsim.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Z
-from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.picture_file import (
@@ -40,7 +40,7 @@ from lidarview.picture_file import (
     PlanningPicture,
     SensorPositions,
 )
-from lidarview.render.colouring import colours_of as colouring_of
+from lidarview.render.coloring import colors_of as coloring_of
 from lidarview.viewer import point_selection as points
 from lidarview.viewer.legends import legend_of
 from lidarview.viewer.point_selection import (
@@ -54,7 +54,7 @@ from lidarview.viewer.point_selection import (
 )
 from lidarview.viewer.range_pictures import range_image
 from lidarview.viewer.result_views import open_result, open_results, show_view
-from lidarview.viewer.shown_surface import ShownSurface, colours_for
+from lidarview.viewer.shown_surface import ShownSurface, colors_for
 from lidarview.viewer.view import Downloads, View
 
 POSES = 25
@@ -113,7 +113,7 @@ def test_what_is_no_result_is_refused(tmp_path):
 
 @pytest.fixture(scope="module")
 def pictured():
-    """Return a room with a roof, 6 by 8 by 3 metres, far from zero, scanned from 25 poses."""
+    """Return a room with a roof, 6 by 8 by 3 meters, far from zero, scanned from 25 poses."""
     room = trimesh.creation.box(bounds=[(0, 0, 0), (6, 8, 3)])
     faces = np.int32(room.faces)
     scene = Scene(np.array(room.vertices), faces, np.zeros(12, np.int32), ("room",), ORIGIN)
@@ -128,7 +128,7 @@ def pictured():
         PlanningPicture(
             start=(1.0, 1.0),
             target=(5.0, 7.0),
-            centres=np.array([[1.0, 6.0]]),
+            centers=np.array([[1.0, 6.0]]),
             radii=np.array([0.5]),
             best=PlannedPath(np.array([[1.0, 1.0], [5.0, 7.0]]), 7.2, 7.2, 1.0),
         ),
@@ -161,7 +161,7 @@ def told(view, what, **asked):
 
 def places(view, **asked):
     """Positions (n, 3) of the points that the page is given, local."""
-    return told(view, "points", **{"colour": "z", "most": ALL, **asked})[1]["positions"]
+    return told(view, "points", **{"color": "z", "most": ALL, **asked})[1]["positions"]
 
 
 def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
@@ -169,36 +169,36 @@ def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
     state, arrays = told(view, "state")
     assert (state["title"], state["points"]) == ("a room", 10_000)
     assert state["origin"] == ORIGIN.tolist()
-    assert [*state["scene_colours"]] == ["grey", "hits", "object", "normals"]
+    assert [*state["scene_colors"]] == ["gray", "hits", "object", "normals"]
     assert arrays["sensor0_places"].shape == (POSES, 3)
     assert arrays["rays"].shape == (18, 2, 3)
     assert state["path"] == {"corners": [[1, 1], [5, 7]], "discs": [[1, 6, 0.5]]}
-    points, arrays = told(view, "points", colour="object", most=ALL, filter="scan,10,19")
+    points, arrays = told(view, "points", color="object", most=ALL, filter="scan,10,19")
     assert (points["count"], len(arrays["rows"])) == (1000, 1000)
     assert [name for name, *_ in points["legend"]["labels"]] == ["room"]
     world = [view.points.values(axis, arrays["rows"]) for axis in "xyz"]
     assert np.allclose(arrays["positions"] + ORIGIN, np.stack(world, axis=1))
 
 
-def test_colours_are_those_of_the_legend_whatever_is_shown(cloud, pictured):
+def test_colors_are_those_of_the_legend_whatever_is_shown(cloud, pictured):
     view = View(CloudFile(cloud), pictured)
-    whole, arrays = told(view, "points", colour="z", most=ALL)
-    some, part = told(view, "points", colour="z", most=ALL, scans="50-59")
+    whole, arrays = told(view, "points", color="z", most=ALL)
+    some, part = told(view, "points", color="z", most=ALL, scans="50-59")
     assert some["legend"] == whole["legend"]
     assert part["rows"].tolist() == list(range(5000, 6000))
-    assert np.array_equal(part["colours"], arrays["colours"][5000:6000])
+    assert np.array_equal(part["colors"], arrays["colors"][5000:6000])
     low, *_, high = whole["legend"]["marks"]
     assert (low, high) == ("0.0", "3.0")
 
 
-def test_points_are_shown_in_their_own_colours(tmp_path):
+def test_points_are_shown_in_their_own_colors(tmp_path):
     rows = np.zeros(300, [*((a, "<f8") for a in "xyz"), *((c, "|u1") for c in ("red", "green"))])
     rows["x"] = np.arange(300)
     rows["red"] = np.arange(300) % 256
     rows["green"] = 9
     path = tmp_path / "cloud.ply"
     path.write_bytes(header(rows.dtype, 300) + rows.tobytes())
-    assert "rgb" not in told(open_result(path), "state")[0]["colours"], "blue is missing"
+    assert "rgb" not in told(open_result(path), "state")[0]["colors"], "blue is missing"
     rgb = np.dtype([*rows.dtype.descr, ("blue", "|u1")])
     more = np.zeros(300, rgb)
     for name in rows.dtype.names:
@@ -207,24 +207,24 @@ def test_points_are_shown_in_their_own_colours(tmp_path):
     path.write_bytes(header(rgb, 300) + more.tobytes())
     view = open_result(path)
     state = told(view, "state")[0]
-    assert state["colours"][0] == "z" and state["colours"][-1] == "rgb"
+    assert state["colors"][0] == "z" and state["colors"][-1] == "rgb"
     assert "rgb" not in [column["name"] for column in state["columns"]], "no column to filter by"
-    answer, arrays = told(view, "points", colour="rgb", most=ALL, filter="x,10,19")
-    assert arrays["colours"].tolist() == [[k, 9, 200, 255] for k in range(10, 20)]
-    assert answer["legend"]["title"] == "colours of the surfaces"
+    answer, arrays = told(view, "points", color="rgb", most=ALL, filter="x,10,19")
+    assert arrays["colors"].tolist() == [[k, 9, 200, 255] for k in range(10, 20)]
+    assert answer["legend"]["title"] == "colors of the surfaces"
 
 
-def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
+def test_surfaces_have_the_colors_that_are_asked_for(cloud, pictured):
     view = View(CloudFile(cloud), pictured)
-    grey, arrays = told(view, "surface", colour="grey")
+    gray, arrays = told(view, "surface", color="gray")
     assert arrays["corners"].shape == (12, 3, 3)
-    assert "colours" not in arrays  # the page has its own, light or dark
-    assert grey["legend"] is None
-    assert grey["roof_cut"] == pytest.approx(2)  # halfway up from the sensors
-    hits, arrays = told(view, "surface", colour="hits")
-    assert "hits per square metre" in hits["legend"]["title"]
-    assert arrays["colours"].shape == arrays["corners"].shape
-    objects, arrays = told(view, "surface", colour="object")
+    assert "colors" not in arrays  # the page has its own, light or dark
+    assert gray["legend"] is None
+    assert gray["roof_cut"] == pytest.approx(2)  # halfway up from the sensors
+    hits, arrays = told(view, "surface", color="hits")
+    assert "hits per square meter" in hits["legend"]["title"]
+    assert arrays["colors"].shape == arrays["corners"].shape
+    objects, arrays = told(view, "surface", color="object")
     assert objects["legend"]["labels"][0][0] == "room"
     assert set(arrays["objects"].tolist()) == {0}
 
@@ -254,15 +254,13 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     scene = Scene.from_meshes([box("Hall", (8, 8, 8)), box("Table", (2, 2, 2))])
     half = np.sqrt(0.5)
     track = Track([0, 2], [[1, 1, 0], [5, 1, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
-    cart = replace(box("Cart", (1, 1, 1)), colours=Colours.plain(np.uint8([[[9, 8, 7]]]), 12))
+    cart = replace(box("Cart", (1, 1, 1)), colors=Colors.plain(np.uint8([[[9, 8, 7]]]), 12))
     scene = replace(scene, actors=(Actor(cart, track),))
     view = View(CloudFile(cloud), seen(scene, [[20, 0, 1]]))
     state, arrays = told(view, "state")
     assert (state["actors"], state["statics"]) == ([{"name": "Cart", "class": None}], 2)
-    assert len(state["actor_colours"]) == 1
-    assert (
-        arrays["mesh0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene_colours"]
-    )
+    assert len(state["actor_colors"]) == 1
+    assert arrays["mesh0_colors"].tolist() == [[9, 8, 7]] * 36 and "color" in state["scene_colors"]
     assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
     assert arrays["actor0_places"][[0, -1]] == pytest.approx(np.array([[1, 1, 0], [5, 1, 0]]))
     assert np.abs(arrays["actor0_turns"][-1]) == pytest.approx([0, 0, half, half])
@@ -294,7 +292,7 @@ def test_without_pictures_sensors_and_sweeps_are_still_shown(tmp_path, spun):
     view = open_result(tmp_path)
     state, arrays = told(view, "state")
     assert state["title"].startswith(tmp_path.name)
-    assert (len(state["sensors"]), state["scene_colours"]) == (1, None)
+    assert (len(state["sensors"]), state["scene_colors"]) == (1, None)
     assert arrays["sensor0_places"] == pytest.approx(spun.pose.positions)
     assert arrays["sweep_begins"] == pytest.approx(spun.begins_ns / 1e9)
     first, last = arrays["sweep_scans"][1:3]
@@ -330,7 +328,7 @@ def test_points_are_colored_filtered_and_played_by_station(tmp_path, spun):
     state, arrays = told(view, "state")
     assert state["stations"] == ["", "station 1", "station 2"]
     assert arrays["sweep_station"].tolist() == [1, 2]
-    legend = told(view, "points", colour="station", most=ALL)[0]["legend"]
+    legend = told(view, "points", color="station", most=ALL)[0]["legend"]
     assert [(name, value) for name, _, value in legend["labels"]] == [
         ("station 1", 1), ("station 2", 2),
     ]  # fmt: skip
@@ -381,13 +379,13 @@ def result_in(folder, sweeps):
     return folder
 
 
-def test_several_results_are_one_view_with_a_colour_each_and_are_played_together(tmp_path, spun):
+def test_several_results_are_one_view_with_a_color_each_and_are_played_together(tmp_path, spun):
     both = [result_in(tmp_path / name, spun) for name in ("before", "after")]
     view = open_results(both)
     state, _ = told(view, "state")
     assert [name for name, *_ in state["results"]] == ["before", "after"]
     assert state["title"].startswith("before and after")
-    legend = told(view, "points", colour="result", most=ALL)[0]["legend"]
+    legend = told(view, "points", color="result", most=ALL)[0]["legend"]
     assert legend["labels"] == state["results"]
     one = open_result(both[0])
     assert len(view.points) == 2 * len(one.points)
@@ -397,7 +395,7 @@ def test_several_results_are_one_view_with_a_colour_each_and_are_played_together
         assert sorted(of_both.tolist()) == sorted(2 * of_one.tolist()), asked
         last = f"{asked.get('filter', 'x,-9,9')};result,1,1"
         assert places(view, **(asked | {"filter": last})).tolist() == of_one.tolist(), asked
-    rows = told(view, "points", colour="scan", most=ALL)[1]["rows"]
+    rows = told(view, "points", color="scan", most=ALL)[1]["rows"]
     again = [one.points.values("scan", slice(None))] * 2
     assert view.points.values("scan", rows).tolist() == np.concatenate(again).tolist()
     point = told(view, "point", row=len(view.points) - 1)[0]["columns"]
@@ -491,13 +489,13 @@ def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, p
     survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")
     view = View(CloudFile(cloud), pictured, Sweeps.from_survey(survey, scene))
     state, arrays = told(view, "state")
-    assert (state["scene_colours"], "axes of their sensor" in state["note"]) == (None, True)
+    assert (state["scene_colors"], "axes of their sensor" in state["note"]) == (None, True)
     assert not arrays["sensor0_places"].any()  # each sensor is at its own origin
     assert len(pictured.sample_rays) and not len(arrays["rays"]), "which are in the scene's axes"
     assert ["Wall", 0] in told(view, "column", name="object")[0]["labels"]
 
 
-def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
+def test_columns_of_other_programs_can_be_colored_and_filtered_by(tmp_path):
     """A cloud without scans, far from zero, with columns of one value or none."""
     rows = np.zeros(20, [*((a, "<f8") for a in "xyz"), ("their", "<f4"), ("2-a", "|u1"),
                          ("nothing", "<f4"), ("big", "<f8")])  # fmt: skip
@@ -517,7 +515,7 @@ def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
     for name in names:
         limits, _ = told(view, "column", name=name)
         assert limits["low"] <= limits["high"]
-        points, arrays = told(view, "points", colour=name, most=ALL)
+        points, arrays = told(view, "points", color=name, most=ALL)
         assert (points["count"], len(arrays["positions"])) == (20, 20)
         assert np.abs(arrays["positions"]).max() < 1
     assert len(places(view, filter="their,3,5")) == 3
@@ -534,7 +532,7 @@ def test_causes_and_no_surface_are_told_in_words(tmp_path, pictured):
         causes = [["surface", 0], ["air", 1]]
         assert told(view, "column", name="cause")[0] == {"labels": causes}
         assert told(view, "column", name="object")[0]["labels"][0] == ["no surface", -1]
-        legend = told(view, "points", colour="cause", most=ALL)[0]["legend"]
+        legend = told(view, "points", color="cause", most=ALL)[0]["legend"]
         assert [[name, value] for name, _, value in legend["labels"]] == causes
         words = dict(told(view, "point", row=0)[0]["columns"])
         assert (words["object"], words["cause"]) == ("no surface", "air")
@@ -557,7 +555,7 @@ def test_labels_are_counted_and_switched_off(tmp_path, monkeypatch):
     view = View(CloudFile(tmp_path / "c.ply"))
     counts, _ = view.answer("counts", {"name": "class"}, bool)
     assert counts == {"counts": [(0, 3000), (1, 3000), (2, 3000)], "exact": True}
-    asked = {"colour": "class", "most": "9000", "filter": "!class,1,1;!class,2,2;x,0,2999"}
+    asked = {"color": "class", "most": "9000", "filter": "!class,1,1;!class,2,2;x,0,2999"}
     told, arrays = view.answer("points", asked, bool)
     assert told["count"] == 1000 and set(arrays["rows"] % 3) == {0}
     assert [label[2] for label in told["legend"]["labels"]] == [0, 1, 2], "all can be switched on"
@@ -568,21 +566,21 @@ def test_labels_are_counted_and_switched_off(tmp_path, monkeypatch):
         view.answer("counts", {"name": "x"}, bool)
 
 
-def test_normals_are_colours_of_points_and_of_the_scene(tmp_path, cloud, pictured):
+def test_normals_are_colors_of_points_and_of_the_scene(tmp_path, cloud, pictured):
     names = ("normal_x", "normal_y", "normal_z")
     normals = [[1, 0, 0], [0, -1, 0], [0, 0, 1], [np.nan] * 3]
     columns = dict(zip(names, np.array(normals, np.float32).T, strict=True))
     view = View(HeldPoints(Cloud(np.zeros((4, 3)), columns)))
-    told, arrays = view.answer("points", {"colour": "normals", "most": "9"}, bool)
-    shown = arrays["colours"][:, :3].tolist()
+    told, arrays = view.answer("points", {"color": "normals", "most": "9"}, bool)
+    shown = arrays["colors"][:, :3].tolist()
     assert shown == [[255, 128, 128], [128, 0, 128], [128, 128, 255], [128, 128, 128]]
     assert "x red, y green, z blue" in told["legend"]["title"]
-    surface = View(CloudFile(cloud), pictured).answer("surface", {"colour": "normals"}, bool)[1]
-    assert not surface["colours"].std(axis=1).any(), "of flat faces"
+    surface = View(CloudFile(cloud), pictured).answer("surface", {"color": "normals"}, bool)[1]
+    assert not surface["colors"].std(axis=1).any(), "of flat faces"
     edges = np.diff(surface["corners"][:, [0, 1, 2]], axis=1)
     across = np.abs(np.cross(edges[:, 0], edges[:, 1])).argmax(axis=1)
-    far_from_grey = np.abs(surface["colours"][:, 0].astype(int) - 128).argmax(axis=1)
-    assert (across == far_from_grey).all()
+    far_from_gray = np.abs(surface["colors"][:, 0].astype(int) - 128).argmax(axis=1)
+    assert (across == far_from_gray).all()
 
 
 def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkeypatch):
@@ -609,20 +607,20 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
     assert np.allclose(corners.max(axis=0), scene.vertices.max(axis=0), atol=0.5)
     first = scene.face_object == 0  # of six objects, far from each other
-    arrays, legend = surface.coloured("hits", np.where(first, 3, 0), NOWHERE)
+    arrays, legend = surface.colored("hits", np.where(first, 3, 0), NOWHERE)
     corners = arrays["corners"]
-    colours = arrays["colours"]
+    colors = arrays["colors"]
     middles = corners.mean(axis=1)
     low, high = scene.object_bounds[0]
     there = ((middles > low - 1) & (middles < high + 1)).all(axis=1)
-    vivid = (np.ptp(colours.astype(int), axis=2) > 40).any(axis=1)
+    vivid = (np.ptp(colors.astype(int), axis=2) > 40).any(axis=1)
     assert vivid[there].mean() > 0.9
     assert not vivid[~there].any()
-    assert "hits per square metre" in legend["title"]
+    assert "hits per square meter" in legend["title"]
     assert len(ShownSurface(scene).corners) == len(scene.faces)  # few enough
 
 
-def test_a_scene_is_coloured_by_the_materials_of_its_faces(tmp_path):
+def test_a_scene_is_colored_by_the_materials_of_its_faces(tmp_path):
     """Those of faces and of instances, also simplified, and read back from a result."""
     square, faces = np.array([[0, 0, 0], [4, 0, 0], [4, 4, 0], [0, 4, 0]]), [[0, 1, 2], [0, 2, 3]]
     named = FaceMaterials(("Brick", "Glass"), np.array([0, 1], np.int32))
@@ -640,41 +638,39 @@ def test_a_scene_is_coloured_by_the_materials_of_its_faces(tmp_path):
     content = PictureContent.load(tmp_path / "pictures.npz")
     view = View(HeldPoints(Cloud(np.ones((3, 3)), {})), content)
     header, _ = view.answer("state", {}, bool)
-    assert "material" in header["scene_colours"]
-    header, arrays = view.answer("surface", {"colour": "material"}, bool)
+    assert "material" in header["scene_colors"]
+    header, arrays = view.answer("surface", {"color": "material"}, bool)
     assert [name for name, *_ in header["legend"]["labels"]] == ["no material", "Brick", "Glass"]
-    colours = {value: colour for _, colour, value in header["legend"]["labels"]}
-    shown = arrays["colours"][:, 0].tolist()
-    assert shown == [colours[material] for material in expected]
-    assert len({*map(tuple, colours.values())}) == 3
+    colors = {value: color for _, color, value in header["legend"]["labels"]}
+    shown = arrays["colors"][:, 0].tolist()
+    assert shown == [colors[material] for material in expected]
+    assert len({*map(tuple, colors.values())}) == 3
     plain = Scene.from_meshes([floor])
     content, _ = PictureContent.before_casting(plain, survey)
     assert content.face_materials is None
-    assert "material" not in colours_for(plain, None, content.face_materials)
+    assert "material" not in colors_for(plain, None, content.face_materials)
 
 
-def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
+def test_a_scene_is_colored_by_the_reflectance_of_its_objects():
     scene = Scene.from_meshes([box("White", (1, 1, 1)), box("Black", (2, 2, 2))])
     share = np.array([1.0, 0.0])
-    assert colours_for(scene, share) == ("grey", "hits", "object", "normals", "reflectance")
-    assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object", "normals")
-    arrays, legend = ShownSurface(scene, share).coloured("reflectance", share, NOWHERE)
-    colours = arrays["colours"]
-    assert np.unique(colours[scene.face_object == 0]).tolist() == [255]
-    assert colours[scene.face_object == 1].max() < 40
+    assert colors_for(scene, share) == ("gray", "hits", "object", "normals", "reflectance")
+    assert colors_for(scene, np.array([0.5, 0.5])) == ("gray", "hits", "object", "normals")
+    arrays, legend = ShownSurface(scene, share).colored("reflectance", share, NOWHERE)
+    colors = arrays["colors"]
+    assert np.unique(colors[scene.face_object == 0]).tolist() == [255]
+    assert colors[scene.face_object == 1].max() < 40
     assert legend["title"] == "reflectance"
 
 
-def colours_of(*arguments):
-    """Colours (n, 3) as bytes, and the legend as JSON."""
-    coloured = colouring_of(*arguments)
-    return as_bytes(coloured.paint(arguments[0])), json.dumps(
-        legend_of(coloured), ensure_ascii=False
-    )
+def colors_of(*arguments):
+    """Colors (n, 3) as bytes, and the legend as JSON."""
+    colored = coloring_of(*arguments)
+    return as_bytes(colored.paint(arguments[0])), json.dumps(legend_of(colored), ensure_ascii=False)
 
 
 def test_the_middle_of_a_bar_about_zero_is_zero_without_a_sign():
-    legend = colours_of(np.linspace(-8, 7.98, 200), Z)[1]
+    legend = colors_of(np.linspace(-8, 7.98, 200), Z)[1]
     assert json.loads(legend)["marks"] == ["-8", "0", "8"]
 
 
@@ -682,36 +678,36 @@ def test_the_middle_of_a_bar_about_zero_is_zero_without_a_sign():
     ("span_ns", "told"), [(2e9, "time, s:"), (3e7, "time, ms:"), (50, "time, ns:")]
 )
 def test_times_are_told_in_a_unit_that_can_be_read(span_ns, told):
-    legend = colours_of(np.linspace(0, span_ns, 200).astype(np.int64), TABLE["time"])[1]
+    legend = colors_of(np.linspace(0, span_ns, 200).astype(np.int64), TABLE["time"])[1]
     assert told in legend
     assert ('"1.0"' in legend) == (span_ns == 2e9)
 
 
-def test_what_is_no_surface_is_grey_and_has_no_object_s_colour():
+def test_what_is_no_surface_is_gray_and_has_no_object_s_color():
     values = np.arange(200, dtype=np.int32) % 3 - 1
-    colours, legend = colours_of(values, OBJECT, ("Ball", "Box"))
-    assert (colours[values < 0] == 128).all()
-    assert not (colours[values >= 0] == 128).all(axis=1).any()
+    colors, legend = colors_of(values, OBJECT, ("Ball", "Box"))
+    assert (colors[values < 0] == 128).all()
+    assert not (colors[values >= 0] == 128).all(axis=1).any()
     assert '["no surface", [128, 128, 128], -1]' in legend
     own = Column("zone", "int32", "", "zone", kind="label")
-    assert "no surface" not in colours_of(values, own)[1]
+    assert "no surface" not in colors_of(values, own)[1]
     many = tuple(f"thing {number}" for number in range(1100))
-    assert '"thing 99"' in colours_of(np.arange(100), OBJECT, many)[1]
-    assert '"more": 100' in colours_of(np.arange(1100), OBJECT, many)[1]
+    assert '"thing 99"' in colors_of(np.arange(100), OBJECT, many)[1]
+    assert '"more": 100' in colors_of(np.arange(1100), OBJECT, many)[1]
     often = np.append(np.arange(100), np.full(9, 73))
-    assert "thing 73" in colours_of(often, OBJECT, many)[1]
+    assert "thing 73" in colors_of(often, OBJECT, many)[1]
 
 
 @pytest.mark.extended(every=6)
 @pytest.mark.parametrize("column", TABLE.values(), ids=lambda column: column.name)
 def test_every_column_takes_no_points_equal_ones_and_its_largest(column):
     dtype = np.dtype(column.dtype)
-    assert colours_of(np.zeros(0, dtype), column)[0].shape == (0, 3)
-    same, legend = colours_of(np.ones(5, dtype), column, ("Ball",))
+    assert colors_of(np.zeros(0, dtype), column)[0].shape == (0, 3)
+    same, legend = colors_of(np.ones(5, dtype), column, ("Ball",))
     assert len(np.unique(same, axis=0)) == 1
     assert "nan" not in legend
     if dtype.kind in "iu":
-        assert colours_of(np.array([0, np.iinfo(dtype).max], dtype), column)[0].shape == (2, 3)
+        assert colors_of(np.array([0, np.iinfo(dtype).max], dtype), column)[0].shape == (2, 3)
 
 
 ALL_ROWS = slice(None)
@@ -722,7 +718,7 @@ def along_y(y=0.0, parallel=False):
     view = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, y], [0, 0, 0, 1]])
     near = 0.1
     far = 1000.0
-    if parallel:  # 10 metres high
+    if parallel:  # 10 meters high
         lens = np.diag([1 / 10, 1 / 5, -2 / (far - near), 1.0])
         lens[2, 3] = -(far + near) / (far - near)
     else:
@@ -769,7 +765,7 @@ def test_a_filter_keeps_what_is_within_all_limits():
 
 @pytest.fixture
 def file(tmp_path, monkeypatch):
-    """Return a file of 100,000 points along y, from 1 to 100 metres, in blocks of 1,000."""
+    """Return a file of 100,000 points along y, from 1 to 100 meters, in blocks of 1,000."""
     monkeypatch.setattr(points, "BLOCK_ROWS", 1000)
     rows = np.zeros(100_000, row_type(np.dtype(np.float32), (SCAN, TABLE["intensity"])))
     random = np.random.default_rng(0)

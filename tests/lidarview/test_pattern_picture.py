@@ -15,7 +15,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def headings(page):
-    """Headings of the charts of a page, without its colour bar."""
+    """Headings of the charts of a page, without its color bar."""
     return [text for axes in page.figure.axes if (text := axes.get_title(loc="left"))]
 
 
@@ -38,7 +38,7 @@ def test_a_pattern_that_repeats_is_drawn_once():
     page = pattern_page(Sensor.grid(360, 4, 20, rate_hz=10))
     assert headings(page) == [
         "one revolution",
-        "the first 8 firings, 1,944 µs, from the first colour on",
+        "the first 8 firings, 1,944 µs, from the first color on",
         "after 0.1, 0.5, 2 s: the same directions",
     ]
 

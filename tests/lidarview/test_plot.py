@@ -157,7 +157,7 @@ def test_a_damaged_file_is_refused(damage, said, result):
 
 
 @pytest.mark.extended
-def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkeypatch):
+def test_the_cloud_is_colored_by_any_of_its_columns(unplanned, tmp_path, monkeypatch):
     wet = Column("wetness", "float32", "%", "how wet it is", source="wetness")
     shown = replace(unplanned, extra_columns=[replace(wet, source="")])
     result = make(tmp_path / "result", shown)
@@ -169,13 +169,13 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
     figures = []
     monkeypatch.setattr(Page, "save", lambda page, path: figures.append(page.figure))
     for name in ("z", "wetness", "object", "ring", "x", "y"):
-        plot(result, "--only", "cloud", "--colour", name, *SMALL)
+        plot(result, "--only", "cloud", "--color", name, *SMALL)
     assert [figure.axes[0].get_ylabel() for figure in figures[:2]] == ["z (m)", "wetness (%)"]
     assert [figure.axes[0].get_ylabel() for figure in figures[4:]] == ["x (m)", "y (m)"]
     keys = [[t.get_text() for t in figure.legends[0].get_texts()] for figure in figures[2:4]]
     assert [key[0] for key in keys] == ["a\ufffd", "channel 0"]
     with pytest.raises(LidarError, match=r"no column 'wettness'\. Did you mean 'wetness'"):
-        plot(result, "--only", "cloud", "--colour", "wettness")
+        plot(result, "--only", "cloud", "--color", "wettness")
 
 
 @pytest.mark.extended
@@ -231,7 +231,7 @@ def test_a_picture_takes_the_place_of_a_link(tmp_path):
 
 
 @pytest.mark.extended
-def test_intensity_and_true_colour_are_drawn(unplanned, tmp_path):
+def test_intensity_and_true_color_are_drawn(unplanned, tmp_path):
     result = make(tmp_path / "result", unplanned)
     at = unplanned.scene.vertices
     zeros = np.zeros(len(at), np.int32)
@@ -240,7 +240,7 @@ def test_intensity_and_true_colour_are_drawn(unplanned, tmp_path):
     columns |= {"intensity": zeros + 1.0, "red": byte, "green": byte}
     save_cloud(Cloud(at, columns), result / "cloud.ply")
     with pytest.raises(LidarError, match="no column 'rgb'"):
-        plot(result, "--only", "cloud", "--colour", "rgb", *SMALL)
+        plot(result, "--only", "cloud", "--color", "rgb", *SMALL)
     save_cloud(Cloud(at, columns | {"blue": byte}), result / "cloud.ply")
-    plot(result, "--only", "intensity", "--only", "cloud", "--colour", "rgb", *SMALL)
+    plot(result, "--only", "intensity", "--only", "cloud", "--color", "rgb", *SMALL)
     assert {"intensity.png", "cloud.png"} <= names(result)

@@ -241,7 +241,7 @@ def test_a_page_holds_all_that_it_asks_for_and_names_no_other_file(drive):
     page = page_of(open_result(drive))
     held = answers(page)
     assert held["state?"]["points"] == COUNT and held["state?"]["offline"]
-    assert {"column?name=z", "column?name=channel", "surface?colour=grey"} < {*held}
+    assert {"column?name=z", "column?name=channel", "surface?color=gray"} < {*held}
     view = open_result(drive)
     for axis, name in enumerate("xyz"):
         exact = np.sort(view.points.values(name, slice(None)) - view.origin[axis])
@@ -249,7 +249,7 @@ def test_a_page_holds_all_that_it_asks_for_and_names_no_other_file(drive):
         assert np.abs(held_values - exact).max() < 1e-4 * np.ptp(exact) + 1e-3
     scans = unpacked_column(held["cloud?"], "scan")
     assert np.array_equal(np.sort(scans), np.sort(view.points.values("scan", slice(None))))
-    for name in held["state?"]["colours"]:
+    for name in held["state?"]["colors"]:
         assert held["cloud?"]["legends"][name]
         assert {f"{name} scale", f"{name} palette"} & {*held["cloud?"]["arrays"]}
     assert not re.search(rb'(src|href)="(?!data:)', page) and b'from "./' not in page

@@ -23,13 +23,13 @@ from lidarpool.report.picture_content import planning_picture
 from lidarpool.report.result_pictures import draw_path
 from lidarsim.columns.table import AXES, TABLE, X, Z
 from lidarsim.scene.shapes import seed_objects
-from lidarview.render.colouring import TURBO, colours_of
+from lidarview.render.coloring import TURBO, colors_of
 from lidarview.render.hit_density import hit_density
 from lidarview.render.pictures import draw_cloud, draw_hits, draw_scene, with_points
 from lidarview.render.shot import GROUND, SKY, take_shot
 from lidarview.render.stage import make_axis, nice_step
 from lidarview.render.surface import separate_objects
-from lidarview.render.theme import object_colours
+from lidarview.render.theme import object_colors
 
 SIZE = (320, 200)
 LEFT = slice(0, int(0.8 * SIZE[0]))  # columns beside the legend
@@ -61,35 +61,35 @@ def pixels(tmp_path):
     return pixels
 
 
-def colourful(image):
-    """Number of pixels that are no shade of grey."""
+def colorful(image):
+    """Number of pixels that are no shade of gray."""
     return int((np.ptp(image, axis=2) > 40).sum())
 
 
 @pytest.mark.extended
-def test_the_scene_shows_every_object_in_its_colour(pixels, shot):
+def test_the_scene_shows_every_object_in_its_color(pixels, shot):
     image = pixels(draw_scene, shot, 9)
-    for colour in object_colours(6):
+    for color in object_colors(6):
         hue = image / np.maximum(image.max(axis=2, keepdims=True), 1)
-        alike = np.abs(hue - colour / colour.max()).max(axis=2) < 0.06
+        alike = np.abs(hue - color / color.max()).max(axis=2) < 0.06
         assert alike[:, LEFT].sum() > 8
 
 
 @pytest.mark.extended
-def test_hits_colour_what_was_hit_and_only_that(pixels, scene):
+def test_hits_color_what_was_hit_and_only_that(pixels, scene):
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     hits = np.zeros(len(scene.faces), np.int64)
-    assert colourful(pixels(draw_hits, shot, hits, NOWHERE, NONE)[:, LEFT]) < 10
+    assert colorful(pixels(draw_hits, shot, hits, NOWHERE, NONE)[:, LEFT]) < 10
     hits[scene.face_object == 0] = 50
     plot = pixels(draw_hits, shot, hits, NOWHERE, NONE)[:, LEFT]
     right = shot.camera.project(scene.object_bounds[0])[0][:, 0].max()
-    assert colourful(plot) > 30
-    assert colourful(plot[:, int(right) + 20 :]) == 0, "the five other objects stay grey"
+    assert colorful(plot) > 30
+    assert colorful(plot[:, int(right) + 20 :]) == 0, "the five other objects stay gray"
 
 
 @pytest.mark.extended
 def test_hits_on_a_wall_of_two_triangles_are_told_apart(pixels):
-    """A floor of 8 by 4 metres, with hits on its left half alone: no diagonal between colours."""
+    """A floor of 8 by 4 meters, with hits on its left half alone: no diagonal between colors."""
     scene = Scene.from_meshes([quad("Floor", (0, 0, 0), (8, 0, 0), (8, 4, 0), (0, 4, 0))])
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     points = np.random.default_rng(0).uniform((0, 0, 0), (4, 4, 0), (2000, 3))
@@ -104,7 +104,7 @@ def test_hits_on_a_wall_of_two_triangles_are_told_apart(pixels):
 
 @pytest.mark.extended
 def test_objects_that_touch_do_not_stipple(pixels):
-    """A slab whose top lies in the plane of that of a block within it has one colour there."""
+    """A slab whose top lies in the plane of that of a block within it has one color there."""
     scene = Scene.from_meshes([box("Slab", (8, 8, 1)), box("Block", (4, 4, 1))])
     shot = take_shot(scene, [], size=(640, 400), backend="numpy")
     low, high = scene.object_bounds[1]
@@ -127,7 +127,7 @@ def test_sides_move_inwards_together_though_their_triangles_share_no_vertices():
 
 
 def test_a_picture_within_a_page_takes_its_ink_from_there(shot):
-    """Letters have colours of the page, which shows through the picture where nothing is."""
+    """Letters have colors of the page, which shows through the picture where nothing is."""
     text = draw_scene(shot, 9).svg()
     page = html.fromstring(f"<div>{text}</div>")
     assert [
@@ -158,9 +158,9 @@ def test_sample_rays_are_drawn(pixels, scene, shot):
 
 
 @pytest.mark.extended
-def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
+def test_cloud_points_have_the_color_of_their_height(pixels, scene, shot):
     assert (
-        colourful(pixels(draw_cloud, shot, Cloud(np.empty((0, 3)), {}), 0)[:, LEFT]) < 60
+        colorful(pixels(draw_cloud, shot, Cloud(np.empty((0, 3)), {}), 0)[:, LEFT]) < 60
     )  # the sensors
     image = pixels(draw_cloud, shot, Cloud(scene.vertices, {}), 5)[:, LEFT]
     red, green, blue = np.moveaxis(image, -1, 0)
@@ -175,17 +175,17 @@ OF_FACTORS = np.geomspace(1, 1000, 999)  # most are small, and a few are large
 @pytest.mark.parametrize("column", [*TABLE.values(), Column("a", "float32", "", "")], ids=str)
 def test_only_energies_have_a_logarithmic_scale(column):
     values = OF_FACTORS.clip(max=255) if column.dtype == "uint8" else OF_FACTORS
-    colouring = colours_of(values.astype(column.dtype), column)
-    assert colouring.logarithmic == (column.name in ENERGIES)
-    assert colouring.logarithmic == (column.scale == "logarithmic")
+    coloring = colors_of(values.astype(column.dtype), column)
+    assert coloring.logarithmic == (column.name in ENERGIES)
+    assert coloring.logarithmic == (column.scale == "logarithmic")
 
 
-def test_half_of_the_colours_are_for_half_of_the_heights():
+def test_half_of_the_colors_are_for_half_of_the_heights():
     heights = np.append(np.full(9000, 0.1), np.linspace(0.1, 20.1, 1001))
     for column in (Z, X, TABLE["origin_z"], TABLE["range"]):
-        colouring = colours_of(heights, column)
-        lower, upper = colouring.limits
-        (middle,) = colouring.paint(np.array([(lower + upper) / 2]))
+        coloring = colors_of(heights, column)
+        lower, upper = coloring.limits
+        (middle,) = coloring.paint(np.array([(lower + upper) / 2]))
         assert np.array_equal(middle, TURBO[127])
 
 
@@ -199,7 +199,7 @@ def test_half_of_the_colours_are_for_half_of_the_heights():
         (5_400_000, 5_400_001, {"5,400,000.0", "5,400,000.2"}),
     ],
 )
-def test_numbers_beside_the_colours_are_whole(lower, upper, marks, scene, shot):
+def test_numbers_beside_the_colors_are_whole(lower, upper, marks, scene, shot):
     points = scene.vertices.copy()
     points[:, 0] = np.linspace(lower, upper, len(points))
     figure = draw_cloud(shot, Cloud(points, {}), len(points), X).figure
@@ -239,8 +239,8 @@ def test_words_of_a_column_are_within_the_picture(name, scene, shot):
 def test_any_scene_and_poses_can_be_drawn(pixels, corners, poses):
     scene = Scene.from_meshes([SceneMesh("T", np.array(corners, float), np.array([[0, 1, 2]]))])
     shot = take_shot(scene, poses, size=SIZE, backend="numpy")
-    assert colourful(pixels(draw_scene, shot, 9)) > 100
-    assert colourful(pixels(draw_hits, shot, np.array([7]), scene.vertices, NONE)) > 100
+    assert colorful(pixels(draw_scene, shot, 9)) > 100
+    assert colorful(pixels(draw_hits, shot, np.array([7]), scene.vertices, NONE)) > 100
     for points in (scene.vertices, scene.vertices[[0] * 500], np.array([[0, 0, 0], [1e7, 0, 0]])):
         pixels(draw_cloud, shot, Cloud(points, {}), 3)
 
@@ -265,7 +265,7 @@ def test_names_from_files_are_words_and_nothing_else(name):
 @pytest.fixture(scope="module")
 def planned():
     planning = Planning(
-        (25, 25), (-30, -20), centres=[(5, 5), (-10, -5)], radii=2.0,
+        (25, 25), (-30, -20), centers=[(5, 5), (-10, -5)], radii=2.0,
         trials=3, particles=60, iterations=40,
     )  # fmt: skip
     trials = [run_trial(planning, k) for k in range(3)]
@@ -308,7 +308,7 @@ def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):
 
 
 def sheet(n):
-    """A square of n x n cells, one metre wide."""
+    """A square of n x n cells, one meter wide."""
     x, y = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1))
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     number = np.arange(x.size).reshape(n + 1, n + 1)

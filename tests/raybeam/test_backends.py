@@ -34,7 +34,7 @@ def test_backend_asked_for_is_taken(backend):
 
 def test_what_cannot_be_had_says_why(monkeypatch):
     with pytest.raises(
-        ValueError, match="Unknown backend 'optix'. The backends are auto, cuda, tiles, numpy"
+        ValueError, match=r"Unknown backend 'optix'. The backends are auto, cuda, tiles, numpy"
     ):
         RayCaster(*MESH, backend="optix")
     with pytest.raises(ValueError, match="threads must be at least 1"):
@@ -73,7 +73,7 @@ def test_threads_of_one_process_may_share_a_caster(backend, shapes):
 
 
 def test_device_that_is_not_there(source_backend):
-    with pytest.raises(ValueError, match="CUDA device 99 does not exist. This process has 1 "):
+    with pytest.raises(ValueError, match=r"CUDA device 99 does not exist. This process has 1 "):
         source_backend(plain(local_mesh(*MESH)), device=99)
 
 

@@ -10,7 +10,7 @@ TRIANGLE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]])
 
 
 def lines_and_triangles(vertices, faces, origin, direction):
-    """For one ray and every triangle: distance, and how far inside the ray passes, in metres.
+    """For one ray and every triangle: distance, and how far inside the ray passes, in meters.
 
     Float64 brute force on the geometry's definition, with none of the package's formulas: the
     plane's distance from its normal, then the least signed distance of the point to an edge's
@@ -31,7 +31,7 @@ def lines_and_triangles(vertices, faces, origin, direction):
 
 
 def check(hits, mesh, rays, graze, t_min=0.0, t_max=np.inf):
-    """Compare with the oracle; within `graze` metres of an edge either answer is right."""
+    """Compare with the oracle; within `graze` meters of an edge either answer is right."""
     vertices, faces = mesh
     origins, directions = rays
     unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)

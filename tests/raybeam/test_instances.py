@@ -185,7 +185,7 @@ def test_moved_instances_are_found_where_a_new_caster_finds_them(backend, forest
         caster.move([2, 6], [np.eye(4), np.diag([1, 1, 0, 1])])
     with pytest.raises(ValueError, match="2 instances require transforms"):
         caster.move([2, 6], np.eye(4)[None])
-    with pytest.raises(IndexError, match="instance 40"):
+    with pytest.raises(IndexError, match="Instance 40"):
         caster.move(40, np.eye(4))
     with pytest.raises(ValueError, match="instance 5 is singular"):
         caster.move(5, np.zeros((3, 4)))

@@ -146,7 +146,7 @@ def test_refused(mask, uv, words):
         Mesh(SQUARE, HALVES, Opacity(mask, uv))
 
 
-def test_at_an_edge_the_opaque_neighbour_stops_a_ray(backend, shapes):
+def test_at_an_edge_the_opaque_neighbor_stops_a_ray(backend, shapes):
     """Rays at the edges of triangles whose masks differ."""
     vertices, faces = shapes["sphere"](12, 16)
     rng = np.random.default_rng(6)

@@ -101,7 +101,7 @@ def hits_of(caster, origins, directions, *limits):
         # Those that drift: not quite of unit length, which `cast` would make them.
         found = caster.engine.closest(Rays(origins, directions, *(limits or (0.0, np.inf))))
         ray = found.ray.astype(np.uint32)
-        # The scale is private: it is about the engines' arithmetic, and hits come in metres.
+        # The scale is private: it is about the engines' arithmetic, and hits come in meters.
         distance = found.t / caster._scene.frame.scale
         return SimpleNamespace(ray=ray, distance=distance, triangle=found.triangle)
     hits = caster.cast(origins, directions, *limits)

@@ -1,4 +1,4 @@
-"""Tiles of neighbouring rays are cast together; which rays share one has no effect on any bit."""
+"""Tiles of neighboring rays are cast together; which rays share one has no effect on any bit."""
 
 import hashlib
 import os
@@ -52,7 +52,7 @@ def found(caster, directions, order, **options):
 
 
 @pytest.mark.extended
-def test_neighbours_have_no_effect(mesh):
+def test_neighbors_have_no_effect(mesh):
     directions = lidar()
     rng = np.random.default_rng(2)
     caster = RayCaster(*mesh, "tiles", threads=1)
@@ -109,7 +109,7 @@ def ties(backend):
         hits = caster.cast(start, directions)
         for column in (hits.distance, hits.triangle, hits.instance):
             found.update(column.tobytes())
-    # Neighbours in tiles, in a plain scene and among instances.
+    # Neighbors in tiles, in a plain scene and among instances.
     for caster in (
         RayCaster(points, rng.permutation(thrice), backend),
         RayCaster.from_instances(stack, backend),

@@ -178,13 +178,13 @@ def test_each_file_has_a_line_that_says_what_it_gave(check, tmp_path):
     scenario["cloud"] = {"columns": ["red"]}
     told = check(text=json.dumps(scenario)).out
     assert "38 triangles, in m, Y-up, 1 texture, 2 plain colors\n" in told
-    assert "in cm, Z-up, no colors\n" in told and "are grey" not in told
+    assert "in cm, Z-up, no colors\n" in told and "are gray" not in told
     scenario["materials"] = [
         {"objects": "m", "reflectance": 0.5}, {"objects": "*", "reflectance": "texture"}
     ]  # fmt: skip
     told = check(text=json.dumps(scenario)).out
-    assert "note: 4 of 8 objects with reflectance: texture have no colours and are grey: " in told
-    assert "grey: P, P.2, P.3, …\n" in told
+    assert "note: 4 of 8 objects with reflectance: texture have no colors and are gray: " in told
+    assert "gray: P, P.2, P.3, …\n" in told
 
 
 def test_objects_with_masks_are_named(check, tmp_path):
@@ -366,13 +366,13 @@ def test_a_flight_is_told_by_its_lines_without_turns(check):
     assert drive["lines"]["count"] == 2
     assert drive["lines"]["seconds"] == pytest.approx(15, abs=1.5)
     [scanner] = drive["sensors"]
-    assert scanner["metres_a_turn"] == pytest.approx(60 / 200, rel=0.02)
-    assert drive["metres"] / drive["seconds"] / 200 < 0.95 * scanner["metres_a_turn"]
+    assert scanner["meters_a_turn"] == pytest.approx(60 / 200, rel=0.02)
+    assert drive["meters"] / drive["seconds"] / 200 < 0.95 * scanner["meters_a_turn"]
     told = check(text=json.dumps(scenario)).out
     model = scenario.pop("sensor")
     scenario["sensors"] = {"turn": {"model": model, "start_s": 12, "steps": 5400}}
     [turn] = json.loads(check("--json", text=json.dumps(scenario)).out)["drive"]["sensors"]
-    assert turn["metres_a_turn"] < 0.95 * scanner["metres_a_turn"], "it fires during the turn only"
+    assert turn["meters_a_turn"] < 0.95 * scanner["meters_a_turn"], "it fires during the turn only"
     assert re.search(r"^trajectory  .* s; 2 flight lines, [\d,]+ m in 1\d\.\d s$", told, re.M)
     assert re.search(r"in one the carrier moves 0\.30\d m on the flight lines$", told, re.M)
 

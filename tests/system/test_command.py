@@ -171,7 +171,7 @@ def test_without_planning_an_earlier_path_is_removed(run, tmp_path):
 
 @pytest.mark.extended
 def test_a_path_that_there_is_not(run):
-    ring = [f"{{centre: [{25 + 6 * np.cos(a):.3f}, {25 + 6 * np.sin(a):.3f}], radius_m: 3}}"
+    ring = [f"{{center: [{25 + 6 * np.cos(a):.3f}, {25 + 6 * np.sin(a):.3f}], radius_m: 3}}"
             for a in np.arange(0, 6.28, 0.5)]  # fmt: skip
     planning = f"planning: {{{ENDS}, trials: 2, iterations: 5, obstacles: [{', '.join(ring)}]}}\n"
     outcome = run(text="scene: seed\nsensor: {layers: 2}\n" + planning)

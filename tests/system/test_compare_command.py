@@ -63,7 +63,7 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
             "'roof'. It has no names of sensors: give none.",
         ),
         (["clean", "clean", "--intensity-b", "signal"], "it has no column 'signal'"),
-        (["clean", "clean", "--distance", "0"], "it must be lengths in metres"),
+        (["clean", "clean", "--distance", "0"], "it must be lengths in meters"),
         (["clean", "clean", "--out", "clean.yaml"], "clean.yaml' is a file"),
         (["clean"], "Missing argument 'B'"),
     ],

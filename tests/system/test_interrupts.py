@@ -201,7 +201,7 @@ def test_a_terminal_spares_workers_and_what_clears_up_behind_them():
 
 
 # {what a signal comes to: a script, its exit code, and what it prints and says}
-SIGNALLED = {
+SIGNALED = {
     "a program under nohup": (
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "for obey in (end_on_signals, interrupt_on_signals):\n"
@@ -248,9 +248,9 @@ SIGNALLED = {
 }
 
 
-@pytest.mark.parametrize("where", SIGNALLED)
+@pytest.mark.parametrize("where", SIGNALED)
 def test_a_signal_does_what_it_should(where):
-    script, (code, out, err) = SIGNALLED[where]
+    script, (code, out, err) = SIGNALED[where]
     script = f"import signal, time\nfrom lidarsim.base.interrupts import *\n{script}"
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout, ended.stderr[: len(err)]) == (code, out, err)

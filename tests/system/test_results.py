@@ -59,12 +59,12 @@ def test_it_is_told_in_three_lines_and_shown_as_a_table_with_pictures(result, sc
 
 @pytest.mark.usefixtures("pictures")
 def test_pictures_are_drawn_and_what_they_cannot_be_is_told(result, tmp_path):
-    made = result.pictures(tmp_path / "new", only=["cloud"], size=(480, 480), colour="channel")
+    made = result.pictures(tmp_path / "new", only=["cloud"], size=(480, 480), color="channel")
     assert made == [tmp_path / "new/cloud.png"] and made[0].read_bytes().startswith(b"\x89PNG")
     for wrong, words in (
         ({"only": ["clod"]}, "Did you mean 'cloud'"),
         ({"size": (10, 10)}, "480 to 4096"),
-        ({"only": ["cloud"], "colour": "rang"}, "no column 'rang'"),
+        ({"only": ["cloud"], "color": "rang"}, "no column 'rang'"),
         ({"only": "cloud"}, "only must be a list of text, but is 'cloud'"),
         ({"size": 480}, "size must be a list of whole numbers, but is 480"),
     ):

@@ -47,7 +47,7 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     files = [(entry.file, entry.unit) for entry in made.scene.files]
     assert files == [("../../my room.stl", "mm"), ("../../#1: é.glb", "mm")]
     assert len(build(made).scene.names) == 2
-    assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimetre"
+    assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimeter"
     text = Path("a/b/scenario.yaml").read_text()
     assert "# This looks like an object of " in text and len(text.splitlines()) < 22
     assert made.sensor.horizontal_fov_deg < 45, "narrowed to them"

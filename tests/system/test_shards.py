@@ -123,8 +123,8 @@ def test_shards_of_a_campaign_have_the_files_of_one_run(campaigns, tmp_path, kep
     report = merge([folder / f"part-{number}" for number in (3, 1, 2)], out)
     assert content(out) == content(folder / "one")
     assert report["jobs"] == {"described": 7, "done": 7, "failed": 0, "resumed": 0}
-    neighbours = [row.split(",")[0] for row in (folder / "part-2/jobs.csv").read_text().split()[1:]]
-    assert neighbours == ["1", "4"]
+    neighbors = [row.split(",")[0] for row in (folder / "part-2/jobs.csv").read_text().split()[1:]]
+    assert neighbors == ["1", "4"]
     some = next((out / ".jobs").iterdir())
     assert some.stat().st_nlink == 2  # a hard link
 
@@ -337,7 +337,7 @@ def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
 
 
 STRANGE_ENTRIES = {
-    "an unknown entry of the row": lambda manifest: manifest["row"].update(colour="red"),
+    "an unknown entry of the row": lambda manifest: manifest["row"].update(color="red"),
     "no points": lambda manifest: manifest["row"].pop("points"),
     "a broken number": lambda manifest: manifest["row"].update(number=1.0),
     "a class without number": lambda manifest: manifest["row"].update(classes={"car": 1}),

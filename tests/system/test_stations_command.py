@@ -8,7 +8,7 @@ import trimesh
 import yaml
 from PIL import Image
 
-from lidarpool.report.result_pictures import COLOURS, COVERED, OTHER, UNCOVERED
+from lidarpool.report.result_pictures import COLORS, COVERED, OTHER, UNCOVERED
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
@@ -40,7 +40,7 @@ def pixels_of_kind(picture, kind):
     """Count the pixels in the hue of a kind of surface, left of the legend."""
     with Image.open(picture) as image:
         pixels = np.asarray(image.convert("RGB"), float)[:, :1200] / 255
-    hue = COLOURS[kind] / COLOURS[kind].max()
+    hue = COLORS[kind] / COLORS[kind].max()
     difference = np.abs(pixels / np.maximum(pixels.max(axis=2, keepdims=True), 0.01) - hue)
     return int((difference.max(axis=2) < 0.05).sum())
 

@@ -47,7 +47,7 @@ def campaign(count: int = 3, **options: Any) -> Campaign:
 def same(one: Sweep, two: Sweep, columns: set[str]) -> bool:
     """Whether two sweeps are equal to the bit, in these columns."""
     plain = ("job", "job_number", "split", "values", "sensor", "number", "time_ns", "object_names")
-    boxes = ("names", "types", "objects", "centres", "quaternions", "sizes", "points")
+    boxes = ("names", "types", "objects", "centers", "quaternions", "sizes", "points")
     return (
         all(getattr(one, name) == getattr(two, name) for name in plain)
         and one.points.tobytes() == two.points.tobytes()
@@ -128,7 +128,7 @@ def test_points_of_actors_are_moved_into_their_boxes(cluster_client, compensated
         (actor,) = sweep.boxes.objects
         points = sweep.points[sweep.objects == actor]
         assert len(points) == sweep.boxes.points[0]
-        inside = (points - sweep.boxes.centres[0]) @ matrices(sweep.boxes.quaternions)[0]
+        inside = (points - sweep.boxes.centers[0]) @ matrices(sweep.boxes.quaternions)[0]
         outside = np.abs(inside) - sweep.boxes.sizes[0] / 2
         farthest_m.append(outside.max(initial=0))
     if compensated:

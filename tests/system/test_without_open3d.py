@@ -23,7 +23,7 @@ def command(*arguments):
 if __name__ == "__main__":
     command("check", "s.yaml")
     command("export", "out", "-f", "pcd", "-f", "laz")
-    command("plot", "out", "--only", "cloud", "--colour", "object", "--size", "480x480")
+    command("plot", "out", "--only", "cloud", "--color", "object", "--size", "480x480")
     with result_page(open_result(Path("out")), port=0, browser=False):
         print("shown")
     client = Client(sys.argv[1])

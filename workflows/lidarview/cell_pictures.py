@@ -24,7 +24,7 @@ from .picture_file import SensorPositions, sensor_positions
 from .render import theme
 from .render.beam_picture import beam_page
 from .render.camera import fit_camera
-from .render.colouring import colours_of
+from .render.coloring import colors_of
 from .render.picture_page import Page
 from .render.pictures import draw_scene as draw_objects
 from .render.pictures import splat
@@ -34,29 +34,29 @@ from .render.stage import PlotBox
 MAX_BYTES = 60_000  # bytes of a picture; notebooks keep all of them
 MAX_POINTS = 60_000
 MAX_TRIANGLES = 200_000
-_PALETTES = (128, 32)  # numbers of colours, until a picture is small enough
+_PALETTES = (128, 32)  # numbers of colors, until a picture is small enough
 _CHART = (0.09, 0.115, 0.72, 0.735)  # left, bottom, width, height on the page
 _BOX = (0.06, 0.2, 0.82, 0.94)  # left, top, right, bottom of the points on the page
 _SPREAD = (1, 99)  # percentiles of the positions that are in the picture
 
 
 def small_png(png: bytes) -> bytes:
-    """Return a PNG with at most `MAX_BYTES`: with fewer colours, and if need be of half the size.
+    """Return a PNG with at most `MAX_BYTES`: with fewer colors, and if need be of half the size.
 
     If both are too large, as of a picture of noise, the last form is returned.
     """
     image = Image.open(io.BytesIO(png)).convert("RGB")
     half = image.resize((image.width // 2, image.height // 2), Image.Resampling.BOX)
-    for candidate, colours in product((image, half), _PALETTES):
+    for candidate, colors in product((image, half), _PALETTES):
         file = io.BytesIO()
-        candidate.quantize(colours, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
+        candidate.quantize(colors, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
         if file.tell() <= MAX_BYTES:
             break
     return file.getvalue()
 
 
 def draw_scene(scene: Scene) -> bytes:
-    """Draw a scene at time 0, each object in its colour."""
+    """Draw a scene at time 0, each object in its color."""
     drawn = SimplifiedScene.from_scene(cut_masks(scene)).scene
     if len(drawn.faces) > MAX_TRIANGLES:
         drawn, _ = simplified(drawn, MAX_TRIANGLES)
@@ -72,7 +72,7 @@ def draw_scene(scene: Scene) -> bytes:
 
 
 def draw_sensor(sensor: Sensor) -> bytes:
-    """Draw the directions of a sensor's first rays, coloured by time."""
+    """Draw the directions of a sensor's first rays, colored by time."""
     return small_png(beam_page(sensor, PICTURE_SIZE).png())
 
 
@@ -82,15 +82,15 @@ def draw_survey(survey: Survey) -> bytes:
     sensors = sensor_positions(survey)
     limits = _around(np.concatenate([sensor.positions for sensor in sensors])[:, :2])
     axes = page.map_chart(_CHART, limits, tick_count=5)
-    colours = theme.object_colours(len(sensors))
-    for sensor, colour in zip(sensors, colours, strict=True):
+    colors = theme.object_colors(len(sensors))
+    for sensor, color in zip(sensors, colors, strict=True):
         x, y, _ = sensor.positions.T
-        axes.plot(x, y, "-" if sensor.moves else "o", color=colour, lw=1.6, ms=4)
-        axes.plot(x[0], y[0], "o", color=colour, ms=5)
+        axes.plot(x, y, "-" if sensor.moves else "o", color=color, lw=1.6, ms=4)
+        axes.plot(x[0], y[0], "o", color=color, ms=5)
     headings = _headings(survey)
     axes.quiver(*headings.T, color=theme.MUTED, width=0.003, scale=24, zorder=3)
     names = [sensor.name or sensor.model or "sensor" for sensor in sensors]
-    page.legend([*zip(names, colours, strict=True)], "")
+    page.legend([*zip(names, colors, strict=True)], "")
     rays = f"{plural(survey.scan_count, 'scan')} · {plural(survey.ray_count, 'ray')}"
     page.title("Survey from above", f"{_positions_in_words(sensors)} · {rays}")
     return small_png(page.png())
@@ -123,7 +123,7 @@ def _positions_in_words(sensors: list[SensorPositions]) -> str:
 
 
 def draw_cloud(cloud: CloudLike) -> bytes | None:
-    """Draw points coloured by height.
+    """Draw points colored by height.
 
     Of many points, an even choice is drawn. Returns None for an empty cloud.
     """
@@ -135,10 +135,10 @@ def draw_cloud(cloud: CloudLike) -> bytes | None:
     positions = positions[((positions >= box[0]) & (positions <= box[1])).all(axis=1)]
     page = Page(PICTURE_SIZE)
     if len(positions):
-        colouring = colours_of(positions[:, 2], Z)
-        image = _image_of(positions, colouring.paint(positions[:, 2]), box)
+        coloring = colors_of(positions[:, 2], Z)
+        image = _image_of(positions, coloring.paint(positions[:, 2]), box)
         page.figure.figimage(image, zorder=-1)
-        page.colour_bar(colouring.scale, Normalize(*colouring.limits or (0, 1)), "z (m)")
+        page.color_bar(coloring.scale, Normalize(*coloring.limits or (0, 1)), "z (m)")
     sides = " × ".join(f"{side:,.1f}" for side in np.ptp(cloud.bounds, axis=0))
     page.title("Point cloud by height", f"{plural(total, 'point')} · {sides} m")
     return small_png(page.png())
@@ -157,7 +157,7 @@ def _sampled(cloud: CloudLike, step: int) -> Floats:
     return np.concatenate(pieces)
 
 
-def _image_of(positions: Floats, colours: Floats, box: Floats) -> Floats32:
+def _image_of(positions: Floats, colors: Floats, box: Floats) -> Floats32:
     """Return a picture (height, width, 4) of points (n, 3) in a box (2, 3), seen from above."""
     origin = np.round(box.mean(axis=0))
     stage = PlotBox.from_bounds(box - origin, origin)
@@ -166,7 +166,7 @@ def _image_of(positions: Floats, colours: Floats, box: Floats) -> Floats32:
     pixels, distance = camera.project(positions - origin)
     order = np.argsort(-distance)
     opaque = np.ones((len(positions), 4), np.float32)
-    opaque[:, :3] = colours
+    opaque[:, :3] = colors
     width, height = PICTURE_SIZE
     radius = float(np.clip(180 / np.sqrt(len(positions)), 1.5, 5.0))
     empty = np.zeros((height, width, 4), np.float32)

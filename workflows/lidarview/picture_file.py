@@ -18,7 +18,7 @@ from lidarsim.media.materials import MaterialTable
 from lidarsim.motion.trajectory import ALWAYS, Beyond, Track, presence_ns
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
 from lidarsim.scene.animation import Animation
-from lidarsim.scene.colours import Colours
+from lidarsim.scene.colors import Colors
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.simplified import SimplifiedScene, cut_masks
@@ -45,7 +45,7 @@ class SensorPositions:
     """Positions of a sensor over time."""
 
     times_ns: Floats  # (k,), ascending, nanoseconds since the survey's start
-    positions: Floats  # (k, 3), metres, local coordinates
+    positions: Floats  # (k, 3), meters, local coordinates
     moves: bool = False  # continuously; else the sensor stays at each position until the next time
     name: str = ""  # "" for a single sensor
     model: str = ""
@@ -76,7 +76,7 @@ class SensorPositions:
 class PlannedPath:
     """The best path of a search in the plane, for pictures."""
 
-    corners: Floats  # (w, 2), from start to target, metres, local coordinates
+    corners: Floats  # (w, 2), from start to target, meters, local coordinates
     length_m: float
     shortest_m: float  # length of the shortest path; inf if discs cut off the target
     clearance_m: float  # smallest distance to a disc; negative within a disc, inf without discs
@@ -90,11 +90,11 @@ class PlannedPath:
 
 @dataclass(frozen=True, eq=False)
 class PlanningPicture:
-    """A search for a path in the plane, for pictures, in metres of local coordinates."""
+    """A search for a path in the plane, for pictures, in meters of local coordinates."""
 
     start: tuple[float, float]
     target: tuple[float, float]
-    centres: Floats  # (m, 2): centres of the discs to keep out of
+    centers: Floats  # (m, 2): centers of the discs to keep out of
     radii: Floats  # (m,): radii of the discs
     best: PlannedPath | None = None  # None before the end of all trials
 
@@ -106,7 +106,7 @@ class PictureContent:
     scene: Scene  # actors have a thousand positions at most, and poses for pictures
     sensors: Sequence[SensorPositions]
     hit_counts: AnyArray  # (f,): of each triangle, triangles of actors last
-    sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
+    sample_rays: Floats32  # (k, 2, 3): ends of some rays, meters, local coordinates
     planning: PlanningPicture | None = None
     duration_ns: float = 0.0  # duration of the survey, by its own clock
     extra_columns: Sequence[
@@ -227,8 +227,8 @@ class PictureContent:
             arrays["reflectance"] = self.reflectance
         if self.face_materials is not None:
             arrays["face_materials"] = self.face_materials
-        if self.scene.colours is not None:
-            arrays["colours"] = self.scene.colours.means()
+        if self.scene.colors is not None:
+            arrays["colors"] = self.scene.colors.means()
         arrays |= self._track_arrays() | self._mesh_arrays() | self._planning_arrays()
         path.write_bytes(packed(arrays))
 
@@ -254,8 +254,8 @@ class PictureContent:
         meshes, arrays["actor_mesh"] = distinct_meshes(self.scene.actors)
         for number, mesh in enumerate(meshes):
             arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
-            if mesh.colours is not None:
-                arrays[f"mesh{number}_colours"] = mesh.colours.means()
+            if mesh.colors is not None:
+                arrays[f"mesh{number}_colors"] = mesh.colors.means()
             if (animation := mesh.animation) is not None:
                 # Differences compress to a third of the size.
                 steps = np.diff(animation.vertices, axis=0, prepend=0)
@@ -278,7 +278,7 @@ class PictureContent:
         best = planning.best
         return {
             "ends": [planning.start, planning.target],
-            "centres": planning.centres,
+            "centers": planning.centers,
             "radii": planning.radii,
             "path": best.corners,
             "waypoints": np.array(best.trials),
@@ -317,7 +317,7 @@ class PictureContent:
                 "",
                 arrays[f"{mesh}_vertices"],
                 arrays[f"{mesh}_faces"],
-                colours=_colours(arrays, f"{mesh}_colours"),
+                colors=_colors(arrays, f"{mesh}_colors"),
                 animation=_animation(arrays, mesh),
             )
             for mesh in (f"mesh{number}" for number in range(max(mesh_of_actor, default=-1) + 1))
@@ -337,7 +337,7 @@ class PictureContent:
             tuple(map(str, names["objects"])),
             arrays["origin"],
             tuple(actors),
-            colours=_colours(arrays, "colours"),
+            colors=_colors(arrays, "colors"),
         )
         sensors = [
             SensorPositions(arrays[f"sensor{k}_times"], arrays[f"sensor{k}"], moves, name, model)
@@ -368,12 +368,12 @@ def _planning(arrays: Mapping[str, Any]) -> PlanningPicture:
     lengths = {field: arrays[name].item() for name, field in _PATH_LENGTHS.items()}
     best = PlannedPath(arrays["path"], **lengths, trials=tuple(arrays["waypoints"]))
     (x0, y0), (x1, y1) = arrays["ends"].tolist()
-    return PlanningPicture((x0, y0), (x1, y1), arrays["centres"], arrays["radii"], best)
+    return PlanningPicture((x0, y0), (x1, y1), arrays["centers"], arrays["radii"], best)
 
 
-def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:
-    """Return the colours of faces, if the archive has any."""
-    return Colours.of_faces(arrays[name]) if name in arrays else None
+def _colors(arrays: Mapping[str, Any], name: str) -> Colors | None:
+    """Return the colors of faces, if the archive has any."""
+    return Colors.of_faces(arrays[name]) if name in arrays else None
 
 
 def _animation(arrays: Mapping[str, Any], mesh: str) -> Animation | None:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from docs.pictures.effects._catalogue import load_effects
+from docs.pictures.effects._catalog import load_effects
 
 IMAGES = Path(__file__).parents[2] / "images"
 

@@ -18,7 +18,7 @@ from lidarscenes.procedural.city import city
 from lidarsim.media.weather import FAINTEST
 from lidarsim.sensor.noise import THRESHOLD_SIGMAS
 from lidarsim.simulator.rig import Rig
-from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS, SENSOR
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS, SENSOR
 
 NOISE = Noise(detection_range_m=90)
 SURFACE = "#8b96a5"
@@ -60,10 +60,10 @@ def page(title: str, weather: dict[str, Any], reach_m: float) -> tuple[Figure, A
         cloud = points(scene, replace(survey, **options))
         air = cloud["cause"] == 1
         dot = 1.8 if air.sum() > 2000 else 3.5
-        for which, colour, label, ms in ((~air, SURFACE, "surfaces", 1.2), (air, AIR, "air", dot)):
+        for which, color, label, ms in ((~air, SURFACE, "surfaces", 1.2), (air, AIR, "air", dot)):
             name = f"{label}: {which.sum():,}"
             axes.plot(
-                cloud["x"][which], cloud["y"][which], ".", ms=ms, mew=0, color=colour, label=name
+                cloud["x"][which], cloud["y"][which], ".", ms=ms, mew=0, color=color, label=name
             )
         axes.set(xlim=(-reach_m, reach_m), ylim=(-reach_m, reach_m), aspect="equal")
         axes.set(xlabel="x (m)", ylabel="y (m)")
@@ -116,14 +116,14 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     survey = replace(in_weather(survey_without()), **weather)
     cloud = points(city(20_000), survey)
     air = cloud["cause"] == 1
-    for which, colour, label in ((~air, SURFACE, "surfaces"), (air, AIR, "air")):
+    for which, color, label in ((~air, SURFACE, "surfaces"), (air, AIR, "air")):
         axes.plot(
             cloud["range"][which],
             cloud["intensity"][which],
             ".",
             ms=2,
             mew=0,
-            color=colour,
+            color=color,
             label=f"simulated: {label}",
             rasterized=True,
         )
@@ -136,7 +136,7 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     scatters = survey.backscatter_at(survey.sensor.optics.wavelength_nm)
     half = 0.299792458 * survey.sensor.optics.pulse_ns / 2
     from_air = survey.air(0).cloud(scatters, distance - half / 2, distance + half / 2)
-    axes.plot(distance, from_air, color=OBJECT_COLOURS[1], lw=1.8, label="half a pulse of the air")
+    axes.plot(distance, from_air, color=OBJECT_COLORS[1], lw=1.8, label="half a pulse of the air")
     axes.axhline(NOISE.threshold, color=MUTED, lw=1, ls="--", label="detection threshold")
     axes.set(xscale="log", yscale="log", xlim=(0.5, 100), ylim=(1e-4, 300))
     axes.set(xlabel="range (m)", ylabel="energy (white surface at 10 m: 1)")
@@ -146,7 +146,7 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture of few colours."""
+    """Write a picture of few colors."""
     import io
 
     from PIL import Image

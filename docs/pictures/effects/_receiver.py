@@ -12,7 +12,7 @@ from lidarsim.simulator.rig import Rig
 
 BLUE = "#1f5fa8"
 RED = "#c8502b"
-GREY = "#8a8a8a"
+GRAY = "#8a8a8a"
 WIDE_RAD = 0.01  # beam of the sensors that hear each other
 
 

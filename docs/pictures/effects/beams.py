@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 from lidarpool import Beams, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.sensor.disc import Beam
 from lidarsim.simulator.rig import Rig
-from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 from raybeam import pattern_rays
 
 DRAWS = "effect-beams.png"
 OVAL = (3.0, 1.5)  # mrad, as Velodyne's manual of the VLP-16 has it
 EXIT_M = 0.0125
 SENSOR = Sensor(Beams(np.zeros(1)), Spin(1, 360))
-EVEN, ROUND, WIDE = OBJECT_COLOURS[:3]
+EVEN, ROUND, WIDE = OBJECT_COLORS[:3]
 
 
 def with_effect(survey: Survey) -> Survey:
@@ -41,7 +41,7 @@ def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> SceneMe
 
 
 def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
-    """Return where the sub-rays of a beam hit a wall: (k, 2), metres across and up."""
+    """Return where the sub-rays of a beam hit a wall: (k, 2), meters across and up."""
     scene = Scene.from_meshes([wall("Wall", distance)])
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig.pulse_casters[0].emitter.subrays_of(rig.pattern(0, 0, 1))
@@ -74,15 +74,15 @@ def picture(path: Path) -> None:
         ("Gaussian, 3.0 × 1.5 mrad", WIDE,
          Returns(subrays=217, divergence_mrad=OVAL, beam_profile="gaussian")),
     )  # fmt: skip
-    for number, (label, colour, returns) in enumerate(kinds):
+    for number, (label, color, returns) in enumerate(kinds):
         positions_cm = 100 * footprint(returns, 50.0)
         middle = 22.0 * (1 - number)
         prints.plot(
-            positions_cm[:, 0], middle + positions_cm[:, 1], ".", ms=3.5, mew=0, color=colour
+            positions_cm[:, 0], middle + positions_cm[:, 1], ".", ms=3.5, mew=0, color=color
         )
         tall = 7.5 if returns.divergence_mrad == OVAL else 15.0
         prints.add_patch(Ellipse((0, middle), 15.0, tall, fill=False, ec=INK, lw=0.8))
-        prints.text(12, middle, label, va="center", fontsize=8, color=colour)
+        prints.text(12, middle, label, va="center", fontsize=8, color=color)
     prints.plot([-7.5, 7.5], [-32, -32], color=INK, lw=1)
     prints.text(0, -33, "15 cm", ha="center", va="top", fontsize=8, color=INK)
     prints.set(xlim=(-12, 34), ylim=(-36, 33), aspect="equal", xticks=[], yticks=[])
@@ -92,8 +92,8 @@ def picture(path: Path) -> None:
     gaussian = [NormalDist().cdf(2 * x) for x in offsets]
     inside = np.clip(offsets, -1, 1)
     even = 0.5 + (inside * np.sqrt(1 - inside**2) + np.arcsin(inside)) / math.pi
-    for colour, exact, name in ((EVEN, even, "even"), (ROUND, gaussian, "gaussian")):
-        edges.plot(offsets, exact, color=colour, lw=1.2, label=f"{name}: closed form")
+    for color, exact, name in ((EVEN, even, "even"), (ROUND, gaussian, "gaussian")):
+        edges.plot(offsets, exact, color=color, lw=1.2, label=f"{name}: closed form")
         for count, mark in ((19, "x"), (217, "o")):
             beam = Returns(
                 "all",
@@ -105,7 +105,7 @@ def picture(path: Path) -> None:
             sampled = offsets[::4]
             simulated = [share(beam, 0.075 * x) for x in sampled]
             edges.plot(
-                sampled, simulated, mark, ms=4, mfc="none", color=colour, label=f"{count} sub-rays"
+                sampled, simulated, mark, ms=4, mfc="none", color=color, label=f"{count} sub-rays"
             )
     edges.set(xlabel="edge, in radii of the beam at 1/e²", ylabel="share of the light on the wall")
     edges.set_title("A beam on an edge", fontsize=11, color=INK)
@@ -117,20 +117,20 @@ def picture(path: Path) -> None:
     )
     gaussian_beam = Beam.from_divergences(19, (OVAL[0] / 1000, OVAL[1] / 1000), "gaussian", EXIT_M)
     assert gaussian_beam.starts is not None
-    for axis, (label, colour) in enumerate((("across", ROUND), ("up", WIDE))):
+    for axis, (label, color) in enumerate((("across", ROUND), ("up", WIDE))):
         waist = EXIT_M / 2
         half = OVAL[axis] / 2000
         widths.loglog(
             ranges,
             2e3 * np.hypot(waist, half * ranges),
-            color=colour,
+            color=color,
             lw=1.2,
             label=f"{label}: 2 √(w0² + (θR/2)²)",
         )
         sampled = ranges[::6]
         simulated = [4e3 * footprint(beam, distance)[:, axis].std() for distance in sampled]
-        widths.loglog(sampled, simulated, "o", ms=4, mfc="none", color=colour, label="simulated")
-        widths.loglog(ranges, 2e3 * half * ranges, color=colour, lw=0.8, ls=":")
+        widths.loglog(sampled, simulated, "o", ms=4, mfc="none", color=color, label="simulated")
+        widths.loglog(ranges, 2e3 * half * ranges, color=color, lw=0.8, ls=":")
     widths.set(xlabel="range (m)", ylabel="width at 1/e² (mm)", ylim=(5, 400))
     widths.set_title("3.0 × 1.5 mrad, 12.5 mm at its start", fontsize=11, color=INK)
     widths.legend(fontsize=7.5, frameon=False, loc="upper left")

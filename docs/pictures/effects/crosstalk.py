@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, WIDE_RAD, points, room, spinning_beam
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, WIDE_RAD, points, room, spinning_beam
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -65,14 +65,14 @@ def picture(path: Path) -> None:
     x = 0.01 * columns["x"]
     y = 0.01 * columns["y"]
     foreign = columns["cause"] == 3
-    above.plot(x[~foreign], y[~foreign], ".", ms=0.6, color=GREY)
+    above.plot(x[~foreign], y[~foreign], ".", ms=0.6, color=GRAY)
     above.plot(x[foreign], y[foreign], ".", ms=4, color=RED, label=f"{foreign.sum()} pulses of B")
     for x_m, name in ((-4, "A"), (4, "B")):
         above.plot(x_m, 0, "^", color="k", ms=4)
         above.text(x_m, -12, name, fontsize=9, ha="center")
     above.set(aspect="equal", xlabel="x, m", ylabel="y, m")
     above.legend(frameon=False, fontsize=8, loc="upper left")
-    above.set_title(f"points of A in {REVOLUTIONS} turns, walls in grey", fontsize=10)
+    above.set_title(f"points of A in {REVOLUTIONS} turns, walls in gray", fontsize=10)
     fields_mrad = np.array([2.0, 5, 10, 20, 40])
     gate_ns = 2 * (150 - 0.5) / LIGHT_M_NS
     waits = gate_ns * 1e-9 * (FIRINGS - 300) * OTHER_HZ  # pulses of B while A waits

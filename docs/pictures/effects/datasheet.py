@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, fixed_beams, wall
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Survey
@@ -16,7 +16,7 @@ DRAWS = "effect-datasheet.png"
 SHOWN = {
     "ouster/os0-64": "#7b3f99",
     "livox/mid360": "#2e8b57",
-    "hesai/xt32": GREY,
+    "hesai/xt32": GRAY,
     "ouster/os1-64": BLUE,
     "livox/avia": RED,
 }
@@ -34,7 +34,7 @@ def picture(path: Path) -> None:
     figure = Figure((9, 3.7), layout="constrained", dpi=110)
     shares, sigmas = figure.subplots(1, 2)
     dark = [Material("*", 0.1)]
-    for name, colour in SHOWN.items():
+    for name, color in SHOWN.items():
         stated = read_model(name).performance.detection
         noise = read_model(name).datasheet().noise
         ranges_m = np.linspace(0.4, 1.5, 23) * stated.range_m
@@ -42,10 +42,10 @@ def picture(path: Path) -> None:
             cast_scan([wall("W", x)], fixed_beams(RAYS), noise, materials=dark) for x in ranges_m
         ]
         detected = [len(scan["range"]) for scan in scans]
-        shares.plot(ranges_m, 100 * np.array(detected) / RAYS, "-", lw=1.2, color=colour)
+        shares.plot(ranges_m, 100 * np.array(detected) / RAYS, "-", lw=1.2, color=color)
         share = 100 * stated.probability
         label = f"{name}: {stated.range_m:g} m, {share:g} %"
-        shares.plot(stated.range_m, share, "o", ms=7, color=colour, label=label)
+        shares.plot(stated.range_m, share, "o", ms=7, color=color, label=label)
     shares.set(xscale="log", xlabel="range of a wall of 10 % reflectance, m", xlim=(1.2, 400))
     ticks = [5, 10, 20, 50, 100, 200]
     shares.set_xticks(ticks, [str(tick) for tick in ticks])
@@ -54,8 +54,8 @@ def picture(path: Path) -> None:
     shares.set_title("detection", fontsize=10)
     name = "livox/tele15"
     noise = read_model(name).datasheet().noise
-    for reflectance, colour, limits, stated_at in (
-        (0.1, GREY, (20, 180), [(70, 2), (120, 4)]),
+    for reflectance, color, limits, stated_at in (
+        (0.1, GRAY, (20, 180), [(70, 2), (120, 4)]),
         (0.8, BLUE, (40, 450), [(220, 2), (380, 4)]),
     ):
         ranges_m = np.geomspace(*limits, 14)
@@ -67,9 +67,9 @@ def picture(path: Path) -> None:
         ]
         spread = [100 * scan["range"].std() for scan in scans]
         label = f"{100 * reflectance:g} % reflectance"
-        sigmas.plot(ranges_m, spread, "-", lw=1.2, color=colour, label=f"simulated, {label}")
+        sigmas.plot(ranges_m, spread, "-", lw=1.2, color=color, label=f"simulated, {label}")
         x, y = zip(*stated_at, strict=True)
-        sigmas.plot(x, y, "v", ms=8, color=colour, label=f"stated (less than), {label}")
+        sigmas.plot(x, y, "v", ms=8, color=color, label=f"stated (less than), {label}")
     sigmas.set(xscale="log", xlabel="range of a wall, m", ylabel="standard deviation of ranges, cm")
     sigmas.set_xticks([20, 50, 100, 200, 400], ["20", "50", "100", "200", "400"])
     sigmas.legend(frameon=False, fontsize=7.5)

@@ -12,11 +12,11 @@ from lidarscenes.procedural.cars import MODELS, car
 from lidarscenes.procedural.city import city
 from lidarsim.simulator.rig import Rig
 from lidarview.render import theme
-from lidarview.render.colouring import DIVERGING
+from lidarview.render.coloring import DIVERGING
 
 DRAWS = "effect-doppler.png"
 DARK = "#3a3f47"
-# metres a second: of the sensor's car, and of the measurement
+# meters a second: of the sensor's car, and of the measurement
 SPEED = 8.0
 NOISE = 0.05
 # Start, speed and direction (degrees) of the other cars.
@@ -67,10 +67,10 @@ def picture(path: Path) -> None:
     azimuth = np.degrees((azimuth + np.pi) % (2 * np.pi) - np.pi)
     figure = Figure(figsize=(10.4, 5.0), dpi=90, layout="constrained")
     map_axes, chart = figure.subplots(1, 2, width_ratios=(1.12, 1))
-    colours = ListedColormap(DIVERGING)
+    colors = ListedColormap(DIVERGING)
     order = np.argsort(moving, kind="stable")  # cars on top
     in_view = order[np.abs(positions[order, :2]).max(axis=1) < REACH]
-    scale = {"cmap": colours, "vmin": -20, "vmax": 20, "linewidths": 0}
+    scale = {"cmap": colors, "vmin": -20, "vmax": 20, "linewidths": 0}
     sizes = np.where(moving, 5.0, 1.2)
     points = map_axes.scatter(
         *positions[in_view, :2].T, c=velocity[in_view], s=sizes[in_view], **scale
@@ -129,8 +129,8 @@ def picture(path: Path) -> None:
     chart.scatter(azimuth[shown], velocity[shown], s=1, color=theme.MUTED, linewidths=0)
     for k, (_, speed, _) in enumerate(OTHERS):
         of_car = batch.object == standing + k
-        colour = theme.OBJECT_COLOURS[(1, 2, 6)[k]]
-        chart.scatter(azimuth[of_car], velocity[of_car], s=5, color=colour, linewidths=0)
+        color = theme.OBJECT_COLORS[(1, 2, 6)[k]]
+        chart.scatter(azimuth[of_car], velocity[of_car], s=5, color=color, linewidths=0)
         if of_car.any():
             middle = azimuth[of_car].mean(), velocity[of_car].mean()
             chart.annotate(
@@ -139,7 +139,7 @@ def picture(path: Path) -> None:
                 (6, 8),
                 textcoords="offset points",
                 fontsize=8,
-                color=colour,
+                color=color,
             )
     angle = np.linspace(-180, 180, 361)
     chart.plot(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._air import save
-from docs.pictures.effects._receiver import BLUE, GREY, RED, wall
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, wall
 from docs.pictures.effects._street import survey_without
 from matplotlib.figure import Figure
 
@@ -80,12 +80,12 @@ def picture(path: Path) -> None:
     axes.set_xlabel("firing of a turn", fontsize=8)
     (axes,) = charts.subplots(1, 1, squeeze=False)[0]
     frozen = Fault("frozen", 1, 2)
-    for faults, colour, words in (
-        ((), GREY, "without faults"),
+    for faults, color, words in (
+        ((), GRAY, "without faults"),
         ((frozen,), BLUE, "frozen from 1 to 2 s"),
         ((Fault("time_jump", 2.5, by_s=0.5),), RED, "time jump by 0.5 s at 2.5 s"),
     ):
-        axes.plot(*approach(*faults), ".", ms=2 if faults else 5, color=colour, label=words)
+        axes.plot(*approach(*faults), ".", ms=2 if faults else 5, color=color, label=words)
     axes.set(xlabel="stamp, s", ylabel="range of a wall ahead, m")
     axes.set_title(f"a carrier at {SPEED_M_S:g} m/s", fontsize=9)
     axes.legend(frameon=False, fontsize=8, markerscale=4)

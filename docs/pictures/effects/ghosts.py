@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, cloud
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, cloud
 from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
@@ -63,9 +63,9 @@ def picture(path: Path) -> None:
     )
     columns = cloud(Scene.from_meshes(meshes), survey)
     ghost = columns["cause"] == 5
-    for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
+    for which, color, label in ((~ghost, GRAY, "surfaces"), (ghost, RED, "ghosts")):
         name = f"{label}: {which.sum():,}"
-        above.plot(columns["y"][which], -columns["x"][which], ".", ms=3, color=colour, label=name)
+        above.plot(columns["y"][which], -columns["x"][which], ".", ms=3, color=color, label=name)
     above.plot(0, 0, ">", color=BLUE, ms=8, label="sensor")
     labels = {
         (6.6, 8.3): "window",
@@ -101,14 +101,14 @@ def picture(path: Path) -> None:
             materials=[glass, Material("*", 1.0)],
             columns=("object", "reflectance"),
         )
-        for number, colour in ((0, GREY), (1, RED), (2, BLUE)):
+        for number, color in ((0, GRAY), (1, RED), (2, BLUE)):
             reflectances = scan["reflectance"][scan["object"] == number]
             right.plot(
-                [np.degrees(angle)] * len(reflectances), reflectances, "o", ms=4, color=colour
+                [np.degrees(angle)] * len(reflectances), reflectances, "o", ms=4, color=color
             )
     angle = np.radians(np.linspace(0, 89, 300))
     mirrored = (1 - DIRT) * fresnel(np.cos(angle))
-    right.plot(np.degrees(angle), DIRT * np.cos(angle), color=GREY, label="dirt: ρ cos θ")
+    right.plot(np.degrees(angle), DIRT * np.cos(angle), color=GRAY, label="dirt: ρ cos θ")
     right.plot(np.degrees(angle), mirrored**2, color=RED, label="ghost: ((1 − ρ) F)²")
     behind = (1 - DIRT - mirrored) ** 2
     right.plot(np.degrees(angle), behind, color=BLUE, label="behind: ((1 − ρ)(1 − F))²")

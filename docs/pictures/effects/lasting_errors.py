@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from docs.pictures.effects._air import save
-from docs.pictures.effects._receiver import BLUE, GREY, RED, wall
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Noise, Scene, Sensor, Survey, load_sensor
@@ -51,7 +51,7 @@ def picture(path: Path) -> None:
         load_sensor("ouster/os1-64"), replace(NOISE, warm_up_m=0.0, ripple_deg=0.0), steps=36
     )
     by_channel.plot(
-        revolution["channel"], 100 * revolution["error"], ".", ms=1, color=GREY, label="returns"
+        revolution["channel"], 100 * revolution["error"], ".", ms=1, color=GRAY, label="returns"
     )
     channel_means = [revolution["error"][revolution["channel"] == k].mean() for k in range(64)]
     by_channel.plot(
@@ -63,17 +63,17 @@ def picture(path: Path) -> None:
     by_channel.set_title("channel_bias_m: 0.015 (dotted)", fontsize=9)
     slow = Sensor.grid(20, 1, 1, step_deg=360, rate_hz=0.05, horizontal_fov_deg=1)
     warm = errors(slow, replace(NOISE, channel_bias_m=0.0, ripple_deg=0.0), steps=150)
-    by_time.plot(warm["time"] / 60, 100 * warm["error"], ".", ms=1.5, color=GREY, label="returns")
+    by_time.plot(warm["time"] / 60, 100 * warm["error"], ".", ms=1.5, color=GRAY, label="returns")
     closed = 100 * NOISE.warm_up_m * np.exp(-warm["time"] / NOISE.warm_up_s)
     by_time.plot(warm["time"] / 60, closed, color=RED, lw=1.4, label=r"3 cm $e^{-t/600\,s}$")
     by_time.set(xlabel="time since the start, min", ylabel="error of range, cm")
     by_time.set_title("warm_up_m: 0.03, warm_up_s: 600", fontsize=9)
     azimuth = np.linspace(0, 360, 721)
-    for cycles, colour in ((1, BLUE), (2, RED)):
+    for cycles, color in ((1, BLUE), (2, RED)):
         error = NOISE.ripple_deg * np.sin(np.radians(cycles * azimuth))
-        by_azimuth.plot(azimuth, error, color=colour, label=f"ripple_cycles: {cycles}", lw=1.2)
+        by_azimuth.plot(azimuth, error, color=color, label=f"ripple_cycles: {cycles}", lw=1.2)
     simulated = ripple(2)
-    by_azimuth.plot(*simulated, ".", ms=3, color=GREY, label="simulated, 2", zorder=3)
+    by_azimuth.plot(*simulated, ".", ms=3, color=GRAY, label="simulated, 2", zorder=3)
     by_azimuth.set(xlabel="azimuth, °", ylabel="true less reported azimuth, °")
     by_azimuth.set_title("ripple_deg: 0.05", fontsize=9)
     for axes in (by_channel, by_time, by_azimuth):

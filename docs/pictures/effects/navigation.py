@@ -76,11 +76,11 @@ def picture(path: Path) -> None:
     """Draw Allan deviations, and the errors of positions over the hours."""
     from matplotlib.figure import Figure
 
-    from lidarsim.motion.trajectory import CENTRE, Stations
+    from lidarsim.motion.trajectory import CENTER, Stations
 
     still = SimpleNamespace(
         navigation=Navigation(imu=IMU, gnss=GNSS, seed=2),
-        path=Stations((CENTRE,)),
+        path=Stations((CENTER,)),
         duration_ns=HOURS * 3600e9,
         carrier="",
     )
@@ -94,8 +94,8 @@ def picture(path: Path) -> None:
     to_hour = np.degrees(1) * 3600
     closed_forms = parts(tau)
     total = np.sqrt(sum(form**2 for form in closed_forms.values()))
-    for (name, form), colour in zip(closed_forms.items(), theme.OBJECT_COLOURS, strict=False):
-        gyroscopes.loglog(tau, form * to_hour, "--", color=colour, lw=1, label=name)
+    for (name, form), color in zip(closed_forms.items(), theme.OBJECT_COLORS, strict=False):
+        gyroscopes.loglog(tau, form * to_hour, "--", color=color, lw=1, label=name)
     gyroscopes.loglog(tau, total * to_hour, color=theme.INK, lw=1.2, label="closed form, all three")
     one_sigma = deviations / np.sqrt(2 * np.maximum(clusters - 3, 1)) * to_hour
     gyroscopes.errorbar(
@@ -116,9 +116,9 @@ def picture(path: Path) -> None:
     gyroscopes.set_title("gyroscopes of a carrier that stands", fontsize=9)
     position_errors = np.concatenate([block.positions for block in fixes(still)])
     hours = np.arange(len(position_errors)) / GNSS.rate_hz / 3600
-    colours = {"east": "#4477aa", "north": "#44aa77", "up": "#ee7733"}
-    for axis, (name, colour) in enumerate(colours.items()):
-        positions.plot(hours, position_errors[:, axis], color=colour, lw=0.5, label=name)
+    colors = {"east": "#4477aa", "north": "#44aa77", "up": "#ee7733"}
+    for axis, (name, color) in enumerate(colors.items()):
+        positions.plot(hours, position_errors[:, axis], color=color, lw=0.5, label=name)
     for sign in (-1, 1):
         positions.axhline(sign * GNSS.drift_vertical_m, color="#ee7733", lw=0.8, ls=":")
         positions.axhline(sign * GNSS.drift_horizontal_m, color="#4477aa", lw=0.8, ls=":")

@@ -109,8 +109,8 @@ def picture(path: Path) -> None:
     bar.set_ylabel("range (m)", fontsize=9)
     bar.tick_params(labelsize=8.5)
     keys = [
-        Line2D([], [], marker="s", ls="", color=colour, mec="#9aa4b0", mew=0.5, label=words)
-        for colour, words in ((SKY, "no return: nothing within range"), (LOST, "return lost"))
+        Line2D([], [], marker="s", ls="", color=color, mec="#9aa4b0", mew=0.5, label=words)
+        for color, words in ((SKY, "no return: nothing within range"), (LOST, "return lost"))
     ]
     figure.legend(handles=keys, loc="upper right", ncols=2, fontsize=9, frameon=False)
     figure.text(0.062, 0.957, "Range image of a turn of an OS1-128", fontsize=12, weight="bold")

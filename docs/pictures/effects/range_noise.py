@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, fixed_beams, wall
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Material, Noise, Survey
@@ -26,13 +26,13 @@ def with_effect(survey: Survey) -> Survey:
 def picture(path: Path) -> None:
     """Draw scatter and walk of simulated walls against energy, with the model's curves."""
     kinds = {
-        "10 % reflectance": (Material("*", 0.1), GREY, np.geomspace(4, 105, 9)),
+        "10 % reflectance": (Material("*", 0.1), GRAY, np.geomspace(4, 105, 9)),
         "80 %": (Material("*", 0.8), BLUE, np.geomspace(10, 250, 9)),
         "retro-reflector": (Material("*", 1.0, retro=True), RED, np.geomspace(20, 250, 5)),
     }
     figure = Figure((9, 3.7), layout="constrained", dpi=110)
     scatter, walk = figure.subplots(1, 2)
-    for name, (material, colour, ranges_m) in kinds.items():
+    for name, (material, color, ranges_m) in kinds.items():
         energies = []
         sigmas = []
         shifts = []
@@ -45,8 +45,8 @@ def picture(path: Path) -> None:
                 cast_scan(target, fixed_beams(RAYS), WALK, materials=[material])["range"].mean()
                 - range_m
             )
-        scatter.plot(energies, 100 * np.array(sigmas), "o", ms=5, color=colour, label=name)
-        walk.plot(energies, 100 * np.array(shifts), "o", ms=5, color=colour)
+        scatter.plot(energies, 100 * np.array(sigmas), "o", ms=5, color=color, label=name)
+        walk.plot(energies, 100 * np.array(shifts), "o", ms=5, color=color)
     ratio = np.geomspace(0.8, 1e6, 200)
     total_sigma = np.hypot(NOISE.range_m, NOISE.range_at_threshold_m / ratio)
     scatter.plot(ratio, 100 * total_sigma, "k-", lw=1, zorder=0, label="σ = 1 cm ⊕ 10 cm · T / E")

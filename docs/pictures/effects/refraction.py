@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lidarpool import Beams, Material, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.media.materials import fresnel
 from lidarsim.simulator.rig import Rig
-from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 from lidarview.render.theme import SENSOR as RED
 
 DRAWS = "effect-refraction.png"
@@ -22,7 +22,7 @@ INDEX = 1.33
 LOSS = 0.15
 FLOOR = 0.4
 WALL = 0.5
-BLUE = OBJECT_COLOURS[4]
+BLUE = OBJECT_COLORS[4]
 NADIRS = np.radians(np.linspace(-72, 72, 289))
 SCANNER = Sensor(Beams(np.abs(NADIRS) - np.pi / 2, np.where(NADIRS < 0, np.pi, 0.0)), Spin(1, 360))
 
@@ -108,10 +108,10 @@ def picture(path: Path) -> None:
         down = np.arcsin(np.sin(nadir) / INDEX)
         top = HEIGHT * np.tan(nadir)
         foot = HEIGHT * np.tan(nadir) + DEPTH * np.tan(down)
-        section.plot([0, top, foot], [HEIGHT, 0, -DEPTH], color=OBJECT_COLOURS[1], lw=1, zorder=3)
+        section.plot([0, top, foot], [HEIGHT, 0, -DEPTH], color=OBJECT_COLORS[1], lw=1, zorder=3)
         apparent_m = HEIGHT / np.cos(nadir) + INDEX * DEPTH / np.cos(down)
         line = [top, apparent_m * np.sin(nadir)], [0, HEIGHT - apparent_m * np.cos(nadir)]
-        section.plot(*line, color=OBJECT_COLOURS[1], lw=1, ls=":", zorder=6)
+        section.plot(*line, color=OBJECT_COLORS[1], lw=1, ls=":", zorder=6)
     section.plot(0, HEIGHT, "^", color=INK, ms=8, zorder=7)
     section.text(0.25, HEIGHT, "sensor", va="center", fontsize=8, color=INK)
     section.set(xlim=(-7.5, 7.5), ylim=(-3.4, 3.4), xlabel="x (m)", ylabel="z (m)", aspect="equal")
@@ -128,7 +128,7 @@ def picture(path: Path) -> None:
     area = (water + INDEX * air) * (tilt * water + INDEX * air / tilt)
     passes = 1 - fresnel(np.cos(angles), INDEX)
     exact = FLOOR * np.cos(within) * passes**2 * np.exp(-2 * LOSS * water) * 100 / area
-    for material, colour, name in ((straight, MUTED, "without"), (wet, RED, "with")):
+    for material, color, name in ((straight, MUTED, "without"), (wet, RED, "with")):
         _, _, nadir, energy = cast(plain, material)
         shown = (nadir >= 0) & (np.arange(len(nadir)) % 6 == 0)
         energies.plot(
@@ -137,7 +137,7 @@ def picture(path: Path) -> None:
             "o",
             ms=4,
             mfc="none",
-            color=colour,
+            color=color,
             label=f"simulated, {name} refraction",
         )
     energies.plot(np.degrees(angles), exact, color=INK, lw=1, label="Snell, Fresnel, Beer–Lambert")

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, cast_scan, fixed_beams, wall
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, cast_scan, fixed_beams, wall
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -69,12 +69,12 @@ def picture(path: Path) -> None:
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
     pulse, widths, apart = figure.subplots(1, 3)
     pulse.axhline(1, color="k", lw=0.8, ls=":")
-    for wall_m, colour in ((8.0, RED), (31.6, BLUE), (50.0, GREY)):
+    for wall_m, color in ((8.0, RED), (31.6, BLUE), (50.0, GRAY)):
         range_m, signal = _waveform(wall_m, NOISE)
         label = f"white wall at {wall_m:g} m"
-        pulse.plot(range_m - wall_m, signal / NOISE.full, color=colour, lw=1.5, label=label)
+        pulse.plot(range_m - wall_m, signal / NOISE.full, color=color, lw=1.5, label=label)
         range_m, signal = _waveform(wall_m, replace(NOISE, saturation=None))
-        pulse.plot(range_m - wall_m, signal / NOISE.full, color=colour, lw=0.8, ls="--")
+        pulse.plot(range_m - wall_m, signal / NOISE.full, color=color, lw=0.8, ls="--")
     pulse.set(
         ylim=(-0.1, 2.2),
         xlim=(-1.5, 1.5),
@@ -88,18 +88,18 @@ def picture(path: Path) -> None:
     closed = PULSE_NS * np.sqrt(1 + np.log2(np.maximum(ratio, 1)))
     kinds = ("W", BLUE, np.geomspace(1, 90, 9)), ("Sign", RED, np.geomspace(3, 90, 6))
     shift = widths.twinx()
-    for name, colour, ranges_m in kinds:
+    for name, color, ranges_m in kinds:
         for wall_m in ranges_m:
             options = {"materials": MATERIALS[name], "columns": COLUMNS}
             columns = cast_scan([wall(name, wall_m)], fixed_beams(1), NOISE, **options)
             over_saturation = columns["intensity"] / NOISE.full
-            widths.plot(over_saturation, columns["pulse_width"], "o", ms=5, color=colour)
+            widths.plot(over_saturation, columns["pulse_width"], "o", ms=5, color=color)
             waves = Returns(waveform="peaks")
             columns = cast_scan(
                 [wall(name, wall_m)], fixed_beams(1), NOISE, returns=waves, **options
             )
             shift.plot(
-                over_saturation, columns["range"] - wall_m, "s", ms=4, mfc="none", color=colour
+                over_saturation, columns["range"] - wall_m, "s", ms=4, mfc="none", color=color
             )
     widths.plot(ratio, closed, "k-", lw=1, zorder=0)
     shift.plot(ratio, -LIGHT_M_NS / 4 * (closed - PULSE_NS), "k--", lw=1, zorder=0)
@@ -108,12 +108,12 @@ def picture(path: Path) -> None:
     widths.set_title("5 ns pulses on walls and signs", fontsize=10)
 
     separable = [
-        (_separable_distance(name, wall_m), colour)
-        for name, colour, ranges_m in kinds
+        (_separable_distance(name, wall_m), color)
+        for name, color, ranges_m in kinds
         for wall_m in ranges_m[3:]
     ]
-    for (over_saturation, behind), colour in separable:
-        apart.plot(over_saturation, behind, "o", ms=5, color=colour)
+    for (over_saturation, behind), color in separable:
+        apart.plot(over_saturation, behind, "o", ms=5, color=color)
     apart.plot(
         ratio, LIGHT_M_NS / 4 * (closed + PULSE_NS), "k-", lw=1, zorder=0, label="wall not clipped"
     )

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, cloud
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, cloud
 from matplotlib.figure import Figure
 
 from lidarpool import (
@@ -64,14 +64,14 @@ def picture(path: Path) -> None:
     columns = cloud(scene, replace(survey, noise=NOISE, **WEATHER))
     wet = columns["cause"] == SPRAY
     for name, axis in (("above", "y"), ("aside", "z")):
-        for which, colour, label in ((~wet, GREY, "surfaces"), (wet, RED, "spray")):
+        for which, color, label in ((~wet, GRAY, "surfaces"), (wet, RED, "spray")):
             views[name].plot(
                 columns["x"][which],
                 columns[axis][which],
                 ".",
                 ms=2.5,
                 mew=0,
-                color=colour,
+                color=color,
                 label=f"{label}: {which.sum():,}",
             )
         views[name].plot(-8, 0 if axis == "y" else 1.9, "^", color=BLUE, ms=7)
@@ -113,12 +113,12 @@ def picture(path: Path) -> None:
     distance_m = np.linspace(0, 28, 1000)
     age = np.ceil(distance_m / (SPEED / 10)) / 10
     curve = full_rate * np.exp(-age / 0.4) * (age <= 1.3)
-    axes.plot(distance_m, curve, color=GREY, label="Poisson's mean, boxes of 0.1 s")
+    axes.plot(distance_m, curve, color=GRAY, label="Poisson's mean, boxes of 0.1 s")
     axes.plot(
         distance_m,
         full_rate * np.exp(-distance_m / SPEED / 0.4),
         ":",
-        color=GREY,
+        color=GRAY,
         label="exp(−x / 10 m)",
     )
     axes.set(xlabel="behind the lorry (m)", ylabel="returns of a beam across", xlim=(0, 28))

@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from lidarpool import Beams, Material, Noise, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarsim.media.leaves import projection
 from lidarsim.simulator.rig import Rig
-from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
+from lidarview.render.theme import INK, LINE, MUTED, OBJECT_COLORS
 
 DRAWS = "effect-vegetation.png"
-# m²/m³, and metres of a canopy: a leaf area index of 1.8
+# m²/m³, and meters of a canopy: a leaf area index of 1.8
 DENSITY = 0.6
 HIGH = 3.0
 KINDS = {"planophile": 0, "spherical": 2, "erectophile": 1}
-GREEN = OBJECT_COLOURS[2]
-BROWN = OBJECT_COLOURS[7]
+GREEN = OBJECT_COLORS[2]
+BROWN = OBJECT_COLORS[7]
 RAYS = 50_000
 
 Real = NDArray[np.float64]
@@ -64,9 +64,9 @@ def section(axes: Any, leaves: Material, title: str) -> None:
     positions = scan.positions
     which = scan.object
     slice_ = (np.abs(positions[:, 1]) < 0.6) & (positions[:, 0] < 9)
-    for number, colour in ((2, MUTED), (0, GREEN), (1, BROWN)):
+    for number, color in ((2, MUTED), (0, GREEN), (1, BROWN)):
         shown = slice_ & (which == number)
-        axes.plot(positions[shown, 0], positions[shown, 2], ".", ms=1.8, mew=0, color=colour)
+        axes.plot(positions[shown, 0], positions[shown, 2], ".", ms=1.8, mew=0, color=color)
     angle = np.linspace(0, 2 * math.pi, 100)
     axes.plot(2.4 * np.cos(angle), 5.5 + 3 * np.sin(angle), color=INK, lw=0.6)
     axes.plot(-9, 2, "^", color=INK, ms=6)
@@ -103,10 +103,10 @@ def picture(path: Path) -> None:
 
     zeniths = np.linspace(0, 80, 81)
     tilts = np.arange(0, 81, 10.0)
-    for kind, colour in KINDS.items():
+    for kind, color in KINDS.items():
         cosine = np.cos(np.radians(zeniths))
         tau = projection(kind, cosine) * DENSITY * HIGH / cosine
-        shade = OBJECT_COLOURS[colour]
+        shade = OBJECT_COLORS[color]
         gaps.plot(zeniths, np.exp(-tau), color=shade, lw=1.2, label=f"{kind}: exp(−G·LAI / cos θ)")
         simulated = [np.isnan(canopy(kind, tilt)).mean() for tilt in tilts]
         gaps.plot(tilts, simulated, "o", ms=4.5, mfc="none", color=shade, label="simulated")

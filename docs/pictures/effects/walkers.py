@@ -10,7 +10,7 @@ import numpy as np
 from lidarpool import Actor, Scanner, Scene, Sensor, Survey, Track
 from lidarsim.scene.actors import box, join_meshes
 from lidarsim.scene.files.meshfile import load_objects
-from lidarview.render.colouring import DIVERGING
+from lidarview.render.coloring import DIVERGING
 
 DRAWS = "effect-walkers.png"
 PERSON = Path(__file__).parents[3] / "examples" / "pedestrian.glb"

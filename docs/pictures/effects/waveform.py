@@ -97,14 +97,14 @@ def _panel(
         bell = parts["amplitude"][row] / top * np.exp(-0.5 * ((fine - middle) / sigma_m) ** 2)
         label = "fitted Gaussians" if row == 0 else None
         axes.plot(fine, bell, color=_LANES["gaussian"][1], lw=1, ls="--", label=label)
-    for lane, (name, (_, colour, marker)) in enumerate(_LANES.items()):
+    for lane, (name, (_, color, marker)) in enumerate(_LANES.items()):
         heights_of_returns = _HEIGHT_M - clouds[name]["range"]
         axes.axhline(-0.10 - 0.11 * lane, color="#dddddd", lw=0.8, zorder=0)
         axes.plot(
             heights_of_returns,
             np.full(len(heights_of_returns), -0.10 - 0.11 * lane),
             marker,
-            color=colour,
+            color=color,
             ms=6,
         )
     axes.set(xlim=span[::-1], ylim=(-0.42, 1.08), xlabel="height above ground, m")
@@ -126,12 +126,12 @@ def picture(path: Path) -> None:
     _panel(tree_axes, wood, (2.8, 2.0), (-1.5, 14.5))
     tree_axes.set_title("an oak", fontsize=10)
     for axes in (edge_axes, tree_axes):
-        for lane, (label, colour, _) in enumerate(_LANES.values()):
+        for lane, (label, color, _) in enumerate(_LANES.values()):
             left_limit = axes.get_xlim()[0]
             axes.annotate(
                 label,
                 (left_limit, -0.10 - 0.11 * lane),
-                color=colour,
+                color=color,
                 fontsize=8,
                 va="bottom",
                 xytext=(2, 1),

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from docs.pictures.effects._receiver import BLUE, GREY, RED, cloud, points, wall
+from docs.pictures.effects._receiver import BLUE, GRAY, RED, cloud, points, wall
 from matplotlib.figure import Figure
 
 from lidarpool import Beams, Material, Noise, Returns, Scene, SceneMesh, Sensor, Spin, Survey
@@ -48,9 +48,9 @@ def picture(path: Path) -> None:
         x = columns["x"]
         z = columns["z"] + 2
         ghost = columns["cause"] == 5
-        for which, colour, label in ((~ghost, GREY, "surfaces"), (ghost, RED, "ghosts")):
+        for which, color, label in ((~ghost, GRAY, "surfaces"), (ghost, RED, "ghosts")):
             shown = f"{label}: {which.sum():,}"
-            axes.plot(x[which], z[which], ".", ms=3, mew=0, color=colour, label=shown)
+            axes.plot(x[which], z[which], ".", ms=3, mew=0, color=color, label=shown)
         axes.plot(0, 2, "^", color=BLUE, ms=7)
         axes.set(xlim=(-1, 34), ylim=(-6, 6), xlabel="x (m)", ylabel="z (m)", title=name)
         axes.legend(fontsize=8, loc="lower left", framealpha=0.9, markerscale=4)
@@ -62,7 +62,7 @@ def picture(path: Path) -> None:
     angle = np.radians(np.linspace(0, 89.5, 400))
     dry = ROAD * np.cos(angle)
     axes = views["right"]
-    axes.plot(np.degrees(angle), dry, color=GREY, label="dry: ρ cos θ")
+    axes.plot(np.degrees(angle), dry, color=GRAY, label="dry: ρ cos θ")
     wet = dry * below_water(np.cos(angle), np.full(len(angle), ROAD))
     axes.plot(np.degrees(angle), wet, color=BLUE, label="wet: ρ cos θ T² / (n² (1 − p ρ))")
     mirrored = fresnel(np.cos(angle), WATER_INDEX) ** 2

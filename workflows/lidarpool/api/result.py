@@ -90,7 +90,7 @@ class Result(RunResult):
         *,
         only: Sequence[str] = (),
         size: tuple[int, int] = (1600, 1000),
-        colour: str = "z",
+        color: str = "z",
     ) -> list[Path]:
         """Draw pictures, as `lidarpool plot` does.
 
@@ -102,8 +102,8 @@ class Result(RunResult):
             Names of pictures: scene, hits, intensity, cloud, path; by default all.
         size
             Width and height in pixels.
-        colour
-            Column to colour the points of the cloud by; "rgb" for red, green and blue.
+        color
+            Column to color the points of the cloud by; "rgb" for red, green and blue.
 
         Returns
         -------
@@ -117,7 +117,7 @@ class Result(RunResult):
         from ..report.result_pictures import draw_pictures
 
         cloud_folder = self._cloud_file.parent
-        return list(draw_pictures(self._pictured, cloud_folder, folder, only, size, colour))
+        return list(draw_pictures(self._pictured, cloud_folder, folder, only, size, color))
 
     @checked
     def view(self, *, port: int = 8080, browser: bool = True) -> None:

@@ -61,7 +61,7 @@ class Shard:
     def jobs(self, count: int) -> range:
         """Return the jobs of the share out of `count`.
 
-        Neighbours are in different shares.
+        Neighbors are in different shares.
         """
         return range(self.number - 1, count, self.total)
 

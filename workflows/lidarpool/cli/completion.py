@@ -51,8 +51,8 @@ def columns(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
     return _in_list(incomplete, OPTIONAL_COLUMNS)
 
 
-def colours(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a column that colours points."""
+def colors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
+    """Complete a column that colors points."""
     del ctx, param
     return starting_with(incomplete, (*ALWAYS_COLUMNS, *OPTIONAL_COLUMNS, *COMPOSED_COLUMNS))
 

@@ -84,7 +84,7 @@ def forecast_scenario(
             file_format = campaign.keep.of_jobs
             figures["notes"] += file_format.contradictions(scenario.cloud.coordinates)
             figures["notes"] += file_format.renamed([*scenario.sensors])
-            figures["notes"] += file_format.unlabelled(job.survey)
+            figures["notes"] += file_format.unlabeled(job.survey)
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 
@@ -263,12 +263,12 @@ def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
     if lines:
         of_lines = f"; {plural(lines['count'], 'flight line')}, "
         of_lines += f"{lines['length_m']:,.0f} m in {lines['seconds']:,.1f} s"
-    yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s{of_lines}"
+    yield f"trajectory  {drive['meters']:,.2f} m in {drive['seconds']:,.3f} s{of_lines}"
     for sensor in drive["sensors"]:
         cycles = ""
         if sensor["turns"]:
             cycles = f", {sensor['turns']:,.2f} {sensor['cycle']}s; in one the carrier moves "
-            cycles += f"{sensor['metres_a_turn']:,.3f} m{' on the flight lines' if lines else ''}"
+            cycles += f"{sensor['meters_a_turn']:,.3f} m{' on the flight lines' if lines else ''}"
         firings = plural(sensor["firings"], "firing")
         yield f"{sensor['name'] or 'sensor':<11} {sensor['model']}, {firings}{cycles}"
 

@@ -67,9 +67,9 @@ class _FormatName(click.Choice[str]):
 )
 @options.copies
 @click.option(
-    "--colour",
+    "--color",
     metavar="COLUMN",
-    shell_complete=completion.colours,
+    shell_complete=completion.colors,
     default="z",
     show_default=True,
     help="Column that determines the point colors, or rgb.",
@@ -80,7 +80,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     \b
     Examples:
       lidarpool plot lidarpool-out
-      lidarpool plot lidarpool-out --only cloud --colour intensity --size 2400x1500 --out figures
+      lidarpool plot lidarpool-out --only cloud --color intensity --size 2400x1500 --out figures
     """  # noqa: D301 - click wants the character, not its name
     from lidarview.picture_file import PICTURE_FILE, PictureContent
 

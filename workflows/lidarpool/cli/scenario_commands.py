@@ -371,7 +371,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
 )
 @options.flag("--keep-noise", help="Include withheld points and noise.")
 @click.option(
-    "--colour",
+    "--color",
     type=click.Choice(["rgb", "intensity"]),
     help="Source of the surfel colors (default: rgb if the cloud has it, otherwise intensity).",
 )
@@ -390,7 +390,7 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
       lidarpool scene points survey.laz place.obj --voxel-m 0.5
       lidarpool scene points scan.xyz place.glb --unit mm
       lidarpool scene points tile.laz place.glb --epsg 32618
-      lidarpool scene points stations.e57 place.glb --colour intensity
+      lidarpool scene points stations.e57 place.glb --color intensity
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.point_scene import points_to_scene
 
@@ -404,7 +404,7 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
             tell(f"{cloud}: {made.gap_note}")
         if place.epsg is not None:
             tell(f"{out} keeps the coordinate system of {cloud}, EPSG:{place.epsg}")
-        if out.suffix.lower() != ".glb" and (place.has_colours.any() or place.material_names):
+        if out.suffix.lower() != ".glb" and (place.has_colors.any() or place.material_names):
             tell(
                 f"{out} cannot store the colors and classes of {cloud}. Write a .glb file to "
                 "keep them."
@@ -417,7 +417,7 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
 def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool = False) -> None:
     """Make a scene and write the scene to a file.
 
-    `paint` gives a generated scene its colours.
+    `paint` gives a generated scene its colors.
     """
     from lidarscenes.procedural.paint import painted
     from lidarscenes.writers.scene_file import check_target, write_scene
@@ -426,7 +426,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     if file.exists() and not overwrite:
         raise LidarError(f"{file} already exists. Use another name, or pass --overwrite.")
     scene = make()
-    if file.suffix.lower() == ".glb":  # other formats hold no colours
+    if file.suffix.lower() == ".glb":  # other formats hold no colors
         scene = painted(scene) if paint else scene
     elif scene.instances and scene.triangles > MAX_COPIED_TRIANGLES:
         raise LidarError(

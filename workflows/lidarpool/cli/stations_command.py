@@ -266,7 +266,7 @@ def _show_coverage(
 
 
 def _station_positions(built: Built) -> Floats:
-    """Return the positions (s, 3) of the sensor at all stations, world metres."""
+    """Return the positions (s, 3) of the sensor at all stations, world meters."""
     path = built.survey.path
     mount = built.survey.carried[0].mount
     poses = [path.pose(number, 0.0).compose(mount) for number in range(path.stations)]

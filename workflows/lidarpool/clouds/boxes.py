@@ -25,9 +25,9 @@ class Boxes:
     has left, the box is missing.
     """
 
-    centres: Floats  # (a, 3): metres, world coordinates, or the sensor frame after `inward`
+    centers: Floats  # (a, 3): meters, world coordinates, or the sensor frame after `inward`
     quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to that frame
-    sizes: Floats  # (a, 3): length, width and height, metres, along the actor's axes
+    sizes: Floats  # (a, 3): length, width and height, meters, along the actor's axes
     points: Ints  # (a,): number of points of the sweep that belong to the actor
     present: Bools  # (a,): True if the actor is in the scene, or appears later and has points
 
@@ -47,8 +47,8 @@ class Boxes:
         """Return boxes of a sweep or several, (n, a), in the sensor frame at the start of each."""
         quaternions = self.quaternions @ pose.quaternion_matrices[index]
         quaternions *= np.where(quaternions[..., 3:] < 0, -1, 1)  # w is at least 0
-        centres = (self.centres - pose.positions[index][..., None, :]) @ pose.rotations[index]
-        return Boxes(centres, quaternions, self.sizes, self.points, self.present)
+        centers = (self.centers - pose.positions[index][..., None, :]) @ pose.rotations[index]
+        return Boxes(centers, quaternions, self.sizes, self.points, self.present)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +58,11 @@ class SweepBoxes:
     names: tuple[str, ...]
     types: tuple[str, ...]  # "Car" of "Car 1"
     objects: Ints32  # (k,): numbers of the actors in the column `object`
-    centres: Floats  # (k, 3): metres, sensor frame
+    centers: Floats  # (k, 3): meters, sensor frame
     quaternions: (
         Floats  # (k, 4): x, y, z, w of the rotation from the box's axes to the sensor frame
     )
-    sizes: Floats  # (k, 3): length, width and height, metres
+    sizes: Floats  # (k, 3): length, width and height, meters
     points: Ints  # (k,): number of points of the sweep that belong to the actor
 
     @classmethod
@@ -80,7 +80,7 @@ class SweepBoxes:
                 names=(),
                 types=(),
                 objects=np.empty(0, np.int32),
-                centres=vectors,
+                centers=vectors,
                 quaternions=np.empty((0, 4)),
                 sizes=vectors,
                 points=np.empty(0, np.int64),
@@ -90,7 +90,7 @@ class SweepBoxes:
             names=tuple(sweeps.actors[actor] for actor in actors),
             types=tuple(sweeps.actor_types[actor] for actor in actors),
             objects=(len(sweeps.objects) + rows).astype(np.int32),
-            centres=boxes.centres[index][rows],
+            centers=boxes.centers[index][rows],
             quaternions=boxes.quaternions[index][rows],
             sizes=boxes.sizes[index][rows],
             points=boxes.points[index][rows],
@@ -108,5 +108,5 @@ class SweepBoxes:
 
     @property
     def rows(self) -> Floats32:
-        """Centre, length, width, height and yaw, float32 (k, 7)."""
-        return np.column_stack([self.centres, self.sizes, self.yaw]).astype(np.float32)
+        """Center, length, width, height and yaw, float32 (k, 7)."""
+        return np.column_stack([self.centers, self.sizes, self.yaw]).astype(np.float32)

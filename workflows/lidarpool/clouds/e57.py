@@ -21,7 +21,7 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
 from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.columns.table import COLOURS, NORMAL
+from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.cloud_scan import CloudScan
 from lidarsim.scene.files.intensity_scales import Limits, scales_of
@@ -46,12 +46,12 @@ _COLORS = ("Red", "Green", "Blue")
 # Columns of the fields that are read.
 _COLUMNS = {
     "intensity": "intensity",
-    **{f"color{color}": name for color, name in zip(_COLORS, COLOURS, strict=True)},
+    **{f"color{color}": name for color, name in zip(_COLORS, COLORS, strict=True)},
     "rowIndex": "row",
     "columnIndex": "column",
 }
 # Columns whose values the flags mark as invalid.
-_FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLOURS}
+_FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
 _GRAY = 188  # byte of a color that is unknown: half of the light
 _MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
 _MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
@@ -100,8 +100,8 @@ def _write_scan(
     data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     if "intensity" in points.columns:
         data["intensity"] = points["intensity"]
-    if {*COLOURS} <= {*points.columns}:
-        data |= {f"color{name.capitalize()}": points[name] for name in COLOURS}
+    if {*COLORS} <= {*points.columns}:
+        data |= {f"color{name.capitalize()}": points[name] for name in COLORS}
     if {*NORMAL} <= {*points.columns}:
         columns = sweeps.columns_compensated(sweep, points)
         data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
@@ -244,8 +244,8 @@ def open_file(source: RecordingSource) -> Recording:
             Allowance(size, _THIN).take(_bytes_of_scan(headers[number]))
             scan = _read_scan(file, headers, number, scale)
             columns = dict(scan.columns)
-            if {*COLOURS} <= columns.keys():
-                for name in COLOURS:
+            if {*COLORS} <= columns.keys():
+                for name in COLORS:
                     columns[name] = np.nan_to_num(columns[name], nan=_GRAY).astype(np.uint8)
             return scan.positions, columns, np.eye(4) if scan.pose is None else scan.pose
 
@@ -287,7 +287,7 @@ def read_points(path: Path) -> FilePoints:
     finally:
         file.close()
     return replace(
-        points, system=system, in_metres=True, notes=[*scale.notes, *points.notes], units_m=None
+        points, system=system, in_meters=True, notes=[*scale.notes, *points.notes], units_m=None
     )
 
 
@@ -306,7 +306,7 @@ def _read_scan(file: Any, headers: Sequence[Any], number: int, scale: _Scale) ->
         raise ValueError(f"{scan_name} has neither Cartesian nor spherical coordinates")
     read = _read_fields(file, header)
     columns = {name: read[field] for field, name in _COLUMNS.items() if field in read}
-    if {*COLOURS} <= columns.keys():
+    if {*COLORS} <= columns.keys():
         columns |= _color_columns(header, columns)
     if (limits := scale.limits[number]) is not None:
         columns["intensity"] = limits.apply(columns["intensity"])
@@ -372,12 +372,12 @@ def _positions(read: Mapping[str, AnyArray], kind: str) -> Floats:
 
 def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, AnyArray]:
     """Return the colors of a scan from 0 to 255, as bytes or, with NaN, as real numbers."""
-    values = [columns[name] for name in COLOURS]
+    values = [columns[name] for name in COLORS]
     full = _full_color(header, max(float(np.nanmax(color, initial=0)) for color in values))
     scaled = [np.rint(np.clip(color * (255 / full), 0, 255)) for color in values]
     has_nan = any(np.isnan(color).any() for color in scaled)
     dtype = np.float32 if has_nan else np.uint8
-    return {name: color.astype(dtype) for name, color in zip(COLOURS, scaled, strict=True)}
+    return {name: color.astype(dtype) for name, color in zip(COLORS, scaled, strict=True)}
 
 
 def _full_color(header: Any, highest: float) -> float:

@@ -20,7 +20,7 @@ NORMALS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 ORIGINS = (("origin_x", "origin_y", "origin_z"),)
 # Names of columns in files of various programs; the first name that a file has is read.
 INTENSITIES = ("intensity", "scalar_Intensity", "scalar_intensity", "reflectivity", "i")
-COLOURS = (("red", "green", "blue"), ("colorRed", "colorGreen", "colorBlue"))
+COLORS = (("red", "green", "blue"), ("colorRed", "colorGreen", "colorBlue"))
 
 Columns = dict[str, AnyArray]  # {name in the file: (n,)}
 Vectors = tuple[str, str, str]
@@ -35,7 +35,7 @@ class FilePoints:
     scanners: Floats | None = None  # (n, 3): NaN where unknown
     ignored: list[str] = field(default_factory=list)
     system: StatedSystem | None = None  # system that the file states
-    in_metres: bool = False  # whether the format has true metres, whatever the system says
+    in_meters: bool = False  # whether the format has true meters, whatever the system says
     units_m: tuple[float, float, float] | None = None  # units of x, y and z, if a header names them
     noise_classes: tuple[int, ...] = NOISE_CLASSES
     left_out: LeftOut = field(default_factory=LeftOut)  # withheld points and noise
@@ -146,7 +146,7 @@ def _measured(columns: Columns) -> Columns:
     Some programs write zeros for quantities that a scan does not have.
     """
     missing: list[str] = []
-    for names in (*((name,) for name in INTENSITIES), *COLOURS):
+    for names in (*((name,) for name in INTENSITIES), *COLORS):
         if {*names} <= columns.keys() and not any(columns[name].any() for name in names):
             missing += names
     return {name: values for name, values in columns.items() if name not in missing}

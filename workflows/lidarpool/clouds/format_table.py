@@ -188,16 +188,16 @@ LAYOUTS = {
     "robosense": ("reflectivity", "time"),
 }
 _ORGANIZED_LAYOUTS = ("velodyne", "ouster", "images", "robosense")
-_COLOURS = ("red", "green", "blue")
+_COLORS = ("red", "green", "blue")
 _SURFACES = (
     "normal_x", "normal_y", "normal_z", "incidence_deg", "origin_x", "origin_y", "origin_z",
 )  # fmt: skip
-_E57 = ("intensity", *_COLOURS, *_SURFACES[:3])
+_E57 = ("intensity", *_COLORS, *_SURFACES[:3])
 _LABELS = ("object", "intensity", "class")
 _KITTI_COLUMNS = ("object", "reflectivity", "class")
 _RINGS = ("channel", "intensity")
 _OSI = ("object", "channel", "intensity", "reflectance", "radial_velocity", "sensor")
-_BAG_COLUMNS = ("channel", *_COLOURS, "radial_velocity", *_SURFACES, "material")
+_BAG_COLUMNS = ("channel", *_COLORS, "radial_velocity", *_SURFACES, "material")
 
 _KITTI_FILES = (
     r"semantic-kitti\.yaml|(poses|label_02)/[^/]+\.txt|"

@@ -37,7 +37,7 @@ class Pieces(pieces.Pieces):
     In a data set, `images/JOB/NAME/000000.npz`. Arrays are images, (channels, firings): `range` and
     all columns of the points of first returns, and with the number of the return behind the name
     (`range2`) of later returns; of all rays `time`, `azimuth` and `elevation`; `x`, `y` and `z` in
-    metres in the sensor frame at the start of the sweep. In addition, `scan` of each firing, `pose`
+    meters in the sensor frame at the start of the sweep. In addition, `scan` of each firing, `pose`
     (4, 4), from the sensor frame at the start of the sweep to the world frame, and `frame`, the
     frame of the points in words.
     """

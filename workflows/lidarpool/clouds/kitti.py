@@ -164,10 +164,10 @@ class Reader(sweep_reader.Reader):
 
 
 def labels_file(classes: Mapping[int, str]) -> bytes:
-    """Return the names of classes, and colours (blue, green, red), for semantic-kitti-api."""
+    """Return the names of classes, and colors (blue, green, red), for semantic-kitti-api."""
     labels = {0: "unlabeled", **classes}
-    colours = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
-    return yaml.safe_dump({"labels": labels, "color_map": colours}, allow_unicode=True).encode()
+    colors = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
+    return yaml.safe_dump({"labels": labels, "color_map": colors}, allow_unicode=True).encode()
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
@@ -210,7 +210,7 @@ def _labels(
     """
     rotation = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
     forward = (rotation @ matrices(boxes.quaternions))[:, :, 0]  # directions of the actors
-    positions = sweeps.pose.inward(sweep, boxes.centres) @ camera.T
+    positions = sweeps.pose.inward(sweep, boxes.centers) @ camera.T
     positions[:, 1] += boxes.sizes[:, 2] / 2
     rotation_y = np.arctan2(-forward[:, 2], forward[:, 0])
     alpha = rotation_y - np.arctan2(positions[:, 0], positions[:, 2])

@@ -24,9 +24,9 @@ from lidarsim.base.errors import CutShortError, LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
-from lidarsim.columns.table import COLOURS, NORMAL, TABLE, Column
+from lidarsim.columns.table import COLORS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
-from lidarsim.scene.files.stated_system import stated_metres
+from lidarsim.scene.files.stated_system import stated_meters
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
 from .file_points import FilePoints, check_count
@@ -82,19 +82,19 @@ def _write(
     `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
     start. A coordinate system is stored as WKT. `return_number` and `returns` are unchanged. Scan
     angle (steps of 0.006 degrees), scan direction, edge of flight line and point source are from
-    `FlightLines`. With `red`, `green` and `blue` the point format is 7, and colours are 257 times
+    `FlightLines`. With `red`, `green` and `blue` the point format is 7, and colors are 257 times
     these, 16 bits. Intensity is the column `intensity`, where `intensity_full_scale` and above
     are 65,535; a record of lidarpool states this number as JSON. Classification is `class` if it is
     below 256. Because of these limits, both columns are in the extra bytes as well. The lookup has
     the names of these classes, ASCII, at most 15 letters. Names of materials are a record of
     lidarpool, a list as JSON. Return numbers are 15 at most. A text area record names the frame of
-    the points. Recorded waveforms make the point format 9, or 10 with colours (`_Packets`).
+    the points. Recorded waveforms make the point format 9, or 10 with colors (`_Packets`).
     """
     packets = _Packets.from_cloud(cloud)
     columns = {column.name for column in cloud.table}
     header = _header(columns, sweeps, packets, intensity_full_scale)
     _set_grid(header, cloud, sweeps.precision_m, path.suffix[1:].upper())
-    format_fields = (*_FORMAT_FIELDS, *COLOURS) if {*COLOURS} <= columns else _FORMAT_FIELDS
+    format_fields = (*_FORMAT_FIELDS, *COLORS) if {*COLORS} <= columns else _FORMAT_FIELDS
     extra = [column for column in cloud.table if column.name not in format_fields]
     header.add_extra_dims([_extra_bytes(column) for column in extra])
     names = [column.name for column in extra]
@@ -143,7 +143,7 @@ def _header(
     columns: set[str], sweeps: Sweeps, packets: _Packets | None, intensity_full_scale: float | None
 ) -> laspy.LasHeader:
     """Return the header of a file with its records, without grid and extra bytes."""
-    point_format = (6 if packets is None else 9) + int({*COLOURS} <= columns)
+    point_format = (6 if packets is None else 9) + int({*COLORS} <= columns)
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.generating_software = "lidarpool"
     header.creation_date = date(1980, 1, 6)  # GPS time 0, the start of surveys without a date
@@ -184,7 +184,7 @@ def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, nam
     lower, upper = np.asarray(cloud.bounds, np.float64)
     header.scales = np.full(3, precision_m)
     header.offsets = np.floor((lower + upper) / 2)
-    # Steps from whole metres may miss the grid of the points, as of a world origin of millimetres.
+    # Steps from whole meters may miss the grid of the points, as of a world origin of millimeters.
     steps = (lower - header.offsets) / precision_m
     beside = (steps - np.round(steps)) * precision_m
     header.offsets += np.where(np.abs(beside) > _ON_GRID * precision_m, beside, 0.0)
@@ -279,8 +279,8 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: fl
         record.classification = np.where(columns["class"] < 256, columns["class"], 0).astype(
             np.uint8
         )
-    if {*COLOURS} <= {*columns}:
-        for name in COLOURS:
+    if {*COLORS} <= {*columns}:
+        for name in COLORS:
             record[name] = columns[name].astype(np.uint16) * 257
     for name in extra:
         column = TABLE.get(name)
@@ -308,7 +308,7 @@ def open_file(source: RecordingSource) -> Recording:
             count = reader.header.point_count
             classes = noise_classes(reader.header)
             places = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
-        metres, notes = stated_metres(system, places, source.unit)
+        meters, notes = stated_meters(system, places, source.unit)
 
     def read_run(reader: laspy.LasReader, start: int, length: int) -> Read:
         reader.seek(start)
@@ -338,8 +338,8 @@ def open_file(source: RecordingSource) -> Recording:
         is_cloud=True,
         point_count=count,
         notes=source.named(notes),
-        metres=metres,
-        epsg=source.epsg_in_metres(system, metres),
+        meters=meters,
+        epsg=source.epsg_in_meters(system, meters),
         sample=sample,
         noise_filter=NoiseFilter(classes),
     )

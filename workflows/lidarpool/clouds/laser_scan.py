@@ -22,7 +22,7 @@ _MAX_STEP_DIFFERENCE = 1e-6  # largest difference between steps of rays, radians
 def is_planar(sensor: Sensor) -> bool:
     """Return True if a sensor is a 2D scanner: a beam that turns in the plane of x and y.
 
-    Its rays start at its centre, and follow each other in even steps.
+    Its rays start at its center, and follow each other in even steps.
     """
     if sensor.channels != 1 or sensor.spins(np.zeros(1, np.int64)) is None:
         return False
@@ -61,7 +61,7 @@ class ScanRays:
     time_increment_s: float  # between rays
     scan_time_s: float  # between sweeps
     range_limits_m: tuple[float, float]
-    ranges: Floats32  # (n,): of the first return, metres; infinite where there is none (REP 117)
+    ranges: Floats32  # (n,): of the first return, meters; infinite where there is none (REP 117)
     intensities: Floats32  # (n,): of the first return; 0 where there is none
 
     @classmethod

@@ -355,9 +355,9 @@ class _Tables:
         # nuscenes-devkit sorts scenes by time, and fails where two have the same.
         day = 0 if self._entry is None else self._entry.number
         times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]
-        for number, neighbours in enumerate(self._chain("sample", list(range(count)))):
+        for number, neighbors in enumerate(self._chain("sample", list(range(count)))):
             scene = self._token("scene", self._scene)
-            self._add("sample", number, timestamp=times[number], scene_token=scene, **neighbours)
+            self._add("sample", number, timestamp=times[number], scene_token=scene, **neighbors)
         for sensor, channel in enumerate(channels):
             self._add("sensor", channel, channel=channel, modality="lidar")
             self._add(
@@ -369,7 +369,7 @@ class _Tables:
                 camera_intrinsic=[],
             )
             sweeps_of_sensor = np.flatnonzero(sweeps.sensor == sensor).tolist()
-            for sweep, neighbours in zip(
+            for sweep, neighbors in zip(
                 sweeps_of_sensor, self._chain("sample_data", sweeps_of_sensor), strict=True
             ):
                 x, y, z, w = sweeps.pose.quaternions[sweep].tolist()
@@ -398,7 +398,7 @@ class _Tables:
                     width=0,
                     filename=names[sweep],
                     is_key_frame=is_key_frame,
-                    **neighbours,
+                    **neighbors,
                 )
 
     def add_actors(self, boxes: list[list[Boxes]]) -> None:
@@ -432,7 +432,7 @@ class _Tables:
                     instance_token=self._token("instance", actor),
                     visibility_token="",
                     attribute_tokens=[],
-                    translation=at_stamp.centres[actor].tolist(),
+                    translation=at_stamp.centers[actor].tolist(),
                     size=[width, length, height],
                     rotation=[w, x, y, z],
                     num_lidar_pts=int(sum(keys.points[actor] for keys in boxes[number])),

@@ -188,7 +188,7 @@ class _Messages:
         )
         actors = []
         for actor in np.flatnonzero(boxes.present).tolist():
-            base = self._base(boxes.centres[actor], boxes.quaternions[actor], boxes.sizes[actor])
+            base = self._base(boxes.centers[actor], boxes.quaternions[actor], boxes.sizes[actor])
             base.velocity = _vector(osi, sweeps.actor_velocities[actor, sweep])
             actors.append(
                 osi.MovingObject(
@@ -256,7 +256,7 @@ class _Messages:
                 probability=1.0, **type_fields
             )
             base = self._base(
-                in_sensor.centres[row], in_sensor.quaternions[row], in_sensor.sizes[row]
+                in_sensor.centers[row], in_sensor.quaternions[row], in_sensor.sizes[row]
             )
             detected.append(
                 osi.DetectedMovingObject(header=header, base=base, candidate=[candidate])
@@ -304,7 +304,7 @@ def encoded_detections(positions: Floats, points: Cloud) -> bytes:
     Parameters
     ----------
     positions
-        float64 (n, 3), metres, sensor frame.
+        float64 (n, 3), meters, sensor frame.
     points
         The columns `object` and `channel`; `intensity`, `reflectance` and `radial_velocity` if
         present.

@@ -107,7 +107,7 @@ class Reader(sweep_reader.Reader):
         return sum(info.size for info in table.filesystem.get_file_info(table.files))
 
     def _group(self, fragment: Any, allowance: Allowance) -> pa.Table:
-        """Read a group of rows, cached because neighbouring sweeps share groups."""
+        """Read a group of rows, cached because neighboring sweeps share groups."""
         key = fragment.path, fragment.row_groups[0].id
         if key not in self._held:
             rows = read_group(fragment, number_columns(fragment.physical_schema), allowance)

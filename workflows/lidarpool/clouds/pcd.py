@@ -11,8 +11,8 @@ from lidarsim.base.arrays import AnyArray
 from lidarsim.base.extras import reading
 from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import COLOURS, NORMAL
-from lidarsim.scene.colours import as_float
+from lidarsim.columns.table import COLORS, NORMAL
+from lidarsim.scene.colors import as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 
 from . import pieces
@@ -49,11 +49,11 @@ class Pieces(pieces.Pieces):
         positions = positions_of(number, points).T.astype(np.float32)
         fields: list[tuple[str, AnyArray]] = [*zip("xyz", positions, strict=True)]
         columns = columns_of(number, points)
-        coloured = {*COLOURS} <= {*columns}
-        if coloured:
-            fields.append(("rgb", as_float(*(points[name] for name in COLOURS))))
+        colored = {*COLORS} <= {*columns}
+        if colored:
+            fields.append(("rgb", as_float(*(points[name] for name in COLORS))))
         for column in self.cloud.table:
-            if (coloured and column.name in COLOURS) or (column.name == "time" and not as_fired):
+            if (colored and column.name in COLORS) or (column.name == "time" and not as_fired):
                 continue
             values = columns[column.name]
             if column.name == "time":
@@ -84,7 +84,7 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
         return scan.positions, scan.columns, scan.pose
 
     return source.recording(
-        len(files), read, metres=source.chosen_metres(), noise_filter=NoiseFilter()
+        len(files), read, meters=source.chosen_meters(), noise_filter=NoiseFilter()
     )
 
 

@@ -25,7 +25,7 @@ from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import NORMAL, TABLE, Column, check_names
 from lidarsim.scene.files.cloud_scan import with_usual_names
 from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
-from lidarsim.scene.files.stated_system import StatedSystem, stated_metres
+from lidarsim.scene.files.stated_system import StatedSystem, stated_meters
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
@@ -368,7 +368,7 @@ def open_file(source: RecordingSource) -> Recording:
         cloud = CloudFile(source.path)
     except LidarError:  # text, or of another program
         return _open_foreign(source)
-    return replace(_open_own(source, cloud), metres=source.chosen_metres())
+    return replace(_open_own(source, cloud), meters=source.chosen_meters())
 
 
 def open_folder(source: RecordingSource) -> Recording:
@@ -393,14 +393,14 @@ def _open_foreign(source: RecordingSource) -> Recording:
             if system is None
             else positions_of(with_usual_names(read_ply_columns(data)))
         )
-        metres, notes = stated_metres(system, positions, source.unit)
+        meters, notes = stated_meters(system, positions, source.unit)
     return source.recording(
         1,
         read,
         is_cloud=True,
         notes=source.named(notes),
-        metres=metres,
-        epsg=source.epsg_in_metres(system, metres),
+        meters=meters,
+        epsg=source.epsg_in_meters(system, meters),
         noise_filter=NoiseFilter(),
     )
 

@@ -21,8 +21,8 @@ _SIZES = (1, 2, 4, 8)  # of numbers, bytes
 class Scale(NamedTuple):
     """Positions of cells: `round((cell * precision_m + origin) * factor) / factor`."""
 
-    precision_m: float  # size of a cell, metres
-    origin: Floats  # world position of the cell 0, 0, 0, (3,), metres
+    precision_m: float  # size of a cell, meters
+    origin: Floats  # world position of the cell 0, 0, 0, (3,), meters
     factor: float  # a power of ten
 
 
@@ -59,7 +59,7 @@ class RowMaker:
     memory
         Memory of the columns.
     precision_m, origin
-        Size of the cells of positions, and world position of the cell 0, 0, 0, (3,), metres.
+        Size of the cells of positions, and world position of the cell 0, 0, 0, (3,), meters.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ from lidarsim.base.extras import reading
 from lidarsim.base.words import did_you_mean
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
-from lidarsim.scene.files.stated_system import Metres, StatedSystem, stated_metres
+from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
 from lidarsim.sweeps.sweep_motion import FiringPoses
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -30,7 +30,7 @@ Read = tuple[AnyArray, Columns, Floats | None]
 # read.
 _RING_COLUMNS = ("ring", "channel", "laser_id", "laser_number", "line", "beam")
 _INTENSITY_COLUMNS = ("intensity", "reflectivity", "i")
-METRES: Metres = (1.0, 1.0, 1.0)
+METERS: Meters = (1.0, 1.0, 1.0)
 
 
 class SweepFiles(NamedTuple):
@@ -43,7 +43,7 @@ class SweepFiles(NamedTuple):
     sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
     notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
     calibration: Path | None = None  # KITTI's calib.txt, which may not exist
-    epsg: int | None = None  # EPSG code of the file's system, if that is in metres
+    epsg: int | None = None  # EPSG code of the file's system, if that is in meters
     stations: Sequence[str] = ()  # name of each sweep if each is from a station; "" for unnamed
 
 
@@ -59,7 +59,7 @@ class SeveralSensorsError(LidarError):
 class RecordedPoints:
     """Points of a sweep, or of a part of a cloud."""
 
-    points: Floats  # (n, 3): metres
+    points: Floats  # (n, 3): meters
     rings: Ints | None = None  # (n,)
     intensities: Floats | None = None  # (n,): of any scale
     rays: Ints | None = None  # (n,): keys of ray and return; None for parts of a cloud
@@ -127,7 +127,7 @@ class NoiseFilter:
 class FiredPoints(NamedTuple):
     """Points of a sweep as they were fired."""
 
-    points: Floats  # (n, 3): in the sensor frame at the firing of each, metres
+    points: Floats  # (n, 3): in the sensor frame at the firing of each, meters
     columns: Columns  # (n,) each
     poses: FiringPoses  # poses of the sensor in the world
 
@@ -148,8 +148,8 @@ class Recording:
     white: float | None = None  # intensity of a white surface, if it is the same at all ranges
     energies: bool = False  # whether intensities are energies, as in results
     firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
-    metres: Metres = METRES  # lengths of the units of x, y and z
-    epsg: int | None = None  # EPSG code of the file's system, if that is in metres
+    meters: Meters = METERS  # lengths of the units of x, y and z
+    epsg: int | None = None  # EPSG code of the file's system, if that is in meters
     sample: Callable[[int], Read] | None = None  # reads about so many points, evenly in the file
     # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
     # None if they are unknown; None if the recording has no frames.
@@ -187,7 +187,7 @@ class Recording:
                     return None
                 poses.append(pose)
         matrices = np.array(poses, np.float64).reshape(-1, 4, 4)
-        matrices[:, :3, 3] *= self.metres
+        matrices[:, :3, 3] *= self.meters
         return matrices
 
     def without_noise(self, noise_filter: NoiseFilter) -> Recording:
@@ -217,14 +217,14 @@ class Recording:
         positions = np.asarray(points, np.float64)
         # Drivers write NaN or zeros for pulses without a return.
         valid = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
-        positions = positions[valid] * self.metres
+        positions = positions[valid] * self.meters
         if in_world and not self.is_cloud:
             if pose is None:
                 raise LidarError(
                     f"{self.name} is in the axes of its sensor, and does not say where that was: "
                     "compare it with a recording of sweeps."
                 )
-            positions = positions @ pose[:3, :3].T + pose[:3, 3] * self.metres
+            positions = positions @ pose[:3, :3].T + pose[:3, 3] * self.meters
         rings = rings_of(columns)
         intensities = intensities_of(self, columns)
         return RecordedPoints(
@@ -289,16 +289,16 @@ class RecordingSource:
         """Return notes: the name of the recording before each clause."""
         return tuple(f"{self.name} {clause}" for clause in clauses)
 
-    def chosen_metres(self) -> Metres:
-        """Return the metres of the chosen unit, of a format that states none."""
-        return stated_metres(None, np.zeros((0, 3)), self.unit)[0]
+    def chosen_meters(self) -> Meters:
+        """Return the meters of the chosen unit, of a format that states none."""
+        return stated_meters(None, np.zeros((0, 3)), self.unit)[0]
 
-    def epsg_in_metres(self, system: StatedSystem | None, metres: Metres) -> int | None:
+    def epsg_in_meters(self, system: StatedSystem | None, meters: Meters) -> int | None:
         """Return the code of a stated system.
 
         Returns None if a unit was chosen instead, or in feet.
         """
-        if system is None or self.unit is not None or metres != METRES:
+        if system is None or self.unit is not None or meters != METERS:
             return None
         return system.epsg
 

@@ -15,11 +15,11 @@ import rerun as rr
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32
 from lidarsim.columns.cloud import CloudLike
-from lidarsim.columns.table import COLOURS
+from lidarsim.columns.table import COLORS
 from lidarsim.packets.encoders import START_NS
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
-from lidarview.render.colouring import TURBO
+from lidarview.render.coloring import TURBO
 
 from .frame_names import CARRIER, WORLD
 from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
@@ -30,13 +30,13 @@ UTC_TIME = "utc"  # timeline of surveys with a date
 _PIPE_BYTES = 1 << 20
 _POINT_PIXELS = 1.5
 _LINE_PIXELS = 1.5
-_GREY = (150, 150, 150)
+_GRAY = (150, 150, 150)
 _WHITE = (255, 255, 255)
 _SCENE_ALPHA = 100  # 255 is opaque; points on a surface, and behind a wall, can be seen
 _ORANGE = (255, 153, 0)
 _BLUE = (51, 153, 255)
 _GREEN = (26, 204, 77)
-# Limits of the colour scale, the same in all sweeps: log10 of intensity, and z in the sensor frame.
+# Limits of the color scale, the same in all sweeps: log10 of intensity, and z in the sensor frame.
 _INTENSITY_LIMITS = (-3.0, 0.0)
 _HEIGHT_LIMITS_M = (-3.0, 7.0)
 
@@ -135,12 +135,12 @@ class RerunLog:
             self._log_static(WORLD, rr.AnnotationContext(names))
         if (surface := surroundings.surface) is not None:
             corners = surface.vertices[surface.faces]  # Rerun shades by the normals of vertices
-            colours = surface.colours
+            colors = surface.colors
             mesh = rr.Mesh3D(
                 vertex_positions=corners.reshape(-1, 3),
                 vertex_normals=_normals(corners).repeat(3, axis=0),
-                vertex_colors=None if colours is None else colours.repeat(3, axis=0),
-                albedo_factor=(*(_GREY if colours is None else _WHITE), _SCENE_ALPHA),
+                vertex_colors=None if colors is None else colors.repeat(3, axis=0),
+                albedo_factor=(*(_GRAY if colors is None else _WHITE), _SCENE_ALPHA),
             )
             self._log_static(f"{WORLD}/scene", mesh)
         for name, positions in surroundings.trajectories.items():
@@ -149,7 +149,7 @@ class RerunLog:
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
-        """Log a planned path, (w, 3), metres, world coordinates."""
+        """Log a planned path, (w, 3), meters, world coordinates."""
         self._log_static(f"{WORLD}/path", self._line(path, _GREEN))
 
     def show_sweep(self, shown: ShownSweep) -> None:
@@ -173,9 +173,9 @@ class RerunLog:
         has_labels = self._has_classes and "class" in columns
         cloud = rr.Points3D(
             shown.positions,
-            colors=_colours(shown.positions, columns),
+            colors=_colors(shown.positions, columns),
             radii=rr.Radius.ui_points(_POINT_PIXELS),
-            class_ids=columns["class"] if has_labels else None,  # names, since there are colours
+            class_ids=columns["class"] if has_labels else None,  # names, since there are colors
         )
         self._recording.log(f"{paths[shown.frame]}/points", cloud, rr.AnyValues(**columns))
         if shown.boxes is not None:
@@ -184,15 +184,15 @@ class RerunLog:
     def _log_static(self, path: str, archetype: rr.AsComponents) -> None:
         self._recording.log(path, archetype, static=True)
 
-    def _line(self, positions: Floats, colour: tuple[int, int, int]) -> rr.LineStrips3D:
+    def _line(self, positions: Floats, color: tuple[int, int, int]) -> rr.LineStrips3D:
         width = rr.Radius.ui_points(_LINE_PIXELS)
-        return rr.LineStrips3D([positions - self._origin], colors=colour, radii=width)
+        return rr.LineStrips3D([positions - self._origin], colors=color, radii=width)
 
     def _boxes(self, boxes: ActorBoxes) -> rr.Boxes3D:
         """Return the boxes of the actors that are present."""
         rows = np.flatnonzero(boxes.present)
         return rr.Boxes3D(
-            centers=boxes.centres[rows] - self._origin,
+            centers=boxes.centers[rows] - self._origin,
             half_sizes=boxes.sizes[rows] / 2,
             quaternions=boxes.quaternions[rows],
             labels=[boxes.names[row] for row in rows.tolist()],
@@ -208,10 +208,10 @@ def _normals(corners: Floats32) -> Floats32:
     return np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
 
 
-def _colours(positions: Floats32, columns: dict[str, AnyArray]) -> Bytes:
-    """Return colours (n, 3) of points: their own, or of their intensity, or of their height."""
-    if columns.keys() >= {*COLOURS}:
-        return np.stack([columns[name] for name in COLOURS], axis=1)
+def _colors(positions: Floats32, columns: dict[str, AnyArray]) -> Bytes:
+    """Return colors (n, 3) of points: their own, or of their intensity, or of their height."""
+    if columns.keys() >= {*COLORS}:
+        return np.stack([columns[name] for name in COLORS], axis=1)
     if "intensity" in columns:
         values = np.log10(np.maximum(columns["intensity"], 1e-9))
         limits = _INTENSITY_LIMITS

@@ -32,7 +32,7 @@ class Transform:
 
     parent: str
     name: str
-    position: Floats  # (3,), metres
+    position: Floats  # (3,), meters
     quaternion: Floats  # (4,): x, y, z, w of the rotation from the frame to its parent
 
 
@@ -40,10 +40,10 @@ class Transform:
 class Surface:
     """Static triangles of a scene."""
 
-    vertices: Floats32  # (v, 3), metres, local coordinates
+    vertices: Floats32  # (v, 3), meters, local coordinates
     faces: Ints32  # (f, 3)
-    colours: Bytes | None  # (f, 3), sRGB; None for a grey scene
-    origin: Floats  # (3,), world coordinates of the local origin, metres
+    colors: Bytes | None  # (f, 3), sRGB; None for a gray scene
+    origin: Floats  # (3,), world coordinates of the local origin, meters
 
     @classmethod
     def from_scene(cls, scene: Scene, max_triangles: int = MAX_TRIANGLES) -> Surface:
@@ -54,7 +54,7 @@ class Surface:
         return cls(
             drawn.vertices.astype(np.float32),
             drawn.faces.astype(np.int32),
-            None if drawn.colours is None else drawn.colours.means(),
+            None if drawn.colors is None else drawn.colors.means(),
             drawn.origin,
         )
 
@@ -64,9 +64,9 @@ class Surroundings:
     """What viewers show beside the sweeps, once: scene, trajectories and planned path."""
 
     surface: Surface | None = None
-    # {name of a frame: positions (k, 3)}, metres, world coordinates
+    # {name of a frame: positions (k, 3)}, meters, world coordinates
     trajectories: Mapping[str, Floats] = field(default_factory=dict)
-    path: Floats | None = None  # (w, 3): corners of the planned path, metres, world coordinates
+    path: Floats | None = None  # (w, 3): corners of the planned path, meters, world coordinates
     classes: Mapping[int, str] = field(default_factory=dict)  # {number: name}
     start_ns: int = START_NS  # start of the survey, since 1970-01-01 UTC
     topics: Sequence[str] = ()  # topics of the points of sweeps that will follow
@@ -74,7 +74,7 @@ class Surroundings:
 
     @property
     def origin(self) -> Floats:
-        """World coordinates, (3,), that viewers with float32 coordinates subtract, metres."""
+        """World coordinates, (3,), that viewers with float32 coordinates subtract, meters."""
         if self.surface is not None:
             return self.surface.origin
         positions = next(iter(self.trajectories.values()), np.zeros((1, 3)))
@@ -119,17 +119,17 @@ class Surroundings:
 
 
 def path_in_world(corners: Floats, origin: Floats) -> Floats:
-    """Return the corners (w, 3) of a planned path, local (w, 2), in world coordinates, metres."""
+    """Return the corners (w, 3) of a planned path, local (w, 2), in world coordinates, meters."""
     return np.pad(corners, ((0, 0), (0, 1))) + origin
 
 
 @dataclass(frozen=True, eq=False)
 class ActorBoxes:
-    """Boxes of the actors in a sweep, a in number, as in `Boxes`, metres, world coordinates."""
+    """Boxes of the actors in a sweep, a in number, as in `Boxes`, meters, world coordinates."""
 
     names: Sequence[str]
     types: Sequence[str]
-    centres: Floats  # (a, 3)
+    centers: Floats  # (a, 3)
     quaternions: Floats  # (a, 4): x, y, z, w
     sizes: Floats  # (a, 3)
     points: Sequence[int]  # points of the sweep on each actor
@@ -142,7 +142,7 @@ class ActorBoxes:
         return cls(
             names=sweeps.actors,
             types=sweeps.actor_types,
-            centres=boxes.centres,
+            centers=boxes.centers,
             quaternions=boxes.quaternions,
             sizes=boxes.sizes,
             points=boxes.points.tolist(),
@@ -158,7 +158,7 @@ class ShownSweep:
     stamp_ns: int  # the same by the sensor's clock, which faults may have moved
     topic: str
     frame: str
-    positions: Floats32  # (n, 3), metres
+    positions: Floats32  # (n, 3), meters
     columns: Mapping[str, AnyArray]  # {name: (n,)}, numbers of at most 32 bits or float64
     transforms: Sequence[Transform]  # transforms of the frames at the start of the sweep
     boxes: ActorBoxes | None = None  # None without actors

@@ -21,7 +21,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 
 from .pieces import Entry
 
-# Points, float32 (n, 3), metres in the sensor's axes, and {column: (n,)}, as the format holds them.
+# Points, float32 (n, 3), meters in the sensor's axes, and {column: (n,)}, as the format holds them.
 PointColumns = tuple[Floats32, dict[str, AnyArray]]
 
 

@@ -11,7 +11,7 @@ from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.ptx import read_ptx
 
 from .file_points import FilePoints, of_scans
-from .recording import METRES, NoiseFilter, Read, Recording, RecordingSource
+from .recording import METERS, NoiseFilter, Read, Recording, RecordingSource
 
 
 def open_file(source: RecordingSource) -> Recording:
@@ -27,7 +27,7 @@ def open_file(source: RecordingSource) -> Recording:
         scans = SCAN_READERS[source.path.suffix.lower()](source.path)
         # Clouds without points have no columns.
         scans = [scan for scan in scans if len(scan.positions)] or scans
-        units_m = METRES if source.unit is not None else scans[0].units_m or METRES
+        units_m = METERS if source.unit is not None else scans[0].units_m or METERS
         shared = set.intersection(*(set(scan.columns) for scan in scans))
         columns = {
             column: np.concatenate([scan.columns[column] for scan in scans])
@@ -37,7 +37,7 @@ def open_file(source: RecordingSource) -> Recording:
         return np.concatenate([scan.positions for scan in scans]) * units_m, columns, None
 
     return source.recording(
-        1, read, is_cloud=True, metres=source.chosen_metres(), noise_filter=NoiseFilter()
+        1, read, is_cloud=True, meters=source.chosen_meters(), noise_filter=NoiseFilter()
     )
 
 
@@ -50,7 +50,7 @@ def _open_ptx(source: RecordingSource) -> Recording:
         return scan.positions, scan.columns, scan.pose
 
     stations = [""] * len(scans)
-    return source.recording(len(scans), read, metres=source.chosen_metres(), stations=stations)
+    return source.recording(len(scans), read, meters=source.chosen_meters(), stations=stations)
 
 
 def read_points(path: Path) -> FilePoints:

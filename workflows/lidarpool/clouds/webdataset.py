@@ -34,7 +34,7 @@ _RESERVED = ("points", "pose", "boxes")  # arrays that are not columns
 class Pieces(pieces.Pieces):
     """A tar file for a hundred sweeps or a million points each, such as `shards/000000.tar`.
 
-    A sweep is a sample SENSOR-000000: `points.npy` (float32 n x 3, metres in the sensor frame at
+    A sweep is a sample SENSOR-000000: `points.npy` (float32 n x 3, meters in the sensor frame at
     the start of the sweep), a file for each column, such as `intensity.npy`, `pose.npy` (4 x 4,
     from this frame to the world frame), `boxes.npy` (float32 k x 7: `SweepBoxes.rows`), and `json`,
     about sweep and boxes. In a data set it is JOB/SENSOR-000000 in `shards/SPLIT/JOB-000000.tar`;

@@ -190,7 +190,7 @@ class Format:
         ]
         return [*notes, *self.contradictions(sweeps.coordinates), *self.renamed(sweeps.sensors)]
 
-    def unlabelled(self, survey: Survey) -> list[str]:
+    def unlabeled(self, survey: Survey) -> list[str]:
         """Return a note if the format labels points by class, and nothing in a survey has one."""
         if "class" not in self.row.needs:
             return []
@@ -404,7 +404,7 @@ def save_cloud(
         Intensity that .las and .laz store as 65,535. By default it is the smallest power of two at
         which at most 1 % of the points are stored as 65,535.
     precision_m
-        Step of stored positions, metres; by default the survey's precision, else 0.001.
+        Step of stored positions, meters; by default the survey's precision, else 0.001.
 
     Returns
     -------
@@ -423,7 +423,7 @@ def save_cloud(
             f"{path}: its ending has no format: use {', '.join(_ENDINGS)}, or give a format."
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
-        raise LidarError(f"precision_m is {precision_m}; it must be a length in metres.")
+        raise LidarError(f"precision_m is {precision_m}; it must be a length in meters.")
     file_format = Format(
         name,
         layout,

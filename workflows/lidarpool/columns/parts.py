@@ -188,7 +188,7 @@ class StoredCloud(CloudDisplay):
     columns: Sequence[Column]  # columns of a part
     cells: Ints | None  # lowest and highest cell, (2, 3); None without points
     precision_m: float  # size of the cells that positions were rounded to
-    origin: Floats  # world position of the scene's local origin, (3,), metres
+    origin: Floats  # world position of the scene's local origin, (3,), meters
     keeper: Any = None  # object that the parts are deleted with
     sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save_cloud`
     tell: Callable[[int], object] = abs  # is called with the number of points that were read
@@ -205,7 +205,7 @@ class StoredCloud(CloudDisplay):
 
     @property
     def bounds(self) -> Floats:
-        """Lowest and highest coordinates, (2, 3), metres, or zeros without points."""
+        """Lowest and highest coordinates, (2, 3), meters, or zeros without points."""
         if self.cells is None:
             return np.zeros((2, 3))
         return positions_of(self.cells, self.precision_m, self.origin)
@@ -226,7 +226,7 @@ class StoredCloud(CloudDisplay):
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
-        """Yield the names of axes with coordinates, (n,), metres, of columns of a part."""
+        """Yield the names of axes with coordinates, (n,), meters, of columns of a part."""
         for i, axis in enumerate(AXES):
             yield axis.name, positions_of(columns[axis.name], self.precision_m, self.origin[i])
 

@@ -22,7 +22,7 @@ from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
 from ..clouds.folder import result_folder, staging
-from ..report.page.rendering import millimetres, rendered
+from ..report.page.rendering import millimeters, rendered
 from .range_image import RangeImages
 
 RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
@@ -34,17 +34,17 @@ WIDTH = 1600  # width of charts, pixels
 LEFT = 0.075
 RIGHT = 0.845
 MAX_DOTS = 120_000
-# colours of A and B
-A_COLOUR = "#4477aa"
-B_COLOUR = "#ee7733"
-# no colours of residuals
+# colors of A and B
+A_COLOR = "#4477aa"
+B_COLOR = "#ee7733"
+# no colors of residuals
 ONLY_A = theme.rgb("#2ca25f")
 ONLY_B = theme.rgb("#101418")
-NO_RETURN = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
+NO_RETURN = theme.rgb("#c8cbd0")  # within images, whatever the page's colors
 GAP_LABELS = ("only A has a return", "only B has a return", "no return")
-# colour maps
-RESIDUAL_COLOURS = "RdBu_r"
-DISTANCE_COLOURS = "plasma"
+# color maps
+RESIDUAL_COLORS = "RdBu_r"
+DISTANCE_COLORS = "plasma"
 RESIDUAL_SCALE = 6.0  # end of the scale, in median absolute deviations: about four sigma
 MIN_DISTANCE_M = 0.001  # end of the scale of distances
 
@@ -52,8 +52,8 @@ MIN_DISTANCE_M = 0.001  # end of the scale of distances
 class MeasuredPoints(NamedTuple):
     """Points of a cloud, and their distances to the compared cloud."""
 
-    points: Floats  # (n, 3), metres
-    distances: Floats  # (n,), metres
+    points: Floats  # (n, 3), meters
+    distances: Floats  # (n,), meters
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,10 +62,10 @@ class Comparison:
 
     __signature__ = ReadableSignature()
 
-    figures: dict[str, Any]  # content of compare.json; lengths in metres, None for unknown
+    figures: dict[str, Any]  # content of compare.json; lengths in meters, None for unknown
     images: RangeImages | None  # images of the first pair of sweeps that has any
-    residuals: Floats  # (k,): of all cells with a return in both, or of a choice, metres
-    distances: tuple[Floats, Floats]  # distances from A's points to B, and from B's to A, metres
+    residuals: Floats  # (k,): of all cells with a return in both, or of a choice, meters
+    distances: tuple[Floats, Floats]  # distances from A's points to B, and from B's to A, meters
     intensities: tuple[Floats, Floats]  # intensities in A and B that are compared
     measured_points: Sequence[MeasuredPoints]  # points of A and of B: one pair of sweeps, or all
 
@@ -141,61 +141,61 @@ def draw_ranges(comparison: Comparison) -> Page:
         frame = (LEFT, layout.image_bottom(number), RIGHT - LEFT, share)
         axes = page.chart(frame, ylabel="elevation, °")
         if number < 2:
-            colours = _range_colours(images, number, range_scale)
+            colors = _range_colors(images, number, range_scale)
         else:
-            colours = _residual_colours(images, residual_scale)
+            colors = _residual_colors(images, residual_scale)
             axes.set_xlabel("azimuth, °")
             _draw_gap_legend(page, axes)
-        _show_image(axes, images, colours)
+        _show_image(axes, images, colors)
         page.heading(axes, words)
     ramp = np.linspace(0, 1, 256)
     frame = (0.862, layout.image_bottom(1), 0.014, 2 * share + layout.gap / layout.page_height)
-    page.colour_bar(theme.mapped(theme.RANGE_COLOURS, ramp), range_scale, "range, m", frame)
+    page.color_bar(theme.mapped(theme.RANGE_COLORS, ramp), range_scale, "range, m", frame)
     frame = (0.862, layout.bottom / layout.page_height, 0.014, share)
-    page.colour_bar(theme.mapped(RESIDUAL_COLOURS, ramp), residual_scale, "A − B, mm", frame)
+    page.color_bar(theme.mapped(RESIDUAL_COLORS, ramp), residual_scale, "A − B, mm", frame)
     return page
 
 
 def _range_scale(images: RangeImages) -> LogNorm:
-    """Return the scale of colours of ranges, metres."""
+    """Return the scale of colors of ranges, meters."""
     ranges = np.concatenate([image[np.isfinite(image)] for image in images.ranges])
     min_m, max_m = np.quantile(ranges, (0.01, 0.98)) if len(ranges) else (0.0, 1.0)
     return LogNorm(max(float(min_m), 0.01), max(float(max_m), float(min_m) * 1.01, 0.02))
 
 
-def _range_colours(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
-    """Return the colours (r, c, …) of the ranges of A (0) or B (1)."""
+def _range_colors(images: RangeImages, index: int, scale: LogNorm) -> AnyArray:
+    """Return the colors (r, c, …) of the ranges of A (0) or B (1)."""
     ranges = np.nan_to_num(images.ranges[index], nan=1.0)
-    colours = theme.mapped(theme.RANGE_COLOURS, scale(ranges).filled(0))
-    colours[~images.returned[index]] = NO_RETURN
-    return colours
+    colors = theme.mapped(theme.RANGE_COLORS, scale(ranges).filled(0))
+    colors[~images.returned[index]] = NO_RETURN
+    return colors
 
 
-def _residual_colours(images: RangeImages, scale: Normalize) -> AnyArray:
-    """Return the colours (r, c, …) of the residuals, and of cells without a return."""
+def _residual_colors(images: RangeImages, scale: Normalize) -> AnyArray:
+    """Return the colors (r, c, …) of the residuals, and of cells without a return."""
     residual = images.ranges[0] - images.ranges[1]
     in_a, in_b = images.returned
-    colours = theme.mapped(RESIDUAL_COLOURS, scale(1000 * np.nan_to_num(residual)).data)
-    colours[~in_a & ~in_b] = NO_RETURN
-    colours[in_a & ~in_b] = ONLY_A
-    colours[~in_a & in_b] = ONLY_B
-    return colours
+    colors = theme.mapped(RESIDUAL_COLORS, scale(1000 * np.nan_to_num(residual)).data)
+    colors[~in_a & ~in_b] = NO_RETURN
+    colors[in_a & ~in_b] = ONLY_A
+    colors[~in_a & in_b] = ONLY_B
+    return colors
 
 
 def _draw_gap_legend(page: Page, axes: Axes) -> None:
-    """Draw a legend of the colours of cells without a return."""
-    for text, colour in zip(GAP_LABELS, (ONLY_A, ONLY_B, NO_RETURN), strict=True):
-        axes.plot([], [], "s", color=colour, ms=4, label=text)
+    """Draw a legend of the colors of cells without a return."""
+    for text, color in zip(GAP_LABELS, (ONLY_A, ONLY_B, NO_RETURN), strict=True):
+        axes.plot([], [], "s", color=color, ms=4, label=text)
     _draw_legend(page, axes)
 
 
-def _show_image(axes: Axes, images: RangeImages, colours: AnyArray) -> None:
-    """Show colours (r, c, …) as the sensor sees the cells: its left is on the left."""
-    row_count, column_count = colours.shape[:2]
+def _show_image(axes: Axes, images: RangeImages, colors: AnyArray) -> None:
+    """Show colors (r, c, …) as the sensor sees the cells: its left is on the left."""
+    row_count, column_count = colors.shape[:2]
     start_deg = images.start_deg - images.step_deg / 2
     stop_deg = start_deg + column_count * images.step_deg
     extent = (stop_deg, start_deg, row_count - 0.5, -0.5)
-    axes.imshow(colours[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)
+    axes.imshow(colors[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)
     rows = np.unique(np.linspace(0, row_count - 1, min(row_count, 5)).round().astype(int))
     axes.set_yticks(rows, [f"{images.elevation_deg[row]:.1f}" for row in rows])
     axes.grid(False)
@@ -228,12 +228,12 @@ def draw_rings(comparison: Comparison) -> Page:
 
 
 def _draw_residual_histogram(axes: Axes, residuals: Floats, limit: float) -> None:
-    """Draw the histogram of residuals (k,) in metres, up to a limit in millimetres."""
-    bin_mm = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimetres
+    """Draw the histogram of residuals (k,) in meters, up to a limit in millimeters."""
+    bin_mm = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimeters
     outer = np.floor(limit / bin_mm) + 0.5
     edges = np.arange(-outer, outer + 1) * bin_mm
     values = np.clip(1000 * residuals, edges[0], edges[-1])
-    counts, *_ = axes.hist(values, bins=edges.tolist(), color=A_COLOUR)
+    counts, *_ = axes.hist(values, bins=edges.tolist(), color=A_COLOR)
     label_logarithms(axes.yaxis, np.max(counts) < 1000)
 
 
@@ -255,7 +255,7 @@ def _draw_ring_residuals(
     axes.hlines(elevation, p05, p95, color=theme.UNSEEN, lw=line_width, label="5 to 95 %")
     axes.axvline(0, color=theme.MUTED, lw=0.7 * page.unit)
     size = _marker_size(page, rings)
-    axes.plot(median, elevation, "o", color=A_COLOUR, ms=size, mew=0, label="median")
+    axes.plot(median, elevation, "o", color=A_COLOR, ms=size, mew=0, label="median")
     mean_style: dict[str, Any] = {"color": theme.SENSOR, "ms": 2 * size, "mew": 0.8 * page.unit}
     axes.plot(mean, elevation, "|", label="mean", **mean_style)
     axes.set_xlim(-limit, limit)
@@ -267,9 +267,9 @@ def _draw_ring_gaps(page: Page, axes: Axes, rings: Sequence[Mapping[str, Any]]) 
     elevation = np.array([ring["elevation_deg"] for ring in rings])
     counts = np.array([[ring["no_return"][name] for name in CELLS] for ring in rings])
     style: dict[str, Any] = {"ms": _marker_size(page, rings), "mew": 0, "lw": 0.6 * page.unit}
-    for colour, state, label in ((A_COLOUR, 1, "A"), (B_COLOUR, 2, "B")):
+    for color, state, label in ((A_COLOR, 1, "A"), (B_COLOR, 2, "B")):
         share = 100 * (counts[:, 0] + counts[:, state]) / counts.sum(axis=1)
-        axes.plot(share, elevation, "o-", color=colour, label=label, **style)
+        axes.plot(share, elevation, "o-", color=color, label=label, **style)
     axes.set_xlim(left=min(0, axes.get_xlim()[0]))
     _draw_legend(page, axes)
 
@@ -279,9 +279,9 @@ def draw_distances(comparison: Comparison) -> Page:
     page = Page((WIDTH, 760))
     distances = comparison.figures["distances"]
     page.title(
-        "Distances to the nearest neighbour",
-        f"medians: A to B {millimetres(distances['a_to_b']['median_m'])}, B to A "
-        f"{millimetres(distances['b_to_a']['median_m'])}",
+        "Distances to the nearest neighbor",
+        f"medians: A to B {millimeters(distances['a_to_b']['median_m'])}, B to A "
+        f"{millimeters(distances['b_to_a']['median_m'])}",
     )
     intensity = comparison.figures["intensity"]
     axes = page.chart(
@@ -293,11 +293,9 @@ def draw_distances(comparison: Comparison) -> Page:
     )
     shares = np.linspace(0, 1, 1001)
     labels = ("A to B", "B to A")
-    for values, colour, label in zip(
-        comparison.distances, (A_COLOUR, B_COLOUR), labels, strict=True
-    ):
+    for values, color, label in zip(comparison.distances, (A_COLOR, B_COLOR), labels, strict=True):
         quantiles = np.quantile(values, shares).clip(MIN_DISTANCE_M)
-        axes.plot(quantiles, 100 * shares, color=colour, lw=1.4 * page.unit, label=label)
+        axes.plot(quantiles, 100 * shares, color=color, lw=1.4 * page.unit, label=label)
     max_m = max(float(np.quantile(values, 0.999)) for values in comparison.distances)
     right_m = max(2 * max_m, 0.01)
     axes.set_xlim(MIN_DISTANCE_M, right_m)
@@ -332,7 +330,7 @@ def _draw_intensities(page: Page, comparison: Comparison) -> None:
 
 
 def draw_above(comparison: Comparison) -> Page:
-    """Draw both clouds from above, coloured by the distance between the clouds."""
+    """Draw both clouds from above, colored by the distance between the clouds."""
     height = 830
     page = Page((WIDTH, height))
     pictured = comparison.figures["pictured"]
@@ -353,27 +351,27 @@ def draw_above(comparison: Comparison) -> Page:
             axes.set_ylabel("")
         _scatter_points(page, axes, cloud, scale)
         page.heading(axes, ("A, distance to B", "B, distance to A")[number])
-    ramp = theme.mapped(DISTANCE_COLOURS, np.linspace(0, 1, 256))
-    page.colour_bar(ramp, scale, "distance, m", (0.875, 0.12, 0.014, chart_height))
+    ramp = theme.mapped(DISTANCE_COLORS, np.linspace(0, 1, 256))
+    page.color_bar(ramp, scale, "distance, m", (0.875, 0.12, 0.014, chart_height))
     return page
 
 
 def _distance_scale(distances: Floats) -> LogNorm:
-    """Return the scale of colours of distances (n,), metres."""
+    """Return the scale of colors of distances (n,), meters."""
     max_m = max(float(np.quantile(distances, 0.99)), 10 * MIN_DISTANCE_M)
     min_m = max(MIN_DISTANCE_M, min(float(np.quantile(distances, 0.05)), max_m / 10))
     return LogNorm(min_m, max_m)
 
 
 def _scatter_points(page: Page, axes: Axes, cloud: MeasuredPoints, scale: LogNorm) -> None:
-    """Draw points of a cloud from above, coloured by distance, the most distant on top."""
+    """Draw points of a cloud from above, colored by distance, the most distant on top."""
     rows = even_indices(len(cloud.points), MAX_DOTS)
     rows = rows[np.argsort(cloud.distances[rows])]
     axes.scatter(
         cloud.points[rows, 0],
         cloud.points[rows, 1],
         c=np.maximum(cloud.distances[rows], scale.vmin or 0.0),
-        cmap=DISTANCE_COLOURS,
+        cmap=DISTANCE_COLORS,
         norm=scale,
         s=(1.6 if len(rows) > 40_000 else 3) * page.unit**2,
         lw=0,
@@ -382,7 +380,7 @@ def _scatter_points(page: Page, axes: Axes, cloud: MeasuredPoints, scale: LogNor
 
 
 def _residual_limit(comparison: Comparison) -> float:
-    """Return the end of the scale of residuals, millimetres."""
+    """Return the end of the scale of residuals, millimeters."""
     residual = comparison.figures["ranges"]["residual"]
     if not residual["cells"]:
         return 1

@@ -49,7 +49,7 @@ class RangeImages:
 
     @property
     def ranges(self) -> Floats:
-        """Ranges of A and B, (2, r, c), metres, NaN without a return."""
+        """Ranges of A and B, (2, r, c), meters, NaN without a return."""
         return self.images[:, 0]
 
     @property
@@ -71,7 +71,7 @@ class _PolarSweep:
 
     azimuth: Floats  # (n,): degrees, 0 to 360
     elevation: Floats  # (n,): degrees
-    ranges: Floats  # (n,): metres
+    ranges: Floats  # (n,): meters
     ring_index: Ints  # (n,): index into `rings`
     intensities: Floats | None  # (n,)
     rings: Ints  # (r,): numbers

@@ -20,7 +20,7 @@ from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 
-from ..base.neighbours import nearest
+from ..base.neighbors import nearest
 from ..clouds.recording import RecordedPoints, Recording
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
@@ -74,7 +74,7 @@ def compare(
         Columns to compare as intensity, if not ``intensity``.
     unit_a, unit_b
         Unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text (um, mm, cm, dm, m, km, in, ft,
-        yd or mi), in place of metres or of the units that a .las, a .laz or a header states.
+        yd or mi), in place of meters or of the units that a .las, a .laz or a header states.
     keep_noise
         Whether points are compared that a .las or .laz withholds or classifies as noise (classes 7
         and 18), or that another cloud marks in such columns. By default they are left out.
@@ -93,7 +93,7 @@ def compare(
         A and B share no quantity to compare.
     """
     if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
-        raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
+        raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in meters.")
     first = open_recording(
         a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
     )
@@ -182,16 +182,16 @@ def _sweep_times(recording: Recording) -> Floats:
 class _CellPairs(NamedTuple):
     """Cells with a return in both sweeps, (k,) each."""
 
-    residual: Floats  # metres
+    residual: Floats  # meters
     ring: Ints
     intensity_a: Floats
     intensity_b: Floats
 
 
 class _NearestPairs(NamedTuple):
-    """Points of a cloud, each with its nearest neighbour in the compared cloud, (n,) each."""
+    """Points of a cloud, each with its nearest neighbor in the compared cloud, (n,) each."""
 
-    distance: Floats  # metres
+    distance: Floats  # meters
     intensity: Floats  # intensity of the point
     nearest_intensity: Floats
 
@@ -420,7 +420,7 @@ class _Comparing:
         }
 
     def _distance_figures(self, to_b: Floats, to_a: Floats) -> dict[str, Any]:
-        """Return figures of the distances of A's points to B, and of B's to A, metres."""
+        """Return figures of the distances of A's points to B, and of B's to A, meters."""
         f_scores: list[dict[str, float | None]] = []
         for distance in self.distances_m:
             scores = _scores(float(np.mean(to_b <= distance)), float(np.mean(to_a <= distance)))
@@ -483,7 +483,7 @@ class _Comparing:
 
 
 def _residual_figures(values: Floats) -> dict[str, Any]:
-    """Return figures of residuals A - B (n,), metres.
+    """Return figures of residuals A - B (n,), meters.
 
     Without residuals, each figure is None.
     """
@@ -516,7 +516,7 @@ def _scores(precision: float | None, recall: float | None) -> dict[str, float | 
 
 
 def _distance_quantiles(values: Floats) -> dict[str, Any]:
-    """Return the mean and quantiles of distances (n,), metres."""
+    """Return the mean and quantiles of distances (n,), meters."""
     shares = {"median_m": 0.5, "p90_m": 0.9, "p95_m": 0.95, "p99_m": 0.99, "max_m": 1.0}
     quantiles = np.quantile(values, list(shares.values())).tolist()
     return {

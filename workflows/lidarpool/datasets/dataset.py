@@ -434,7 +434,7 @@ def _packed(boxes: Sequence[Boxes]) -> bytes:
     # The sizes are in the sweeps.
     return packed(
         {
-            "centres": np.stack([boxes_of_sweep.centres for boxes_of_sweep in boxes]),
+            "centers": np.stack([boxes_of_sweep.centers for boxes_of_sweep in boxes]),
             "quaternions": np.stack([boxes_of_sweep.quaternions for boxes_of_sweep in boxes]),
             "points": np.stack([boxes_of_sweep.points for boxes_of_sweep in boxes]),
             "there": np.stack([boxes_of_sweep.present for boxes_of_sweep in boxes]),

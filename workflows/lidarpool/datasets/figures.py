@@ -127,9 +127,9 @@ class Figures:
         self._per_job = {
             name: array("d") for name in ("points", "rays", "hits", "seconds", "failed")
         }
-        # Numbers, or indices into the labels; `_labelled` tells which.
+        # Numbers, or indices into the labels; `_labeled` tells which.
         self._values = {name: array("d") for name in names}
-        self._labelled = {name: array("b") for name in names}
+        self._labeled = {name: array("b") for name in names}
         self._labels: dict[str, dict[str, int]] = {name: {} for name in names}
         self._digest = hashlib.sha256()
         for row in jobs:
@@ -145,11 +145,11 @@ class Figures:
             column.append(not row.done if name == "failed" else getattr(row, name))
         for name, labels in self._labels.items():
             value = row.values.get(name, np.nan)
-            if labelled := isinstance(value, str | bool | np.bool_):
+            if labeled := isinstance(value, str | bool | np.bool_):
                 text = value if isinstance(value, str) else str(value).lower()
                 value = labels.setdefault(text, len(labels))
             self._values[name].append(value)
-            self._labelled[name].append(labelled)
+            self._labeled[name].append(labeled)
         if not row.done:
             if len(self.failed) < MAX_FAILED:
                 self.failed.append(row)
@@ -190,7 +190,7 @@ class Figures:
         values[~has_value] = np.nan
         if not labels:
             return Varied(name, values)
-        numbers = has_value & (np.array(self._labelled[name]) == 0)
+        numbers = has_value & (np.array(self._labeled[name]) == 0)
         codes = values.copy()
         for value in np.unique(values[numbers]).tolist():  # words too: «auto» beside 1 and 2
             codes[numbers & (values == value)] = labels.setdefault(f"{value:g}", len(labels))

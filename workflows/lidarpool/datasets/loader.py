@@ -146,13 +146,13 @@ class SavedSweeps:
         """Return a `torch.utils.data.IterableDataset` of the sweeps.
 
         The workers of a DataLoader share the sweeps, and so do the ranks of torch.distributed if
-        that is initialised when the loader begins. Each sweep is read by a single worker.
+        that is initialized when the loader begins. Each sweep is read by a single worker.
 
         Parameters
         ----------
         transform
             Makes an item of a sweep. By default a dict of tensors: `points`, `pose`, the columns
-            (whole numbers as int64), `boxes` (k, 7: centre, length, width, height, yaw),
+            (whole numbers as int64), `boxes` (k, 7: center, length, width, height, yaw),
             `box_objects`; and `box_types`, `job`, `sensor`, `number`, `time_ns`.
         even
             Whether to leave out the last sweeps, fewer than the ranks, so that all ranks have the
@@ -207,10 +207,10 @@ class _OpenJob:
             name = job_file(row.data_set, job.name, BOXES_FILE)
             with open_archive(storage.path(name), partial(storage.read, name)) as arrays:
                 sizes = np.broadcast_to(
-                    np.ptp(self.sweeps.actor_bounds, axis=1), arrays["centres"].shape
+                    np.ptp(self.sweeps.actor_bounds, axis=1), arrays["centers"].shape
                 )
                 boxes = Boxes(
-                    arrays["centres"],
+                    arrays["centers"],
                     arrays["quaternions"],
                     sizes,
                     arrays["points"],

@@ -38,7 +38,7 @@ class Sweep:
     sensor: str  # name; "" for a single sensor without a name
     number: int  # index among the sweeps of its sensor in the job, from 0
     time_ns: int  # start of the sweep, nanoseconds since the start of the survey
-    points: Floats32  # (n, 3): metres, sensor frame
+    points: Floats32  # (n, 3): meters, sensor frame
     columns: Mapping[str, AnyArray]  # {name: (n,)}: columns that the format holds
     pose: Floats  # (4, 4): from the sensor frame to the world frame
     object_names: tuple[str, ...]  # names of the numbers in the column `object`

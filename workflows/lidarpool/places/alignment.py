@@ -1,6 +1,6 @@
 """Aligns sweeps to the planes of a place, and calibrates the rings of the sensor by them.
 
-Odometry is exact to centimetres, and the rings of a sensor differ by as much. Both blur a place.
+Odometry is exact to centimeters, and the rings of a sensor differ by as much. Both blur a place.
 Here the distances of points to the planes of the map are made small: by the pose of each sweep, and
 by an offset of range, elevation and azimuth of each ring. Points as they were fired are compensated
 by the motion from their sweep to the next or, if they were fired before the stamp of their sweep,
@@ -42,7 +42,7 @@ _NEAR_VOXELS = 160  # twice the median range
 _MAX_SHARE_OF_VOXELS = 0.99  # of those of the usual way, filled in another way that is right
 _SHIFTS = (0.0, 0.5)  # of the voxels that are counted, in voxels
 _STEPS = 3  # of Gauss and Newton in a round
-_MAX_VOXELS = 1.5  # distance to a plane's centre beyond which a point is not compared
+_MAX_VOXELS = 1.5  # distance to a plane's center beyond which a point is not compared
 _MIN_SIGMA_M = 0.005  # of distances: simulated ranges may have no noise
 _TUKEY_SIGMAS = 4.0  # distances beyond which a point does not count (Tukey's biweight)
 # Standard deviations of the offsets of rings, before the points say more.
@@ -66,11 +66,11 @@ class Alignment:
     sweep_s
         Seconds that a sweep takes: from most sweeps to the next, if none was dropped.
     voxel_m
-        Edge of the voxels of the map, metres.
+        Edge of the voxels of the map, meters.
     motion
         How the points of a sweep are compensated.
     ring_offsets
-        float64 (r, 3): added to the range (metres), elevation and azimuth (radians) of the points
+        float64 (r, 3): added to the range (meters), elevation and azimuth (radians) of the points
         of a ring.
     thickness_m
         Median thickness of the planes of the map after each round.
@@ -164,7 +164,7 @@ class AlignedSweep(NamedTuple):
     """Returns of a sweep, as arrays of n points."""
 
     points: Floats  # (n, 3): in the sensor frame at the stamp, calibrated, meters
-    world: Floats  # (n, 3): metres
+    world: Floats  # (n, 3): meters
     origins: Floats  # (n, 3): of the rays, in the world
     ring: Ints  # (n,)
     intensities: Floats | None  # (n,)
@@ -173,7 +173,7 @@ class AlignedSweep(NamedTuple):
 
     @property
     def range_m(self) -> Floats:
-        """Ranges (n,) along the rays, metres."""
+        """Ranges (n,) along the rays, meters."""
         return np.asarray(np.linalg.norm(self.world - self.origins, axis=1))
 
 
@@ -195,7 +195,7 @@ class AlignedSweeps:
         return self.aligned(self.recorded.read(number), number)
 
     def read_with_lost(self, number: int) -> tuple[AlignedSweep, AlignedSweep]:
-        """Read a sweep, and return it and its lost pulses, as points a metre away."""
+        """Read a sweep, and return it and its lost pulses, as points a meter away."""
         step, step_s = self.alignment.step(number)
         # Points as fired have no gaps by motion.
         is_compensated = self.alignment.motion is Motion.COMPENSATED
@@ -361,7 +361,7 @@ def _sample(sweep: RecordedSweep, number: int) -> RecordedSweep:
 
 
 def _voxel_m(samples: Sequence[RecordedSweep]) -> float:
-    """Return the edge of the voxels of the map, metres."""
+    """Return the edge of the voxels of the map, meters."""
     ranges = np.concatenate([np.linalg.norm(sample.points, axis=1) for sample in samples])
     return float(np.clip(_VOXEL_SHARE * np.median(ranges), _MIN_VOXEL_M, _MAX_VOXEL_M))
 
@@ -391,7 +391,7 @@ class _PlanePoints:
 
     rows: Bools  # (n,): of the sample
     points: Floats  # (k, 3): in the sensor frame
-    distances: Floats  # (k,): to the planes, signed, metres
+    distances: Floats  # (k,): to the planes, signed, meters
     normals: Floats  # (k, 3): of the planes, in the world
     weights: Floats  # (k,): 0 to 1
 

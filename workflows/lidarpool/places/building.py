@@ -28,7 +28,7 @@ from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import quaternions_of
-from lidarsim.scene.colours import Colours, as_srgb
+from lidarsim.scene.colors import Colors, as_srgb
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.sensor.models import SensorModel, read_model
@@ -60,7 +60,7 @@ from .stretch_tasks import (
     build_stretch,
 )
 from .stretches import AlignedStretch, Stretch, divide, joined
-from .surfels import joined_surfels, surfel_centres, surfel_mesh
+from .surfels import joined_surfels, surfel_centers, surfel_mesh
 
 MIN_SWEEPS = 4
 SCENE_FILE = "place.glb"
@@ -88,17 +88,17 @@ class Twin:
     Attributes
     ----------
     scene
-        The place: surfels with reflectances as colours, and classes as materials.
+        The place: surfels with reflectances as colors, and classes as materials.
     poses
         float64 (s, 4, 4): from the sensor frame at the stamp of each sweep to the scene frame.
     times_s
         float64 (s,): stamps of the sweeps, seconds from the first.
     origin
-        float64 (3,): of the scene frame in the world of the recording's poses, metres.
+        float64 (3,): of the scene frame in the world of the recording's poses, meters.
     model
         The sensor of the recording, with the noise that was fitted.
     figures
-        Numbers and texts of the report; lengths in metres.
+        Numbers and texts of the report; lengths in meters.
     """
 
     __signature__ = ReadableSignature()
@@ -165,7 +165,7 @@ class Twin:
         }
         if self.origin.any():
             scenario["world"] = {"origin": self.origin.tolist()}
-        light = {"reflectance": "texture"} if self.scene.has_colours.any() else {}
+        light = {"reflectance": "texture"} if self.scene.has_colors.any() else {}
         classes = self._classes()
         is_dark = NO_RETURN in self.scene.names
         materials: list[dict[str, Any]] = [{"objects": NO_RETURN, "reflectance": 0}] * is_dark
@@ -390,7 +390,7 @@ class _Building:
             are_energies=recorded.recording.energies,
         )
         name = Path(recorded.recording.name).name
-        # The points of a stretch may all belong to its neighbours.
+        # The points of a stretch may all belong to its neighbors.
         meshes = {
             index: part.surfels.mesh(name)
             for index, part in enumerate(built.parts)
@@ -418,9 +418,7 @@ class _Building:
         }
         if response is not None:
             meshes = {
-                index: coloured(
-                    mesh, response.reflectances(self._seen(index), surfel_centres(mesh))
-                )
+                index: colored(mesh, response.reflectances(self._seen(index), surfel_centers(mesh)))
                 for index, mesh in meshes.items()
             }
         return Twin(
@@ -598,9 +596,9 @@ def _median(values: Floats) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
-def coloured(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
-    """Return the mesh of surfels, whose colours are their reflectances."""
+def colored(mesh: SceneMesh, reflectances: Reflectances | None) -> SceneMesh:
+    """Return the mesh of surfels, whose colors are their reflectances."""
     if reflectances is None:
         return mesh
     light = reflectances.surfels[:, None].repeat(3, axis=1)
-    return replace(mesh, colours=Colours.of_faces(as_srgb(light).repeat(2, axis=0)))
+    return replace(mesh, colors=Colors.of_faces(as_srgb(light).repeat(2, axis=0)))

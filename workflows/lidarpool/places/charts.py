@@ -32,8 +32,8 @@ _DIFFERENCE_M = 0.1  # end of the scale of differences
 STANDING_DOTS = 150_000
 _MOVED_DOTS = 40_000
 _NO_RETURN = theme.rgb("#c8cbd0")
-_MOVED_COLOUR = "#d7301f"
-_PATH_COLOUR = "#08519c"
+_MOVED_COLOR = "#d7301f"
+_PATH_COLOR = "#08519c"
 
 
 class _Image(NamedTuple):
@@ -42,7 +42,7 @@ class _Image(NamedTuple):
     words: str
     values: Floats32  # (r, c)
     scale: Any  # of Matplotlib
-    colours: str  # name of a colour map
+    colors: str  # name of a color map
 
 
 class SweepImages(NamedTuple):
@@ -78,8 +78,8 @@ class SweepImages(NamedTuple):
         differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
         words = f"difference, red where the twin is farther, to {1000 * _DIFFERENCE_M:.0f} mm"
         images = [
-            _Image("range, recorded", self.range_m, ranges, theme.RANGE_COLOURS),
-            _Image("range, in the twin", self.simulated_m, ranges, theme.RANGE_COLOURS),
+            _Image("range, recorded", self.range_m, ranges, theme.RANGE_COLORS),
+            _Image("range, in the twin", self.simulated_m, ranges, theme.RANGE_COLORS),
             _Image(words, self.simulated_m - self.range_m, differences, "RdBu_r"),
         ]
         if self.intensity is not None and self.simulated_intensity is not None:
@@ -92,7 +92,7 @@ class SweepImages(NamedTuple):
 class Above(NamedTuple):
     """Some points of some sweeps, in the world."""
 
-    still: Floats32  # (n, 2): of what stands, metres
+    still: Floats32  # (n, 2): of what stands, meters
     moved: Floats32  # (k, 2)
 
     @classmethod
@@ -123,7 +123,7 @@ def draw_sweep(sweep: SweepImages) -> Page:
         frame = (_LEFT, bottom / height, _CHART_WIDTH, _IMAGE_HEIGHT / height)
         axes = page.chart(frame, ylabel="ring")
         known = np.nan_to_num(one.values, nan=1.0)
-        drawn = theme.mapped(one.colours, np.asarray(one.scale(known).data))
+        drawn = theme.mapped(one.colors, np.asarray(one.scale(known).data))
         drawn[~np.isfinite(one.values)] = _NO_RETURN
         extent = (180, -180, one.values.shape[0] - 0.5, -0.5)
         axes.imshow(drawn[:, ::-1], aspect="auto", interpolation="nearest", extent=extent)
@@ -161,7 +161,7 @@ def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
 def draw_above(parts: Sequence[Above], path: Floats) -> Page:
     """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
     page = Page((_WIDTH, _ABOVE_HEIGHT))
-    page.title("From above", "grey: what stands; red: left out, because rays passed it")
+    page.title("From above", "gray: what stands; red: left out, because rays passed it")
     near = np.concatenate([part.still for part in parts])
     moved = np.concatenate([part.moved for part in parts])
     low, high = np.quantile(near, (0.01, 0.99), axis=0)
@@ -169,14 +169,14 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
     sides = np.array([_ABOVE_FRAME[2] * _WIDTH, _ABOVE_FRAME[3] * _ABOVE_HEIGHT])
     half = ((high - low) / sides).max() * sides / 2
     axes = page.map_chart(_ABOVE_FRAME, (low + high) / 2 + [-half, half])
-    for points, colour, size, most in (
+    for points, color, size, most in (
         (near, theme.UNSEEN, 1.0, STANDING_DOTS),
-        (moved, _MOVED_COLOUR, 1.6, _MOVED_DOTS),
+        (moved, _MOVED_COLOR, 1.6, _MOVED_DOTS),
     ):
         some = points[:: max(-(-len(points) // most), 1)]
         dots = size * page.unit**2
-        axes.scatter(some[:, 0], some[:, 1], c=colour, s=dots, lw=0, rasterized=True)
-    axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOUR, lw=1.6 * page.unit)
+        axes.scatter(some[:, 0], some[:, 1], c=color, s=dots, lw=0, rasterized=True)
+    axes.plot(path[:, 0], path[:, 1], color=_PATH_COLOR, lw=1.6 * page.unit)
     return page
 
 
@@ -195,7 +195,7 @@ def draw_errors(figures: Mapping[str, Any]) -> Page:
         half = [1000 * entry["median_size_m"] for entry in known]
         most = [1000 * entry["p90_size_m"] for entry in known]
         axes.vlines(x, half, most, color=theme.UNSEEN, lw=1.8 * page.unit)
-        axes.plot(x, half, "o", color=theme.OBJECT_COLOURS[0], ms=4 * page.unit, mew=0)
+        axes.plot(x, half, "o", color=theme.OBJECT_COLORS[0], ms=4 * page.unit, mew=0)
         axes.set_yscale("log")
         if known:
             label_logarithms(axes.yaxis, max(most) < 1000 * min(half))

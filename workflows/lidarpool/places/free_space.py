@@ -20,7 +20,7 @@ from .recorded_sweeps import elevations
 _COLUMNS = 1024  # of an image: wider than the step of azimuth of nearly all sensors
 _ROW_RAD = np.radians(0.5)  # of an image of a sensor without rings
 _MARGIN_RAD = 0.003  # above the highest and below the lowest ring: divergence of a beam
-# Distance of a point in front of the surfaces around its direction: at least, and for each metre.
+# Distance of a point in front of the surfaces around its direction: at least, and for each meter.
 _TOLERANCE_M = 0.2
 _TOLERANCE_PER_M = 0.01
 # Sweeps before and after a sweep that are asked, in numbers of sweeps.

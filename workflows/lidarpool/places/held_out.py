@@ -33,9 +33,9 @@ class HeldOut:
     sweep, ring
         Number of the sweep, and row of the ring, of each ray.
     range_m
-        As recorded, metres; NaN of a lost pulse.
+        As recorded, meters; NaN of a lost pulse.
     simulated_m
-        Range in the twin, metres; NaN where the twin has nothing.
+        Range in the twin, meters; NaN where the twin has nothing.
     intensity, simulated_intensity
         As recorded, and in the twin; NaN if unknown.
     standing

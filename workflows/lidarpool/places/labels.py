@@ -72,6 +72,6 @@ def _part(mesh: SceneMesh, name: str, faces: Ints, classes: Ints) -> SceneMesh:
         name=name,
         vertices=corners.reshape(-1, 3),
         faces=surfel_faces(len(corners)),
-        colours=None if mesh.colours is None else mesh.colours.take(faces),
+        colors=None if mesh.colors is None else mesh.colors.take(faces),
         materials=FaceMaterials(names, rows.astype(np.int32)) if any(names) else None,
     )

@@ -3,7 +3,7 @@
 A ring fires at even steps of azimuth, so a gap of several steps between two returns holds lost
 pulses. Two gaps are none. Dropped packets leave gaps in all rings at once. And where points are
 compensated for the motion within their sweep, near and far surfaces are moved apart: a sensor that
-moves by d metres sees them turn by up to d/r.
+moves by d meters sees them turn by up to d/r.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _MAX_STEPS = 3.0  # of a ring's own step, over the typical step
 _MIN_STEP_RAD = np.radians(0.02)  # closer returns are of one pulse
 _MIN_RETURNS = 8  # of a ring whose steps are known
 _MAX_GAP_M = 5.0  # wide, of lost pulses on a surface that returns nothing: a side of a car
-# Step of range between the ends of such a gap: at most, and for each metre of range.
+# Step of range between the ends of such a gap: at most, and for each meter of range.
 _MAX_STEP_M = 0.5
 _MAX_STEP_PER_M = 0.2
 _COLUMNS = 720  # of the cells of a ring, in which a sensor may never see anything
@@ -36,7 +36,7 @@ _MIN_RINGS = 0.05  # share of the rings that return in a sector; with less, no p
 def lost_pulses(
     sweep: RecordedSweep, elevation_rad: Floats, answering: Answering, moved_m: float
 ) -> tuple[RecordedSweep, Floats]:
-    """Return the lost pulses of a sweep, as points a metre away, and the ranges around their gaps.
+    """Return the lost pulses of a sweep, as points a meter away, and the ranges around their gaps.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def lost_pulses(
     -------
     tuple
         The k pulses, without intensities, and the ranges (k,) that surfaces have there which end
-        where the gap does, metres; NaN of a wide gap, or between different surfaces.
+        where the gap does, meters; NaN of a wide gap, or between different surfaces.
     """
     if not len(elevation_rad) or len(sweep) < _MIN_RETURNS:
         return sweep.part(np.zeros(len(sweep), bool)), np.empty(0)
@@ -110,7 +110,7 @@ class _Gaps(NamedTuple):
     ring: Ints  # (n,)
     following: Ints  # (n,): next return of the ring; the first follows the last
     gap_rad: Floats  # (n,): to the next return of the ring
-    step_rad: Floats  # (n,): between the azimuths of neighbouring pulses of the ring
+    step_rad: Floats  # (n,): between the azimuths of neighboring pulses of the ring
 
     @classmethod
     def of_sweep(cls, sweep: RecordedSweep) -> _Gaps:

@@ -45,7 +45,7 @@ class Step(NamedTuple):
     """Motion of the sensor from the stamp of a sweep to that of another, in the sensor frame."""
 
     rotation: Floats  # (3,): rotation vector, radians
-    translation: Floats  # (3,): metres
+    translation: Floats  # (3,): meters
 
     @classmethod
     def between(cls, pose: Floats, following: Floats) -> Step:

@@ -35,10 +35,10 @@ DEFAULT_PERIOD_S = 0.1  # of a recording without times: most lidars turn at 10 H
 class RecordedPoses(NamedTuple):
     """Poses of the sweeps of a recording."""
 
-    matrices: Floats  # (s, 4, 4): from the sensor frame to the frame of the place, metres
+    matrices: Floats  # (s, 4, 4): from the sensor frame to the frame of the place, meters
     times_s: Floats  # (s,): ascending, from 0
     source: str  # a clause, such as "of the recording"
-    origin: Floats  # (3,): of the frame of the place in the world, whole metres
+    origin: Floats  # (3,): of the frame of the place in the world, whole meters
     share: float = 0.0  # of the motion of a sweep as fired, at which its pose holds
     first_s: float = 0.0  # from the stamp of a sweep to its first point, of poses with a share
 

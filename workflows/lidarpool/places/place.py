@@ -36,7 +36,7 @@ _SHIFT_PRIOR = 1.0  # rays that would leave a surfel where it is
 _VOTING_SWEEPS = 40  # of a stretch at most, evenly chosen
 _ON_SURFEL_M = 0.06  # distance to the plane of a surfel within which a point is on it
 _VIEW_CELL_M = 0.5  # edge of the cells in which ranges of points are compared
-_CELL_BITS = 21  # of a coordinate of a cell: places repeat every million metres
+_CELL_BITS = 21  # of a coordinate of a cell: places repeat every million meters
 _CELL_MASK = (1 << _CELL_BITS) - 1
 _MAX_VIEW_FACTOR = 1.5  # of the shortest range in a cell, beyond which points are left out
 _ON_RAY_M = 0.15  # difference of ranges within which a ray ends on a surfel
@@ -118,7 +118,7 @@ class Place:
         surfel = hits.triangle[met].astype(np.int64) // 2
         range_m = np.linalg.norm(directions[met], axis=1)
         normals = self.surfels.normals[surfel]
-        offsets = sweep.world[rows[met]] - self.surfels.centres[surfel]
+        offsets = sweep.world[rows[met]] - self.surfels.centers[surfel]
         off_plane_m = np.abs(np.einsum("ij,ij->i", offsets, normals))
         inward = np.einsum("ij,ij->i", directions[met], normals) / range_m
         return Seen(
@@ -253,9 +253,9 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
             labels.append(sweep.labels[kept])
     world = np.concatenate(positions)
     # A sweep without points may have no columns.
-    labelled = sum(map(len, labels)) == len(world)
+    labeled = sum(map(len, labels)) == len(world)
     return ScannedPoints(
-        world, np.concatenate(outward), np.concatenate(labels) if labels and labelled else None
+        world, np.concatenate(outward), np.concatenate(labels) if labels and labeled else None
     )
 
 

@@ -50,7 +50,7 @@ _MIN_CLUSTER = 1e-3  # share of the points in a cluster: fewer are stray points
 class RecordedSweep:
     """Returns of a sweep, in the sensor frame."""
 
-    points: Floats  # (n, 3): metres
+    points: Floats  # (n, 3): meters
     ring: Ints  # (n,): row in `RecordedSweeps.elevation_rad`; 0 for a sensor without rings
     intensities: Floats | None  # (n,): in the scale of the recording
     labels: Ints | None  # (n,): of class and object
@@ -324,7 +324,7 @@ class RecordedSweeps:
 
     @property
     def gap_rad(self) -> float:
-        """Typical angle between the rays of neighbouring rings, radians."""
+        """Typical angle between the rays of neighboring rings, radians."""
         if len(self.elevation_rad) < MIN_RINGS:
             return _GAP_RAD
         return float(np.median(-np.diff(self.elevation_rad)))
@@ -398,7 +398,7 @@ class RecordedSweeps:
         """Return the rows (k,) of runs with median elevations (k,), -1 for a run without a ring.
 
         Each ring is given to one run: the median elevation of a ring changes with what it meets, by
-        more than neighbouring rings differ.
+        more than neighboring rings differ.
         """
         from scipy.optimize import linear_sum_assignment
 
@@ -502,7 +502,7 @@ def _clusters(points: Floats) -> Floats | None:
 
 
 def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyArray]]:
-    """Return the points (n, 3) of a sweep in the sensor frame, metres, and their columns."""
+    """Return the points (n, 3) of a sweep in the sensor frame, meters, and their columns."""
     with reading(recording.name):
         points, columns, _ = recording.read(number)
         recording.check_intensity(columns)
@@ -510,7 +510,7 @@ def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyAr
     # Drivers write NaN or zeros for pulses without a return.
     returned = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
     kept = {name: np.asarray(values)[returned] for name, values in columns.items()}
-    return positions[returned] * recording.metres, kept
+    return positions[returned] * recording.meters, kept
 
 
 def _runs(points: Floats) -> tuple[Ints, Bools]:

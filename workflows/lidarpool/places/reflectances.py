@@ -57,21 +57,21 @@ class Response:
         factors = self.by_range[_range_bin(range_m)] * self.by_incidence[_incidence_bin(cosine)]
         return np.asarray(factors * self.by_ring[ring] * self.white)
 
-    def reflectances(self, seen: Observations, centres: Floats) -> Reflectances:
-        """Return the reflectances of surfels with centres (m, 3).
+    def reflectances(self, seen: Observations, centers: Floats) -> Reflectances:
+        """Return the reflectances of surfels with centers (m, 3).
 
         Surfels that no ray meets, behind others, are as bright as the nearest surfel that is met.
         """
         from scipy.spatial import cKDTree
 
         seen = seen.part(np.isfinite(seen.intensity))
-        count = len(centres)
+        count = len(centers)
         expected = self.factors(seen.range_m, seen.cosine, seen.ring)
         intensity = np.minimum(seen.intensity, self.brightest)
         surfels = _ratios(seen.surfel, intensity, expected, np.full(count, np.nan))
         known = np.isfinite(surfels)
         if known.any():
-            _, nearest = cKDTree(centres[known]).query(centres[~known])
+            _, nearest = cKDTree(centers[known]).query(centers[~known])
             surfels[~known] = surfels[known][nearest]
         else:
             surfels[:] = self.typical

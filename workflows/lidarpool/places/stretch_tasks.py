@@ -76,7 +76,7 @@ class BuildTask(StretchTask):
 class StretchSurfels(NamedTuple):
     """Surfels of a stretch, and numbers of the points of its own sweeps."""
 
-    corners: Floats  # (m, 4, 3): metres
+    corners: Floats  # (m, 4, 3): meters
     dark_corners: Floats  # (d, 4, 3): of surfels that return nothing
     materials: AnyArray | None  # names
     material: Ints32 | None  # (m,): rows of `materials`
@@ -127,7 +127,7 @@ def build_stretch(task: BuildTask) -> BuiltStretch:
     standing = standing_points(sweeps, stretch.numbers.tolist())
     held_out, images = compared_sweeps(sweeps, task, standing)
     place = build_place(sweeps, standing, task.voxel_m)
-    own = stretch.owns(place.surfels.centres, task.alignment.poses)
+    own = stretch.owns(place.surfels.centers, task.alignment.poses)
     seen = place.observations(sweeps, standing).of_surfels(own & ~place.surfels.dark)
     surfels = StretchSurfels.of_surfels(place.surfels, own, standing, stretch.own_numbers)
     above = Above.of_sweeps(sweeps, standing, stretch.own_numbers, task.drawn_share)
@@ -189,4 +189,4 @@ def rebuild(
     )
     if response is None:
         return place, None
-    return place, response.reflectances(seen, place.surfels.centres)
+    return place, response.reflectances(seen, place.surfels.centers)

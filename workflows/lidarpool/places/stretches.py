@@ -4,7 +4,7 @@ A stretch has consecutive sweeps of its own, and looks at sweeps before and afte
 same surfaces. A surface belongs to the stretch whose sensor came nearest. So stretches depend on
 nothing but the drive, and any number of processes makes the same place.
 
-A sensor that stands sees the same again and again: of the sweeps within a metre some count.
+A sensor that stands sees the same again and again: of the sweeps within a meter some count.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .motion import Step
 _OWN_SWEEPS = 80  # of a stretch, about
 _AROUND_SWEEPS = 40  # before and after, at most
 _AROUND_M = 40.0
-_METRE_M = 1.0  # length of the drive of which all or no sweeps belong to a stretch
-_METRE_SWEEPS = 80  # of a metre that count
+_METER_M = 1.0  # length of the drive of which all or no sweeps belong to a stretch
+_METER_SWEEPS = 80  # of a meter that count
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Stretch:
     own
         Which of the `numbers` are of the stretch itself.
     landmarks
-        int64 (p,): those of the `numbers` that are the first of their metre.
+        int64 (p,): those of the `numbers` that are the first of their meter.
     """
 
     numbers: Ints
@@ -63,47 +63,47 @@ class Stretch:
 
 def divide(positions: Floats) -> list[Stretch]:
     """Divide a drive with positions (s, 3) of its sweeps into stretches."""
-    metres = _metres(positions)
-    counts = np.array([len(metre) for metre in metres])
+    meters = _meters(positions)
+    counts = np.array([len(meter) for meter in meters])
     before = np.cumsum(counts) - counts
     stretch_count = max(1, round(int(counts.sum()) / _OWN_SWEEPS))
-    of_metre = before * stretch_count // int(counts.sum())
-    starts = np.flatnonzero(np.diff(of_metre, prepend=-1)).tolist()
+    of_meter = before * stretch_count // int(counts.sum())
+    starts = np.flatnonzero(np.diff(of_meter, prepend=-1)).tolist()
     stretches = []
-    for start, stop in zip(starts, [*starts[1:], len(metres)], strict=True):
-        first = _reach(metres, positions, range(start - 1, -1, -1), metres[start][0])
-        last = _reach(metres, positions, range(stop, len(metres)), metres[stop - 1][-1])
+    for start, stop in zip(starts, [*starts[1:], len(meters)], strict=True):
+        first = _reach(meters, positions, range(start - 1, -1, -1), meters[start][0])
+        last = _reach(meters, positions, range(stop, len(meters)), meters[stop - 1][-1])
         lead = int(counts[start - first : start].sum())
         stretches.append(
             Stretch(
-                np.concatenate(metres[start - first : stop + last]),
+                np.concatenate(meters[start - first : stop + last]),
                 slice(lead, lead + int(counts[start:stop].sum())),
-                np.array([metre[0] for metre in metres[start - first : stop + last]]),
+                np.array([meter[0] for meter in meters[start - first : stop + last]]),
             )
         )
     return stretches
 
 
-def _metres(positions: Floats) -> list[Ints]:
-    """Return the sweeps that count of each metre of a drive."""
+def _meters(positions: Floats) -> list[Ints]:
+    """Return the sweeps that count of each meter of a drive."""
     starts = [0]
     for number, position in enumerate(positions):
-        if np.linalg.norm(position - positions[starts[-1]]) >= _METRE_M:
+        if np.linalg.norm(position - positions[starts[-1]]) >= _METER_M:
             starts.append(number)
     stops = [*starts[1:], len(positions)]
     return [
-        start + even_indices(stop - start, _METRE_SWEEPS)
+        start + even_indices(stop - start, _METER_SWEEPS)
         for start, stop in zip(starts, stops, strict=True)
     ]
 
 
-def _reach(metres: Sequence[Ints], positions: Floats, beyond: range, end: int) -> int:
-    """Return how many metres `beyond` the end of a stretch see the same surfaces."""
+def _reach(meters: Sequence[Ints], positions: Floats, beyond: range, end: int) -> int:
+    """Return how many meters `beyond` the end of a stretch see the same surfaces."""
     count = 0
     sweeps = 0
-    for metre in beyond:
-        sweeps += len(metres[metre])
-        distance_m = np.linalg.norm(positions[metres[metre][0]] - positions[end])
+    for meter in beyond:
+        sweeps += len(meters[meter])
+        distance_m = np.linalg.norm(positions[meters[meter][0]] - positions[end])
         if sweeps > _AROUND_SWEEPS or distance_m > _AROUND_M:
             break
         count += 1

@@ -18,7 +18,7 @@ import numpy as np
 from lidarsim.base.allowance import bytes_of, memory
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
-from lidarsim.scene.colours import join_colours
+from lidarsim.scene.colors import join_colors
 from lidarsim.scene.face_materials import join_materials
 from lidarsim.scene.scene_mesh import SceneMesh
 
@@ -26,13 +26,13 @@ from ..clouds.file_points import POINT_BYTES
 from ..scenario.point_files import ScannedPoints
 from ..scenario.point_scene import Voxels, surfel_faces, surfel_materials
 
-_NEIGHBOURS = (12, 32, 80)  # of which the first number that is no line counts
+_NEIGHBORS = (12, 32, 80)  # of which the first number that is no line counts
 _MIN_WIDTH = 0.1  # smaller over larger variance within a plane: less is a line
-_EXTENT = 0.85  # half of a side over the standard deviation of the neighbours
+_EXTENT = 0.85  # half of a side over the standard deviation of the neighbors
 _MAX_HALF_VOXELS = 3  # that half a side is long, beside the gaps between rays
 _MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
 _PLANE_GAPS = 0.55  # half a side, across the rings, over the gap between rays on a plane
-_MAX_RADII = 1.0  # the same over the distance of the farthest neighbour, at most
+_MAX_RADII = 1.0  # the same over the distance of the farthest neighbor, at most
 _MAX_GAPS = 1.0  # half a side over the gap between rays elsewhere, at most
 _MIN_COSINE = 0.1  # of the incidence, by which gaps grow
 _BLOCK = 1 << 16  # surfels at a time
@@ -49,9 +49,9 @@ class Surfels:
         return len(self.mesh.faces) // 2
 
     @cached_property
-    def centres(self) -> Floats:
-        """Middles of the surfels, (m, 3), metres."""
-        return surfel_centres(self.mesh)
+    def centers(self) -> Floats:
+        """Middles of the surfels, (m, 3), meters."""
+        return surfel_centers(self.mesh)
 
     @cached_property
     def normals(self) -> Floats:
@@ -71,7 +71,7 @@ class Surfels:
         return Surfels(SceneMesh(mesh.name, vertices, faces, materials=materials), self.dark[rows])
 
     def moved(self, shifts_m: Floats) -> Surfels:
-        """Return the surfels moved along their normals by shifts (m,), metres."""
+        """Return the surfels moved along their normals by shifts (m,), meters."""
         offsets = (shifts_m[:, None] * self.normals).repeat(4, axis=0)
         return replace(self, mesh=replace(self.mesh, vertices=self.mesh.vertices + offsets))
 
@@ -84,7 +84,7 @@ class Surfels:
     def are_enough(points: ScannedPoints, voxel_m: float) -> bool:
         """Whether points make surfels: they are in enough voxels."""
         cells = np.unique(np.floor(points.positions / voxel_m).astype(np.int64), axis=0)
-        return len(cells) > 2 * _NEIGHBOURS[-1]
+        return len(cells) > 2 * _NEIGHBORS[-1]
 
     @classmethod
     def of_points(cls, name: str, points: ScannedPoints, voxel_m: float, gap_rad: float) -> Surfels:
@@ -99,7 +99,7 @@ class Surfels:
         voxel_m
             Edge of the voxels.
         gap_rad
-            Angle between the rays of neighbouring rings.
+            Angle between the rays of neighboring rings.
 
         Raises
         ------
@@ -117,10 +117,10 @@ class Surfels:
                 f"memory, of at most {bytes_of(memory() // 2)}: give a larger voxel_m than "
                 f"{voxel_m:.3g}."
             )
-        if count < _NEIGHBOURS[-1]:
+        if count < _NEIGHBORS[-1]:
             raise LidarError(
                 f"{name} has {count} points that stand in different voxels of {voxel_m:.3g} m, and "
-                f"at least {_NEIGHBOURS[-1]} are needed."
+                f"at least {_NEIGHBORS[-1]} are needed."
             )
         means = voxels.means(points.positions)
         outward = voxels.means(points.outward)
@@ -140,12 +140,12 @@ class Surfels:
 
 
 def surfel_mesh(name: str, corners: Floats) -> SceneMesh:
-    """Return the mesh of surfels with corners (m, 4, 3), metres."""
+    """Return the mesh of surfels with corners (m, 4, 3), meters."""
     return SceneMesh(name, corners.reshape(-1, 3), surfel_faces(len(corners)))
 
 
-def surfel_centres(mesh: SceneMesh) -> Floats:
-    """Return the middles (m, 3) of the surfels of a mesh, metres."""
+def surfel_centers(mesh: SceneMesh) -> Floats:
+    """Return the middles (m, 3) of the surfels of a mesh, meters."""
     return np.asarray(mesh.vertices.reshape(-1, 4, 3).mean(axis=1))
 
 
@@ -156,34 +156,34 @@ def joined_surfels(meshes: Sequence[SceneMesh]) -> SceneMesh:
         meshes[0].name,
         np.concatenate([mesh.vertices for mesh in meshes]),
         surfel_faces(sum(sizes) // 2),
-        colours=join_colours([mesh.colours for mesh in meshes], sizes),
+        colors=join_colors([mesh.colors for mesh in meshes], sizes),
         materials=join_materials([mesh.materials for mesh in meshes], sizes),
     )
 
 
 class _Planes(NamedTuple):
-    """Planes of the neighbours of m points."""
+    """Planes of the neighbors of m points."""
 
     axes: Floats  # (m, 3, 3): unit vectors: normal, across the lines, along the lines
-    halves: Floats  # (m, 2): half the sides of surfels across and along, metres
-    radius_m: Floats  # (m,): distance of the farthest neighbour; 0 if these are in no plane
+    halves: Floats  # (m, 2): half the sides of surfels across and along, meters
+    radius_m: Floats  # (m,): distance of the farthest neighbor; 0 if these are in no plane
 
     @classmethod
-    def around(cls, centres: Floats, tree: object, means: Floats) -> _Planes:
-        """Find the planes of the neighbours of some of the means (v, 3), which are in a tree."""
-        count = len(centres)
+    def around(cls, centers: Floats, tree: object, means: Floats) -> _Planes:
+        """Find the planes of the neighbors of some of the means (v, 3), which are in a tree."""
+        count = len(centers)
         axes = np.empty((count, 3, 3))
         halves = np.empty((count, 2))
         radius_m = np.empty(count)
         left = np.arange(count)
-        for neighbours in _NEIGHBOURS:
-            around = means[_nearest(tree, centres[left], neighbours)]
+        for neighbors in _NEIGHBORS:
+            around = means[_nearest(tree, centers[left], neighbors)]
             variances, found = _principal(around)
             axes[left] = found
             flat = variances[:, 0] < _MAX_FLAT * variances[:, 1]
-            farthest_m = np.linalg.norm(around[:, -1] - centres[left], axis=1)
+            farthest_m = np.linalg.norm(around[:, -1] - centers[left], axis=1)
             radius_m[left] = np.where(flat, farthest_m, 0.0)
-            near = around[:, : _NEIGHBOURS[0]] - centres[left, None]
+            near = around[:, : _NEIGHBORS[0]] - centers[left, None]
             close = np.square(np.einsum("mki,mji->mkj", near, found[:, 1:])).mean(axis=1)
             is_line = close[:, 0] < _MIN_WIDTH * close[:, 1]
             close[is_line, 0] = variances[is_line, 1]
@@ -193,7 +193,7 @@ class _Planes(NamedTuple):
                 break
         return cls(axes, halves, radius_m)
 
-    def corners(self, centres: Floats, outward: Floats, voxel_m: float, gap_rad: float) -> Floats:
+    def corners(self, centers: Floats, outward: Floats, voxel_m: float, gap_rad: float) -> Floats:
         """Return the corners (m, 4, 3) of surfels, counter-clockwise seen from the sensor."""
         range_m = np.linalg.norm(outward, axis=1)
         facing = np.einsum("mi,mi->m", self.axes[:, 0], outward)
@@ -208,15 +208,15 @@ class _Planes(NamedTuple):
         along = self.axes[:, 2] * halves[:, 1:]
         inverted = np.einsum("mi,mi->m", np.cross(along, across), outward) < 0
         across = np.where(inverted[:, None], -across, across)
-        corners = np.empty((len(centres), 4, 3))
+        corners = np.empty((len(centers), 4, 3))
         for corner, (a, b) in enumerate(((-1, -1), (1, -1), (1, 1), (-1, 1))):
-            corners[:, corner] = centres + a * along + b * across
+            corners[:, corner] = centers + a * along + b * across
         return corners
 
 
-def _nearest(tree: object, centres: Floats, count: int) -> Ints:
+def _nearest(tree: object, centers: Floats, count: int) -> Ints:
     """Return the indices (m, count) of the nearest points in a tree, the nearest first."""
-    _, rows = tree.query(centres, count)  # type: ignore[attr-defined]
+    _, rows = tree.query(centers, count)  # type: ignore[attr-defined]
     return np.asarray(rows)
 
 

@@ -1,4 +1,4 @@
-"""Planes of a place: means of points in voxels, and the normals of their neighbourhoods."""
+"""Planes of a place: means of points in voxels, and the normals of their neighborhoods."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 
 from ..scenario.point_scene import Voxels
 
-_NEIGHBOURS = 12
+_NEIGHBORS = 12
 _MAX_FLAT = 0.1  # variance along the normal of a plane, over the smaller variance within it
 _MIN_WIDTH = 0.05  # smaller over larger variance within a plane: less is a line
 
 
 @dataclass(frozen=True, eq=False)
 class VoxelPlanes:
-    """Means of the points in voxels whose neighbours lie in a plane."""
+    """Means of the points in voxels whose neighbors lie in a plane."""
 
-    centres: Floats  # (p, 3): metres
+    centers: Floats  # (p, 3): meters
     normals: Floats  # (p, 3): unit vectors, of either side
-    tree: Any  # scipy.spatial.cKDTree of the centres
-    thickness_m: float  # median standard deviation of the neighbours along the normals
+    tree: Any  # scipy.spatial.cKDTree of the centers
+    thickness_m: float  # median standard deviation of the neighbors along the normals
 
     @classmethod
     def of_points(cls, name: str, points: Floats, voxel_m: float) -> VoxelPlanes | None:
@@ -35,13 +35,13 @@ class VoxelPlanes:
         from scipy.spatial import cKDTree
 
         means = Voxels.of_points(Path(name), points, voxel_m).means(points)
-        if len(means) < _NEIGHBOURS:
+        if len(means) < _NEIGHBORS:
             return None
-        _, neighbours = cKDTree(means).query(means, _NEIGHBOURS)
-        around = means[neighbours]
+        _, neighbors = cKDTree(means).query(means, _NEIGHBORS)
+        around = means[neighbors]
         middles = around.mean(axis=1)
         around -= middles[:, None]
-        covariances = np.einsum("nki,nkj->nij", around, around) / _NEIGHBOURS
+        covariances = np.einsum("nki,nkj->nij", around, around) / _NEIGHBORS
         variances, axes = np.linalg.eigh(covariances)
         flat = _is_plane(variances)
         if not flat.any():
@@ -54,16 +54,16 @@ class VoxelPlanes:
     def distances(self, points: Floats, max_m: float) -> tuple[Floats, Ints, Bools]:
         """Return signed distances (k,) of points (n, 3) to their planes, the planes, and a mask.
 
-        The mask (n,) marks the points that are within `max_m` of the centre of a plane.
+        The mask (n,) marks the points that are within `max_m` of the center of a plane.
         """
         distance, plane = self.tree.query(points, distance_upper_bound=max_m)
         near = np.isfinite(distance)
         plane = plane[near]
-        offsets = points[near] - self.centres[plane]
+        offsets = points[near] - self.centers[plane]
         return np.einsum("ij,ij->i", offsets, self.normals[plane]), plane, near
 
 
 def _is_plane(variances: Floats) -> Bools:
-    """Mark neighbourhoods that are planes by their variances (n, 3), ascending."""
+    """Mark neighborhoods that are planes by their variances (n, 3), ascending."""
     smallest, middle, largest = variances.T
     return np.asarray((smallest < _MAX_FLAT * middle) & (middle > _MIN_WIDTH * largest))

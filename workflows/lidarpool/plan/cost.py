@@ -36,7 +36,7 @@ class PathCost:
     the two ends.
     """
 
-    def __init__(self, centres: Floats, radii: Floats, waypoints: int, particles: int) -> None:
+    def __init__(self, centers: Floats, radii: Floats, waypoints: int, particles: int) -> None:
         self._points = np.zeros((waypoints + 2, 2, particles), np.float32)
         self._points[0, 0] = -0.5
         self._points[-1, 0] = 0.5
@@ -53,7 +53,7 @@ class PathCost:
         # A workspace for each width, at most two: their loops run over whole, contiguous buffers,
         # which is twice as fast as over parts of wider buffers.
         self._workspaces = {
-            width: _Workspace(centres, _enlarged_radii(centres, radii), waypoints + 1, width)
+            width: _Workspace(centers, _enlarged_radii(centers, radii), waypoints + 1, width)
             for width in {block.stop - block.start for block in self._blocks}
         }
 
@@ -65,10 +65,10 @@ class PathCost:
         return self._cost
 
 
-def _enlarged_radii(centres: Floats, radii: Floats) -> Floats:
+def _enlarged_radii(centers: Floats, radii: Floats) -> Floats:
     """Return radii with a margin for rounding, which does not reach either end of the path."""
-    distance = np.sqrt(centres[:, 0] ** 2 + centres[:, 1] ** 2)
-    end_distances = [np.sqrt((centres[:, 0] - x) ** 2 + centres[:, 1] ** 2) for x in (-0.5, 0.5)]
+    distance = np.sqrt(centers[:, 0] ** 2 + centers[:, 1] ** 2)
+    end_distances = [np.sqrt((centers[:, 0] - x) ** 2 + centers[:, 1] ** 2) for x in (-0.5, 0.5)]
     nearest = np.maximum(np.minimum(*end_distances), radii)
     return np.asarray(np.minimum(radii + _MARGIN * (1 + distance + radii), nearest))
 
@@ -80,19 +80,19 @@ class _Workspace:
     u = (C - M) · e and c = (C - M) x e. The point of the segment closest to C is
     √(c² + max(|u| - h, 0)²) away. All lengths are doubled here (2C, 2M = the sum of both ends,
     2h = the length), which saves the halving; max(|u| - h, 0) = |u| - min(|u|, h), since NumPy
-    has a vectorised minimum of two arrays, and none of an array and a number.
+    has a vectorized minimum of two arrays, and none of an array and a number.
 
     Axes are (disc, segment, particle): the last two of each factor are contiguous, so that a
     product with a disc's coordinate is one long loop.
     """
 
-    def __init__(self, centres: Floats, radii: Floats, segments: int, width: int) -> None:
+    def __init__(self, centers: Floats, radii: Floats, segments: int, width: int) -> None:
         def singles(*shape: int) -> Floats32:
             return np.empty(shape, np.float32)
 
         discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # discs in a block
         self._disc_blocks = [slice(i, i + discs) for i in range(0, len(radii), discs or 1)]
-        doubled = (2 * centres).astype(np.float32)
+        doubled = (2 * centers).astype(np.float32)
         self._x = doubled[:, 0, None, None]
         self._y = doubled[:, 1, None, None]
         self._squared_radii = (4 * radii**2).astype(np.float32)[:, None]

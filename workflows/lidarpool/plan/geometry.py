@@ -1,4 +1,4 @@
-"""Segments against discs in the plane, exactly, and normalised coordinates for planning."""
+"""Segments against discs in the plane, exactly, and normalized coordinates for planning."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ import numpy as np
 from lidarsim.base.arrays import Floats
 
 
-def segment_distances(first: Floats, last: Floats, centres: Floats) -> Floats:
-    """Return the distance of every segment to every centre.
+def segment_distances(first: Floats, last: Floats, centers: Floats) -> Floats:
+    """Return the distance of every segment to every center.
 
-    Segments (s, 2) and (s, 2), which may be single points, and centres (m, 2): the distance from
-    each centre to the closest point of each segment is (s, m).
+    Segments (s, 2) and (s, 2), which may be single points, and centers (m, 2): the distance from
+    each center to the closest point of each segment is (s, m).
     """
     direction = last - first
     squared = direction[:, 0] ** 2 + direction[:, 1] ** 2
-    to_centre = centres[None, :, :] - first[:, None, :]
-    reach = to_centre[..., 0] * direction[:, None, 0] + to_centre[..., 1] * direction[:, None, 1]
+    to_center = centers[None, :, :] - first[:, None, :]
+    reach = to_center[..., 0] * direction[:, None, 0] + to_center[..., 1] * direction[:, None, 1]
     # A segment of length 0 has reach 0: whatever the divisor, its point is closest.
     share = np.clip(reach / np.where(squared > 0, squared, 1.0)[:, None], 0.0, 1.0)
-    gap_x = to_centre[..., 0] - share * direction[:, None, 0]
-    gap_y = to_centre[..., 1] - share * direction[:, None, 1]
+    gap_x = to_center[..., 0] - share * direction[:, None, 0]
+    gap_y = to_center[..., 1] - share * direction[:, None, 1]
     return np.asarray(np.sqrt(gap_x**2 + gap_y**2))
 
 
@@ -33,7 +33,7 @@ def path_length(points: Floats) -> float:
     return float(sum(np.sqrt(steps[:, 0] ** 2 + steps[:, 1] ** 2).tolist()))
 
 
-def clearance(points: Floats, centres: Floats, radii: Floats) -> float:
+def clearance(points: Floats, centers: Floats, radii: Floats) -> float:
     """Return the smallest distance from the path through `points`, (p, 2), to the edge of a disc.
 
     The distance is negative if the path enters a disc, by its greatest depth; 0 if the path touches
@@ -41,7 +41,7 @@ def clearance(points: Floats, centres: Floats, radii: Floats) -> float:
     """
     if not len(radii):
         return float("inf")
-    return float((segment_distances(points[:-1], points[1:], centres) - radii).min())
+    return float((segment_distances(points[:-1], points[1:], centers) - radii).min())
 
 
 class PathAxes:
@@ -55,7 +55,7 @@ class PathAxes:
     def __init__(self, start: tuple[float, float], target: tuple[float, float]) -> None:
         run = target[0] - start[0]
         rise = target[1] - start[1]
-        self.unit_m = math.sqrt(run * run + rise * rise)  # metres in a unit of these axes
+        self.unit_m = math.sqrt(run * run + rise * rise)  # meters in a unit of these axes
         self._axis = run / self.unit_m, rise / self.unit_m  # x, in the plane
         self._middle = (np.array(start) + np.array(target)) / 2
 

@@ -45,11 +45,11 @@ class Planning(Search):
     Parameters
     ----------
     start, target
-        x and y of either end, in metres.
-    centres
-        Centres of the discs to keep out of: (m, 2), metres; m may be 0.
+        x and y of either end, in meters.
+    centers
+        Centers of the discs to keep out of: (m, 2), meters; m may be 0.
     radii
-        Radii in metres, above 0: (m,), or a number for all discs.
+        Radii in meters, above 0: (m,), or a number for all discs.
     **search
         The fields of `Search`. The same seed gives the same plan, to the bit, wherever the trials
         run.
@@ -62,15 +62,15 @@ class Planning(Search):
 
     Examples
     --------
-    >>> planning = Planning((0, 0), (10, 0), centres=[(5, 0)], radii=2.0)
+    >>> planning = Planning((0, 0), (10, 0), centers=[(5, 0)], radii=2.0)
     >>> planning.radii
     array([2.])
     """
 
     start: tuple[float, float] = (25.0, 25.0)
     target: tuple[float, float] = (-30.0, -20.0)
-    centres: Floats = field(default_factory=lambda: np.empty((0, 2)))  # (m, 2), metres
-    radii: Floats = field(default_factory=lambda: np.empty(0))  # (m,), metres
+    centers: Floats = field(default_factory=lambda: np.empty((0, 2)))  # (m, 2), meters
+    radii: Floats = field(default_factory=lambda: np.empty(0))  # (m,), meters
 
     def __post_init__(self) -> None:
         start, target = ((float(x), float(y)) for x, y in (self.start, self.target))
@@ -79,26 +79,26 @@ class Planning(Search):
                 f"start and target of the path are both {start}: there is nothing to plan. "
                 "Move one of them."
             )
-        centres = _checked(
-            "centres",
-            self.centres,
+        centers = _checked(
+            "centers",
+            self.centers,
             lambda n: n.size == 0 or (n.ndim == 2 and n.shape[1] == 2),
             "finite numbers of shape (m, 2)",
         ).reshape(-1, 2)
         radii = _checked(
             "radii",
             self.radii,
-            lambda n: n.shape in ((), (len(centres),)) and bool((n > 0).all()),
+            lambda n: n.shape in ((), (len(centers),)) and bool((n > 0).all()),
             "finite numbers above 0, one for each disc or one for all",
         )
-        radii = np.broadcast_to(radii, len(centres)).copy()
-        for array in (centres, radii):
+        radii = np.broadcast_to(radii, len(centers)).copy()
+        for array in (centers, radii):
             array.setflags(write=False)
-        _check_outside({"start": start, "target": target}, centres, radii)
+        _check_outside({"start": start, "target": target}, centers, radii)
         for name, value in (
             ("start", start),
             ("target", target),
-            ("centres", centres),
+            ("centers", centers),
             ("radii", radii),
         ):
             object.__setattr__(self, name, value)
@@ -118,15 +118,15 @@ def _checked(
 
 
 def _check_outside(
-    end_points: dict[str, tuple[float, float]], centres: Floats, radii: Floats
+    end_points: dict[str, tuple[float, float]], centers: Floats, radii: Floats
 ) -> None:
     """Raise LidarError if an end of the path, {name: x and y}, lies in a disc."""
     for name, end in end_points.items():
         point = np.array([end])
-        within = np.flatnonzero(segment_distances(point, point, centres)[0] < radii)
+        within = np.flatnonzero(segment_distances(point, point, centers)[0] < radii)
         if len(within):
             disc = int(within[0])
-            x, y = centres[disc]
+            x, y = centers[disc]
             raise LidarError(
                 f"The path's {name} ({end[0]:g}, {end[1]:g}) lies within disc {disc} of radius "
                 f"{radii[disc]:g} at ({x:g}, {y:g}): move the {name} out of it."

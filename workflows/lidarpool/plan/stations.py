@@ -22,7 +22,7 @@ from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
 
-from ..base.neighbours import nearest
+from ..base.neighbors import nearest
 
 MAX_STATIONS = 100
 MIN_GAIN = 0.01  # share of the visible area that each adds, if no number or coverage is given
@@ -71,7 +71,7 @@ class Sight:
     def sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
         """Return the visible sides of surfaces at points (n, 3) from a station (3,): int8 (n,).
 
-        Positions are local, in metres. The points are on triangles of the scene, with unit normals
+        Positions are local, in meters. The points are on triangles of the scene, with unit normals
         (n, 3). 1 is the side that the normal points to, -1 the opposite side, 0 a hidden point.
         """
         offsets = points - station
@@ -98,9 +98,9 @@ class StationPlan:
     Coverage is by area, of the sides of surfaces of the targets that at least one candidate sees.
     """
 
-    stations: Floats  # (s, 3) world metres
+    stations: Floats  # (s, 3) world meters
     coverage: Floats  # (s,) share in 0 to 1, after each station
-    candidates: Floats  # (c, 3) world metres
+    candidates: Floats  # (c, 3) world meters
     spacing_m: float  # spacing of the candidates
     targets: Bools  # (objects,) whether an object is to be covered; other objects only occlude
     visible_m2: Floats  # (objects,) area of targets that candidates see
@@ -153,9 +153,9 @@ def plan_stations(
         Instead of `count`: share of the area of targets that any candidate sees, in (0, 1]. With
         neither, stations are chosen for as long as each adds 1 %. There are at most 100 stations.
     height_m
-        Of the instrument above the floor, metres.
+        Of the instrument above the floor, meters.
     spacing_m
-        Of the candidates, metres; by default such that there are about 600.
+        Of the candidates, meters; by default such that there are about 600.
     slant_deg
         Largest angle of incidence, degrees from the normal, in (0, 90].
 
@@ -224,13 +224,13 @@ def survey_coverage(
     sensor
         The instrument, upright. Its range and field of view count.
     positions
-        The stations (s, 3), world metres.
+        The stations (s, 3), world meters.
     clouds
-        Points (n, 3) each, world metres, which are held in memory one by one.
+        Points (n, 3) each, world meters, which are held in memory one by one.
     targets
         Names of the objects whose area counts, or patterns with * and ?; by default all objects.
     within_m
-        Surface within this distance of a point is covered, metres.
+        Surface within this distance of a point is covered, meters.
     slant_deg
         Largest angle of incidence that counts as seen, degrees from the normal.
 
@@ -340,7 +340,7 @@ def _choose_rows(
 
 
 def _default_spacing_m(scene: Scene) -> float:
-    """Return a round spacing of candidates for the scene's ground, metres."""
+    """Return a round spacing of candidates for the scene's ground, meters."""
     width_m, depth_m, _ = np.ptp(scene.bounds, axis=0)
     spacing = max(math.sqrt(width_m * depth_m / _CANDIDATES), _MIN_SPACING_M)
     power = 10.0 ** math.floor(math.log10(spacing))
@@ -348,7 +348,7 @@ def _default_spacing_m(scene: Scene) -> float:
 
 
 def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: float) -> Floats:
-    """Return local positions (c, 3), metres, where an instrument can stand, on a grid.
+    """Return local positions (c, 3), meters, where an instrument can stand, on a grid.
 
     The floor is the lowest surface, or the top of a slab if that is lowest. Floors that are
     reached only by a climb of more than 45 degrees, such as eaves without ground below, are
@@ -433,22 +433,22 @@ def _largest_level(floor: Floats, spacing_m: float) -> Bools:
         while to_visit:
             i, j = cell = to_visit.pop()
             sizes[-1] += 1
-            for neighbour in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
-                within = 0 <= neighbour[0] < floor.shape[0] and 0 <= neighbour[1] < floor.shape[1]
+            for neighbor in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+                within = 0 <= neighbor[0] < floor.shape[0] and 0 <= neighbor[1] < floor.shape[1]
                 if (
                     within
-                    and group[neighbour] < 0
-                    and abs(floor[neighbour] - floor[cell]) <= spacing_m
+                    and group[neighbor] < 0
+                    and abs(floor[neighbor] - floor[cell]) <= spacing_m
                 ):
-                    group[neighbour] = len(sizes) - 1
-                    to_visit.append(neighbour)
+                    group[neighbor] = len(sizes) - 1
+                    to_visit.append(neighbor)
     return group == int(np.argmax(sizes)) if sizes else group >= 0
 
 
 def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
     """Return the indices of positions (c, 3) with room around, and not inside an object.
 
-    Inside an object most rays above the horizon meet back faces. A hall that is modelled by its
+    Inside an object most rays above the horizon meet back faces. A hall that is modeled by its
     outside is not such an object: most positions are inside.
     """
     n = np.arange(_SPHERE_RAYS)
@@ -475,7 +475,7 @@ def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
 class _SurfaceSamples(NamedTuple):
     """Points on the surfaces of a scene."""
 
-    points: Floats  # (n, 3), local metres
+    points: Floats  # (n, 3), local meters
     normals: Floats  # (n, 3), of length 1
     owner: Ints  # (n,), objects
     area_m2: Floats  # (n,), area that a point stands for

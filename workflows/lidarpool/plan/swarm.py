@@ -49,8 +49,8 @@ class Randoms:
         for quarter in range(4):
             total += (raw >> np.uint64(16 * quarter)) & np.uint64(0xFFFF)
         # Four whole numbers below 2**16 have mean 2 (2**16 - 1) and variance near 2**32 / 3.
-        centred = total.astype(np.float32) - np.float32(2 * (2**16 - 1))
-        return centred * np.float32(math.sqrt(3) / 2**16)
+        centered = total.astype(np.float32) - np.float32(2 * (2**16 - 1))
+        return centered * np.float32(math.sqrt(3) / 2**16)
 
     def below(self, end: int, count: int) -> list[int]:
         """Draw whole numbers from 0 to end - 1, for an `end` far below 2**64."""

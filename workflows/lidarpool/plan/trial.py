@@ -29,8 +29,8 @@ class Trial:
 
     trial: int  # its number, from 0
     seed: int  # seed of its random numbers
-    length: float  # length of the path, metres
-    waypoints: Floats  # (k, 2): corners of the path between its two ends, metres
+    length: float  # length of the path, meters
+    waypoints: Floats  # (k, 2): corners of the path between its two ends, meters
     collision_free: bool  # whether the path enters no disc, by the exact check
     seconds: float = field(compare=False)  # duration of the trial
 
@@ -56,7 +56,7 @@ def run_trial(planning: Planning, trial: int) -> Trial:
         seed=seed,
         length=path_length(path),
         waypoints=waypoints,
-        collision_free=clearance(path, planning.centres, planning.radii) >= 0,
+        collision_free=clearance(path, planning.centers, planning.radii) >= 0,
         seconds=time.perf_counter() - started,
     )
 
@@ -68,11 +68,11 @@ def with_ends(planning: Planning, waypoints: Floats) -> Floats:
 
 def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
     """Return the swarm of `planning`, spread as widely as a path around the discs may reach."""
-    centres = axes.to_local(planning.centres)
+    centers = axes.to_local(planning.centers)
     radii = planning.radii / axes.unit_m
-    cost = PathCost(centres, radii, planning.waypoints, planning.particles)
+    cost = PathCost(centers, radii, planning.waypoints, planning.particles)
     line = np.array([[-0.5, 0.0], [0.5, 0.0]])
-    edges = segment_distances(line[:1], line[1:], centres)[0] + radii
+    edges = segment_distances(line[:1], line[1:], centers)[0] + radii
     # No path worth having leaves the line by more than half its length.
     widest = min(float(edges.max(initial=0.0)), cost.entry_price / 2)
     return Swarm(cost, widest, Randoms(seed))
@@ -85,14 +85,14 @@ class Plan:
     Parameters
     ----------
     path
-        Corners of the path from start to target, both included, in metres: (k + 2, 2).
+        Corners of the path from start to target, both included, in meters: (k + 2, 2).
     length
-        Its length in metres.
+        Its length in meters.
     shortest_possible
-        Length in metres of the shortest path, computed from the discs' tangents; inf if discs cut
+        Length in meters of the shortest path, computed from the discs' tangents; inf if discs cut
         off the target.
     clearance
-        Smallest distance in metres from the path to a disc; negative if the path enters a disc,
+        Smallest distance in meters from the path to a disc; negative if the path enters a disc,
         inf without discs.
     trial
         Number of the trial that found the path.
@@ -136,7 +136,7 @@ def best(trials: Iterable[Trial], planning: Planning) -> Plan:
     ranked = []
     for trial in trials:
         path = with_ends(planning, trial.waypoints)
-        clearance_m = clearance(path, planning.centres, planning.radii)
+        clearance_m = clearance(path, planning.centers, planning.radii)
         ranked.append((max(0.0, -clearance_m), path_length(path), trial.trial, clearance_m, path))
     if not ranked:
         raise LidarError("No planning trial was finished, so there is no best path.")
@@ -145,7 +145,7 @@ def best(trials: Iterable[Trial], planning: Planning) -> Plan:
         path=path,
         length=length,
         shortest_possible=shortest_path_length(
-            planning.start, planning.target, planning.centres, planning.radii
+            planning.start, planning.target, planning.centers, planning.radii
         ),
         clearance=clearance_m,
         trial=number,

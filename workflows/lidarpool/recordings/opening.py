@@ -79,19 +79,19 @@ def open_recording(
 
     `sensor` chooses one of several sensors, or the topic of a bag; `intensity` is the column of the
     intensity, if not one of the usual names; `name` is the name of a cloud in memory; `unit` is the
-    unit of a file of `_UNIT_SUFFIXES`, in place of metres or of the units that a .las states;
+    unit of a file of `_UNIT_SUFFIXES`, in place of meters or of the units that a .las states;
     without `keep_noise`, points that a file withholds or classifies as noise are left out.
     LidarError if the source is none of these, cannot be opened, or has lengths that are not true.
     """
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:
-            raise LidarError(f"{name} is in metres: leave out its unit, {unit!r}.")
+            raise LidarError(f"{name} is in meters: leave out its unit, {unit!r}.")
         return open_cloud(name, source, source.sweeps, sensor, intensity)
     path = Path(source)
     name = str(source)
     if unit is not None and path.suffix.lower() not in _UNIT_SUFFIXES:
         raise LidarError(
-            f"{name} is in metres: leave out its unit, {unit!r}, which is for a file "
+            f"{name} is in meters: leave out its unit, {unit!r}, which is for a file "
             f"{' '.join(_UNIT_SUFFIXES)}."
         )
     recording = _open_path(RecordingSource(path, name, sensor, intensity, unit))

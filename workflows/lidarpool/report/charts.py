@@ -15,7 +15,7 @@ from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import plural, rounded, shortened
 from lidarsim.columns.table import TABLE, Z, value_names
 from lidarview.render import theme
-from lidarview.render.colouring import colours_of
+from lidarview.render.coloring import colors_of
 from lidarview.render.picture_page import FONT, Page, label_logarithms
 
 from ..datasets.figures import Figures, Varied
@@ -41,7 +41,7 @@ LABEL_HEIGHT = 60
 SLANTED_HEIGHT = 56  # more below slanted labels
 ROW_GAP = 76  # gap between two rows of charts
 PERCENTILES = (10, 50, 90)  # percentiles of the points of jobs with near values
-MAX_COLOURS = 6  # labels that have separate colours
+MAX_COLORS = 6  # labels that have separate colors
 # groups of jobs with similar values, whose medians are drawn; jobs of a group
 _MAX_GROUPS = 12
 _MIN_GROUP = 8
@@ -55,7 +55,7 @@ MAX_VALUES = 4  # limit for named values
 def draw_varied(figures: Figures) -> Page | None:
     """Draw a histogram of each varied quantity above a plot of the points of jobs by value.
 
-    Jobs have the colours of the quantity of few labels whose groups differ most in points. None
+    Jobs have the colors of the quantity of few labels whose groups differ most in points. None
     without varied quantities or jobs.
     """
     drawable = [varied for varied in figures.varied if len(varied.known_values)]
@@ -68,14 +68,14 @@ def draw_varied(figures: Figures) -> Page | None:
     failures = figures.failures
     limits = _limits(points[~failures])
     informative = _most_informative(scales, points, ~failures)
-    colours = _dot_colours(informative, len(points))
+    colors = _dot_colors(informative, len(points))
     for number, scale in enumerate(scales):
         upper, lower = layout.add_charts(page, number)
         bars: Iterable[Any] = [BAR]
         if scale is informative:
-            bars = theme.object_colours(len(scale.labels))
+            bars = theme.object_colors(len(scale.labels))
         _draw_counts(upper, scale, failures, bars)
-        _draw_points(page, lower, scale, _JobDots(points, failures, colours))
+        _draw_points(page, lower, scale, _JobDots(points, failures, colors))
         lower.set_ylim(limits)
         layout.label_charts(page, number, scale, upper, lower)
     page.title(
@@ -140,24 +140,24 @@ class _JobDots(NamedTuple):
 
     points: Floats
     failures: Bools
-    colours: Floats  # (jobs, 3)
+    colors: Floats  # (jobs, 3)
 
 
-def _dot_colours(informative: Varied | None, count: int) -> Floats:
-    """Return the colours (jobs, 3) of dots, by the labels of a quantity, if any."""
-    colours = np.tile(theme.rgb(DOT), (count, 1))
+def _dot_colors(informative: Varied | None, count: int) -> Floats:
+    """Return the colors (jobs, 3) of dots, by the labels of a quantity, if any."""
+    colors = np.tile(theme.rgb(DOT), (count, 1))
     if informative is not None:
-        label_colours = theme.object_colours(len(informative.labels))
+        label_colors = theme.object_colors(len(informative.labels))
         has_label = np.isfinite(informative.values)
-        colours[has_label] = label_colours[informative.values[has_label].astype(np.intp)]
-    return colours
+        colors[has_label] = label_colors[informative.values[has_label].astype(np.intp)]
+    return colors
 
 
 def _remarks(figures: Figures, informative: Varied | None, hidden: int) -> str:
-    """Return a sentence about colours, failures and the number of hidden quantities."""
+    """Return a sentence about colors, failures and the number of hidden quantities."""
     remarks = []
     if informative is not None:
-        remarks.append(f"coloured by {shortened(informative.name, 40)}")
+        remarks.append(f"colored by {shortened(informative.name, 40)}")
     if failed := int(figures.failures.sum()):
         remarks.append(f"red: {plural(failed, 'failed job')}")
     if figures.done > MAX_DOTS:
@@ -173,7 +173,7 @@ def _most_informative(scales: Sequence[Varied], points: Floats, is_done: Bools) 
     variances = {}  # {quantity: variance of the means of its groups}
     for scale in scales:
         is_known = is_done & np.isfinite(scale.values)
-        if 2 <= len(scale.labels) <= MAX_COLOURS and is_known.any():
+        if 2 <= len(scale.labels) <= MAX_COLORS and is_known.any():
             groups = scale.values[is_known].astype(np.intp)
             means = np.bincount(groups, points[is_known]) / np.bincount(groups).clip(1)
             variances[scale] = float(np.var(means[groups]))
@@ -244,14 +244,14 @@ def _tick(value: float, _: object = None) -> str:
     return f"{value:,.6g}"
 
 
-def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colours: Iterable[Any]) -> None:
-    """Draw a histogram with bars in `colours`, behind a histogram of failed jobs."""
+def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colors: Iterable[Any]) -> None:
+    """Draw a histogram with bars in `colors`, behind a histogram of failed jobs."""
     bar_width = 0.7 if scale.labels else 1.0  # labels are apart, since they have no order
     edges = scale.edges.tolist()
     failed = scale.values[failures & np.isfinite(scale.values)]
     counts, *_ = axes.hist(scale.known_values, edges, rwidth=bar_width)
-    for bar, colour in zip(axes.patches, cycle(colours)):
-        bar.set_facecolor(colour)
+    for bar, color in zip(axes.patches, cycle(colors)):
+        bar.set_facecolor(color)
     axes.hist(failed, edges, rwidth=bar_width, color=theme.SENSOR)
     axes.set_ylim(0, 1.1 * max(1, np.max(counts)))
 
@@ -271,7 +271,7 @@ def _draw_points(page: Page, axes: Axes, scale: Varied, dots: _JobDots) -> None:
         x[drawn],
         dots.points[drawn],
         s=size,
-        c=dots.colours[drawn],
+        c=dots.colors[drawn],
         alpha=alpha,
         linewidths=0,
         clip_on=False,
@@ -333,7 +333,7 @@ def _groups_of_near(x: Floats, jobs: Indices) -> list[Indices]:
 def _adjoining_bars(groups: Sequence[Floats]) -> Floats:
     """Return the left and right ends of bars of groups of values, and NaN: (groups, 3).
 
-    Bars of neighbouring groups meet halfway between the groups.
+    Bars of neighboring groups meet halfway between the groups.
     """
     lowest = np.array([values.min() for values in groups])
     highest = np.array([values.max() for values in groups])
@@ -379,7 +379,7 @@ def _set_labels(page: Page, axes: Axes, scale: Varied, width: float) -> None:
 
 
 def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
-    """Draw the points of a sweep in the sensor frame, coloured by class, or else by height."""
+    """Draw the points of a sweep in the sensor frame, colored by class, or else by height."""
     page = Page(SWEEP_SIZE)
     frame = np.divide(SWEEP_FRAME, SWEEP_SIZE * 2)
     axes = page.chart((frame[0], frame[1], frame[2], frame[3]))
@@ -392,15 +392,15 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     ]
     page.title(
         f"A sweep of job {sweep.job}",
-        f"{plural(len(sweep), 'point')} from above, metres in the sensor's axes",
+        f"{plural(len(sweep), 'point')} from above, meters in the sensor's axes",
         ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:
-        colouring = colours_of(classes, TABLE["class"], value_names({0: "none", **names}))
-        page.legend(colouring.labels, "sensor")
-        painted = colouring.paint(classes)
+        coloring = colors_of(classes, TABLE["class"], value_names({0: "none", **names}))
+        page.legend(coloring.labels, "sensor")
+        painted = coloring.paint(classes)
     else:
-        painted = colours_of(points[:, 2], Z).paint(points[:, 2])
+        painted = colors_of(points[:, 2], Z).paint(points[:, 2])
     reach = 1.0
     if len(points):
         reach = float(np.percentile(np.abs(points[:, :2]).max(axis=1), 100 * SWEEP_SHARE))

@@ -41,9 +41,9 @@ class CloudCounts:
     objects, materials
         Numbers of objects and materials of the scene.
     precision_m
-        Size of the cells of positions, metres.
+        Size of the cells of positions, meters.
     origin
-        World position of the cell 0, 0, 0, (3,), metres.
+        World position of the cell 0, 0, 0, (3,), meters.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class CloudCounts:
 
     @property
     def bounds(self) -> Floats:
-        """Lowest and highest coordinates in the world, (2, 3), metres, or zeros without points."""
+        """Lowest and highest coordinates in the world, (2, 3), meters, or zeros without points."""
         if self._box is None:
             return np.zeros((2, 3))
         return positions_of(self._box, self._precision_m, self._origin)
@@ -127,12 +127,12 @@ class CloudCounts:
 
     @property
     def pixel_m(self) -> float:
-        """Side of a pixel of `above`, metres."""
+        """Side of a pixel of `above`, meters."""
         return self._pixels.side * self._precision_m
 
     @property
     def corner(self) -> Floats:
-        """World position of the corner of `above` in the south-west, (2,), metres."""
+        """World position of the corner of `above` in the south-west, (2,), meters."""
         return positions_of(self._pixels.lowest, self._precision_m, self._origin[:2])
 
     @property

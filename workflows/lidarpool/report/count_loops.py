@@ -52,7 +52,7 @@ def count_labels(labels, counts):
     Labels beyond the counts are not counted.
     """
     last = np.int64(-1)
-    repeats = 0  # of the last label: neighbours are often of the same object
+    repeats = 0  # of the last label: neighbors are often of the same object
     negative = 0
     for k in range(len(labels)):
         label = np.int64(labels[k])

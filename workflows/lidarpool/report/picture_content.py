@@ -40,7 +40,7 @@ def planning_picture(
     return PlanningPicture(
         start=planning.start,
         target=planning.target,
-        centres=planning.centres,
+        centers=planning.centers,
         radii=planning.radii,
         best=best,
     )

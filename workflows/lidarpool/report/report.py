@@ -65,7 +65,7 @@ def versions() -> dict[str, str]:
 def make_report(result: RunResult, cloud: CloudCounts) -> dict[str, Any]:
     """Return the report of a run, ready for JSON.
 
-    Lengths are in metres, times in seconds; infinite and unknown values are None.
+    Lengths are in meters, times in seconds; infinite and unknown values are None.
     """
     scene = result.scene
     survey = result.survey

@@ -27,7 +27,7 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.table import TABLE, X, Y, Z
 from lidarview.picture_file import PictureContent, PlannedPath, PlanningPicture, moving_positions
 from lidarview.render import theme
-from lidarview.render.colouring import with_composed
+from lidarview.render.coloring import with_composed
 from lidarview.render.picture_page import DPI, FONT, Page
 from lidarview.render.pictures import MAX_POINTS, draw_cloud, draw_hits, draw_scene
 from lidarview.render.shot import SIZE, Samples, SurfaceView, take_shot
@@ -44,10 +44,10 @@ MAX_RATIO = 2  # longer side to shorter, at most, or legends do not fit
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
 MAX_TRIALS = 1000
 _BEST_WIDTH = 2.0  # line of the best path, points
-PATH_COLOUR = "#d6336c"
-TRIAL_COLOUR = "#5b8fd0"
+PATH_COLOR = "#d6336c"
+TRIAL_COLOR = "#5b8fd0"
 COVERED, UNCOVERED, HIDDEN, OTHER = range(4)  # hidden from all candidates; no target
-COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY, "#c8bda6")])
+COLORS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY, "#c8bda6")])
 _BLOCK = 4  # pixels a side
 
 
@@ -57,13 +57,13 @@ def draw_pictures(
     folder: str | Path,
     only: Sequence[str] = (),
     size: tuple[int, int] = SIZE,
-    colour: str = Z.name,
+    color: str = Z.name,
     show: WritingProgress = lambda *_: None,
 ) -> Iterator[Path]:
     """Draw all pictures of a result, or `only` named pictures, into a folder and into its page.
 
-    The folder is created. All pictures have the same viewpoint, and the cloud has the colours of
-    the column `colour`. Without planning, the picture of the path is missing. Points in the frames
+    The folder is created. All pictures have the same viewpoint, and the cloud has the colors of
+    the column `color`. Without planning, the picture of the path is missing. Points in the frames
     of their sensors, which differ from the scene's, have no picture.
     """
     cloud = result / "cloud.ply"
@@ -75,7 +75,7 @@ def draw_pictures(
             f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
             f"{MIN_SIDE} to {MAX_SIDE} each, one at most twice the other, such as 1600 x 1000."
         )
-    makers = _picture_makers(shown, cloud, size, colour)
+    makers = _picture_makers(shown, cloud, size, color)
     for name in only:
         if name not in PICTURES:
             advice = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
@@ -102,7 +102,7 @@ def draw_pictures(
 
 
 def _picture_makers(
-    shown: PictureContent, cloud: Path, size: tuple[int, int], colour: str
+    shown: PictureContent, cloud: Path, size: tuple[int, int], color: str
 ) -> dict[str, Callable[[], Page]]:
     """Return functions that draw pictures.
 
@@ -141,13 +141,13 @@ def _picture_makers(
         columns_by_name = with_composed(
             {name: c for c in (Z, X, Y, *file.table) for name in (c.name, c.in_files)}
         )
-        if colour not in columns_by_name:
+        if color not in columns_by_name:
             available = list(dict.fromkeys(c.name for c in columns_by_name.values()))
             raise LidarError(
-                f"{cloud} has no column {colour!r}."
-                + (did_you_mean(colour, columns_by_name) or f" There are {', '.join(available)}.")
+                f"{cloud} has no column {color!r}."
+                + (did_you_mean(color, columns_by_name) or f" There are {', '.join(available)}.")
             )
-        column = columns_by_name[colour]
+        column = columns_by_name[color]
         return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
 
     makers: dict[str, Callable[[], Page]] = {
@@ -187,7 +187,7 @@ def draw_path(
     pixel_m = float(limits[1, 0] - limits[0, 0]) / (FRAME[2] * size[0])
     width_m = pixel_m * _BEST_WIDTH * unit * DPI / 72  # width of the line of the best path
     drawn_trials = [trial for trial in drawn_trials if farthest(trial, best) > width_m]
-    circles = zip(planning.centres, planning.radii, strict=True)
+    circles = zip(planning.centers, planning.radii, strict=True)
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
         facecolor=theme.UNSEEN,
@@ -197,10 +197,10 @@ def draw_path(
     axes.add_collection(discs)
     alpha = float(np.clip(6 / max(len(drawn_trials), 1), 0.08, 0.6))
     axes.add_collection(
-        LineCollection(drawn_trials, colors=TRIAL_COLOUR, linewidths=0.8 * unit, alpha=alpha)
+        LineCollection(drawn_trials, colors=TRIAL_COLOR, linewidths=0.8 * unit, alpha=alpha)
     )
-    axes.plot(*best.T, color=PATH_COLOUR, lw=_BEST_WIDTH * unit, solid_joinstyle="round", zorder=4)
-    axes.plot(*best[1:-1].T, "o", color=PATH_COLOUR, ms=2.6 * unit, zorder=5)
+    axes.plot(*best.T, color=PATH_COLOR, lw=_BEST_WIDTH * unit, solid_joinstyle="round", zorder=4)
+    axes.plot(*best[1:-1].T, "o", color=PATH_COLOR, ms=2.6 * unit, zorder=5)
     _draw_ends(axes, page, planning)
     page.key(_path_legend(unit, len(drawn_trials), len(planning.radii)), 7.4)
     page.title("Planned path", _verdict(path, trials))
@@ -229,10 +229,10 @@ def farthest(path: Floats, other: Floats) -> float:
 
 def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Line2D]:
     """Return the handles of the legend of a planned path."""
-    handles = [Line2D([], [], color=PATH_COLOUR, lw=_BEST_WIDTH * unit, label="Best path")]
+    handles = [Line2D([], [], color=PATH_COLOR, lw=_BEST_WIDTH * unit, label="Best path")]
     if trial_count:
         label = plural(trial_count, "other trial")
-        handles.append(Line2D([], [], color=TRIAL_COLOUR, lw=0.8 * unit, alpha=0.6, label=label))
+        handles.append(Line2D([], [], color=TRIAL_COLOR, lw=0.8 * unit, alpha=0.6, label=label))
     if obstacle_count:
         handles.append(
             Line2D(
@@ -269,7 +269,7 @@ def _limits(
 ) -> Floats:
     """Return the lowest and highest corner (2, 2) of the plot, in the page's proportions."""
     reach = planning.radii[:, None]
-    shown = np.concatenate([best, *trials, planning.centres - reach, planning.centres + reach])
+    shown = np.concatenate([best, *trials, planning.centers - reach, planning.centers + reach])
     lower = shown.min(axis=0)
     upper = shown.max(axis=0)
     width = np.maximum(upper - lower, 1e-3) * 1.1
@@ -316,10 +316,10 @@ def draw_stations(plan: StationPlan) -> Page:
     """Draw the scene of a plan and color each pixel by its visibility from the stations."""
     shot = take_shot(plan.scene, plan.stations)
     page = Page(SIZE)
-    axes = page.show(shot, _by_coverage(shot, plan).paint(COLOURS, 0.6))
+    axes = page.show(shot, _by_coverage(shot, plan).paint(COLORS, 0.6))
     page.numbers(axes, shot)
     names = ["covered", "not covered", "out of sight"] + ["not a target"] * (not plan.targets.all())
-    page.legend([*zip(names, COLOURS, strict=False)], "station")
+    page.legend([*zip(names, COLORS, strict=False)], "station")
     candidates = plural(len(plan.candidates), "place")
     targets = "" if plan.targets.all() else f" of {plural(int(plan.targets.sum()), 'object')}"
     page.title(

@@ -307,12 +307,12 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
                 "scans": steps * survey.path.stations,
                 "firings": firings * survey.path.stations,
                 "turns": rate_hz and (stop_s - start_s) * rate_hz,
-                "metres_a_turn": rate_hz and speed_m_s / rate_hz,
+                "meters_a_turn": rate_hz and speed_m_s / rate_hz,
             }
         )
     return {
         "seconds": seconds,
-        "metres": float(traveled_m[-1]),
+        "meters": float(traveled_m[-1]),
         "lines": lines and lines.summary(),
         "sensors": sensors,
     }

@@ -46,7 +46,7 @@ class RunResult:
     identity
         Fingerprints of scene, survey and planning, and versions of the software.
     sample_rays
-        float32 (k, 2, 3): first and last point of some rays, metres, local coordinates.
+        float32 (k, 2, 3): first and last point of some rays, meters, local coordinates.
     seconds, survey_seconds, planning_seconds
         Wall time of all, of the survey and of the planning.
     replayed

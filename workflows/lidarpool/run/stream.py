@@ -102,7 +102,7 @@ class SweepStream:
         """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
 
         Its DataLoader needs ``num_workers=0``, since the cluster works ahead. Ranks of
-        torch.distributed, if that is initialised when the loader begins, get the same number of
+        torch.distributed, if that is initialized when the loader begins, get the same number of
         jobs each. `transform` makes an item of a sweep, as of `SavedSweeps.torch`.
 
         LidarError if torch is not installed; in a worker of a DataLoader.

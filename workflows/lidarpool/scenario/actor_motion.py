@@ -168,7 +168,7 @@ class TrajectorySection(Section):
         Strict(False),
         about(
             "for latitudes and longitudes: those of the world's zero, degrees, and its height, "
-            "metres; by default the first position",
+            "meters; by default the first position",
             [48.7758, 9.1829, 290],
         ),
     ] = None
@@ -177,7 +177,7 @@ class TrajectorySection(Section):
         about("whether poses have camera axes (z ahead); by default those of KITTI have"),
     ] = None
     points: Annotated[
-        Several[TimedPose], about("instead of a file: time_s, position and angles, world metres")
+        Several[TimedPose], about("instead of a file: time_s, position and angles, world meters")
     ] = ()
     vehicle: Annotated[
         Identity | None,
@@ -265,7 +265,7 @@ class TrajectorySection(Section):
         )
 
     def footprint(self, path: PathOf) -> Floats:
-        """Return positions on the trajectory seen from above, (n, 2), world metres.
+        """Return positions on the trajectory seen from above, (n, 2), world meters.
 
         There are none on the trajectory of a vehicle of traffic. `path` returns the path of a file
         in the scenario. LidarError if a file cannot be read.
@@ -354,7 +354,7 @@ class ActorSection(DeformingSection):
     joints: Annotated[
         Annotated[JointTable, by_text("file", JointTable)] | None,
         about(
-            "of a robot: a table of time_s and the values of joints, radians or metres", "arm.csv"
+            "of a robot: a table of time_s and the values of joints, radians or meters", "arm.csv"
         ),
     ] = None
 
@@ -378,7 +378,7 @@ class ActorSection(DeformingSection):
             raise ValueError("a robot has joints: leave out animation and wheels.")
         if self.robot and self.robot.model_fields_set - _ROBOT_FIELDS:
             raise ValueError(
-                "a robot is in metres and in its own axes: give just its file, opacity and assets."
+                "a robot is in meters and in its own axes: give just its file, opacity and assets."
             )
         return self
 

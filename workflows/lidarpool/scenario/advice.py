@@ -26,9 +26,9 @@ from ..clouds.laser_scan import has_planar_sensors
 from .build import Built
 from .scenario import Scenario
 
-# Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
-# seen from outside is rarely longer than a bus. glTF is in metres, and some exporters write
-# millimetres.
+# Sizes of scenes in meters are between these. An .stl is mostly a part, in millimeters; an object
+# seen from outside is rarely longer than a bus. glTF is in meters, and some exporters write
+# millimeters.
 LARGE_M = 500.0
 LARGE_STL_M = 20.0
 LARGE_OBJECT_M = 10.0
@@ -54,7 +54,7 @@ def advice(built: Built) -> list[str]:
     step = built.survey.precision_m
     every = built.survey.keep_every
     placed = "" if built.placing is None else built.placing.note
-    likely = filter(None, (_size_note(built, side), placed, _colour_note(built)))
+    likely = filter(None, (_size_note(built, side), placed, _color_note(built)))
     scanners = [
         "bags have a LaserScan of a 2D scanner only if every return is kept: set cloud.keep_every "
         "to 1"
@@ -63,10 +63,10 @@ def advice(built: Built) -> list[str]:
         f"points are rounded to {step:g} m, and the scene is {side:.3g} m long: give a smaller "
         "cloud.precision_m in a scenario"
     ] * (side < MIN_STEPS * step)
-    unlabelled = [
-        note for entry in built.scenario.output.write for note in entry.unlabelled(built.survey)
+    unlabeled = [
+        note for entry in built.scenario.output.write for note in entry.unlabeled(built.survey)
     ]
-    labels = (*unlabelled, *_unnamed_classes(built.survey))
+    labels = (*unlabeled, *_unnamed_classes(built.survey))
     settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
     light = (*_single_returns(built), *_dark_fog(built.survey))
     groups = (
@@ -94,7 +94,7 @@ def _writes_bags(scenario: Scenario) -> bool:
 
 
 def _size_note(built: Built, side: float) -> str:
-    """Return a note if the longest side of the scene (metres) suggests another unit, else ""."""
+    """Return a note if the longest side of the scene (meters) suggests another unit, else ""."""
     scenario = built.scenario
     placing = built.placing
     files = [entry.file for entry in scenario.scene.files if entry.unit is None]
@@ -109,9 +109,9 @@ def _size_note(built: Built, side: float) -> str:
     if not (unitless or (surrounded and files)) or min_m <= side <= max_m:
         return ""
     unit = "mm" if side > max_m else "km"
-    stated = "states no unit" if unitless else "is in metres by its format"
+    stated = "states no unit" if unitless else "is in meters by its format"
     return (
-        f"{(unitless or files)[0]} {stated}, and in metres the scene is {rounded(side, 5)} m long. "
+        f"{(unitless or files)[0]} {stated}, and in meters the scene is {rounded(side, 5)} m long. "
         f"If that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
         "mesh file"
     )
@@ -123,27 +123,27 @@ def _lacks_unit(path: Path) -> bool:
     return row is not None and row.unitless and not written_by_lidarpool(path)
 
 
-def _colour_note(built: Built) -> str:
-    """Return a note on objects that lack the colours that settings need, or an empty string."""
+def _color_note(built: Built) -> str:
+    """Return a note on objects that lack the colors that settings need, or an empty string."""
     scene = built.scene
-    if not built.scenario.coloured:
+    if not built.scenario.colored:
         return ""
-    if not scene.coloured:
+    if not scene.colored:
         return (
-            "a column or reflectance: texture needs colours, but nothing in the scene has any, "
-            "so that all is grey"
+            "a column or reflectance: texture needs colors, but nothing in the scene has any, "
+            "so that all is gray"
         )
     names = scene.object_names
     kinds = scene.surface_kinds
     table = MaterialTable.build(built.survey.materials, kinds, voxels=scene.has_voxels)
     textured = np.zeros(len(names), np.bool_)
     textured[kinds.object[table.scale > 0]] = True
-    if not len(grey := np.flatnonzero(textured & ~scene.has_colours)):
+    if not len(gray := np.flatnonzero(textured & ~scene.has_colors)):
         return ""
-    shown = ", ".join(names[i] for i in grey[:3]) + ", …" * (len(grey) > 3)
+    shown = ", ".join(names[i] for i in gray[:3]) + ", …" * (len(gray) > 3)
     return (
-        f"{len(grey):,} of {plural(int(textured.sum()), 'object')} with reflectance: texture "
-        f"have no colours and are grey: {shown}"
+        f"{len(gray):,} of {plural(int(textured.sum()), 'object')} with reflectance: texture "
+        f"have no colors and are gray: {shown}"
     )
 
 

@@ -26,12 +26,12 @@ from lidarsim.media.materials import (
     with_classes,
 )
 from lidarsim.media.weather import Weather
-from lidarsim.motion.trajectory import CENTRE, Pose, Track
+from lidarsim.motion.trajectory import CENTER, Pose, Track
 from lidarsim.scene.actors import Actor, check_spray
 from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Noise, Returns, Sensor
 from lidarsim.simulator.casting.static_bodies import warn_of_reach
-from lidarsim.simulator.casting.surfaces import warn_of_grey
+from lidarsim.simulator.casting.surfaces import warn_of_gray
 from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.sweeps.sweeps import Sweeps
@@ -63,7 +63,7 @@ from .traffic import (
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
 
-# Default poses of the sensor among the objects of the demo, world metres.
+# Default poses of the sensor among the objects of the demo, world meters.
 SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
 # Class of buildings by ASPRS LAS: sensors are not placed inside objects of this class.
@@ -104,7 +104,7 @@ class Job:
     LidarError
         If a field has another type, the survey's precision is too fine for the scene, a
         material is for no object, an object lacks a material while others have one, or the
-        survey's coordinate system is not in metres that are true where the scene is.
+        survey's coordinate system is not in meters that are true where the scene is.
     """
 
     scene: Scene
@@ -140,7 +140,7 @@ class Job:
         if survey.epsg is not None:
             check_epsg(survey.epsg, scene)
         warn_of_place(scene, survey.epsg)
-        warn_of_grey(scene, survey)
+        warn_of_gray(scene, survey)
         warn_of_reach(scene, survey)
 
     @property
@@ -278,7 +278,7 @@ class _SurveyParts(NamedTuple):
     sensors: Sequence[Mounted]
     # Trajectory of the carrier, local; or poses, world: the scenario's, else default poses.
     track_or_poses: Track | Sequence[Pose]
-    origin: Floats  # (3,), of the scene, world metres
+    origin: Floats  # (3,), of the scene, world meters
     epsg: int | None  # EPSG code of the rasters' coordinate system
 
 
@@ -394,7 +394,7 @@ def _check_sensors(scenario: Scenario) -> None:
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     with prefixed(scenario.source):
         for name, section in sections.items():
-            section.mounted(scenario.path, CENTRE, scenario.noise, scenario.returns, name)
+            section.mounted(scenario.path, CENTER, scenario.noise, scenario.returns, name)
 
 
 def _mounted_sensors(shapes: Shapes) -> list[Mounted]:
@@ -419,7 +419,7 @@ def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
     scenario = shapes.scenario
     mount: MountSection | None = getattr(section, "mount", scenario.mount)
     if mount is None or mount.link is None:
-        return CENTRE if mount is None else mount.pose()
+        return CENTER if mount is None else mount.pose()
     carriers = [
         (entry, shapes.robot(entry.robot))
         for entry in scenario.actors
@@ -707,11 +707,11 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
                 "planning.obstacles."
             )
     search_options = declared(section, Search)
-    return Planning(start_xy, target_xy, centres=discs[:, :2], radii=discs[:, 2], **search_options)
+    return Planning(start_xy, target_xy, centers=discs[:, :2], radii=discs[:, 2], **search_options)
 
 
 def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]]:
-    """Return the obstacles as discs (m, 3) of x, y, radius, local, metres, and their labels (m,).
+    """Return the obstacles as discs (m, 3) of x, y, radius, local, meters, and their labels (m,).
 
     By default all static objects higher than `FLAT_M` are obstacles. `planning.clearance_m` is not
     added to the radii.
@@ -722,9 +722,9 @@ def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]
     discs: dict[str, list[float]] = {}  # {label: x, y, radius}
     for number, entry in enumerate(scenario.planning.obstacles):
         if entry.object is None:
-            assert entry.centre and entry.radius_m, "either of the two kinds is given"
-            centre = np.subtract(entry.centre, scene.origin[:2])
-            discs[f"planning.obstacles[{number}]"] = [*centre, entry.radius_m]
+            assert entry.center and entry.radius_m, "either of the two kinds is given"
+            center = np.subtract(entry.center, scene.origin[:2])
+            discs[f"planning.obstacles[{number}]"] = [*center, entry.radius_m]
             continue
         # An exact name comes first, even with brackets; else the text is a pattern.
         matches = [i for i, name in enumerate(scene.names) if name == entry.object] or [

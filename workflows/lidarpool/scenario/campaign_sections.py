@@ -476,7 +476,7 @@ class CampaignSection(Section):
             "{name: share of the jobs}; they add up to 1", {"train": 0.8, "val": 0.1, "test": 0.1}
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
-    license: Annotated[str, about("licence of the data set, for its card", "CC-BY-4.0")] = ""
+    license: Annotated[str, about("license of the data set, for its card", "CC-BY-4.0")] = ""
     title: Annotated[str, about("title of the data set; by default the file's name")] = ""
 
     @model_validator(mode="after")

@@ -278,7 +278,7 @@ def _direction(azimuth_deg: float, elevation_deg: float) -> Floats:
 
 
 def _viewing_distance_m(carried: Mounted, diagonal_m: float, field_deg: float) -> float:
-    """Return the distance in metres where an object with a diagonal fills the view."""
+    """Return the distance in meters where an object with a diagonal fills the view."""
     sensor = carried.sensor
     half = np.radians(max(field_deg, 1e-3) / 2)
     diagonals = float(np.clip(0.5 / np.sin(half), *_DIAGONALS))

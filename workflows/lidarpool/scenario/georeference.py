@@ -21,13 +21,13 @@ _SAME_SHARE = 0.2
 
 
 def check_epsg(epsg: int, scene: Scene) -> None:
-    """Check that a coordinate system is in metres that are true where a scene is.
+    """Check that a coordinate system is in meters that are true where a scene is.
 
     Raises
     ------
     LidarError
         If lengths in the system are wrong by more than 1 % in the middle of the scene, or not in
-        metres. Without rasterio, only systems for maps of the world are refused.
+        meters. Without rasterio, only systems for maps of the world are refused.
     """
     x, y = _middle(scene).tolist()
     problem = target_problem(epsg, x, y, why_there=", where the scene is (world.origin moves it)")
@@ -71,7 +71,7 @@ def place_problem(scene: Scene, epsg: int | None) -> str:
 
 
 def _middle(scene: Scene) -> Floats:
-    """Return x and y of the middle of a scene, (2,), world metres."""
+    """Return x and y of the middle of a scene, (2,), world meters."""
     middle: Floats = (scene.bounds.mean(axis=0) + scene.origin)[:2]
     return middle
 

@@ -35,7 +35,7 @@ class StandingSurfaces:
 
     @property
     def origin(self) -> Floats:
-        """Origin of the scene, (3,), world metres."""
+        """Origin of the scene, (3,), world meters."""
         return np.zeros(3) if self._scene is None else self._scene.origin
 
     def of_objects(self, names: Sequence[str]) -> StandingSurfaces:
@@ -94,7 +94,7 @@ class StandingSurfaces:
 
     @property
     def rectangle(self) -> Floats:
-        """Lowest x and y, highest x and y of the surfaces, world metres: (4,)."""
+        """Lowest x and y, highest x and y of the surfaces, world meters: (4,)."""
         assert self._scene is not None
         x, y = self._tops[0][..., :2].reshape(-1, 2).T
         origin = self._scene.origin[[0, 1, 0, 1]]
@@ -106,7 +106,7 @@ class StandingSurfaces:
         return np.unique(self._tops[1])
 
     def heights_below(self, positions: Floats) -> tuple[Floats, Ints32]:
-        """Return the heights of the surface below positions (n, 2), and its objects, world metres.
+        """Return the heights of the surface below positions (n, 2), and its objects, world meters.
 
         Both are (n,): nan and -1 without a surface.
         """
@@ -129,7 +129,7 @@ def follow_surfaces(track: Track, standing: StandingSurfaces) -> list[Track]:
     """Return the pieces of a trajectory that are on surfaces, with a pose every 0.5 m.
 
     Heights of the trajectory are above the surface. The z axes of the poses are the mean normal
-    of the surface within a metre; headings stay.
+    of the surface within a meter; headings stay.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def _surface_poses(
 ) -> tuple[Floats, Floats]:
     """Return the heights (n,) of surfaces below positions, and the axes (n, 3, 3) of the slope.
 
-    `positions` (n, 2) are local, in metres; `ahead` (n, 2) are the unit directions of travel.
+    `positions` (n, 2) are local, in meters; `ahead` (n, 2) are the unit directions of travel.
     """
     leftward = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     probes = [

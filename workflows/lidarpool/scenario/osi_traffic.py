@@ -32,7 +32,7 @@ from .traffic import (
 
 OSI_SUFFIXES = (".osi", ".mcap")
 _MAX_SIZE_M = 1e4  # limit for a moving object: ships and trains are shorter
-_ROW = 6  # x, y, z of the box's centre, metres; yaw, pitch and roll, radians
+_ROW = 6  # x, y, z of the box's center, meters; yaw, pitch and roll, radians
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class ObjectPassage:
 
     name: str  # its identity
     kind: str  # its type, such as «heavy_truck»
-    size: tuple[float, float, float] | None  # length, width and height, metres; None if unknown
+    size: tuple[float, float, float] | None  # length, width and height, meters; None if unknown
     times_s: array[float] = field(default_factory=lambda: array("d"))
     rows: array[float] = field(default_factory=lambda: array("d"))  # `_ROW` numbers at each time
 
@@ -64,7 +64,7 @@ class ObjectPassage:
         middle under the box's. Without a mesh, the trajectory follows OSI's position.
         """
         rows = np.array(self.rows).reshape(-1, _ROW)
-        centres = rows[:, :3] + section.translation
+        centers = rows[:, :3] + section.translation
         angles_deg = np.degrees(rows[:, 3:])
         offset = np.zeros(3)
         if mesh is not None:
@@ -72,10 +72,10 @@ class ObjectPassage:
             height_m = upper[2] - lower[2] if self.size is None else self.size[2]
             offset = np.array([*(lower[:2] + upper[:2]) / 2, lower[2] + height_m / 2])
         if section.surfaces:
-            centres[:, 2] = section.translation[2] + offset[2]
+            centers[:, 2] = section.translation[2] + offset[2]
             angles_deg[:, 1:] = 0.0
         rotations = rotations_of(angles_deg)
-        positions = centres - rotations @ offset - origin
+        positions = centers - rotations @ offset - origin
         smooth = section.interpolation == "smooth"
         times = np.array(self.times_s) + section.offset_s
         return Track(times, positions, quaternions_of(rotations), smooth, start_s, beyond="absent")
@@ -265,7 +265,7 @@ def _size_of(moving: Any) -> tuple[float, float, float] | None:
     if sides == (0.0, 0.0, 0.0):
         return None
     if not all(0 < side <= _MAX_SIZE_M for side in sides):
-        raise ValueError(f"a moving object has the dimensions {sides}, metres")
+        raise ValueError(f"a moving object has the dimensions {sides}, meters")
     return sides
 
 

@@ -40,7 +40,7 @@ _TRAVELS_M = 2.0
 # Cosines of tilt, on the average: a level carrier, and a carrier that lies on its side.
 _LEVEL = 0.9
 _TILTED = 0.5
-# A path that rises and falls by more than these metres and this share of its length, while it
+# A path that rises and falls by more than these meters and this share of its length, while it
 # stays within a share of that height along x or y, has another axis up.
 _RISE_M = 5.0
 _RISE_SHARE = 0.3
@@ -56,7 +56,7 @@ class _Motion(NamedTuple):
 
     times_ns: Floats  # (k,)
     durations_s: Floats  # (k,): between the poses
-    positions: Floats  # (k, 3), metres
+    positions: Floats  # (k, 3), meters
     rotations: Floats  # (k, 3, 3), from the carrier frame to the scene frame
     velocities: Floats  # (k, 3), m/s
     rates: Floats  # (k, 3), rad/s
@@ -217,7 +217,7 @@ def _inside_actor(actor: Actor, samples: list[_SensorPosition]) -> Bools:
 
 
 def _sight_m(scene: Scene, surroundings: Surroundings | None, positions: Floats) -> float:
-    """Return the range of a sensor without a limit of range, metres."""
+    """Return the range of a sensor without a limit of range, meters."""
     if surroundings is not None:
         distances = surroundings.views(positions).distance
         if len(distances := distances[np.isfinite(distances)]):
@@ -235,12 +235,12 @@ def _noise_warnings(survey: Survey, sight_m: float) -> Iterator[str]:
             if value > NOISE_SHARE * range_m:
                 yield (
                     f"noise.{field}{name} is {rounded(value, 4)} m, more than a tenth of the "
-                    f"range, {rounded(range_m, 4)} m: give it in metres"
+                    f"range, {rounded(range_m, 4)} m: give it in meters"
                 )
         if noise.range_per_m > NOISE_SHARE:
             yield (
                 f"noise.range_per_m{name} is {noise.range_per_m:g}, more than a tenth of the "
-                "range: give metres for each metre of range"
+                "range: give meters for each meter of range"
             )
 
 
@@ -323,7 +323,7 @@ def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
         yield (
             f"the trajectory rises and falls by {rounded(extent_m[2], 4)} m, and stays within "
             f"{rounded(extent_m[flat_axis])} m along {'xy'[flat_axis]}: give positions with z up, "
-            f"in metres (is {'xy'[flat_axis]} the up axis of its file?)"
+            f"in meters (is {'xy'[flat_axis]} the up axis of its file?)"
         )
 
 

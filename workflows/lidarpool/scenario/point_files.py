@@ -1,4 +1,4 @@
-"""Point clouds in files: positions, where they were seen from, classes, intensities and colours."""
+"""Point clouds in files: positions, where they were seen from, classes, intensities and colors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from lidarsim.scene.files.noise_points import LeftOut, usable_points
 from lidarsim.scene.files.stated_system import (
     Reprojection,
     check_metric_format,
-    stated_metres,
+    stated_meters,
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
 from ..clouds.file_points import (
-    COLOURS,
+    COLORS,
     INTENSITIES,
     MIN_POINTS,
     NORMALS,
@@ -35,7 +35,7 @@ from ..clouds.file_points import (
 )
 from ..clouds.format_table import point_suffixes, points_reader
 
-_SAMPLE = 1000  # points that tell whether another system has true metres there
+_SAMPLE = 1000  # points that tell whether another system has true meters there
 NO_CLASS = np.iinfo(np.int64).min  # class of a point without a class
 # Names of columns in files of various programs; the first name that a file has is read.
 CLASSES = (
@@ -46,24 +46,24 @@ CLASSES = (
 
 @dataclass(frozen=True, eq=False)
 class ScannedPoints:
-    """Points of a file, in metres, and the quantities that surfels keep.
+    """Points of a file, in meters, and the quantities that surfels keep.
 
     A quantity that the file does not have is None.
 
     Attributes
     ----------
     positions
-        float64 (n, 3), finite, metres.
+        float64 (n, 3), finite, meters.
     outward
         float64 (n, 3): direction to the scanner, or the normal of the file; zero if unknown.
     classes
         int64 (n,); `NO_CLASS` for points without a class.
     intensities
         float64 (n,), from 0, in the scale of the file; NaN for points without an intensity.
-    colours
+    colors
         float32 (n, 3), sRGB from 0 to 255; NaN for points without a color.
     scanners
-        float64 (n, 3): position of the scanner of each point, metres; NaN where unknown.
+        float64 (n, 3): position of the scanner of each point, meters; NaN where unknown.
     epsg
         EPSG code of the coordinate system of the positions, or None if it is not known.
     """
@@ -72,7 +72,7 @@ class ScannedPoints:
     outward: Floats | None = None
     classes: Ints | None = None
     intensities: Floats | None = None
-    colours: Floats32 | None = None
+    colors: Floats32 | None = None
     scanners: Floats | None = None
     epsg: int | None = None
 
@@ -86,7 +86,7 @@ class ScannedPoints:
             None if self.outward is None else self.outward[row_indices],
             None if self.classes is None else self.classes[row_indices],
             None if self.intensities is None else self.intensities[row_indices],
-            None if self.colours is None else self.colours[row_indices],
+            None if self.colors is None else self.colors[row_indices],
             None if self.scanners is None else self.scanners[row_indices],
             self.epsg,
         )
@@ -100,14 +100,14 @@ def read_points(
     epsg: int | None = None,
     keep_noise: bool = False,
 ) -> ScannedPoints:
-    """Return the finite points of a file, in true metres.
+    """Return the finite points of a file, in true meters.
 
     Parameters
     ----------
     path
         A file with one of `point_suffixes()`.
     unit
-        Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
+        Unit of x, y and z, in place of meters or of the units that a .las or .laz states.
     tell
         Called with lines on converted units, and on points and columns that are left out.
     epsg
@@ -119,7 +119,7 @@ def read_points(
     ------
     LidarError
         If the file cannot be read, is too large, has fewer than `MIN_POINTS` points, or lengths
-        that are not true; see `stated_metres` and `Reprojection`.
+        that are not true; see `stated_meters` and `Reprojection`.
     """
     reader = points_reader(path)
     if reader is None:
@@ -136,8 +136,8 @@ def read_points(
             content = reader(path)
             if not keep_noise:
                 content = _without_noise(path, content, tell)
-            to_metres, placed_epsg = _to_metres(path, content, unit, epsg, tell)
-            points, notes = _scanned_points(content, to_metres)
+            to_meters, placed_epsg = _to_meters(path, content, unit, epsg, tell)
+            points, notes = _scanned_points(content, to_meters)
             points = replace(points, epsg=placed_epsg)
     except LidarError:
         raise
@@ -189,14 +189,14 @@ def _without_noise(path: Path, content: FilePoints, tell: Callable[[str], None])
     )
 
 
-def _to_metres(
+def _to_meters(
     path: Path,
     content: FilePoints,
     unit: str | None,
     epsg: int | None,
     tell: Callable[[str], None],
 ) -> tuple[Callable[[Floats], Floats], int | None]:
-    """Return a function from positions (n, 3) of a file to true metres, and their EPSG code.
+    """Return a function from positions (n, 3) of a file to true meters, and their EPSG code.
 
     The code is None if the coordinates are in no known system afterwards. `tell` gets a message
     that says how positions are converted.
@@ -211,42 +211,42 @@ def _to_metres(
         convert = reprojection.apply
         placed_epsg = epsg
     else:
-        if content.in_metres and unit is None:
+        if content.in_meters and unit is None:
             notes = check_metric_format(content.system, finite)
-            metres = (1.0, 1.0, 1.0)
+            meters = (1.0, 1.0, 1.0)
         elif content.units_m is not None and unit is None:
-            metres = content.units_m
-            lengths = ", ".join(f"{length:g}" for length in metres)
-            notes = [f"was converted to metres: its header names units of {lengths} m"]
+            meters = content.units_m
+            lengths = ", ".join(f"{length:g}" for length in meters)
+            notes = [f"was converted to meters: its header names units of {lengths} m"]
         else:
-            metres, notes = stated_metres(content.system, finite, unit)
-        convert = partial(np.multiply, metres)
+            meters, notes = stated_meters(content.system, finite, unit)
+        convert = partial(np.multiply, meters)
         placed_epsg = None
-        if content.system is not None and unit is None and metres == (1.0, 1.0, 1.0):
-            placed_epsg = content.system.epsg_in_metres
+        if content.system is not None and unit is None and meters == (1.0, 1.0, 1.0):
+            placed_epsg = content.system.epsg_in_meters
     for note in notes:
         tell(f"{path} {note}")
     return convert, placed_epsg
 
 
 def _scanned_points(
-    content: FilePoints, to_metres: Callable[[Floats], Floats]
+    content: FilePoints, to_meters: Callable[[Floats], Floats]
 ) -> tuple[ScannedPoints, list[str]]:
-    """Return the finite points of a file's content in metres, and notes on them.
+    """Return the finite points of a file's content in meters, and notes on them.
 
     Notes are clauses that follow the name of the file.
     """
     columns = content.columns
     notes = []
-    positions = to_metres(content.positions)
-    colours = _first_vectors(columns, COLOURS)
+    positions = to_meters(content.positions)
+    colors = _first_vectors(columns, COLORS)
     outward = _first_vectors(columns, NORMALS)
     scanners = content.scanners
     if scanners is None:
         scanners = _first_vectors(columns, ORIGINS)
     if scanners is not None:
         try:
-            scanners = to_metres(scanners.astype(np.float64))
+            scanners = to_meters(scanners.astype(np.float64))
             outward = scanners - positions
         except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
             scanners = outward = None
@@ -262,7 +262,7 @@ def _scanned_points(
         None if outward is None else np.nan_to_num(outward.astype(np.float64)),
         None if classes is None else _as_integers(classes),
         intensities,
-        None if colours is None else _as_srgb(colours),
+        None if colors is None else _as_srgb(colors),
         scanners,
     )
     # Depth cameras write NaN for pixels without a return.
@@ -307,14 +307,14 @@ def _as_integers(classes: AnyArray) -> Ints:
     return numbers
 
 
-def _as_srgb(colours: AnyArray) -> Floats32:
+def _as_srgb(colors: AnyArray) -> Floats32:
     """Return colors (n, 3) from 0 to 255: of 8 or 16 bits, or real numbers from 0 to 1 or 255."""
-    if colours.dtype == np.uint8:
-        return colours.astype(np.float32)
-    values = colours.astype(np.float64)
+    if colors.dtype == np.uint8:
+        return colors.astype(np.float32)
+    values = colors.astype(np.float64)
     values[~np.isfinite(values).all(axis=1)] = np.nan
     highest = np.nanmax(values, initial=0)
-    if highest <= 1 and colours.dtype.kind == "f":
+    if highest <= 1 and colors.dtype.kind == "f":
         values = 255 * values
     elif highest > 255:
         values = values / 257  # 16 bits; several programs write 8 bits into the 16 of LAS
@@ -327,7 +327,7 @@ def _left_out(content: FilePoints) -> list[str]:
     used: set[str] = set()
     for names in (CLASSES, INTENSITIES):
         used.update([name for name in names if name in columns][:1])
-    for axes in (*COLOURS, *NORMALS, *ORIGINS):
+    for axes in (*COLORS, *NORMALS, *ORIGINS):
         used.update(axes)
     remaining = [
         name for name, values in columns.items() if name not in used and _has_values(values)

@@ -21,7 +21,7 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, rounded
-from lidarsim.scene.colours import GREY, LINEAR, Colours, as_srgb
+from lidarsim.scene.colors import GRAY, LINEAR, Colors, as_srgb
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import warn
 from lidarsim.scene.scene import Scene
@@ -32,13 +32,13 @@ from ..clouds.file_points import MIN_POINTS, POINT_BYTES
 from .point_files import NO_CLASS, ScannedPoints, read_points
 from .surfel_gaps import expected_loss
 
-# Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
+# Chosen on scans of a city, from 7 to 30 neighbors and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.
-_NEIGHBOURS = MIN_POINTS
+_NEIGHBORS = MIN_POINTS
 _EXTENT = 0.85
-# length of half a surfel, in voxels: distant and stray points have no neighbours
+# length of half a surfel, in voxels: distant and stray points have no neighbors
 _MAX_HALF_VOXELS = 3
-_SAMPLE = 20_000  # points whose neighbours tell the spacing
+_SAMPLE = 20_000  # points whose neighbors tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _MAX_VOXELS = 1 << 62  # voxels of the box around the points: 64 bits number voxels
 CLASS_MATERIAL = "class "  # and the number: name of the material of surfels with a class
@@ -58,7 +58,7 @@ def scene_of_points(
     unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
     epsg: Annotated[int, Field(ge=1024, le=32767)] | None = None,
     keep_noise: bool = False,
-    colour: Literal["rgb", "intensity"] | None = None,
+    color: Literal["rgb", "intensity"] | None = None,
     tell: Callable[[str], None] = warn,
 ) -> Scene:
     """Make a scene of a point cloud, for example a scan of a real place.
@@ -67,7 +67,7 @@ def scene_of_points(
     and is about as large as the gaps between the points in both directions. Its front faces the
     scanner, where the file has positions of scanners, or has the side of the file's normals.
 
-    A surfel has the mean colour of its points, and as the name of its material the most frequent
+    A surfel has the mean color of its points, and as the name of its material the most frequent
     of their classes, such as «class 2».
 
     Parameters
@@ -76,23 +76,23 @@ def scene_of_points(
         .ply, .pcd, text (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin of KITTI or nuScenes, .las
         or .laz, which need laspy, or .e57, which needs pye57. Scans are joined by their poses.
         Z-up; .las and .laz in the units of their coordinate system, text in the units of its
-        header, others in metres.
+        header, others in meters.
     voxel_m
         Edge of cubes; the points of a cube become their mean. By default the median distance of
-        points to the eighth of their neighbours.
+        points to the eighth of their neighbors.
     size
         A factor of the surfels' sides: larger surfels close gaps, and reach farther beyond edges.
     unit
-        Unit of x, y and z, in place of metres or of the units that a .las or .laz states.
+        Unit of x, y and z, in place of meters or of the units that a .las or .laz states.
     epsg
-        Code of a projected system in true metres, such as the code of a UTM zone. Points are
+        Code of a projected system in true meters, such as the code of a UTM zone. Points are
         brought to the system from the system that the file states; needs rasterio. Heights are
-        converted to metres and stay as in the file otherwise. By default coordinates are kept.
+        converted to meters and stay as in the file otherwise. By default coordinates are kept.
     keep_noise
         Whether points become surfaces that a file withholds or classifies as noise (class 7, in
         point formats 6 to 10 of LAS also 18); by default they are left out.
-    colour
-        What colours surfels: red, green and blue, or mean intensities as greys. The 99th
+    color
+        What colors surfels: red, green and blue, or mean intensities as grays. The 99th
         percentile of intensities is white. By default red, green and blue if the file has them.
     tell
         Called with a line on converted units, on points that are left out, and on what a scene does
@@ -105,7 +105,7 @@ def scene_of_points(
     Raises
     ------
     LidarError
-        If the file cannot be read, has fewer than 12 points, lacks what `colour` names, has a
+        If the file cannot be read, has fewer than 12 points, lacks what `color` names, has a
         coordinate system without lengths or with lengths that are not true, as Web Mercator, cannot
         be brought to `epsg`, or needs too much memory.
     """
@@ -116,7 +116,7 @@ def scene_of_points(
         unit=unit,
         epsg=epsg,
         keep_noise=keep_noise,
-        colour=colour,
+        color=color,
         tell=tell,
     ).scene
 
@@ -129,7 +129,7 @@ class PointScene(NamedTuple):
     scene
         The scene, with the coordinate system of the cloud.
     voxel_m
-        Edge of the cubes whose points became a surfel, metres.
+        Edge of the cubes whose points became a surfel, meters.
     loss
         Share of returns that are expected to be lost in gaps between points (`expected_loss`), or
         None if it cannot be estimated.
@@ -165,7 +165,7 @@ def points_to_scene(
     unit: str | None,
     epsg: int | None,
     keep_noise: bool,
-    colour: str | None,
+    color: str | None,
     tell: Callable[[str], None],
 ) -> PointScene:
     """Make a scene of a point cloud as `scene_of_points`, and estimate what it loses."""
@@ -173,7 +173,7 @@ def points_to_scene(
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} is {value}; it must be a positive number.")
     points = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
-    points = _coloured(path, points, colour, tell)
+    points = _colored(path, points, color, tell)
     surfels = _surfels_of(path, points, voxel_m, size)
     loss = None
     if points.scanners is not None:
@@ -192,34 +192,34 @@ class _Surfels(NamedTuple):
     """Surfels of points."""
 
     mesh: SceneMesh
-    voxel_m: float  # edge of the cubes whose points became a surfel, metres
+    voxel_m: float  # edge of the cubes whose points became a surfel, meters
 
 
-def _coloured(
-    path: Path, points: ScannedPoints, colour: str | None, tell: Callable[[str], None]
+def _colored(
+    path: Path, points: ScannedPoints, color: str | None, tell: Callable[[str], None]
 ) -> ScannedPoints:
-    """Return points with either colours or intensities.
+    """Return points with either colors or intensities.
 
     LidarError if the chosen quantity is missing.
     """
-    present = {"rgb": points.colours is not None, "intensity": points.intensities is not None}
-    if colour is not None and not present[colour]:
-        quantity = "colours" if colour == "rgb" else "intensities"
-        raise LidarError(f"{path} has no {quantity}: leave out colour {colour}.")
+    present = {"rgb": points.colors is not None, "intensity": points.intensities is not None}
+    if color is not None and not present[color]:
+        quantity = "colors" if color == "rgb" else "intensities"
+        raise LidarError(f"{path} has no {quantity}: leave out color {color}.")
     if points.classes is not None:
         _note_unknown(path, "class", points.classes == NO_CLASS, "have no material", tell)
     if not any(present.values()):
         return points
-    colour = colour or next(name for name, is_present in present.items() if is_present)
+    color = color or next(name for name, is_present in present.items() if is_present)
     if all(present.values()):
-        other, choice = ("intensities", "intensity") if colour == "rgb" else ("colours", "rgb")
-        tell(f"{path}: {other} are not kept, because surfels have a colour: choose colour {choice}")
-    if points.colours is not None and colour == "rgb":
-        _note_unknown(path, "color", np.isnan(points.colours[:, 0]), _GRAY, tell)
+        other, choice = ("intensities", "intensity") if color == "rgb" else ("colors", "rgb")
+        tell(f"{path}: {other} are not kept, because surfels have a color: choose color {choice}")
+    if points.colors is not None and color == "rgb":
+        _note_unknown(path, "color", np.isnan(points.colors[:, 0]), _GRAY, tell)
         return replace(points, intensities=None)
     if points.intensities is not None:
         _note_unknown(path, "intensity", np.isnan(points.intensities), _GRAY, tell)
-    return replace(points, colours=None)
+    return replace(points, colors=None)
 
 
 def _note_unknown(
@@ -234,7 +234,7 @@ def _note_unknown(
 
 
 def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: float) -> _Surfels:
-    """Return the surfels of the points of a file, with their colours and classes."""
+    """Return the surfels of the points of a file, with their colors and classes."""
     # Covariances of Open3D lose the digits of points far from zero.
     positions = points.positions
     origin = np.round((positions.min(axis=0) + positions.max(axis=0)) / 2)
@@ -251,13 +251,13 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
             f"memory, of at most {bytes_of(memory() // 2)}: give a larger voxel_m than "
             f"{voxel_m:.3g}."
         )
-    if count < _NEIGHBOURS:
+    if count < _NEIGHBORS:
         raise LidarError(
             f"{path} has {count} points in different voxels of {voxel_m:.3g} m, and at least "
-            f"{_NEIGHBOURS} are needed: give a smaller voxel_m, or another cloud."
+            f"{_NEIGHBORS} are needed: give a smaller voxel_m, or another cloud."
         )
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(voxels.means(positions)))
-    cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBOURS))
+    cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBORS))
     outward = None if points.outward is None else voxels.means(_directions(points.outward))
     corners = _surfel_corners(
         np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size, outward
@@ -266,7 +266,7 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
         path.stem,
         corners.reshape(-1, 3) + origin,
         surfel_faces(count),
-        colours=_surfel_colours(o3d, points, voxels, np.asarray(cloud.points)),
+        colors=_surfel_colors(o3d, points, voxels, np.asarray(cloud.points)),
         materials=surfel_materials(points, voxels),
     )
     return _Surfels(mesh, voxel_m)
@@ -344,17 +344,17 @@ def _directions(vectors: Floats) -> Floats:
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
 
 
-def _surfel_colours(
+def _surfel_colors(
     o3d: Any, points: ScannedPoints, voxels: Voxels, centers: Floats
-) -> Colours | None:
+) -> Colors | None:
     """Return the mean colors of surfels in linear light, or grays of their mean intensities.
 
     `centers` (v, 3) are the centers of the surfels. A surfel whose points have neither has the mean
     of its neighbors, or, if these have neither, the gray of a file without colors.
     """
     light: Floats
-    if points.colours is not None:
-        light = voxels.known_means(_light(points.colours))
+    if points.colors is not None:
+        light = voxels.known_means(_light(points.colors))
     elif points.intensities is not None:
         white = np.nanquantile(points.intensities, _WHITE_QUANTILE)
         intensities = voxels.known_means(points.intensities[:, None])
@@ -362,8 +362,8 @@ def _surfel_colours(
     else:
         return None
     _fill_from_neighbors(o3d, light, centers)
-    colours: Bytes = np.where(np.isnan(light), GREY[0], as_srgb(light))
-    return Colours.of_faces(colours.repeat(2, axis=0))
+    colors: Bytes = np.where(np.isnan(light), GRAY[0], as_srgb(light))
+    return Colors.of_faces(colors.repeat(2, axis=0))
 
 
 def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
@@ -373,17 +373,17 @@ def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
         return
     tree = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(centers))
     tree.knn_index()
-    neighbors, _ = tree.knn_search(o3d.core.Tensor(centers[unknown]), _NEIGHBOURS)
+    neighbors, _ = tree.knn_search(o3d.core.Tensor(centers[unknown]), _NEIGHBORS)
     around = light[neighbors.numpy()]
     known = ~np.isnan(around)
     with np.errstate(invalid="ignore"):  # 0 / 0 of surfels without such neighbors
         light[unknown] = np.where(known, around, 0.0).sum(axis=1) / known.sum(axis=1)
 
 
-def _light(colours: Floats32) -> Floats:
+def _light(colors: Floats32) -> Floats:
     """Return the linear light (n, 3) of sRGB colors from 0 to 255, NaN of NaN."""
-    known = np.isfinite(colours)
-    light = LINEAR[np.where(known, colours, 0).astype(np.uint8)]
+    known = np.isfinite(colors)
+    light = LINEAR[np.where(known, colors, 0).astype(np.uint8)]
     return np.where(known, light, np.nan)
 
 
@@ -423,7 +423,7 @@ def _surfel_corners(
 
 
 def _spacing_m(o3d: Any, points: Floats) -> float:
-    """Return the median distance of points to the eighth of their neighbours."""
+    """Return the median distance of points to the eighth of their neighbors."""
     tree = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(points))
     tree.knn_index()
     sampled = points[:: -(-len(points) // _SAMPLE)]

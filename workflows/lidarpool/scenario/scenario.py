@@ -18,11 +18,11 @@ from lidarsim.base.errors import LidarError, Mistakes, prefixed
 from lidarsim.base.input_files import not_found
 from lidarsim.base.section_fields import FieldPath, dotted, fields_of, is_section
 from lidarsim.base.yamlfile import read_yaml
-from lidarsim.columns.table import COLOURS
+from lidarsim.columns.table import COLORS
 from lidarsim.media.materials import ClassNames, Material
 from lidarsim.media.weather import Weather
 from lidarsim.motion.navigation import Navigation
-from lidarsim.motion.trajectory import CENTRE
+from lidarsim.motion.trajectory import CENTER
 from lidarsim.motion.trajectory_files import files_of_trajectory
 from lidarsim.scene.files.mesh_formats import endings, format_of
 from lidarsim.sensor.models import plugin_model_file
@@ -121,7 +121,7 @@ class Scenario(Section):
         See `lidarpool.scenario.sections`.
     poses
         Poses of the sensor, in the coordinates of the scene. By default the sensor is at the origin
-        (objects of the demo), 1, 2 and 3 metres above the ground; in other scenes chosen by
+        (objects of the demo), 1, 2 and 3 meters above the ground; in other scenes chosen by
         `place_sensor`: in the middle of a room or landscape, or around an object.
     steps, classes
         Time steps from each pose, and names of semantic classes, {number: name}.
@@ -140,7 +140,7 @@ class Scenario(Section):
     poses: Annotated[
         Several[PoseEntry] | None,
         about(
-            "poses of the sensor in the scene, metres, Z-up; by default 1, 2 and 3 m "
+            "poses of the sensor in the scene, meters, Z-up; by default 1, 2 and 3 m "
             "above the origin (objects of the demo) or the middle of the floor (files), below the "
             "ceiling, or around an object that is no place to stand in",
             [[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}],
@@ -305,7 +305,7 @@ class Scenario(Section):
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
                 with mistakes.noted(), self.naming_lost_files(), prefixed(self._source):
-                    mounted = section.mounted(self.path, CENTRE, self.noise, self.returns)
+                    mounted = section.mounted(self.path, CENTER, self.noise, self.returns)
                     (mounted.returns or self.returns).divergence(mounted.sensor.optics)
         mistakes.tell()
 
@@ -437,10 +437,10 @@ class Scenario(Section):
         return {mount.link for mount in mounts if mount is not None and mount.link is not None}
 
     @property
-    def coloured(self) -> bool:
-        """Whether colours of meshes are read: for a column, or a reflectance of the texture."""
+    def colored(self) -> bool:
+        """Whether colors of meshes are read: for a column, or a reflectance of the texture."""
         columns = {*self.cloud.columns, *self.output.needs}
-        return bool(columns & {*COLOURS}) or any(m.reflectance == "texture" for m in self.materials)
+        return bool(columns & {*COLORS}) or any(m.reflectance == "texture" for m in self.materials)
 
     @property
     def names_materials(self) -> bool:

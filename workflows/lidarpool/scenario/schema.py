@@ -92,13 +92,13 @@ _FULL_HEAD = f"""\
 {_HEAD}
 # A lidar survey for lidarpool, with path planning. Every field has its default here, and may be
 # left out. A name after "# " is an example for a field whose default lidarpool chooses. Lengths
-# are in metres, angles in degrees, Z is up.
+# are in meters, angles in degrees, Z is up.
 #
 #     lidarpool check {SCENARIO_FILE}
 #     lidarpool run {SCENARIO_FILE}"""
 _SHORT_HEAD = f"""\
 {_HEAD}
-# A lidar survey for lidarpool; lengths are in metres, Z is up. Fields that are left out have their
+# A lidar survey for lidarpool; lengths are in meters, Z is up. Fields that are left out have their
 # defaults; lidarpool init DIR --all writes all of them."""
 # {section of a short scenario: (an example, its meaning)}
 _SECTIONS = {

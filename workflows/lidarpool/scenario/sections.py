@@ -105,13 +105,13 @@ class MeshFile(Section):
     ]
     unit: LengthUnit = None
     up_axis: UpAxis = None
-    translation: Annotated[Triple, about("translation in metres, applied last")] = (0, 0, 0)
+    translation: Annotated[Triple, about("translation in meters, applied last")] = (0, 0, 0)
     rotation_deg: Annotated[
         Three[AngleDeg], about("rotation about the world's x, y and z axes, degrees")
     ] = (0, 0, 0)
     scale: Annotated[Scale, about("one factor, or one for each axis; applied first")] = (1, 1, 1)
     matrix: Annotated[
-        Four[Four[Factor]] | None, about("instead of the three: 4 rows of 4, metres")
+        Four[Four[Factor]] | None, about("instead of the three: 4 rows of 4, meters")
     ] = None
     opacity: Opacity = "mask"
     assets: Annotated[
@@ -202,7 +202,7 @@ def _pose(value: Any) -> Any:
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
         raise must_be(
-            "x, y and z in metres, [0, 0, 1], or position and angles, {position: [0, 0, 1], "
+            "x, y and z in meters, [0, 0, 1], or position and angles, {position: [0, 0, 1], "
             "yaw_deg: 90}"
         )
     return value
@@ -225,7 +225,7 @@ class CopySection(Section, Pose):
 
     position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
         PointXYZ,
-        about("x, y and z of the mesh's origin, metres; without z it stands on the surface"),
+        about("x, y and z of the mesh's origin, meters; without z it stands on the surface"),
     ]
     scale: Annotated[Scale, about("one factor, or one for each axis of the mesh")] = (1, 1, 1)
 
@@ -259,7 +259,7 @@ class Scatter(Section):
         Rectangle | None, about("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]")
     ] = None
     spacing_m: Annotated[
-        float, about("least distance between two, seen from above, metres", ge=0, le=1e6)
+        float, about("least distance between two, seen from above, meters", ge=0, le=1e6)
     ] = 0.0
     scale: Annotated[
         MinMax[Annotated[float, Field(gt=0, le=1e9)]], about("least and largest factor")
@@ -276,7 +276,7 @@ class ShapeSection(Section):
         MeshEntry | None, about("its mesh in its own axes, as in scene.files", "car.glb")
     ] = None
     box: Annotated[
-        Three[Length] | None, about("instead of a file: length, width and height of a box, metres")
+        Three[Length] | None, about("instead of a file: length, width and height of a box, meters")
     ] = None
     semantic_class: Annotated[
         SemanticClass | None,
@@ -361,12 +361,12 @@ class CopiesSection(ShapeSection):
 class Ground(Section):
     """A horizontal rectangle under the objects, poses, trajectories and actors of a scenario."""
 
-    height_m: Annotated[Coordinate, about("z of the rectangle, metres")] = 0.0
+    height_m: Annotated[Coordinate, about("z of the rectangle, meters")] = 0.0
     margin_m: Annotated[
         float,
         about(
             "how far it extends beyond the objects, poses, trajectories and actors on each side, "
-            "metres",
+            "meters",
             ge=0,
             le=1e6,
         ),
@@ -408,7 +408,7 @@ class SceneSection(Section):
     ground: Annotated[
         Ground | None,
         about(
-            "a horizontal rectangle under the objects, poses, trajectories and actors, metres",
+            "a horizontal rectangle under the objects, poses, trajectories and actors, meters",
             {"height_m": 0, "margin_m": 5},
         ),
     ] = None
@@ -443,7 +443,7 @@ class WorldSection(Section):
         ),
         about(
             "where the scenario's zero is in that system: x and y (east and north), perhaps z, "
-            "metres"
+            "meters"
         ),
     ] = (0, 0, 0)
 
@@ -657,17 +657,17 @@ class Obstacle(Section):
     """
 
     object: Annotated[Text | None, about("name of objects of the scene, with * and ?")] = None
-    centre: Annotated[Pair | None, about("centre of a disc, x and y, metres")] = None
-    radius_m: Annotated[float | None, about("radius of the disc, metres", gt=0, le=1e6)] = None
+    center: Annotated[Pair | None, about("center of a disc, x and y, meters")] = None
+    radius_m: Annotated[float | None, about("radius of the disc, meters", gt=0, le=1e6)] = None
 
     @model_validator(mode="after")
     def _check_kind(self) -> Obstacle:
         """Raise ValueError unless the obstacle is either an object or a disc."""
-        disc = self.centre is not None and self.radius_m is not None
+        disc = self.center is not None and self.radius_m is not None
         if (self.object is None) != disc or (
             self.object is not None and self.model_fields_set > {"object"}
         ):
-            raise ValueError("give either object, or both centre and radius_m.")
+            raise ValueError("give either object, or both center and radius_m.")
         return self
 
 
@@ -680,19 +680,19 @@ class _Route:
     enabled: Annotated[
         bool | None, about("by default whether start and target are given", True)
     ] = None
-    start: Annotated[Pair | None, about("x and y, metres", [25, 25])] = None
-    target: Annotated[Pair | None, about("x and y, metres", [-30, -20])] = None
+    start: Annotated[Pair | None, about("x and y, meters", [25, 25])] = None
+    target: Annotated[Pair | None, about("x and y, meters", [-30, -20])] = None
     obstacles: Annotated[
         Obstacles | None,
         short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
         about(
             "bounding circles of all objects that are not flat (auto), or a list",
             "auto",
-            ["Shelf*", {"centre": [-6, -1], "radius_m": 1}],
+            ["Shelf*", {"center": [-6, -1], "radius_m": 1}],
         ),
     ] = None
     clearance_m: Annotated[
-        float, about("distance to keep from obstacles, metres", ge=0, le=1000)
+        float, about("distance to keep from obstacles, meters", ge=0, le=1000)
     ] = 0.0
 
 

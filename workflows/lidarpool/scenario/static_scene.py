@@ -113,7 +113,7 @@ class _StaticObjects(NamedTuple):
 
     objects: Objects
     findings: Findings
-    corners: Floats  # (n, 2): corners of the objects, seen from above, world metres
+    corners: Floats  # (n, 2): corners of the objects, seen from above, world meters
 
 
 class SceneCache:
@@ -166,7 +166,7 @@ def _key(scenario: Scenario) -> object:
     states = file_states(map(scenario.path, files))
     reading_options = (
         scenario.path(""),
-        scenario.coloured,
+        scenario.colored,
         scenario.names_materials,
         scenario.world.epsg,
     )
@@ -307,12 +307,12 @@ class Shapes:
         if entry not in self._robots:
             path = self.scenario.path(entry.file)
             tell = self.findings.notes.append
-            colours = self.scenario.coloured
+            colors = self.scenario.colored
             name_materials = self.scenario.names_materials
             robot = load_robot(
                 path,
                 opacity=entry.opacity,
-                colours=colours,
+                colors=colors,
                 materials=name_materials,
                 assets=self._assets_of(entry),
                 tell=tell,
@@ -348,7 +348,7 @@ class Shapes:
             **entry.reading_options,
             **world_options,
             transform=transform,
-            colours=scenario.coloured,
+            colors=scenario.colored,
             materials=scenario.names_materials,
             assets=self._assets_of(entry),
             animation=animation,
@@ -364,7 +364,7 @@ class Shapes:
         """Return the links of a robot as static objects, with the joints at zero."""
         if refused_fields := sorted(entry.model_fields_set - _ROBOT_FIELDS):
             raise LidarError(
-                f"{self.scenario.path(entry.file)} is a robot, which is in metres and Z-up: leave "
+                f"{self.scenario.path(entry.file)} is a robot, which is in meters and Z-up: leave "
                 f"out {' and '.join(refused_fields)}."
             )
         robot = self.robot(entry)
@@ -406,7 +406,7 @@ def _place_copies(
 
 
 def _copy_extents(section: SceneSection) -> list[Floats]:
-    """Return the corners of scatter rectangles and the positions of lists, (n, 2) each, metres."""
+    """Return the corners of scatter rectangles and the positions of lists, (n, 2) each, meters."""
     scatters = [entry.scatter for entry in section.copies if entry.scatter is not None]
     position_lists = [[copy.position[:2] for copy in entry.at] for entry in section.copies]
     return [
@@ -416,7 +416,7 @@ def _copy_extents(section: SceneSection) -> list[Floats]:
 
 
 def _footprints(scenario: Scenario) -> list[Floats]:
-    """Return points that the ground of a scenario lies under, (n, 2) each, world metres.
+    """Return points that the ground of a scenario lies under, (n, 2) each, world meters.
 
     These are the copies' rectangles and positions, the poses, and the trajectories and poses of the
     carrier and of actors. Vehicles of traffic are not among them.
@@ -435,7 +435,7 @@ def _footprints(scenario: Scenario) -> list[Floats]:
 
 
 def _corners(scene: Scene) -> Floats:
-    """Return the lowest and the highest x and y of a scene, (2, 2), world metres."""
+    """Return the lowest and the highest x and y of a scene, (2, 2), world meters."""
     return (scene.bounds + scene.origin)[:, :2]
 
 
@@ -514,7 +514,7 @@ def copies_of(
 class _CopyPoses(NamedTuple):
     """Poses and scales of the copies of an entry."""
 
-    positions: Floats  # (n, 3), world metres; z is nan for copies that stand on a surface
+    positions: Floats  # (n, 3), world meters; z is nan for copies that stand on a surface
     angles_deg: Floats  # (n, 3): yaw, pitch, roll
     scales: Floats  # (n, 3)
 
@@ -596,7 +596,7 @@ def _scatter_copies(scatter: Scatter, name: str, standing: StandingSurfaces) -> 
 
 
 def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSurfaces) -> Floats:
-    """Draw positions (n, 3) on surfaces, world metres.
+    """Draw positions (n, 3) on surfaces, world meters.
 
     Raises LidarError without room.
 

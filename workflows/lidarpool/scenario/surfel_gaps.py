@@ -32,11 +32,11 @@ def expected_loss(positions: Floats, scanners: Floats, corners: Floats) -> float
     Parameters
     ----------
     positions
-        The points (n, 3), metres.
+        The points (n, 3), meters.
     scanners
-        Position of the scanner of each point (n, 3), metres; NaN where unknown.
+        Position of the scanner of each point (n, 3), meters; NaN where unknown.
     corners
-        Corners of the surfels (v, 4, 3), metres.
+        Corners of the surfels (v, 4, 3), meters.
 
     Returns
     -------
@@ -65,8 +65,8 @@ class _Rays(NamedTuple):
     """Rays from a scanner at zero, between its points."""
 
     directions: Floats  # (k, _RAYS, 3), of length 1
-    nearest: Floats  # (k,): of the points around, metres
-    farthest: Floats  # (k,): of the points around, metres
+    nearest: Floats  # (k,): of the points around, meters
+    farthest: Floats  # (k,): of the points around, meters
 
     def covered_by(self, corners: Floats) -> Bools:
         """Return whether rays (k, _RAYS) meet one of their surfels (k · _RAYS, s, 4, 3)."""

@@ -110,7 +110,7 @@ class TrafficSection(Section):
     ] = ()
     time_unit: TimeUnitEntry = None
     offset_s: Annotated[Seconds, about("added to all times")] = 0.0
-    translation: Annotated[Triple, about("added to all positions, metres")] = (0, 0, 0)
+    translation: Annotated[Triple, about("added to all positions, meters")] = (0, 0, 0)
     surfaces: Annotated[
         TextOrTexts | None,
         about(

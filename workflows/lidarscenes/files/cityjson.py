@@ -21,7 +21,7 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import message_of
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import plural
-from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.coordinate_systems import (
     crs_of_text,
     has_registry,
@@ -146,7 +146,7 @@ class _CityFile:
     def __init__(self, head: _Json, allowance: Allowance, options: ReadOptions) -> None:
         self._head = head
         self._allowance = allowance
-        self._colours = options.colours
+        self._colors = options.colors
         self._names_materials = options.materials
         self._unit = options.unit  # unit that the user gives
         version = str(head.get("version"))
@@ -177,15 +177,15 @@ class _CityFile:
                 for parent in entry.get("parents") or ():
                     parts[parent] = max(parts[parent], finest)
         surfaces_of_objects: list[tuple[str, list[_Json]]] = []
-        for key, levelled in levels.items():
+        for key, leveled in levels.items():
             # A building stands for its parts unless they are finer.
-            best = max((level for level, _ in levelled), default=-np.inf)
-            if not levelled or best < parts.get(key, -np.inf):
+            best = max((level for level, _ in leveled), default=-np.inf)
+            if not leveled or best < parts.get(key, -np.inf):
                 continue
             self._levels[best] += 1
             name = f"{objects[key]['type']} {key}"
             geometries_of_best = []
-            for level, geometry in levelled:
+            for level, geometry in leveled:
                 if level == best and geometry["type"] == "GeometryInstance":
                     self._place_template(name, geometry, points)
                 elif level == best:
@@ -285,16 +285,16 @@ class _CityFile:
         return faces, owners
 
     def _piece(self, points: Floats, faces: Ints, material: int, document: _Json) -> Piece:
-        """Return triangles with colour and name of a material, where -1 is not a material."""
-        colours = None
+        """Return triangles with color and name of a material, where -1 is not a material."""
+        colors = None
         name = ""
         if material >= 0:
             entry = document["appearance"]["materials"][material]
-            if self._colours:
-                colour = as_bytes(entry.get("diffuseColor") or (0.8, 0.8, 0.8))
-                colours = Colours.plain(colour.reshape(1, 1, 3), len(faces))
+            if self._colors:
+                color = as_bytes(entry.get("diffuseColor") or (0.8, 0.8, 0.8))
+                colors = Colors.plain(color.reshape(1, 1, 3), len(faces))
             name = str(entry.get("name") or "") if self._names_materials else ""
-        return Piece(points, faces, None, colours, name)
+        return Piece(points, faces, None, colors, name)
 
     def _surfaces(self, geometries: Sequence[_Json]) -> Iterator[tuple[list[list[int]], int]]:
         """Yield the rings of polygons and the numbers of their materials, -1 for none."""
@@ -305,10 +305,10 @@ class _CityFile:
             semantics = geometry.get("semantics") or {}
             kinds = dict(enumerate(surface["type"] for surface in semantics.get("surfaces") or ()))
             paint: _Json = {}
-            if self._colours or self._names_materials:  # the first theme counts
+            if self._colors or self._names_materials:  # the first theme counts
                 paint = next(iter((geometry.get("material") or {}).values()), {})
             values = semantics.get("values"), paint.get("values", paint.get("value"))
-            if self._colours and geometry.get("texture"):
+            if self._colors and geometry.get("texture"):
                 self._unread["texture"] += 1
             for rings, kind, material in _surfaces_at(
                 geometry["boundaries"], _DEPTHS[geometry["type"]], *values
@@ -319,7 +319,7 @@ class _CityFile:
                 yield rings, -1 if material is None else int(material)
 
     def content(self) -> Content:
-        """Return all objects, in metres."""
+        """Return all objects, in meters."""
         bounds = [
             np.zeros((1, 3)),
             *(node.mesh.bounds + node.matrix[:3, 3] for node in self._placed),
@@ -361,7 +361,7 @@ class _System:
     epsg: int | None
     crs: Any  # None without rasterio, and if PROJ does not know the code
     is_of_angles: bool
-    unit_m: float = 1.0  # unit of x and y, metres
+    unit_m: float = 1.0  # unit of x and y, meters
     height_units: float = 1.0  # units of x and y in the unit of heights
 
     @classmethod
@@ -418,7 +418,7 @@ class _System:
 
 
 def _looks_like_angles(corners: Floats) -> bool:
-    """Return True if the corners (n, 3) of a city are degrees with heights in metres."""
+    """Return True if the corners (n, 3) of a city are degrees with heights in meters."""
     width, depth, height = np.ptp(corners, axis=0)
     is_small = np.abs(corners[:, :2]).max() <= 360
     return bool(is_small and height > _MAX_SLOPE * max(width, depth))

@@ -2,9 +2,9 @@
 
 This is not pycollada, which drops geometry with a material, a skin or a morph that it does not
 resolve, holes in polygons and offsets of accessors, refuses comments, pictures without paths and
-odd colours, and keeps single precision; nor assimp 5.4, which refused twice as many of 661 public
+odd colors, and keeps single precision; nor assimp 5.4, which refused twice as many of 661 public
 files, skips missing geometries, keeps single precision, and ends the process if nodes contain each
-other. Only triangles are read, and the diffuse colours and images of materials; not lights, cameras
+other. Only triangles are read, and the diffuse colors and images of materials; not lights, cameras
 and animations.
 """
 
@@ -23,7 +23,7 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
 from lidarsim.base.vectors import length, matmul
 from lidarsim.base.xmlfile import xml_root
-from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.companions import image_file
 from lidarsim.scene.files.polygons import check_corners, fanned, triangulated, unrolled, with_holes
 from lidarsim.scene.files.scene_graph import (
@@ -37,7 +37,7 @@ from lidarsim.scene.files.scene_graph import (
     placed_content,
     placed_nodes,
 )
-from lidarsim.scene.masks import MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
+from lidarsim.scene.masks import MaskError, MaskNotes, Texture, Wrap, read_colors, remembered
 from lidarsim.scene.scene_mesh import SceneMesh
 from lidarsim.scene.transform import affine, rotation_about
 
@@ -54,7 +54,7 @@ class _Inputs(NamedTuple):
 
 
 def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the visual scene of a file, with colours and names of its materials."""
+    """Read the visual scene of a file, with colors and names of its materials."""
     root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
@@ -63,7 +63,7 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
             f"is an XML file, but not COLLADA. Its root element is <{root.tag[:40]}>"
         )
     allowance = Allowance(len(data), SMALLER)
-    paint = _Effects(path, options, allowance) if options.colours else None
+    paint = _Effects(path, options, allowance) if options.colors else None
     document = _Document(root, allowance, paint, options)
     content = placed_content(placed_nodes(document.roots(), document.node, path.stem))
     content.notes = paint.notes.lines() if paint else []
@@ -212,7 +212,7 @@ class _Document:
         return tuple((symbol, material) for symbol, material in materials if material is not None)
 
     def _piece(self, primitive: Element, material: Element | None) -> Piece:
-        """Return the triangles of a primitive, in the colours of a material."""
+        """Return the triangles of a primitive, in the colors of a material."""
         points, offset, stride = self._inputs(primitive)
         lists = [e for e in primitive.iter() if e.tag in ("p", "h")]
         numbers = map(_integers, lists)
@@ -224,21 +224,21 @@ class _Document:
         triangles = _triangles(primitive, points[corners[:, offset]], list_corners.__getitem__)
         rows = np.concatenate([np.zeros((0, 3), np.int64), *triangles])
         faces = corners[:, offset][rows]
-        colours = None
+        colors = None
         if self._paint and material is not None and len(faces):
-            with self._paint.notes.without_colour(material.get("name") or material.get("id") or ""):
-                colours = self._colours(self._paint, primitive, material, corners, rows)
-        return Piece(points, faces, colours=colours)
+            with self._paint.notes.without_color(material.get("name") or material.get("id") or ""):
+                colors = self._colors(self._paint, primitive, material, corners, rows)
+        return Piece(points, faces, colors=colors)
 
-    def _colours(
+    def _colors(
         self,
         paint: _Effects,
         primitive: Element,
         material: Element,
         corners: Ints,
         triangle_corners: Ints,
-    ) -> Colours | None:
-        """Return the colours of triangles by a material, or None if its effect has no colour.
+    ) -> Colors | None:
+        """Return the colors of triangles by a material, or None if its effect has no color.
 
         `corners` (c, stride) are the numbers in <p>. Rows of `corners` are the corners of
         triangles, `triangle_corners` (t, 3).
@@ -248,8 +248,8 @@ class _Document:
         shade = paint.shade(self._target(url, "effect"), self._ids)
         if isinstance(shade, Texture):
             uv, offset = self._coordinates(primitive)
-            return shade.colours(uv, corners[:, offset][triangle_corners])
-        return None if shade is None else Colours.plain(shade, len(triangle_corners))
+            return shade.colors(uv, corners[:, offset][triangle_corners])
+        return None if shade is None else Colors.plain(shade, len(triangle_corners))
 
     def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
         """Return texture coordinates (c, 2), and the offset of their indices in <p>."""
@@ -312,7 +312,7 @@ class _Document:
 
 
 class _Effects:
-    """Diffuse colours of effects.
+    """Diffuse colors of effects.
 
     Each image is read once.
     """
@@ -325,19 +325,19 @@ class _Effects:
         self._texture = remembered(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
-        """Return the image or colour (1, 1, 3) of an effect.
+        """Return the image or color (1, 1, 3) of an effect.
 
-        Returns None for an effect without colour.
+        Returns None for an effect without color.
         """
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None
         texture = diffuse.find("texture")
-        colour = diffuse.findtext("color")
+        color = diffuse.findtext("color")
         if texture is None:
-            if colour is None:
+            if color is None:
                 return None
-            return as_bytes(np.array(colour.split()[:3], np.float64)).reshape(1, 1, 3)
+            return as_bytes(np.array(color.split()[:3], np.float64)).reshape(1, 1, 3)
         # A sampler's surface names an image; some programs leave out the sampler or both.
         parameters = {e.get("sid", ""): e for e in effect.iter("newparam")}
         name = texture.get("texture", "")
@@ -366,7 +366,7 @@ class _Effects:
         name, *wraps = key
         file = image_file(self._path, name, self._options, self._allowance)
         wrap_s, wrap_t = (_WRAPS.get(wrap, "repeat") for wrap in wraps)
-        image = read_colours(file, self._allowance, self.notes)
+        image = read_colors(file, self._allowance, self.notes)
         return Texture(image, (wrap_s, wrap_t), self._allowance)
 
 

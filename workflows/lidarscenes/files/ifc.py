@@ -1,4 +1,4 @@
-"""Buildings of IFC, .ifc and .ifczip, through ifcopenshell (licence LGPL-3.0-or-later).
+"""Buildings of IFC, .ifc and .ifczip, through ifcopenshell (license LGPL-3.0-or-later).
 
 `ifc_child.py` reads the files in a separate process. The shapes of elements come from the geometry
 iterator of ifcopenshell, with openings cut out.
@@ -27,7 +27,7 @@ from lidarsim.base.elementary import arctan2
 from lidarsim.base.extras import install_command
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.words import plural
-from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
 from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
@@ -70,7 +70,7 @@ MIN_MEMORY_BYTES = 1024 * 2**20  # bytes that ifcopenshell and its process may t
 MEMORY_TIMES = 30  # memory as a multiple of the file's bytes
 _END = b"END-ISO-10303-21"
 _END_BYTES = 200  # bytes of a file that contain its end
-_MAX_SCALE_ERROR = 0.1  # limit: metres of a map are metres of a building, nearly
+_MAX_SCALE_ERROR = 0.1  # limit: meters of a map are meters of a building, nearly
 _MAP_NUMBERS = (
     "Eastings",
     "Northings",
@@ -195,22 +195,22 @@ class _Shapes:
         return self._meshes[key]
 
     def _mesh(self, number: int, name: str, plain_material: str) -> list[SceneMesh]:
-        """Return the mesh of a shape, with colours and materials if asked for."""
+        """Return the mesh of a shape, with colors and materials if asked for."""
         frame, (vertices, faces, styles) = self._frames[number]
         pieces = []
         for style in np.unique(styles).tolist():
             style_faces = faces[styles == style].astype(np.int64)
-            material: dict[str, Any] = {"name": plain_material, "colour": None, "transparency": 0}
+            material: dict[str, Any] = {"name": plain_material, "color": None, "transparency": 0}
             if 0 <= style < len(frame["materials"]):
                 material = frame["materials"][style]
             if material["transparency"] > 0 and self._options.masks:
                 self.notes.glass[material["name"]] = None
-            colours = None
-            if self._options.colours and material["colour"] is not None:
-                colour = as_bytes(material["colour"]).reshape(1, 1, 3)
-                colours = Colours.plain(colour, len(style_faces))
+            colors = None
+            if self._options.colors and material["color"] is not None:
+                color = as_bytes(material["color"]).reshape(1, 1, 3)
+                colors = Colors.plain(color, len(style_faces))
             material_name = material["name"] or plain_material if self._options.materials else ""
-            pieces.append(Piece(vertices, style_faces, None, colours, material_name))
+            pieces.append(Piece(vertices, style_faces, None, colors, material_name))
         return join_pieces(name, pieces, self._allowance)
 
 

@@ -205,18 +205,18 @@ class Building:
         )
 
     def _material(self, style: Any) -> dict[str, Any]:
-        """Return the name, colour and transparency of a style.
+        """Return the name, color and transparency of a style.
 
-        A colour is None if not stated.
+        A color is None if not stated.
         """
-        colour = style.get_color()
-        shares = [colour.r(), colour.g(), colour.b()]
+        color = style.get_color()
+        shares = [color.r(), color.g(), color.b()]
         transparency = style.transparency
         number = style.instance_id()
         name = getattr(self._file.by_id(number), "Name", None) if number > 0 else None
         return {
             "name": name or "",
-            "colour": shares if np.isfinite(shares).all() else None,
+            "color": shares if np.isfinite(shares).all() else None,
             "transparency": transparency if np.isfinite(transparency) else 0.0,
         }
 

@@ -45,7 +45,7 @@ from lidarsim.scene.files.coordinate_systems import (
     projjson,
     target_problem,
     transformed,
-    zone_in_metres,
+    zone_in_meters,
 )
 from lidarsim.scene.files.las_units import unit_by_name
 from lidarsim.scene.files.scene_graph import (
@@ -108,7 +108,7 @@ def read_raster(_data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the first band as a mesh: a vertex at the middle of each pixel, two triangles a cell.
 
     Cells with a pixel without height are holes. Coordinates are of the system `epsg` in
-    `options.own`; else the raster's own if they are in metres that are true to scale in its
+    `options.own`; else the raster's own if they are in meters that are true to scale in its
     middle, or of the UTM zone of its middle. The window has the pixels whose middles are within.
     """
     if find_spec("rasterio") is None:
@@ -222,11 +222,11 @@ class _Source:
     file: Any
     affine: Any  # transform from columns and rows to x and y, in meters in a local system
     crs: Any  # horizontal coordinate system of x and y; None for none on Earth
-    up_m: float | None  # unit of heights of the vertical system, metres
+    up_m: float | None  # unit of heights of the vertical system, meters
     local: _LocalSystem | None = None  # system without a place on Earth, if the file states one
 
     def heights_m(self, values: Floats, unit_m: float) -> Floats:
-        """Return the heights in metres of values of the first band, which has a unit."""
+        """Return the heights in meters of values of the first band, which has a unit."""
         return (values * self.file.scales[0] + self.file.offsets[0]) * unit_m
 
 
@@ -372,9 +372,9 @@ def _check_kind(source: Any) -> None:
 
 
 def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
-    """Return the coordinate system of the mesh, in true metres, or raise MeshFileError.
+    """Return the coordinate system of the mesh, in true meters, or raise MeshFileError.
 
-    Appends a note if the metres of the raster are not true to scale, and if the metres of the mesh
+    Appends a note if the meters of the raster are not true to scale, and if the meters of the mesh
     are not true at its edges.
     """
     crs = source.crs
@@ -411,7 +411,7 @@ def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
 def _chosen_crs(crs: Any, epsg: int, middle: Floats) -> Any:
     """Return the system of a chosen code.
 
-    Raises MeshFileError if the system is not in true metres.
+    Raises MeshFileError if the system is not in true meters.
     """
     target = crs_of_code(epsg)
     place = middle
@@ -435,7 +435,7 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
             "and latitude. Project it to meters first, for example with `gdalwarp -t_srs SYSTEM "
             "IN OUT`"
         )
-    code = zone_in_metres(*place)
+    code = zone_in_meters(*place)
     width_deg = _width_deg(source)
     if width_deg > _WIDEST_DEG and code not in POLAR_EPSG:
         raise MeshFileError(
@@ -537,7 +537,7 @@ class _RasterGrid:
 
     @cached_property
     def pixel_m(self) -> float:
-        """Side of a square as large as the pixel in the middle, metres."""
+        """Side of a square as large as the pixel in the middle, meters."""
         column = np.array([0.0, 1.0, 0.0])
         row = np.array([0.0, 0.0, 1.0])
         x, y = self.coordinates(column + self.file.width // 2, row + self.file.height // 2)
@@ -699,7 +699,7 @@ def _grid_mesh(
 
 
 def _height_unit_m(source: _Source, notes: list[str]) -> float:
-    """Return the metres in the unit of heights: of the band, else of the vertical system."""
+    """Return the meters in the unit of heights: of the band, else of the vertical system."""
     stated = source.file.units[0]
     if stated:
         if (unit_m := unit_by_name(stated)) is not None:

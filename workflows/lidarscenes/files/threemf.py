@@ -27,7 +27,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import CutShortError, message_of
 from lidarsim.base.words import plural
 from lidarsim.base.xmlfile import AT_END, PIECE_BYTES, parse_pieces, refuse_entity
-from lidarsim.scene.colours import GREY, Colours
+from lidarsim.scene.colors import GRAY, Colors
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.scene_graph import (
     SMALLER,
@@ -52,10 +52,10 @@ _UNITS_M = {
 _SUPPORTED = re.compile(r"/(material|production|securecontent)/")
 
 # What a few letters make.
-_OBJECT_BYTES = 1000  # bytes of an object, its placement, or a group of colours
-_COLOUR_BYTES = 100  # bytes of a colour or material in a group
+_OBJECT_BYTES = 1000  # bytes of an object, its placement, or a group of colors
+_COLOR_BYTES = 100  # bytes of a color or material in a group
 
-_COLOUR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
+_COLOR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
 
 _Key = tuple[str, str]  # inner file and number of an object
 
@@ -68,7 +68,7 @@ class _MeshObject:
     vertices: array[float] = field(default_factory=lambda: array("d"))
     faces: array[int] = field(default_factory=lambda: array("q"))
     components: list[_Placement] = field(default_factory=list)
-    # Number of a group of colours, and index in it, of triangles without.
+    # Number of a group of colors, and index in it, of triangles without.
     default_property: tuple[str, str] = ("", "0")
     shades: array[int] = field(default_factory=lambda: array("B"))  # shades of corners, if read
     materials: list[str] = field(default_factory=list)  # names of triangles, if read
@@ -80,10 +80,10 @@ class _MeshObject:
             return []
         vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
         faces = np.frombuffer(self.faces, np.int64).reshape(-1, 3)
-        colours = None
+        colors = None
         corners = np.frombuffer(self.shades, np.uint8).reshape(-1, 3, 3)
-        if (corners != GREY).any():
-            colours = Colours.of_corners(corners)
+        if (corners != GRAY).any():
+            colors = Colors.of_corners(corners)
         materials = None
         if self.materials:
             names = tuple(dict.fromkeys(self.materials))
@@ -91,7 +91,7 @@ class _MeshObject:
             index = np.array([rows[name] for name in self.materials], np.int32)
             materials = FaceMaterials(names, index if names[1:] else None)
             materials = materials if any(names) else None
-        return [SceneMesh(self.name, vertices, faces, colours=colours, materials=materials)]
+        return [SceneMesh(self.name, vertices, faces, colors=colors, materials=materials)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,7 @@ class _Placement:
 
 
 def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read the build items of a file, and colours of base materials and colour groups."""
+    """Read the build items of a file, and colors of base materials and color groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         package = _Package(archive, Allowance(len(data), SMALLER), options)
         root = package.model(package.start())
@@ -121,8 +121,8 @@ def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
         content = placed_content(placed_nodes(root.items, node, path.stem))
     content.unit_m = _UNITS_M[root.unit]
     content.up_axis = "z"
-    if grey_count := sum(model.grey_count for model in package.models.values()):
-        words = plural(grey_count, "triangle")
+    if gray_count := sum(model.gray_count for model in package.models.values()):
+        words = plural(gray_count, "triangle")
         content.notes.append(
             f"contains textures, which are not supported, or lacks colors. As a result, {words} "
             "became gray"
@@ -203,10 +203,10 @@ class _Model:
         self, name: str, text: Iterable[bytes], allowance: Allowance, options: ReadOptions
     ) -> None:
         self.unit = "millimeter"
-        self.grey_count = 0  # triangles whose colours are not in the file
-        self._colours = options.colours
+        self.gray_count = 0  # triangles whose colors are not in the file
+        self._colors = options.colors
         self._names_materials = options.materials
-        self._groups: dict[str, list[bytes]] = {}  # {number of a group: its colours}
+        self._groups: dict[str, list[bytes]] = {}  # {number of a group: its colors}
         self._group: list[bytes] = []
         self._names: dict[str, list[str]] = {}  # {number of a group: names of its materials}
         self._names_of_group: list[str] = []
@@ -219,8 +219,8 @@ class _Model:
         self._readers: dict[str, Callable[[dict[str, str]], None]] = {
             "basematerials": self._begin_group,
             "colorgroup": self._begin_group,
-            "base": self._add_colour,
-            "color": self._add_colour,
+            "base": self._add_color,
+            "color": self._add_color,
             "object": self._begin_object,
             "component": lambda a: self._object.components.append(self._placement(a)),
             "item": lambda a: self.items.append(self._placement(a)),
@@ -248,7 +248,7 @@ class _Model:
             self._object.vertices.extend([float(attributes[axis]) for axis in "xyz"])
         elif tag == "triangle":
             self._object.faces.extend([int(attributes[corner]) for corner in ("v1", "v2", "v3")])
-            if self._colours:
+            if self._colors:
                 self._shade(attributes)
             if self._names_materials:
                 self._object.materials.append(self._material(attributes))
@@ -258,17 +258,17 @@ class _Model:
             raise MeshFileError(f"contains <{tag}>, which is not supported. Export it as triangles")
 
     def _begin_group(self, attributes: dict[str, str]) -> None:
-        """Begin a group of colours or materials."""
+        """Begin a group of colors or materials."""
         self._allowance.take(_OBJECT_BYTES)
         self._group = self._groups.setdefault(attributes["id"], [])
         self._names_of_group = self._names.setdefault(attributes["id"], [])
 
-    def _add_colour(self, attributes: dict[str, str]) -> None:
-        """Add a colour and its name to the group."""
-        self._allowance.take(_COLOUR_BYTES)
-        colour = attributes.get("displaycolor", attributes.get("color", ""))
-        match = _COLOUR.fullmatch(colour)
-        self._group.append(bytes.fromhex(match[1]) if match else GREY.tobytes())
+    def _add_color(self, attributes: dict[str, str]) -> None:
+        """Add a color and its name to the group."""
+        self._allowance.take(_COLOR_BYTES)
+        color = attributes.get("displaycolor", attributes.get("color", ""))
+        match = _COLOR.fullmatch(color)
+        self._group.append(bytes.fromhex(match[1]) if match else GRAY.tobytes())
         self._names_of_group.append(attributes.get("name", ""))
 
     def _begin_object(self, attributes: dict[str, str]) -> None:
@@ -300,16 +300,16 @@ class _Model:
         return names[index] if 0 <= index < len(names) else ""
 
     def _shade(self, attributes: dict[str, str]) -> None:
-        """Add the colours of a triangle's corners, or grey for a triangle without colours."""
+        """Add the colors of a triangle's corners, or gray for a triangle without colors."""
         group, number = self._object.default_property
         group = attributes.get("pid", group)
         first = attributes.get("p1", number)
         indices = [int(attributes.get(name, first)) for name in ("p1", "p2", "p3")]
-        colours = self._groups.get(group, [])
-        has_colours = all(0 <= index < len(colours) for index in indices)
-        self.grey_count += bool(group) and not has_colours
+        colors = self._groups.get(group, [])
+        has_colors = all(0 <= index < len(colors) for index in indices)
+        self.gray_count += bool(group) and not has_colors
         for index in indices:
-            self._object.shades.frombytes(colours[index] if has_colours else GREY.tobytes())
+            self._object.shades.frombytes(colors[index] if has_colors else GRAY.tobytes())
 
     def _placement(self, attributes: dict[str, Any]) -> _Placement:
         """Read a component or build item."""

@@ -1,8 +1,8 @@
-"""OpenUSD scenes, .usd .usda .usdc .usdz, through usd-core (Pixar, licence TOST-1.0).
+"""OpenUSD scenes, .usd .usda .usdc .usdz, through usd-core (Pixar, license TOST-1.0).
 
 `usd_child.py` reads the scenes in a separate process, and states the reasons. References
 to other files are resolved by usd-core; content from outside the scene's folder is refused.
-`usd_materials.py` reads masks and colours.
+`usd_materials.py` reads masks and colors.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def _contents(
                 content = _content(stage | frame, arrays, meshes, stem, allowance)
                 content.notes += materials.notes.lines()
                 yield _with_notes(content, stage, frame["counts"])
-                materials.coloured = False  # all poses have the colours of the first
+                materials.colored = False  # all poses have the colors of the first
 
 
 def _frames(path: Path, options: ReadOptions, allowance: Allowance) -> Generator[Frame]:
@@ -186,7 +186,7 @@ def _shape_mesh(
     # Without texture coordinates they have no masks either, and a note says so.
     materials.cutout(number, look, rows)
     named = FaceMaterials.named(materials.name(number))
-    return [replace(mesh, colours=materials.colours(number, look, rows), materials=named)]
+    return [replace(mesh, colors=materials.colors(number, look, rows), materials=named)]
 
 
 def _plain_shape(frame: dict[str, Any]) -> SceneMesh | None:

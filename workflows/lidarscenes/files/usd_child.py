@@ -342,12 +342,12 @@ def _poses_up_to(
 
 
 class Looks:
-    """Images and materials, written when they are first used, and colours of meshes."""
+    """Images and materials, written when they are first used, and colors of meshes."""
 
     def __init__(self, request: dict[str, Any], write: Any) -> None:
         self.time = Usd.TimeCode.Default()
         self._masks = request["masks"]
-        self._colours = request["colours"]
+        self._colors = request["colors"]
         self._write = write
         self._names_materials = request["materials"]
         self._folders = tuple(os.path.join(folder, "") for folder in request["folders"])  # noqa: PTH118
@@ -357,14 +357,14 @@ class Looks:
         self._numbers_by_content: dict[str, int] = {}  # {description of a material: number}
 
     def inherited(self, instance: Any) -> Any:
-        """Return the material and colour that prims in an instance inherit.
+        """Return the material and color that prims in an instance inherit.
 
         Returns None without both.
         """
-        if not (self._masks or self._colours or self._names_materials):
+        if not (self._masks or self._colors or self._names_materials):
             return None
-        colour = self._values(instance, "displayColor") if self._colours else None
-        look = self._bound(instance)[0], colour and (colour[0], colour[1].tobytes())
+        color = self._values(instance, "displayColor") if self._colors else None
+        look = self._bound(instance)[0], color and (color[0], color[1].tobytes())
         return None if look == (None, None) else look
 
     def mesh_fields(self, prim: Any, arrays: list[Any]) -> dict[str, Any]:
@@ -374,11 +374,11 @@ class Looks:
 
         Values are at corners, vertices, polygons or constant, by OpenUSD's interpolation.
         """
-        if not (self._masks or self._colours or self._names_materials):
+        if not (self._masks or self._colors or self._names_materials):
             return {}
         prim_material, names_read = self._bound(prim)
         materials: list[Any] = [] if prim_material is None else [(prim_material, None)]
-        names = {*names_read, *(["displayColor"] if self._colours else [])}
+        names = {*names_read, *(["displayColor"] if self._colors else [])}
         subsets = UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets()
         if not prim.IsA(UsdGeom.Mesh):
             subsets = []
@@ -431,30 +431,30 @@ class Looks:
         number = self._numbers_by_content.setdefault(json.dumps(properties), count)
         if number == len(self._numbers_by_content) - 1:
             self._write({"what": "material", "number": number} | properties)
-        sources = [properties.get("colour", {}), properties.get("opacity", {})]
+        sources = [properties.get("color", {}), properties.get("opacity", {})]
         return number, [source["values"] for source in sources if "values" in source]
 
     def _properties(self, shader: Any, kind: str) -> dict[str, Any]:
-        """Return colour, opacity and threshold of a surface, as far as they are asked for."""
+        """Return color, opacity and threshold of a surface, as far as they are asked for."""
         properties: dict[str, Any] = {}
         if kind not in _SURFACES:
-            if self._colours:
-                properties["colour"] = {"unread": f"its shader {kind[:40]} is not supported"}
+            if self._colors:
+                properties["color"] = {"unread": f"its shader {kind[:40]} is not supported"}
         elif kind == "OmniPBR":
-            if self._colours:
-                properties["colour"] = self._omniverse_colour(shader)
+            if self._colors:
+                properties["color"] = self._omniverse_color(shader)
         else:
-            if self._colours:
+            if self._colors:
                 name, usual = _SURFACES[kind]
-                properties["colour"] = self._source(shader.GetInput(name)) or {"value": usual}
+                properties["color"] = self._source(shader.GetInput(name)) or {"value": usual}
             if self._masks and (opacity := self._source(shader.GetInput("opacity"))):
                 properties["opacity"] = opacity
                 threshold = self._source(shader.GetInput("opacityThreshold")) or {}
                 properties["threshold"] = threshold.get("value", 0)
         return properties
 
-    def _omniverse_colour(self, shader: Any) -> dict[str, Any]:
-        """Return the base colour of NVIDIA's OmniPBR."""
+    def _omniverse_color(self, shader: Any) -> dict[str, Any]:
+        """Return the base color of NVIDIA's OmniPBR."""
         inputs = ("diffuse_tint", "diffuse_color_constant", "diffuse_texture")
         tint, plain, image = (_constant(shader.GetInput(name)) for name in inputs)
         tint = tint or (1, 1, 1)
@@ -579,7 +579,7 @@ def _numbers(value: Any) -> Any:
     return [float(number) for number in value] if hasattr(value, "__len__") else float(value)
 
 
-# {shader of a surface: (input of its base colour, colour if that is not set)}
+# {shader of a surface: (input of its base color, color if that is not set)}
 _SURFACES = {
     "UsdPreviewSurface": ("diffuseColor", [0.18] * 3),
     "ND_UsdPreviewSurface_surfaceshader": ("diffuseColor", [0.18] * 3),
@@ -729,7 +729,7 @@ def main(path: str, request: dict[str, Any]) -> None:
                 "what": "stage",
                 "files": _stage_files(stage),
                 "missing": [name for name in missing if not name.endswith(".mtlx")],
-                "materialx": request["colours"] and any(name.endswith(".mtlx") for name in missing),
+                "materialx": request["colors"] and any(name.endswith(".mtlx") for name in missing),
                 "unit_m": UsdGeom.GetStageMetersPerUnit(stage),
                 "unit_stated": UsdGeom.StageHasAuthoredMetersPerUnit(stage),
                 "up_axis": UsdGeom.GetStageUpAxis(stage).lower(),

@@ -1,4 +1,4 @@
-"""Materials and colours of OpenUSD's meshes, from the frames of `usd_child.py`."""
+"""Materials and colors of OpenUSD's meshes, from the frames of `usd_child.py`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.base.vectors import matmul
-from lidarsim.scene.colours import LINEAR, Colours, as_srgb
+from lidarsim.scene.colors import LINEAR, Colors, as_srgb
 from lidarsim.scene.files.polygons import check_corners, triangulated
 from lidarsim.scene.files.scene_graph import Piece, ReadOptions
 from lidarsim.scene.masks import (
@@ -19,7 +19,7 @@ from lidarsim.scene.masks import (
     MaskNotes,
     Texture,
     Wrap,
-    read_colours,
+    read_colors,
     read_opacity,
     remembered,
 )
@@ -28,10 +28,10 @@ from lidarsim.scene.scene_mesh import Cutout
 _DEFAULT_THRESHOLD = 0.5  # lowest opacity that stops light, unless a material states another
 _BYTES = np.arange(256) / 255
 
-# Source of a colour or an opacity of a material: a `value`, an `image`, or `values` of the mesh;
+# Source of a color or an opacity of a material: a `value`, an `image`, or `values` of the mesh;
 # `Looks` in usd_child.py writes them.
-ColourSource = dict[str, Any]
-_DISPLAY: ColourSource = {"values": "displayColor"}
+ColorSource = dict[str, Any]
+_DISPLAY: ColorSource = {"values": "displayColor"}
 
 
 class _Use(NamedTuple):
@@ -45,7 +45,7 @@ class _Use(NamedTuple):
     wraps: tuple[Wrap, Wrap]
 
     @classmethod
-    def from_source(cls, source: ColourSource) -> _Use:
+    def from_source(cls, source: ColorSource) -> _Use:
         """Return the use of an image by a source."""
         scale = tuple(source.get("scale", (1,) * 4))
         bias = tuple(source.get("bias", (0,) * 4))
@@ -60,7 +60,7 @@ class _Use(NamedTuple):
 
 
 class MeshLook:
-    """Arrays of a mesh that its materials read: texture coordinates and colours.
+    """Arrays of a mesh that its materials read: texture coordinates and colors.
 
     Parameters
     ----------
@@ -77,22 +77,22 @@ class MeshLook:
         self._value_indices = value_indices
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
-    def coordinates(self, source: ColourSource, face_indices: Ints) -> tuple[Floats, Ints]:
+    def coordinates(self, source: ColorSource, face_indices: Ints) -> tuple[Floats, Ints]:
         """Return texture coordinates (c, 2) as in glTF, and their indices at corners, (k, 3)."""
         values, corners = self._corner_values(source["values"], face_indices, 2)
         matrix = np.array(source.get("matrix", np.eye(3, 2)))
         u, v = (matmul(values, matrix[:2]) + matrix[2]).T
         return np.stack([u, 1 - v], axis=1), corners
 
-    def painted(self, name: str, face_indices: Ints) -> Colours | None:
-        """Return colours of triangles by values, linear light, or None without values."""
+    def painted(self, name: str, face_indices: Ints) -> Colors | None:
+        """Return colors of triangles by values, linear light, or None without values."""
         if name not in self._values:
             return None
         values, corners = self._corner_values(name, face_indices, 3)
-        colours = as_srgb(np.nan_to_num(values))
-        if len(colours) == 1:
-            return Colours.plain(colours[None], len(face_indices))
-        return Colours.of_corners(colours[corners])
+        colors = as_srgb(np.nan_to_num(values))
+        if len(colors) == 1:
+            return Colors.plain(colors[None], len(face_indices))
+        return Colors.of_corners(colors[corners])
 
     def _corner_values(self, name: str, face_indices: Ints, width: int) -> tuple[Floats, Ints]:
         """Return values (c, width), and their indices at corners (k, 3), or raise MaskError."""
@@ -114,11 +114,11 @@ class MeshLook:
 
 
 class UsdMaterials:
-    """Images and materials of a scene by their numbers, with colours and masks of triangles."""
+    """Images and materials of a scene by their numbers, with colors and masks of triangles."""
 
     def __init__(self, allowance: Allowance, options: ReadOptions) -> None:
         self._allowance = allowance
-        self.coloured = options.colours
+        self.colored = options.colors
         self._names_materials = options.materials
         # {number: (reason if the image is not read, content)}
         self._images: dict[int, tuple[str, bytes]] = {}
@@ -143,25 +143,25 @@ class UsdMaterials:
             else str(self._materials[number]["name"])
         )
 
-    def colours(self, number: int | None, look: MeshLook, face_indices: Ints) -> Colours | None:
-        """Return the colours that a material gives triangles, or None."""
-        if not self.coloured:
+    def colors(self, number: int | None, look: MeshLook, face_indices: Ints) -> Colors | None:
+        """Return the colors that a material gives triangles, or None."""
+        if not self.colored:
             return None
         material = self._materials[number]
-        source = material.get("colour", _DISPLAY)
-        for colour_source in (source, source.get("instead", _DISPLAY)):
-            with self.notes.without_colour(material["name"]):
+        source = material.get("color", _DISPLAY)
+        for color_source in (source, source.get("instead", _DISPLAY)):
+            with self.notes.without_color(material["name"]):
                 if not self._allowance.fits(FACE_BYTES * len(face_indices)):
                     raise MaskError("the mesh has too many triangles")
-                if "unread" in colour_source:
-                    raise MaskError(colour_source["unread"])
-                if "value" in colour_source:
-                    light = np.nan_to_num(np.array(colour_source["value"]))
-                    return Colours.plain(as_srgb(light).reshape(1, 1, 3), len(face_indices))
-                if "image" in colour_source:
-                    coordinates = look.coordinates(colour_source, face_indices)
-                    return self._shades(_Use.from_source(colour_source)).colours(*coordinates)
-                return look.painted(colour_source["values"], face_indices)
+                if "unread" in color_source:
+                    raise MaskError(color_source["unread"])
+                if "value" in color_source:
+                    light = np.nan_to_num(np.array(color_source["value"]))
+                    return Colors.plain(as_srgb(light).reshape(1, 1, 3), len(face_indices))
+                if "image" in color_source:
+                    coordinates = look.coordinates(color_source, face_indices)
+                    return self._shades(_Use.from_source(color_source)).colors(*coordinates)
+                return look.painted(color_source["values"], face_indices)
         return None
 
     def cutout(self, number: int | None, look: MeshLook, face_indices: Ints) -> Cutout | None:
@@ -193,8 +193,8 @@ class UsdMaterials:
         return content
 
     def _read_shades(self, use: _Use) -> Texture:
-        """Read the colours of an image as a texture."""
-        image = read_colours(self._image(use.image), self._allowance, self.notes)
+        """Read the colors of an image as a texture."""
+        image = read_colors(self._image(use.image), self._allowance, self.notes)
         names = use.channels if use.channels == "rgb" else use.channels * 3
         tables = [as_srgb(np.nan_to_num(use.light(name))) for name in names]
         shades = [table[image[..., "rgb".index(k)]] for table, k in zip(tables, names, strict=True)]
@@ -212,8 +212,8 @@ class UsdMaterials:
             opacity = read_opacity(content, self._allowance)
             opacity = np.full((1, 1), 255, np.uint8) if opacity is None else opacity
         else:
-            colours = read_colours(content, self._allowance, self.notes)
-            opacity = colours[..., "rgb".index(channel)]
+            colors = read_colors(content, self._allowance, self.notes)
+            opacity = colors[..., "rgb".index(channel)]
         mask = (use.light(channel) >= (threshold or _DEFAULT_THRESHOLD))[opacity]
         if mask.all():
             return None
@@ -240,7 +240,7 @@ def material_pieces(
     """
     sizes, corners, solid = polygons
     check_corners(corners, len(vertices))
-    # By the number of the corner, since a vertex may have another colour in each polygon.
+    # By the number of the corner, since a vertex may have another color in each polygon.
     solid_corners = np.flatnonzero(np.repeat(solid, sizes))
     faces = solid_corners[
         triangulated(vertices[corners[solid_corners]], np.arange(len(solid_corners)), sizes[solid])
@@ -260,5 +260,5 @@ def material_pieces(
         rows = np.flatnonzero(face_groups == number)
         material = numbers[number]
         cutout = materials.cutout(material, look, rows)
-        colours = materials.colours(material, look, rows)
-        yield Piece(vertices, corners[faces[rows]], cutout, colours, materials.name(material))
+        colors = materials.colors(material, look, rows)
+        yield Piece(vertices, corners[faces[rows]], cutout, colors, materials.name(material))

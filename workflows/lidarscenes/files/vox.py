@@ -21,7 +21,7 @@ from lidarsim.scene.scene_mesh import MAX_LEAF_DENSITY, MAX_VOXELS, SceneMesh, V
 DENSITY = "PadBVTotal"
 _MAX_COUNT_ERROR = 2  # voxels between corners and counts; HELIOS++'s own writer makes 1.5
 # The box is larger on all sides by this share of a voxel's edge: its sides do not coincide with the
-# ground or a neighbouring grid, which light would miss.
+# ground or a neighboring grid, which light would miss.
 _MARGIN = 0.02
 
 
@@ -68,7 +68,7 @@ class _Grid(NamedTuple):
     """Grid of a voxel file."""
 
     counts: Floats  # (3,), voxels along x, y and z
-    min_corner: Floats  # (3,), metres: start of the first voxel
+    min_corner: Floats  # (3,), meters: start of the first voxel
     edges_m: Floats  # (3,), edges of a voxel
 
 
@@ -118,7 +118,7 @@ def _numbers(text: bytes, columns: list[str], used: tuple[int, ...], first_line:
 
 
 def _box_around(name: str, densities: Floats32, min_corner: Floats, edges_m: Floats) -> SceneMesh:
-    """Return a box around voxels (x, y, z) that start at a corner (3,), metres."""
+    """Return a box around voxels (x, y, z) that start at a corner (3,), meters."""
     sides_m = np.array(densities.shape) * edges_m
     margin_m = _MARGIN * edges_m.min()
     shell = box(name, tuple(sides_m + 2 * margin_m))

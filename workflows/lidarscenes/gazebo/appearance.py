@@ -1,4 +1,4 @@
-"""Colours and names of materials in SDFormat."""
+"""Colors and names of materials in SDFormat."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from lidarsim.base.arrays import Bytes
 from lidarsim.base.errors import LidarError
 from lidarsim.base.words import printable
-from lidarsim.scene.colours import as_bytes, as_srgb
+from lidarsim.scene.colors import as_bytes, as_srgb
 
 from .frames import numbers_of
 
 FULL_RETRO = 255.0  # value of <laser_retro> that is as bright as white
 
-# Diffuse colours of the plain materials that Gazebo brings, sRGB.
+# Diffuse colors of the plain materials that Gazebo brings, sRGB.
 _NAMED: dict[str, tuple[float, float, float]] = {
     "black": (0.0, 0.0, 0.0),
     "blue": (0.0, 0.0, 1.0),
@@ -38,21 +38,21 @@ _PREFIX = "Gazebo/"
 
 
 class Appearance(NamedTuple):
-    """Colour and material of a visual.
+    """Color and material of a visual.
 
     Attributes
     ----------
-    colour
-        uint8 (1, 1, 3), sRGB; None without a colour.
+    color
+        uint8 (1, 1, 3), sRGB; None without a color.
     material
         Name of the material; empty without a name.
     is_retro
-        Whether <laser_retro> gives the colour, and takes precedence over images.
+        Whether <laser_retro> gives the color, and takes precedence over images.
     is_hidden
         Whether the visual is transparent altogether.
     """
 
-    colour: Bytes | None
+    color: Bytes | None
     material: str
     is_retro: bool
     is_hidden: bool
@@ -67,17 +67,17 @@ def appearance_of(shape: Element, retro: float) -> Appearance:
     hidden = numbers_of(shape, "transparency", 1, "0").item() >= 1
     name = "" if material is None else printable(material.findtext("script/name") or "")
     if retro > 0:
-        grey = as_srgb(np.full((1, 1, 3), min(retro / FULL_RETRO, 1.0)))
-        return Appearance(grey, name, True, hidden)
-    colour = None
+        gray = as_srgb(np.full((1, 1, 3), min(retro / FULL_RETRO, 1.0)))
+        return Appearance(gray, name, True, hidden)
+    color = None
     if material is not None:
         text = (material.findtext("diffuse") or "").strip()
         values = text.split()
         if text and len(values) not in (3, 4):
             raise LidarError(f"<diffuse> is {text[:60]!r}; it must be 3 or 4 finite numbers.")
         if text:
-            colour = as_bytes(numbers_of(material, "diffuse", len(values), "")[:3])
+            color = as_bytes(numbers_of(material, "diffuse", len(values), "")[:3])
         elif name.startswith(_PREFIX):
             named = _NAMED.get(name.removeprefix(_PREFIX).lower())
-            colour = None if named is None else as_bytes(named)
-    return Appearance(None if colour is None else colour.reshape(1, 1, 3), name, False, hidden)
+            color = None if named is None else as_bytes(named)
+    return Appearance(None if color is None else color.reshape(1, 1, 3), name, False, hidden)

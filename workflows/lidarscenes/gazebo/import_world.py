@@ -76,7 +76,7 @@ def _unseen_objects(
     flags = {flags_of(visual) for visual in visuals} - {0}
     if all(mask and all(mask & value for value in flags) for mask in masks):
         return {}
-    options = ReadOptions(masks=False, colours=False, folders=folders, own=GazeboOptions())
+    options = ReadOptions(masks=False, colors=False, folders=folders, own=GazeboOptions())
     with np.errstate(all="ignore"):
         content, placed = content_of(world, options)
     # Objects without an area are not in the content, which is else in the same order.

@@ -182,7 +182,7 @@ def _directions(figures: Element) -> dict[str, Any]:
 
 
 def _range_m(ranges: Element | None) -> tuple[float, float]:
-    """Return the shortest and the longest range, metres."""
+    """Return the shortest and the longest range, meters."""
     if ranges is None:
         return 0.0, math.inf
     longest = (ranges.findtext("max") or "inf").strip()

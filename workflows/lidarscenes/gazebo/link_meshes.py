@@ -16,7 +16,7 @@ from lidarsim.base.input_files import read_input
 from lidarsim.base.vectors import matmul
 from lidarsim.base.words import listed, printable
 from lidarsim.scene.actors import join_meshes
-from lidarsim.scene.colours import Colours
+from lidarsim.scene.colors import Colors
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import load_meshes
 from lidarsim.scene.files.scene_graph import ReadOptions
@@ -152,11 +152,11 @@ class LinkMeshes:
         return moved
 
     def painted(self, mesh: SceneMesh, appearance: Appearance) -> SceneMesh:
-        """Return a mesh with colour and material of its visual, unless its file has any."""
-        colour = appearance.colour
-        is_plain = mesh.colours is None or appearance.is_retro
-        if self.options.colours and colour is not None and is_plain:
-            mesh = replace(mesh, colours=Colours.plain(colour, len(mesh.faces)))
+        """Return a mesh with color and material of its visual, unless its file has any."""
+        color = appearance.color
+        is_plain = mesh.colors is None or appearance.is_retro
+        if self.options.colors and color is not None and is_plain:
+            mesh = replace(mesh, colors=Colors.plain(color, len(mesh.faces)))
         if self.options.materials and mesh.materials is None:
             mesh = replace(mesh, materials=FaceMaterials.named(appearance.material))
         return mesh
@@ -276,7 +276,7 @@ class LinkMeshes:
             file.path,
             up_axis="z",
             opacity="mask" if self.options.masks else "ignore",
-            colours=self.options.colours,
+            colors=self.options.colors,
             materials=self.options.materials,
             assets=self._asset_folders(file),
             tell=lambda line: self.notes.of_meshes.setdefault(_without_path(line, file.path)),

@@ -20,7 +20,7 @@ from lidarsim.scene.transform import rotation_about
 
 from .files import Assets, clean, flag, number, read, vector
 
-_SPEED = 70.0  # default, metres a second
+_SPEED = 70.0  # default, meters a second
 _BETWEEN_S = 0.001  # time between legs: the carrier turns on the spot or goes to its next leg
 _AFTER_S = 1.0  # duration of the trajectory after the last leg
 _FACING_Y_DEG = 90.0  # yaw of platforms that do not turn
@@ -33,7 +33,7 @@ class Leg:
     """A leg of a survey: its start and its settings."""
 
     number: int
-    position: Floats  # (3,): of the start, metres
+    position: Floats  # (3,): of the start, meters
     scanner: dict[str, str]  # settings
     platform: dict[str, str]  # settings
     longest_s: float  # maximum duration; infinite without a limit
@@ -81,7 +81,7 @@ def read_legs(
 ) -> list[Leg]:
     """Return the legs of a survey.
 
-    `height` returns the height of the ground at x, y, metres.
+    `height` returns the height of the ground at x, y, meters.
     """
     legs = []
     for index, element in enumerate(survey.findall("leg")):

@@ -47,7 +47,7 @@ class Device:
     rotation
         Rotation (3, 3) from the sensor frame to the frame of the platform's mount.
     position
-        Start of the light (3,), metres beside the mount.
+        Start of the light (3,), meters beside the mount.
     head_s
         Duration of the head's rotation from start to stop, seconds; None without a head.
     range_m
@@ -381,7 +381,7 @@ def _oscillating(
 
 
 def _fibers(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> ScannerSection:
-    """Return a sensor with fibres side by side, each with a pulse in a line."""
+    """Return a sensor with fibers side by side, each with a pulse in a line."""
     fibers = max(int(scanner.number("numFibers", 1)), 1)
     mirror = {"motion": "sawtooth", "width_deg": clean(2 * _half_angle_deg(scanner, settings))}
     return _mirror(fibers, pulse_hz / fibers, mirror), _LINE

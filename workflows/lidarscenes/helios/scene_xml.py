@@ -31,7 +31,7 @@ from ..procedural.floor import heights_at
 from .files import Assets, clean, number, read, rotation
 
 # Makes a mesh of surfels, a surfel for each cubic cell with points: of the path of the file, points
-# (n, 3) in metres, and the edge of the cells in metres.
+# (n, 3) in meters, and the edge of the cells in meters.
 SurfelMaker = Callable[[Path, Floats, float], SceneMesh]
 
 _LOADERS = ("objloader", "detailedvoxels", "geotiffloader", "xyzloader")
@@ -46,7 +46,7 @@ class HeliosPart:
     up_axis: str | None
     rotation: Floats  # (3, 3)
     scale: float
-    offset: Floats  # (3,): metres
+    offset: Floats  # (3,): meters
     falls: bool  # whether it is moved down or up to stand on the ground
     library: Path | None = None  # file other than .obj, for the material
     material: str = ""  # name in the library
@@ -206,7 +206,7 @@ class HeliosScene:
         return SimplifiedScene.from_scene(Scene.from_meshes(meshes)).scene if meshes else None
 
     def height(self, x: float, y: float) -> float:
-        """Return the height of the lowest ground at x, y, in metres, or 0 without ground."""
+        """Return the height of the lowest ground at x, y, in meters, or 0 without ground."""
         heights = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
         if not len(heights):
             self._missing.add(f"{x:g}, {y:g}")
@@ -245,7 +245,7 @@ class HeliosScene:
                 self._assets.check(folder / f"{name}.txt", name)
                 text = _text(folder / f"{name}.txt")
                 rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
-                if rows:  # micrometres and per cent
+                if rows:  # micrometers and per cent
                     lengths, shares = np.array(sorted((float(x), float(y)) for x, y in rows)).T
                     return float(np.interp(wavelength_nm / 1000, lengths, shares) / 100)
         self.unread.append(f"the missing spectrum {name!r} (a reflectance of 0.5 is used)")
@@ -367,7 +367,7 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
 def _points(path: Path, settings: dict[str, str]) -> tuple[Floats, float]:
     """Return the points (n, 3) of a file for an `xyzloader`, and the edge of a surfel's cell.
 
-    Both are in metres.
+    Both are in meters.
     """
     separators = dict.fromkeys(map(ord, settings.get("separator") or " "), " ")
     lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()

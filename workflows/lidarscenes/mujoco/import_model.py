@@ -100,7 +100,7 @@ def import_model(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]:
 def _options(path: Path, assets: Sequence[Path]) -> ReadOptions:
     """Return the options of reading a model without its images."""
     folders = (path.parent.resolve(), *(folder.resolve() for folder in assets))
-    return ReadOptions(masks=False, colours=False, folders=folders, own=MujocoOptions())
+    return ReadOptions(masks=False, colors=False, folders=folders, own=MujocoOptions())
 
 
 def _loaded(path: Path, assets: Sequence[Path]) -> Any:
@@ -201,11 +201,11 @@ def _beams(model: Any, group: _Group, sites: list[int]) -> tuple[Floats, Floats,
         return matrix, np.zeros_like(directions), directions
     axes = model.xmat[group.body].reshape(3, 3)
     positions = model.site_xpos[sites]
-    centre = positions.mean(axis=0)
+    center = positions.mean(axis=0)
     directions = model.site_xmat[sites].reshape(-1, 3, 3)[:, :, 2]
     return (
-        affine(axes, centre),
-        turned(positions - centre, axes.T),
+        affine(axes, center),
+        turned(positions - center, axes.T),
         turned(directions, axes.T),
     )
 

@@ -59,7 +59,7 @@ def main(path: str, request: dict[str, Any]) -> None:
         names = [prefix + name for prefix, rest in _OF_MODEL.items() for name in rest]
         # Older versions lack some.
         fields = {name: getattr(model, name) for name in names if hasattr(model, name)}
-        if not request["colours"]:
+        if not request["colors"]:
             fields["tex_data"] = fields["tex_data"][:0]
         fields["names"] = np.frombuffer(model.names, np.uint8)
         fields |= {name: getattr(data, name) for name in _OF_DATA}

@@ -52,7 +52,7 @@ from .model_sources import check_sources
 
 MUJOCO_BYTES = 512 * 2**20  # bytes that MuJoCo takes for any file
 _ADVICE = "simplify its meshes, or divide the model"
-# Half of the side of planes without a size: at least metres, and as a multiple of the model's size.
+# Half of the side of planes without a size: at least meters, and as a multiple of the model's size.
 _MIN_PLANE_M = 200.0
 _PLANE_SIZES = 5.0
 _MAX_ROUND_TRIANGLES = 4_000_000  # triangles of balls, ellipsoids, capsules and cylinders in all
@@ -114,7 +114,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         )
     if sys.platform == "win32":  # where a process has no limits of memory
         raise MeshFileError("is a MuJoCo model, which is not supported on Windows")
-    request = {"keyframe": options.own.keyframe, "colours": options.colours}
+    request = {"keyframe": options.own.keyframe, "colors": options.colors}
     with TemporaryDirectory() as folder:
         child = Child(
             Path(__file__).with_name("model_child.py"),
@@ -131,7 +131,7 @@ def load_model(data: bytes, path: Path, options: ReadOptions) -> SimpleNamespace
         hint = name_hint(keyframe, frame["names"])
         raise LidarError(f"the model has no keyframe {keyframe!r}.{hint}")
     fields = dict(zip(frame.pop("names"), arrays, strict=True))
-    if not options.colours:  # without the pixels of textures
+    if not options.colors:  # without the pixels of textures
         fields["mat_texid"] = np.full_like(fields["mat_texid"], -1)
     return SimpleNamespace(**frame, **fields)
 
@@ -194,7 +194,7 @@ def _choice(model: Any, options: MujocoOptions, bodies: list[int], geoms: list[i
 
 
 def _sag_m(model: Any, geoms: Ints) -> float:
-    """Return the sag of round geoms, larger for many of them, metres."""
+    """Return the sag of round geoms, larger for many of them, meters."""
     kinds = np.column_stack([model.geom_type[geoms], model.geom_size[geoms]])
     shapes, counts = np.unique(kinds, axis=0, return_counts=True)
     sag_m = SAG_M
@@ -236,10 +236,10 @@ def body_matrix(model: Any, body: int) -> Floats:
 
 
 def _stripped(mesh: SceneMesh, options: ReadOptions) -> SceneMesh:
-    """Return a mesh with the colours and materials that are asked for."""
+    """Return a mesh with the colors and materials that are asked for."""
     return replace(
         mesh,
-        colours=mesh.colours if options.colours else None,
+        colors=mesh.colors if options.colors else None,
         materials=mesh.materials if options.materials else None,
     )
 

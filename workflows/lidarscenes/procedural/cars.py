@@ -17,7 +17,7 @@ _FRAME = 0.12  # share of a window's width that is frame
 
 @dataclass(frozen=True)
 class Model:
-    """Outline of a car that faces x, from the front to the back, metres.
+    """Outline of a car that faces x, from the front to the back, meters.
 
     A station is (x, half width, height of the belt line, height of the roof); without a cabin the
     two heights are nearly the same. Windows are beside and between the stations of the cabin.

@@ -1,7 +1,7 @@
 """A generated city of any size: streets, houses, towers, trees, cars, lamps.
 
 Streets run along x and y, and two streets cross at (0, 0). Blocks between streets are divided into
-lots, two rows back to back; lots near the centre have more towers. Objects are made for all blocks
+lots, two rows back to back; lots near the center have more towers. Objects are made for all blocks
 at once, by arrays, so that ten million triangles take a few seconds more than a thousand.
 """
 
@@ -24,7 +24,7 @@ from .city_kinds import Solid
 from .plants import MAX_TREES
 from .terrain import grid_faces
 
-# A row for each object: position and size; `block` is counted from the centre.
+# A row for each object: position and size; `block` is counted from the center.
 _OBJECT = np.dtype({
     "names": ["kind", "owner", "block", "place", "yaw", "scale"],
     "formats": ["i8", "i8", "i8", "3f8", "f8", "3f8"],
@@ -56,7 +56,7 @@ def city(
 
     There is a crossing at (0, 0), where a sensor may stand. The ground, at z = 0, is an object, the
     pavement of all blocks too, and each building, tree, car and lamp: building-12, tree-7, counted
-    from the centre.
+    from the center.
 
     Parameters
     ----------
@@ -117,14 +117,14 @@ def _furniture(
 
 
 def _select_objects(kinds: dict[str, list[Solid]], sizes: Ints, budget: int, seed: int) -> AnyArray:
-    """Return objects from the centre outwards, within the budget of triangles."""
+    """Return objects from the center outwards, within the budget of triangles."""
     rings = 1
     while True:
         objects = _CityBlocks(kinds, rings, seed).objects()
         used = np.cumsum(sizes[objects["kind"]])
         if used[-1] >= budget:
             return objects[: int(np.searchsorted(used, budget, side="right"))]
-        # Triangles grow with the square of the rings; the centre's towers have the most.
+        # Triangles grow with the square of the rings; the center's towers have the most.
         rings = max(rings + 1, int(np.sqrt(budget / used[-1]) * rings))
 
 
@@ -163,7 +163,7 @@ def _scene(solids: list[Solid], objects: AnyArray, ground: Solid) -> Scene:
 
 
 def _copies(solid: Solid, objects: AnyArray) -> Floats:
-    """Return the vertices of a solid repeated for each object: (objects, v, 3), metres."""
+    """Return the vertices of a solid repeated for each object: (objects, v, 3), meters."""
     vertices = solid.vertices * objects["scale"][:, None]
     cos = np.cos(objects["yaw"])[:, None]
     sin = np.sin(objects["yaw"])[:, None]
@@ -176,7 +176,7 @@ def _copies(solid: Solid, objects: AnyArray) -> Floats:
 
 
 def _names(objects: AnyArray) -> list[str]:
-    """Return names of all objects but pavements: class and number, from 1 at the centre."""
+    """Return names of all objects but pavements: class and number, from 1 at the center."""
     numbers = dict.fromkeys(CLASSES, 0)
     names = []
     for owner in objects["owner"].tolist():
@@ -190,19 +190,19 @@ class _Lots(NamedTuple):
     """Lots of the blocks without parks, in two rows back to back, along x."""
 
     block: Ints  # (n,): number of the block
-    size: Floats  # (n, 2): metres
+    size: Floats  # (n, 2): meters
     side: Floats  # (n,): -1 if the street is to the south, 1 if it is to the north
-    x: Floats  # (n,): of the middle, metres
+    x: Floats  # (n,): of the middle, meters
     edge: Floats  # (n,): y of the edge at the pavement
     yaw: Floats  # (n,): of buildings
-    centrality: Floats  # (n,): 1 at the centre of the city, falling to 0
+    centrality: Floats  # (n,): 1 at the center of the city, falling to 0
 
 
 class _StreetPositions(NamedTuple):
     """Positions along the edges of blocks."""
 
     block: Ints  # (n,): number of the block
-    xy: Floats  # (n, 2): metres
+    xy: Floats  # (n, 2): meters
     yaw: Floats  # (n,): outwards over the edge
     along_edge: Floats  # (n, 2): unit vectors along the edge, to the left of outwards
 
@@ -224,7 +224,7 @@ class _CityBlocks:
         self._lay_blocks(rings)
 
     def _lay_blocks(self, rings: int) -> None:
-        """Set middles and sizes (n, 2) of the blocks between streets, from the centre outwards."""
+        """Set middles and sizes (n, 2) of the blocks between streets, from the center outwards."""
         spans = []
         for min_m, max_m in _BLOCK_M:
             halves = []
@@ -241,7 +241,7 @@ class _CityBlocks:
         size = np.stack(np.meshgrid(width, depth, indexing="ij"), axis=-1).reshape(-1, 2)
         order = np.argsort(np.hypot(*middle.T), kind="stable")
         park = self._rng.random(len(middle)) < _PARKS
-        park[:4] = False  # never at the centre
+        park[:4] = False  # never at the center
         self._middle = middle[order]
         self._size = size[order]
         self._park = park

@@ -15,7 +15,7 @@ from .plants import SCALES, SPECIES, all_trees, place_instances
 
 MAX_CARS = 50_000
 
-# Along the edge of a block: metres between positions, from the edge inwards, and free at corners.
+# Along the edge of a block: meters between positions, from the edge inwards, and free at corners.
 _TREE_APART_M = 7.0
 _TREE_INWARDS_M = 1.3
 _TREE_CORNER_M = 5.0
@@ -41,13 +41,13 @@ def street_trees(
     Parameters
     ----------
     blocks
-        (b, 2, 2): middles and sizes, metres.
+        (b, 2, 2): middles and sizes, meters.
     boxes
         For each block: lowest and highest corners of its buildings, (n, 2, 2).
     lamps
         For each block: positions of its lamps, (n, 2).
     z
-        Height of the ground, metres.
+        Height of the ground, meters.
 
     Raises
     ------
@@ -76,7 +76,7 @@ def street_trees(
 class _TreeSites(NamedTuple):
     """Positions for trees in a block."""
 
-    xy: Floats  # (n, 2): metres
+    xy: Floats  # (n, 2): meters
     room: Floats  # (n,): distance to the nearest building, or the limit at streets
     at_street: Bools  # (n,)
 

@@ -15,7 +15,7 @@ from lidarsim.scene.shapes import revolve
 
 
 class Solid(NamedTuple):
-    """Triangles in local coordinates, metres, standing on z = 0.
+    """Triangles in local coordinates, meters, standing on z = 0.
 
     `vertices` are float64 (v, 3), `faces` int64 (f, 3), counter-clockwise seen from outside.
     """
@@ -24,7 +24,7 @@ class Solid(NamedTuple):
     faces: Ints
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
-        """Return a copy, moved by x, y and z, metres."""
+        """Return a copy, moved by x, y and z, meters."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
@@ -62,7 +62,7 @@ def _towers() -> list[Solid]:
 def _storeys(floors: int, base: float = 0.0, inset: float = 0.0) -> list[tuple[float, float]]:
     """Return the profile of a front with a recessed band of windows in each storey, and a parapet.
 
-    The profile has pairs of a height and an inset, metres.
+    The profile has pairs of a height and an inset, meters.
     """
     line = [(base, inset)]
     for floor in range(floors):
@@ -111,7 +111,7 @@ def _houses() -> list[Solid]:
 
 
 def _eaves(storeys: int) -> float:
-    """Return the height of the eaves of a dwelling, metres."""
+    """Return the height of the eaves of a dwelling, meters."""
     return 0.4 + 2.8 * storeys
 
 
@@ -178,7 +178,7 @@ def _cars() -> list[Solid]:
 
 
 def _car(side: list[tuple[float, float]]) -> Solid:
-    """Return a car by the outline of its side: points x, z, metres."""
+    """Return a car by the outline of its side: points x, z, meters."""
     body = lying(loft(side, [(-0.85, 0.08), (-0.75, 0), (0.75, 0), (0.85, 0.08)]))
     wheel = lying(loft(regular(8, 0.33), [(-0.12, 0), (0.12, 0)]))
     wheels = [wheel.moved(x, y, 0.31) for x in (-1.35, 1.35) for y in (-0.8, 0.8)]
@@ -205,7 +205,7 @@ def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
     """Return an outline extruded along z, with insets, and closed at both ends.
 
     `outline` (n, 2) is a polygon, counter-clockwise, completely visible from its first point;
-    `profile` has pairs of a height and an inset of the outline's sides at that height, metres. The
+    `profile` has pairs of a height and an inset of the outline's sides at that height, meters. The
     solid has ``2 * n * len(profile) - 4`` triangles.
     """
     points = np.asarray(outline, dtype=np.float64)
@@ -216,9 +216,9 @@ def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
     inward = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     previous_inward = np.roll(inward, 1, axis=0)
     # A corner moves so that both its sides move by the inset.
-    mitre = (inward + previous_inward) / (1 + (inward * previous_inward).sum(axis=1, keepdims=True))
+    miter = (inward + previous_inward) / (1 + (inward * previous_inward).sum(axis=1, keepdims=True))
     rings = np.empty((len(height), n, 3))
-    rings[..., :2] = points + inset[:, None, None] * mitre
+    rings[..., :2] = points + inset[:, None, None] * miter
     rings[..., 2] = height[:, None]
     corners = np.arange(len(height) * n).reshape(-1, n)
     next_corners = np.roll(corners, -1, axis=1)

@@ -14,7 +14,7 @@ FURNITURE_M = 1.5  # minimum height of a ceiling above the floor
 
 
 def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
-    """Return the heights of the floor and the ceiling at a position, world coordinates, metres.
+    """Return the heights of the floor and the ceiling at a position, world coordinates, meters.
 
     The floor is the lowest triangle at the position if it faces up, like ground, or the top of the
     lowest slab; else the lowest point of the scene. The ceiling is the lowest triangle that is
@@ -29,7 +29,7 @@ def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
 
 
 def heights_at(scene: Scene, x: float, y: float) -> Floats:
-    """Return the heights (k,), world metres, at which a vertical line at x, y crosses triangles."""
+    """Return the heights (k,), world meters, at which a vertical line at x, y crosses triangles."""
     heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     return heights + scene.origin[2]
 

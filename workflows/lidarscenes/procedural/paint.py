@@ -1,4 +1,4 @@
-"""Plain colours of generated scenes, by the classes of objects."""
+"""Plain colors of generated scenes, by the classes of objects."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats32, Ints32
-from lidarsim.scene.colours import Colours
+from lidarsim.scene.colors import Colors
 from lidarsim.scene.scene import Scene
 
-# {class of objects: sRGB colours, used in turn}
+# {class of objects: sRGB colors, used in turn}
 _PAINTS = {
     "ground": ["46464a"],
     "pavement": ["a5a097"],
@@ -25,9 +25,9 @@ _PAINTS = {
 _NAMES = tuple(_PAINTS)
 _FIRST = dict(zip(_NAMES, np.cumsum([0, *map(len, _PAINTS.values())]).tolist(), strict=False))
 _PALETTE = tuple(
-    np.array([[[*bytes.fromhex(colour)]]], np.uint8)
-    for colours in _PAINTS.values()
-    for colour in colours
+    np.array([[[*bytes.fromhex(color)]]], np.uint8)
+    for colors in _PAINTS.values()
+    for color in colors
 )
 _TRUNK_M = 0.6  # crowns begin higher
 # z of normals
@@ -37,7 +37,7 @@ _STEEP = 0.65  # maximum of rock
 
 
 def painted(scene: Scene) -> Scene:
-    """Return a scene of `city` or `terrain` with plain colours, by the names of its objects."""
+    """Return a scene of `city` or `terrain` with plain colors, by the names of its objects."""
     numbered = [name.rpartition("-") for name in scene.names]
     kinds = [kind or name for kind, _, name in numbered]
     numbers = [int(number) if kind else 0 for kind, _, number in numbered]
@@ -50,9 +50,9 @@ def painted(scene: Scene) -> Scene:
     face_kind = kind_of_object[scene.face_object]
     faces = _face_geometry(scene)
 
-    def paint(kind: str, mask: Bools, colour: str) -> None:
+    def paint(kind: str, mask: Bools, color: str) -> None:
         """Paint the faces of a kind in a mask (f,)."""
-        image[(face_kind == _NAMES.index(kind)) & mask] = _FIRST[colour]
+        image[(face_kind == _NAMES.index(kind)) & mask] = _FIRST[color]
 
     paint("building", faces.up > _UP, "tiles")
     paint("building", faces.up > _FLAT, "roof")
@@ -61,18 +61,18 @@ def painted(scene: Scene) -> Scene:
     instances = scene.instances
     if instances is not None:
         mesh_parts = [
-            part._replace(colours=Colours(_PALETTE, _part_paint(part.faces, number)))
+            part._replace(colors=Colors(_PALETTE, _part_paint(part.faces, number)))
             for number, part in enumerate(instances.mesh_parts)
         ]
         instances = replace(instances, mesh_parts=tuple(mesh_parts))
-    return replace(scene, colours=Colours(_PALETTE, image), instances=instances)
+    return replace(scene, colors=Colors(_PALETTE, image), instances=instances)
 
 
 class _FaceGeometry(NamedTuple):
     """Slopes and heights of the faces of a scene."""
 
     up: Floats32  # (f,): z of the unit normal
-    height: Floats32  # (f,): of the lowest corner above the lowest point of the object, metres
+    height: Floats32  # (f,): of the lowest corner above the lowest point of the object, meters
 
 
 def _face_geometry(scene: Scene) -> _FaceGeometry:

@@ -36,7 +36,7 @@ class Species:
     height_m: float
     trunk_m: float  # radius above the roots
     bare: float  # share of the height without branches
-    crown: tuple[float, ...]  # lengths of branches, metres, at equal steps up the crown
+    crown: tuple[float, ...]  # lengths of branches, meters, at equal steps up the crown
     angle_deg: tuple[float, float]  # angles of the lowest and the highest branch with the vertical
     rise_deg: float  # angle between the foot of a branch and its end, upwards
     branches: int
@@ -81,7 +81,7 @@ def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> SceneMesh:
     seed
         The same seed gives the same tree.
     root_m
-        Length of the trunk below the ground, metres, above 0; more for slopes.
+        Length of the trunk below the ground, meters, above 0; more for slopes.
 
     Examples
     --------
@@ -118,7 +118,7 @@ def place_instances(
     kind
         (n,): numbers of the meshes.
     positions
-        (n, 3): metres.
+        (n, 3): meters.
     yaw
         (n,): rotations about z, radians.
     scale
@@ -137,7 +137,7 @@ def place_instances(
 
 
 def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the points (k, 3) of a stem from the root to the top, and radii (k,), metres."""
+    """Return the points (k, 3) of a stem from the root to the top, and radii (k,), meters."""
     share = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
     sway = (sway - sway[0]) * share[:, None]
@@ -152,7 +152,7 @@ def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Fl
 def _branches(
     species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Return the points (n, k, 3) of the branches, and radii (n, k), metres."""
+    """Return the points (n, k, 3) of the branches, and radii (n, k), meters."""
     n = species.branches
     share, full_length = _branch_shares(species, rng)
     height = species.height_m * (species.bare + (0.97 - species.bare) * share)
@@ -177,7 +177,7 @@ def _branches(
 
 
 def _branch_shares(species: Species, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return the heights (n,) of branches as shares of the crown, and their lengths (n,), metres.
+    """Return the heights (n,) of branches as shares of the crown, and their lengths (n,), meters.
 
     Branches are denser where they are long, so that they fill the crown evenly.
     """

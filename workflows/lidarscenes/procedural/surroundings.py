@@ -61,7 +61,7 @@ class Views:
     """Hits of rays in all directions from a list of positions."""
 
     directions: Floats  # (n, 3), unit vectors
-    distance: Floats  # (n,), metres; infinite without a hit
+    distance: Floats  # (n,), meters; infinite without a hit
     back: Bools  # (n,), whether the back of a triangle was hit
     normals: Floats  # (n, 3), unit normals of the triangles hit; 0 without a hit
     heights: Floats  # (n,), local z of the hits

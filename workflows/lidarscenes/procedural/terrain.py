@@ -56,7 +56,7 @@ def terrain(
     seed
         The same numbers give the same terrain.
     side_m
-        Length of a side, metres; (0, 0) is in the middle, and z = 0 is the lowest point.
+        Length of a side, meters; (0, 0) is in the middle, and z = 0 is the lowest point.
     trees
         Number of trees, in woods on ground of at most 40 degrees: instances of a mesh for each of
         `SPECIES` in plants.py. Conifers are higher up. Triangles of trees are not counted in

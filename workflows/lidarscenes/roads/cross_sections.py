@@ -289,7 +289,7 @@ def part_counts(surfaces: Sequence[SampledSurface], sag_m: float) -> list[Floats
     Triangles between two cross sections differ from the surface by its bend along the road, which
     shrinks with the square of the distance, and by the twist between two columns, which shrinks
     with the distance. Both are measured in heights where the plan is the same: a curve whose chord
-    is beside it by centimetres is also too high, by this times the slope across the road.
+    is beside it by centimeters is also too high, by this times the slope across the road.
     """
     if not surfaces:
         return []

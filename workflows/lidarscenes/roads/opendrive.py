@@ -20,7 +20,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.declared import about
 from lidarsim.base.validation import checked_fields
 from lidarsim.base.xmlfile import xml_root
-from lidarsim.scene.colours import Colours
+from lidarsim.scene.colors import Colors
 from lidarsim.scene.files.coordinate_systems import middle_of, scale_problem, world_advice
 from lidarsim.scene.files.scene_graph import (
     Content,
@@ -36,11 +36,11 @@ from .elements import UnreadElements, number
 from .lanes import Lane, SectionSurface, lane_sections, section_surfaces
 from .road import Network, Road
 from .road_marks import painted_quads
-from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, colour_of, material_of_lane
+from .road_materials import CARRIAGEWAY, CLASSES, CONCRETE, PAINT, color_of, material_of_lane
 from .road_objects import ObjectBuilder
 from .signals import SignalBuilder
 
-# Roads of a junction lie on each other. These lanes are lower by metres, so that lanes on which
+# Roads of a junction lie on each other. These lanes are lower by meters, so that lanes on which
 # vehicles drive are hit.
 _SINK_OF_NONE_M = 0.005
 _SINK_M = 0.002
@@ -145,18 +145,18 @@ class _RoadReader:
             piece = Piece(points, strip.faces, material=material)
             self._add(f"{lane.type} lane {road.name}/{lane.number}", piece)
         for quads in painted_quads(surface, self._allowance, self._unread):
-            piece = Piece(quads.points, quads.faces, material=f"{PAINT} {quads.colour}")
+            piece = Piece(quads.points, quads.faces, material=f"{PAINT} {quads.color}")
             self._add(f"road mark {road.name}", piece)
 
     def _add(self, name: str, piece: Piece) -> None:
-        """Add triangles to an object, with colours and materials if asked for."""
+        """Add triangles to an object, with colors and materials if asked for."""
         if not len(piece.faces):
             return
-        colours = None
-        if self._options.colours:
-            colours = Colours.plain(colour_of(piece.material), len(piece.faces))
+        colors = None
+        if self._options.colors:
+            colors = Colors.plain(color_of(piece.material), len(piece.faces))
         material = piece.material if self._options.materials else ""
-        self._pieces[name].append(piece._replace(colours=colours, material=material))
+        self._pieces[name].append(piece._replace(colors=colors, material=material))
 
     def _drop_degenerate(self) -> None:
         """Drop triangles without an area, such as of lanes whose width shrinks to zero."""
@@ -180,10 +180,8 @@ class _RoadReader:
                     remaining.append(piece)
                 elif mask.any():
                     face_indices = np.flatnonzero(mask)
-                    colours = None if piece.colours is None else piece.colours.take(face_indices)
-                    remaining.append(
-                        piece._replace(faces=piece.faces[face_indices], colours=colours)
-                    )
+                    colors = None if piece.colors is None else piece.colors.take(face_indices)
+                    remaining.append(piece._replace(faces=piece.faces[face_indices], colors=colors))
             self._pieces[name] = remaining
 
 

@@ -90,7 +90,7 @@ class PlanTable:
 
         Returns their starts on the road.
 
-        The last geometry ends with the road, of `length` metres.
+        The last geometry ends with the road, of `length` meters.
         """
         starts = [positive(geometry, "s") for geometry in geometries]
         first = len(self._bends)

@@ -42,13 +42,13 @@ class _Line(NamedTuple):
     stops: Floats  # (d,), m
     shift: float  # distance to the left of the border, m
     width: float  # m
-    colour: str
+    color: str
 
 
 class PaintedQuads(NamedTuple):
-    """Road marks of a colour."""
+    """Road marks of a color."""
 
-    colour: str
+    color: str
     points: Floats  # (v, 3), m
     faces: Ints  # (f, 3)
 
@@ -56,7 +56,7 @@ class PaintedQuads(NamedTuple):
 def painted_quads(
     surface: SectionSurface, allowance: Allowance, unread: UnreadElements
 ) -> list[PaintedQuads]:
-    """Return the road marks of a lane section, by colours."""
+    """Return the road marks of a lane section, by colors."""
     section = surface.section
     lanes = [*section.all_lanes, *([section.middle] if section.middle else [])]
     knots = [
@@ -68,14 +68,14 @@ def painted_quads(
     if not knots:
         return []
     points = _points_of(surface, knots)
-    quads_of_colours: dict[str, list[Ints]] = {}  # first cross sections of quadrangles
+    quads_of_colors: dict[str, list[Ints]] = {}  # first cross sections of quadrangles
     offset = 0
     for entry in knots:
-        quads_of_colours.setdefault(entry.colour, []).append(offset + entry.quads)
+        quads_of_colors.setdefault(entry.color, []).append(offset + entry.quads)
         offset += len(entry.stations)
     return [
-        PaintedQuads(colour, points, _quads(np.concatenate(quads), offset))
-        for colour, quads in quads_of_colours.items()
+        PaintedQuads(color, points, _quads(np.concatenate(quads), offset))
+        for color, quads in quads_of_colors.items()
     ]
 
 
@@ -102,7 +102,7 @@ class _Knots(NamedTuple):
     second_t: Floats  # (q,): at the following stations, m
     width: float  # m
     quads: Ints  # (p,): cross sections at which quadrangles start
-    colour: str
+    color: str
 
 
 def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
@@ -126,7 +126,7 @@ def _knots_of(line: _Line, surface: SectionSurface, border: Floats) -> _Knots:
         second_t=middle[stations + 1],
         width=line.width,
         quads=quads,
-        colour=line.colour,
+        color=line.color,
     )
 
 
@@ -201,22 +201,22 @@ def _lines_of_mark(
     mark: Element, start: float, stop: float, side: int, allowance: Allowance
 ) -> list[_Line]:
     """Return the lines of a mark: explicit lines, the lines of its type, or lines by its name."""
-    colour = _colour(mark, "white")
+    color = _color(mark, "white")
     width = positive(mark, "width", 0.0) or WIDTH_M
     explicit = mark.findall("explicit/line")
     if explicit:
-        return [_explicit_line(line, start, stop, width, colour) for line in explicit]
+        return [_explicit_line(line, start, stop, width, color) for line in explicit]
     typed = mark.find("type")
     if typed is not None and typed.find("line") is not None:
         width = positive(typed, "width", 0.0) or width
         return [
-            _typed_line(line, start, stop, width, colour, allowance)
+            _typed_line(line, start, stop, width, color, allowance)
             for line in typed.iterfind("line")
         ]
     name = mark.get("type", "")
     if name == "botts dots":
         dots = _dashes(start, stop, _DOT_M, _DOT_SPACE_M, allowance)
-        return [_Line(*dots, 0.0, _DOT_M, colour)]
+        return [_Line(*dots, 0.0, _DOT_M, color)]
     # Of lanes, the lines of a name run from the inside out; of the middle, from left to right.
     broken = _LINES.get(name, (False,))
     shifts = [2 * width * (k - (len(broken) - 1) / 2) for k in range(len(broken))]
@@ -226,13 +226,13 @@ def _lines_of_mark(
             *_dashes(start, stop, DASH_M, SPACE_M if is_broken else 0.0, allowance),
             direction * shift,
             width,
-            colour,
+            color,
         )
         for is_broken, shift in zip(broken, shifts, strict=True)
     ]
 
 
-def _explicit_line(line: Element, start: float, stop: float, width: float, colour: str) -> _Line:
+def _explicit_line(line: Element, start: float, stop: float, width: float, color: str) -> _Line:
     """Return a single line of a mark."""
     first = start + number(line, "sOffset", 0.0)
     last = min(first + positive(line, "length", 0.0), stop)
@@ -242,12 +242,12 @@ def _explicit_line(line: Element, start: float, stop: float, width: float, colou
         np.array([last] if last > first else []),
         number(line, "tOffset", 0.0),
         positive(line, "width", 0.0) or width,
-        colour,
+        color,
     )
 
 
 def _typed_line(
-    line: Element, start: float, stop: float, width: float, colour: str, allowance: Allowance
+    line: Element, start: float, stop: float, width: float, color: str, allowance: Allowance
 ) -> _Line:
     """Return a line of the type of a mark, which repeats its length and space."""
     first = start + max(0.0, number(line, "sOffset", 0.0))
@@ -258,7 +258,7 @@ def _typed_line(
         *dashes,
         number(line, "tOffset", 0.0),
         positive(line, "width", 0.0) or width,
-        _colour(line, colour),
+        _color(line, color),
     )
 
 
@@ -277,7 +277,7 @@ def _dashes(
     return np.asarray(starts, np.float64), np.asarray(np.minimum(starts + length, stop))
 
 
-def _colour(element: Element, default: str) -> str:
-    """Return the colour of a mark or line, by default the standard colour white."""
-    colour = element.get("color") or default
-    return "white" if colour == "standard" else colour[:20]
+def _color(element: Element, default: str) -> str:
+    """Return the color of a mark or line, by default the standard color white."""
+    color = element.get("color") or default
+    return "white" if color == "standard" else color[:20]

@@ -1,4 +1,4 @@
-"""Materials of roads, their colours, and classes of objects."""
+"""Materials of roads, their colors, and classes of objects."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from functools import cache
 import numpy as np
 
 from lidarsim.base.arrays import Bytes
-from lidarsim.scene.colours import as_srgb
+from lidarsim.scene.colors import as_srgb
 from lidarsim.scene.files.scene_graph import ObjectClass
 
 ASPHALT = "asphalt"
 CONCRETE = "concrete"
 EARTH = "earth"
 GRASS = "grass"
-PAINT = "paint"  # a colour may follow: "paint white"
+PAINT = "paint"  # a color may follow: "paint white"
 SIGN = "sign face"
 LAMP = "lamp"
 METAL = "metal"
@@ -118,8 +118,8 @@ CLASSES = {
 
 
 @cache
-def colour_of(material: str) -> Bytes:
-    """Return the sRGB colour (1, 1, 3) of a material."""
+def color_of(material: str) -> Bytes:
+    """Return the sRGB color (1, 1, 3) of a material."""
     return as_srgb(np.array(_LINEAR.get(material, _OTHER)).reshape(1, 1, 3))
 
 

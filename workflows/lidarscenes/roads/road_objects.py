@@ -172,7 +172,7 @@ class ObjectBuilder:
             starts, stops = self._dashed(np.array(line), marking)
             if len(starts):
                 lift = np.array([0, 0, max(number(marking, "zOffset", LIFT_M), LIFT_M)])
-                paint = f"{PAINT} {_paint_colour(marking.get('color'))}"
+                paint = f"{PAINT} {_paint_color(marking.get('color'))}"
                 yield painted_strips(starts + lift, stops + lift, width, paint)
 
     def _dashed(self, line: Floats, marking: Element) -> tuple[Floats, Floats]:
@@ -546,9 +546,9 @@ def _sheet(first: Floats, second: Floats, steps: Ints) -> Piece:
 def _paint_of(element: Element) -> str:
     """Return the paint of an object that is a mark."""
     stated = element.find("material")
-    return f"{PAINT} {_paint_colour(None if stated is None else stated.get('roadMarkColor'))}"
+    return f"{PAINT} {_paint_color(None if stated is None else stated.get('roadMarkColor'))}"
 
 
-def _paint_colour(colour: str | None) -> str:
-    """Return the colour of paint, by default the standard colour white."""
-    return "white" if colour in (None, "", "standard") else colour[:MAX_SHOWN]
+def _paint_color(color: str | None) -> str:
+    """Return the color of paint, by default the standard color white."""
+    return "white" if color in (None, "", "standard") else color[:MAX_SHOWN]

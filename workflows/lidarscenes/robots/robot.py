@@ -16,7 +16,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.elementary import interp, sin_cos
 from lidarsim.base.errors import LidarError, message_of
 from lidarsim.base.signatures import ReadableSignature, shown_readably
-from lidarsim.base.tables import METRES, RADIANS, Quantity, read_table
+from lidarsim.base.tables import METERS, RADIANS, Quantity, read_table
 from lidarsim.base.textfile import read_text
 from lidarsim.base.time_units import TimeUnit
 from lidarsim.base.validation import as_array, checked
@@ -62,7 +62,7 @@ class Joint:
     axis
         float64 (3,): unit vector about or along which the joint moves, in the joint's frame.
     limits
-        Smallest and largest value, radians or metres; None without limits.
+        Smallest and largest value, radians or meters; None without limits.
     mimic
         Another joint, and factor and offset of its value; None for a joint with its own value.
     """
@@ -85,7 +85,7 @@ class Joint:
 class Robot:
     """Links, and the joints between links, read by `load_robot`.
 
-    Values of joints are radians or metres. `joints` of the methods are a table (a file with a
+    Values of joints are radians or meters. `joints` of the methods are a table (a file with a
     header), or a mapping: of a joint's name to its value, or, with time_s, to its values at these
     seconds by the trajectory's clock. Values in between are linear in time. A joint without values
     follows the joint that it mimics, else it is at zero, or at its limit nearest to zero.
@@ -350,7 +350,7 @@ class Robot:
             Quantity(
                 joint.name,
                 (),
-                METRES if joint.kind == "prismatic" else RADIANS,
+                METERS if joint.kind == "prismatic" else RADIANS,
                 "m" if joint.kind == "prismatic" else "rad",
                 exact=True,
             )
@@ -385,7 +385,7 @@ class Hinge:
     before: Floats  # (4, 4): from the joint's frame to the frame behind the hinge before
     axis: Floats  # (3,): unit vector, in the joint's frame
     slides: bool  # along its axis; else it turns
-    values: Floats  # (k,): radians or metres
+    values: Floats  # (k,): radians or meters
 
 
 @dataclass(frozen=True, eq=False)
@@ -518,7 +518,7 @@ class LinkPath:
 class _LinkMotion(NamedTuple):
     """Poses and velocities of a frame of the robot at k times, in the scene frame."""
 
-    positions: Floats  # (3, k): metres
+    positions: Floats  # (3, k): meters
     rotations: Floats  # (3, 3, k)
     anchors: Floats  # (3, k): points of the frame that have the velocities
     velocities: Floats  # (3, k): m/s

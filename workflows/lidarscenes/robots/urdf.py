@@ -28,7 +28,7 @@ from lidarsim.base.words import printable
 from lidarsim.base.xmlfile import xml_root
 from lidarsim.motion.rotations import rotations_of
 from lidarsim.scene.actors import join_meshes
-from lidarsim.scene.colours import Colours, as_bytes
+from lidarsim.scene.colors import Colors, as_bytes
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.mesh_options import OpacityMode
 from lidarsim.scene.files.meshfile import load_meshes, warn
@@ -51,7 +51,7 @@ def load_robot(
     path: str | Path,
     *,
     opacity: OpacityMode = "mask",
-    colours: bool = False,
+    colors: bool = False,
     materials: bool = False,
     assets: str | Path | None = None,
     tell: Callable[[str], None] = warn,
@@ -71,9 +71,9 @@ def load_robot(
         A .urdf file; a .xacro has to be expanded before.
     opacity
         Use of transparent textures (`load_meshes`).
-    colours, materials
-        Whether colours and names of materials are read. A material of the URDF applies to shapes,
-        and to meshes without colours, or without materials.
+    colors, materials
+        Whether colors and names of materials are read. A material of the URDF applies to shapes,
+        and to meshes without colors, or without materials.
     assets
         A further folder whose mesh files, and the files that these name, may be read: a
         package, or a folder of packages.
@@ -99,7 +99,7 @@ def load_robot(
             root=root,
             size=size,
             opacity=opacity,
-            colours=colours,
+            colors=colors,
             materials=materials,
             assets=folders,
             tell=tell,
@@ -298,7 +298,7 @@ class _LinkMeshes:
     root: Element
     size: int  # size of the file, bytes
     opacity: OpacityMode
-    colours: bool
+    colors: bool
     materials: bool
     assets: tuple[Path, ...]  # resolved folders; all files come from these folders
     tell: Callable[[str], None]
@@ -324,7 +324,7 @@ class _LinkMeshes:
             if shape is None:
                 raise LidarError("a <visual> has no <geometry>.")
             origin = _origin(visual)
-            colour = self._colour(visual)
+            color = self._color(visual)
             scale, parts = self._shape(shape)
             if not scale.all():
                 self._flat.append(link)
@@ -332,8 +332,8 @@ class _LinkMeshes:
             for part in parts:
                 self._allowance.take(part.vertices.nbytes + part.faces.nbytes)
                 mesh = part.moved(part.name, origin[:3, :3] * scale, origin[:3, 3])
-                if colour is not None and mesh.colours is None:
-                    mesh = replace(mesh, colours=Colours.plain(colour, len(mesh.faces)))
+                if color is not None and mesh.colors is None:
+                    mesh = replace(mesh, colors=Colors.plain(color, len(mesh.faces)))
                 if self.materials and mesh.materials is None:
                     mesh = replace(mesh, materials=_material(visual))
                 yield mesh
@@ -348,16 +348,16 @@ class _LinkMeshes:
                 names = ", ".join(dict.fromkeys(links[:3])) + ", …" * (len(links) > 3)
                 self.tell(f"{self.path} contains links that {reason} and were skipped: {names}.")
 
-    def _colour(self, visual: Element) -> Bytes | None:
-        """Return the colour (1, 1, 3) of a visual, or of its material in the robot, or None."""
+    def _color(self, visual: Element) -> Bytes | None:
+        """Return the color (1, 1, 3) of a visual, or of its material in the robot, or None."""
         material = visual.find("material")
-        if not self.colours or material is None:
+        if not self.colors or material is None:
             return None
-        colour = material.find("color")
-        colour = self._shared.get(material.get("name", "")) if colour is None else colour
-        if colour is None:
+        color = material.find("color")
+        color = self._shared.get(material.get("name", "")) if color is None else color
+        if color is None:
             return None
-        return as_bytes(_numbers(colour, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
+        return as_bytes(_numbers(color, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
 
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
         """Return factors (3,) along the axes, which may be zero, and the meshes to be scaled."""
@@ -410,7 +410,7 @@ class _LinkMeshes:
                 path,
                 up_axis="z",
                 opacity=self.opacity,
-                colours=self.colours,
+                colors=self.colors,
                 materials=self.materials,
                 assets=self.assets,
                 tell=self.tell,

@@ -1,4 +1,4 @@
-"""Scenes as .glb files: an object is a node, and its masks and colours are materials.
+"""Scenes as .glb files: an object is a node, and its masks and colors are materials.
 
 trimesh is not used: it writes one material for a mesh.
 """
@@ -17,7 +17,7 @@ from PIL import Image
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Indices, Ints32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.vectors import applied, matmul, turned
-from lidarsim.scene.colours import LINEAR
+from lidarsim.scene.colors import LINEAR
 from lidarsim.scene.files.scene_graph import GENERATOR
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_instances import SceneInstance
@@ -30,7 +30,7 @@ _TYPES = {"f": 5126, "u": 5125}  # {kind of NumPy type: component type}
 
 
 def glb_of(scene: Scene) -> bytes:
-    """Return a .glb file with all objects of a scene but the actors, in metres, Y-up.
+    """Return a .glb file with all objects of a scene but the actors, in meters, Y-up.
 
     Nodes have the scene's origin, in double precision, so that scenes far from zero lose no digits.
 
@@ -114,17 +114,17 @@ class _Writer:
 
         `index` (n,) are rows of the triangles' materials in `names`.
         """
-        colours = mesh.colours
-        image = np.full(len(index), -1) if colours is None else colours.image[: len(index)]
+        colors = mesh.colors
+        image = np.full(len(index), -1) if colors is None else colors.image[: len(index)]
         points: int | None = None
         primitives = []
         appearances = np.unique(np.column_stack([image, index]), axis=0)
         for number, material in appearances.tolist():
             rows = np.flatnonzero((image == number) & (index == material))
             texture = uv = tints = None
-            if colours is not None:
-                shown = colours.take(rows)
-                texture = colours.images[number]
+            if colors is not None:
+                shown = colors.take(rows)
+                texture = colors.images[number]
                 uv = None if texture.size == 3 else shown.uv
                 if shown.corners is not None and (shown.corners < 255).any():
                     tints = shown.corners
@@ -145,12 +145,12 @@ class _Writer:
         self, mesh: SceneMesh, first: int, index: Ints32, names: tuple[str, ...]
     ) -> list[dict[str, Any]]:
         """Return a primitive for each mask, whose triangles start at `first`."""
-        colours = mesh.colours
+        colors = mesh.colors
         primitives = []
         for cut in mesh.cutouts:
             rows = np.arange(first, first + len(cut.uv))
             # A material has room for one texture with its coordinates, which is the mask.
-            tints = None if colours is None else colours.take(rows).means()[:, None].repeat(3, 1)
+            tints = None if colors is None else colors.take(rows).means()[:, None].repeat(3, 1)
             attributes = self._corners(mesh, rows, cut.uv, tints)
             material = self._material(cut.mask, names[index[first]])
             primitives.append({"attributes": attributes, "material": material})
@@ -194,7 +194,7 @@ class _Writer:
         return self._put("bufferViews", view)
 
     def _material(self, image: AnyArray | None, name: str) -> int:
-        """Return the number of the material of a mask, bool (h, w), an image, colour or name.
+        """Return the number of the material of a mask, bool (h, w), an image, color or name.
 
         The material is added on its first use.
         """

@@ -37,7 +37,7 @@ class Lidar(NamedTuple):
     data
         Content of a data file of the sensor.
     range_m
-        Shortest and longest range, metres; the longest may be infinite.
+        Shortest and longest range, meters; the longest may be infinite.
     matrix, model_matrix
         From the frames of the lidar and of the model to the world, (4, 4).
     left_out

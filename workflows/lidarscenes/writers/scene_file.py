@@ -27,9 +27,9 @@ SUFFIXES = (".ply", ".glb", ".obj")
 def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
-    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colours
-    are kept in .glb only: in .ply and .obj, triangles are solid and grey. Where a triangle has both
-    a mask and a texture, its colour is the texture's mean. All formats store metres; .glb is Y-up,
+    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colors
+    are kept in .glb only: in .ply and .obj, triangles are solid and gray. Where a triangle has both
+    a mask and a texture, its color is the texture's mean. All formats store meters; .glb is Y-up,
     by its standard, .ply and .obj are Z-up. Coordinates are world coordinates; .ply and .glb have
     single precision, .glb from the scene's origin. The coordinate system, `Scene.epsg`, is kept. A
     comment, or the generator of .glb, tells

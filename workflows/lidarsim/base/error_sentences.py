@@ -25,7 +25,7 @@ _EXAMPLES = {
     "Mounted": "Mounted(sensor, Pose((1, 0, 2)), 'roof')",
     "Navigation": "Navigation(imu=Imu(), gnss=Gnss())",
     "Noise": "Noise(range_m=0.01)",
-    "Planning": "Planning((0, 0), (10, 0), centres=[(5, 0)], radii=2)",
+    "Planning": "Planning((0, 0), (10, 0), centers=[(5, 0)], radii=2)",
     "Pose": "Pose((0, 0, 1), yaw_deg=90)",
     "Returns": "Returns('dual')",
     "Scene": "Scene.load('hall.glb')",

@@ -47,7 +47,7 @@ class _Interrupt:
 
 
 def _drops_errors(frame: FrameType | None) -> bool:
-    """Return True if an object may be being finalised: Python drops errors raised there."""
+    """Return True if an object may be being finalized: Python drops errors raised there."""
     while frame is not None:
         code = frame.f_code
         if code.co_name == "__del__" or code.co_filename in _WEAK:

@@ -32,7 +32,7 @@ def draw_with(drawers: Mapping[str, str]) -> None:
 
 
 def table_of(rows: Iterable[tuple[str, str]]) -> str:
-    """Return an HTML table of names and values, in the colours of the notebook."""
+    """Return an HTML table of names and values, in the colors of the notebook."""
     from html import escape
 
     left = " style='text-align:left'"

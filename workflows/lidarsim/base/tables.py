@@ -22,11 +22,11 @@ from .time_units import SECONDS, TimeUnit, seconds_of
 from .words import alternatives, did_you_mean_each, fits, in_yaml, joined, printable, rounded
 
 # {unit: number of these units in the first unit}
-METRES = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
+METERS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "km": 1e-3}
 DEGREES = {"deg": 1.0, "rad": np.pi / 180}
 RADIANS = {"rad": 1.0, "deg": 180 / np.pi}
 NUMBERS = {"": 1.0}
-_UNIT_WORDS = {"s": "seconds", "deg": "degrees", "rad": "radians", "m": "metres"}
+_UNIT_WORDS = {"s": "seconds", "deg": "degrees", "rad": "radians", "m": "meters"}
 _UNIT_SPELLINGS = {
     "s": ("sec", "secs", "second", "seconds"),
     "ms": ("msec", "msecs", "millisecond", "milliseconds"),

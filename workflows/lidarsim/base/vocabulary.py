@@ -41,9 +41,9 @@ OPTIONAL_COLUMNS = (
     "green",
     "blue",
 )
-COMPOSED_COLUMNS = ("rgb", "normals")  # colours that pictures make of several columns
+COMPOSED_COLUMNS = ("rgb", "normals")  # colors that pictures make of several columns
 
-# Metres in each unit.
+# Meters in each unit.
 UNITS_M = {
     "um": 1e-6,
     "mm": 1e-3,
@@ -61,7 +61,7 @@ WAIT_S = 10.0  # wait for partitions that are empty at the start of a run
 QUEUE_S = 3600.0  # limit for both waits, if workers are jobs in a queue
 PATIENCE_S = 60.0  # wait for partitions that become empty; a nanny needs a few seconds
 
-# EPSG codes of systems for maps of the whole Earth, whose metres are true along a line at most:
+# EPSG codes of systems for maps of the whole Earth, whose meters are true along a line at most:
 # Mercator and cylindrical projections, such as Web Mercator, EPSG:3857.
 WORLD_EPSG = frozenset({3395, 3410, 3785, 3832, 3857, 3975, 4087, 4088, 6933, 32662, 54004})
 OF_THE_WORLD = (

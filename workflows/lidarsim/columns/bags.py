@@ -46,7 +46,7 @@ class BagMessage(NamedTuple):
 
     topic: str
     time_ns: int  # at which the message was recorded
-    content: Any  # the deserialised message
+    content: Any  # the deserialized message
 
 
 def is_bag(path: Path) -> bool:

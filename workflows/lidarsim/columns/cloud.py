@@ -34,7 +34,7 @@ class CloudLike(Protocol):
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), metres, in the type of the positions."""
+        """Lowest and highest coordinates, (2, 3), meters, in the type of the positions."""
 
     @property
     def table(self) -> tuple[Column, ...]:
@@ -80,7 +80,7 @@ class Cloud(CloudDisplay):
     Parameters
     ----------
     positions
-        float32 or float64 (n, 3), metres, world coordinates.
+        float32 or float64 (n, 3), meters, world coordinates.
     columns
         {name: (n,)}: the other columns, of `lidarsim.columns.table` or custom ones.
     custom_columns
@@ -199,7 +199,7 @@ class Cloud(CloudDisplay):
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), metres, or zeros for an empty cloud."""
+        """Lowest and highest coordinates, (2, 3), meters, or zeros for an empty cloud."""
         if not len(self):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])

@@ -38,7 +38,7 @@ class CloudFile:
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), metres.
+        """Lowest and highest coordinates, (2, 3), meters.
 
         All points are read.
         """

@@ -31,7 +31,7 @@ class PartColumns:
     # (k,): hit counters that are not 0 (`Scene.counters`); an instance has one for all triangles
     triangles: Ints32
     hits: Ints  # (k,): number of hits of each of these counters
-    # (scans,) and (scans, samples, 3): hits of each scan, and ends of sampled rays, metres, local
+    # (scans,) and (scans, samples, 3): hits of each scan, and ends of sampled rays, meters, local
     # coordinates, NaN in unused rows; empty in a part that is not stored.
     scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))
     samples: Floats32 = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
@@ -72,9 +72,9 @@ class PartColumns:
         table
             Columns beside the positions.
         precision_m
-            Size of a cell, metres.
+            Size of a cell, meters.
         origin
-            (3,): world position of cell 0, metres.
+            (3,): world position of cell 0, meters.
         row_selection
             Rows of the points, as integers or a slice.
         sweeps
@@ -101,7 +101,7 @@ def decimals_of(precision_m: float) -> int:
 
 
 def positions_of(cells: AnyArray, precision_m: float, origin: Floats | float) -> Floats:
-    """Return world coordinates, metres, of points in cells of `precision_m`.
+    """Return world coordinates, meters, of points in cells of `precision_m`.
 
     Cells are whole numbers, (n, 3) with an origin (3,), or (n,) along an axis with a coordinate.
     """

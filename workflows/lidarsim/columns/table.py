@@ -1,6 +1,6 @@
 """The table of columns: all quantities of points, and their sources.
 
-Sensors, stages, parts, exporters, viewer, colouring, report and documentation read this table;
+Sensors, stages, parts, exporters, viewer, coloring, report and documentation read this table;
 nothing else lists columns. Your own columns are `Column` objects in `Survey.columns`.
 """
 
@@ -18,7 +18,7 @@ from ..base.validation import checked_fields
 from ..base.words import did_you_mean
 from .waveforms import WAVEFORM, column_type
 
-Kind = Literal["number", "label"]  # a colour scale, or a colour for each value
+Kind = Literal["number", "label"]  # a color scale, or a color for each value
 Scale = Literal["linear", "logarithmic"]
 
 NO_SURFACE = "no surface"  # instead of an object's name
@@ -55,11 +55,11 @@ class Column:
     coordinates
         Coordinate system of the values: "world", "sensor", or "" for none.
     kind
-        Display of the values: "number" on a colour scale, "label" with a colour for each value.
+        Display of the values: "number" on a color scale, "label" with a color for each value.
     file_name
         Usual name of the column in files.
     scale
-        Colour scale of numbers. "linear", for positions, angles, times and numbers of things; or
+        Color scale of numbers. "linear", for positions, angles, times and numbers of things; or
         "logarithmic", for energies and the like: where the values differ by large factors, equal
         factors have equal distances on the scale.
 
@@ -240,11 +240,11 @@ OPTIONAL = (
         Column(f"origin_{axis}", "float64", "m", f"{axis} of the ray's origin", coordinates="world")
         for axis in "xyz"
     ),
-    Column("red", "uint8", "", "red of the surface, sRGB; what has no colour is grey, 188"),
+    Column("red", "uint8", "", "red of the surface, sRGB; what has no color is gray, 188"),
     Column("green", "uint8", "", "green of the surface, sRGB"),
     Column("blue", "uint8", "", "blue of the surface, sRGB"),
 )
-COLOURS = ("red", "green", "blue")
+COLORS = ("red", "green", "blue")
 
 TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
 

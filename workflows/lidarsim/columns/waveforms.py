@@ -9,7 +9,7 @@ import numpy as np
 from ..base.arrays import AnyArray, Floats, Records
 
 WAVEFORM = "waveform"  # name of the column in parts; of cloud files, only LAS holds waveforms
-ZERO = 2048  # digitised value of 0; noise is also negative
+ZERO = 2048  # digitized value of 0; noise is also negative
 FAINTEST = -126  # exponent of the faintest waveforms: 2**FAINTEST is a normal float32
 
 
@@ -19,7 +19,7 @@ def record(samples: int) -> np.dtype[np.void]:
     A sample is `(samples - ZERO) * 2.0**exponent`, in units of energy: the height of a returned
     pulse that is as narrow as the sent pulse is its energy. Sample 0 is `begin` sample steps after
     firing. The return is at `location_ps` after sample 0. `toward` is the direction to the sensor,
-    times half the distance that light travels in a picosecond, metres, in the frame of the points.
+    times half the distance that light travels in a picosecond, meters, in the frame of the points.
     """
     return np.dtype(
         [

@@ -43,7 +43,7 @@ NEAREST_M = 1e-3  # energies do not grow below this distance
 NEAR_NM = 905.0
 FAR_NM = 1550.0
 POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
-DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
+DARKEST = 1e-3  # least reflectance of a color, so that every hit is a return
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass"]
@@ -117,7 +117,7 @@ class Material:
         allowed("from 0 to 1, or texture"),
         about(
             "share of light that is scattered; by default 0.5, for glass and whole mirrors "
-            "0; texture: the luminance of the colour that was hit"
+            "0; texture: the luminance of the color that was hit"
         ),
     ] = None
     semantic_class: Annotated[SemanticClass, about("value of the column class", alias="class")] = 0
@@ -267,7 +267,7 @@ class Material:
 
     @property
     def _suits_leaves(self) -> bool:
-        """Whether leaves can have this material, which only scatters light and needs no colours."""
+        """Whether leaves can have this material, which only scatters light and needs no colors."""
         scatters_otherwise = self.transparent != "none" or self.retro or self.roughness is not None
         return (
             not (scatters_otherwise or self.specular_reflectance) and self.reflectance != "texture"
@@ -293,7 +293,7 @@ class Material:
             )
 
     def share(self, wavelength_nm: float) -> float:
-        """Return the share of light that is scattered, for a texture where it lacks a colour."""
+        """Return the share of light that is scattered, for a texture where it lacks a color."""
         if self.spectrum is not None:
             at_905_nm, at_1550_nm = reflectances()[self.spectrum].shares
             # The nearer measurement: between both wavelengths, leaves absorb more than at either.
@@ -566,7 +566,7 @@ class MaterialTable:
     """Materials of kinds of surfaces: arrays with a value for each kind."""
 
     reflectance: Floats
-    scale: Floats  # factor of the luminance of colours; 0 where the reflectance is a number
+    scale: Floats  # factor of the luminance of colors; 0 where the reflectance is a number
     roughness: Floats  # 0 for no gloss
     metalness: Floats
     retro: Bools
@@ -645,13 +645,13 @@ class MaterialTable:
 
     @property
     def textured(self) -> bool:
-        """Whether the reflectance of any surface is its colour."""
+        """Whether the reflectance of any surface is its color."""
         return bool(self.scale.any())
 
     def shares(self, kind_indices: Integers, luminance: Floats | None) -> Floats:
         """Return the share of light that surfaces scatter, by their kinds (n,): (n,).
 
-        `luminance` (n,) is the luminance of the hit colours, if the table is `textured`.
+        `luminance` (n,) is the luminance of the hit colors, if the table is `textured`.
         """
         shares = self.reflectance[kind_indices]
         if luminance is not None:
@@ -666,7 +666,7 @@ class MaterialTable:
         """Return the share of light that surfaces return, by their kinds (n,): (n,).
 
         The share is 1 for a white surface hit at right angles. `cosine` (n,) is the cosine of the
-        angle of incidence; `luminance` (n,) is the luminance of the hit colours, if the table is
+        angle of incidence; `luminance` (n,) is the luminance of the hit colors, if the table is
         `textured`.
         """
         shares = self.shares(kind_indices, luminance)
@@ -695,7 +695,7 @@ def gloss(cosine: Floats, roughness: Floats) -> Floats:
 
 
 def fresnel(cosine: Any, index: Any = GLASS_INDEX) -> Any:
-    """Return the share of unpolarised light that a surface reflects (Fresnel's equations).
+    """Return the share of unpolarized light that a surface reflects (Fresnel's equations).
 
     `index` is the refractive index behind the surface over the index before it. Where `index` is
     below 1 and the cosine is small, all light is reflected.
@@ -726,7 +726,7 @@ def within_water(mirrored: Any, reflectance: Any) -> Any:
 
 
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
-    """Return the energy from white surfaces hit at right angles, by distance in metres."""
+    """Return the energy from white surfaces hit at right angles, by distance in meters."""
     distance = np.maximum(distance, NEAREST_M)
     nearer = np.square(REFERENCE_M / distance)
     return nearer * exp(-2 * extinction * distance) if extinction else nearer

@@ -164,7 +164,7 @@ class Particles(NamedTuple):
 
 
 def rain(mm_h: float) -> Particles:
-    """Return the drops of a rain of `mm_h` millimetres an hour (Marshall and Palmer 1948).
+    """Return the drops of a rain of `mm_h` millimeters an hour (Marshall and Palmer 1948).
 
     A drop mirrors light at its front and, on the axis, at its back, by geometrical optics: with
     Fresnel's r = ((n-1)/(n+1))², its reflectance is (r + r (1-r)² (n/(2-n))²) / 4.
@@ -226,7 +226,7 @@ def dust(mg_m3: float) -> tuple[float, float]:
 
 
 def reach(min_range_m: float, max_range_m: float) -> tuple[float, float]:
-    """Return the shortest and the longest range of particles, metres, for a sensor's ranges."""
+    """Return the shortest and the longest range of particles, meters, for a sensor's ranges."""
     return max(min_range_m, NEAREST_M), min(max_range_m, FARTHEST_M)
 
 
@@ -239,24 +239,24 @@ class Air(NamedTuple):
     """
 
     extinction: float  # 1/m
-    exit_m: float  # diameter of the beam where it leaves the sensor, metres
+    exit_m: float  # diameter of the beam where it leaves the sensor, meters
     divergence: float  # full angle, radians
     overlap_m: float  # nearest range where the receiver sees the beam completely
 
     def width(self, distance: Floats) -> Floats:
-        """Return the diameters of the beam at distances (n,), metres: (n,)."""
+        """Return the diameters of the beam at distances (n,), meters: (n,)."""
         return np.asarray(hypot(self.exit_m, self.divergence * distance))
 
     def white_energy(self, distance: Any) -> Any:
-        """Return the energy of a white disc that fills the beam, at distances in metres."""
+        """Return the energy of a white disc that fills the beam, at distances in meters."""
         effective_m = np.maximum(distance, max(self.overlap_m, 1e-3))
         transmission = exp(-2 * self.extinction * distance)
         return np.square(REFERENCE_M / effective_m) * np.maximum(transmission, MIN_TRANSMISSION)
 
     def smallest(self, particles: Particles, energy: float, distance: Floats) -> Floats:
-        """Return the diameters of particles that return an energy, millimetres: (n,).
+        """Return the diameters of particles that return an energy, millimeters: (n,).
 
-        `distance` (n,) is in metres; the diameter is inf where no particle returns the energy.
+        `distance` (n,) is in meters; the diameter is inf where no particle returns the energy.
         """
         share = energy / (particles.reflectance * self.white_energy(distance))
         diameter_mm = 1000 * self.width(distance) * np.sqrt(share)
@@ -272,7 +272,7 @@ class Air(NamedTuple):
     ) -> float:
         """Return the mean number of particles in a beam that return at least an energy.
 
-        Particles are counted from `start_m` to `stop_m`, ranges in metres.
+        Particles are counted from `start_m` to `stop_m`, ranges in meters.
         """
         distance = geomspace(start_m, max(stop_m, start_m * 1.001), NODES)
         return float(np.trapezoid(self.rate(particles, energy, distance), distance))
@@ -280,7 +280,7 @@ class Air(NamedTuple):
     def cloud(self, backscatter: float, starts: Floats, stops: Floats) -> Floats:
         """Return the energies (n,) that fog or dust returns from slabs that fill the beam.
 
-        `starts` and `stops` (n,) are ranges in metres; energies are means by Simpson's rule.
+        `starts` and `stops` (n,) are ranges in meters; energies are means by Simpson's rule.
         """
         middle = (starts + stops) / 2
         slab = stops - starts

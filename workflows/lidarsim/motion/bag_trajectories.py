@@ -41,7 +41,7 @@ class TimedPoses(NamedTuple):
     """Poses of a carrier."""
 
     seconds: Floats  # (k,): by the clock of the bag
-    positions: Floats  # (k, 3): metres
+    positions: Floats  # (k, 3): meters
     quaternions: Floats | None  # (k, 4): x, y, z, w; None if the bag has none
 
 
@@ -66,7 +66,7 @@ def read_bag(path: Path, topic: str | None, origin: Origin) -> TimedPoses:
         space; or, for a frame of /tf, «/tf:FRAME». None if the bag has poses of one topic or
         frame.
     origin
-        For NavSatFix: latitude and longitude, degrees, and height, metres, of the world's zero.
+        For NavSatFix: latitude and longitude, degrees, and height, meters, of the world's zero.
         None for the first fix.
 
     Raises
@@ -119,7 +119,7 @@ def _chosen(labels: Sequence[str], topic: str | None) -> str:
 
 
 def _row_of(pose: Any) -> list[float]:
-    """Return x, y, z (metres) and the quaternion x, y, z, w of a Pose or a Transform message."""
+    """Return x, y, z (meters) and the quaternion x, y, z, w of a Pose or a Transform message."""
     position = pose.position if hasattr(pose, "position") else pose.translation
     orientation = pose.orientation if hasattr(pose, "orientation") else pose.rotation
     return [

@@ -33,7 +33,7 @@ from ..base.random_numbers import Purpose, named_seed, normal
 from ..base.validation import checked_fields
 from ..base.vectors import applied, hypot, into_axes, length, matmul, turned
 from .rotations import rotation_sines
-from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, full_poses, velocities
+from .trajectory import AT_CENTER, CENTER, Pose, Trajectory, full_poses, velocities
 
 WHITE = Purpose(41, "white noise of an instrument")
 DRIVEN = Purpose(42, "steps of an instrument's bias")
@@ -50,7 +50,7 @@ GeodeticPosition = Annotated[
 ]
 TurnNoise = Annotated[float, Field(ge=0, le=100)]  # noise of a gyroscope
 SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # noise of an accelerometer
-Deviation = Annotated[float, Field(ge=0, le=1e6)]  # metres
+Deviation = Annotated[float, Field(ge=0, le=1e6)]  # meters
 Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
 Skew = Annotated[float, Field(ge=0, le=10)]  # degrees
 Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
@@ -74,7 +74,7 @@ class Imu:
     rate_hz: Annotated[
         float, about("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
     ] = 200.0
-    mount: Annotated[Pose, AT_CENTRE, about("pose in the carrier frame")] = CENTRE
+    mount: Annotated[Pose, AT_CENTER, about("pose in the carrier frame")] = CENTER
     gyroscope_noise_density: Annotated[TurnNoise, about("angle random walk, rad/s/sqrt(Hz)")] = 0.0
     gyroscope_bias: Annotated[
         TurnNoise,
@@ -117,7 +117,7 @@ class Gnss:
     """
 
     rate_hz: Annotated[float, about("positions a second", ge=0.0001, le=1000)] = 10.0
-    mount: Annotated[Pose, AT_CENTRE, about("pose of the antenna in the carrier frame")] = CENTRE
+    mount: Annotated[Pose, AT_CENTER, about("pose of the antenna in the carrier frame")] = CENTER
     horizontal_m: Annotated[
         Deviation, about("standard deviation of white noise to the east and north")
     ] = 0.0
@@ -142,7 +142,7 @@ class Gnss:
     origin: Annotated[
         GeodeticPosition | None,
         about(
-            "latitude and longitude, degrees, and ellipsoidal height, metres, of the "
+            "latitude and longitude, degrees, and ellipsoidal height, meters, of the "
             "world's zero, x to the east and y to the north; by default by world.epsg",
             [48.7758, 9.1829, 290.0],
         ),
@@ -198,7 +198,7 @@ class Fixes(NamedTuple):
     """Consecutive positions of a GNSS receiver's antenna."""
 
     times_ns: Ints  # (k,): since the survey's start
-    positions: Floats  # (k, 3): metres, scene coordinates
+    positions: Floats  # (k, 3): meters, scene coordinates
 
 
 class InstrumentedDrive(Protocol):
@@ -366,7 +366,7 @@ def _bridging_errors(
 class _Motion(NamedTuple):
     """Motion of an instrument, in the scene frame."""
 
-    positions: Floats  # (k, 3): metres
+    positions: Floats  # (k, 3): meters
     rotations: Floats  # (k, 3, 3)
     velocities: Floats  # (k, 3): m/s
 
@@ -458,7 +458,7 @@ class _Errors:
 
 
 def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
-    """Return latitudes and longitudes, degrees, and ellipsoidal heights, metres: (k, 3).
+    """Return latitudes and longitudes, degrees, and ellipsoidal heights, meters: (k, 3).
 
     Through geocentric coordinates of WGS 84; Bowring's (1985) latitude is exact to 1e-9 degrees
     below a height of 10 km.
@@ -466,9 +466,9 @@ def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
     Parameters
     ----------
     positions
-        (k, 3): metres east, north and up of the origin.
+        (k, 3): meters east, north and up of the origin.
     origin
-        Latitude and longitude, degrees, and ellipsoidal height, metres.
+        Latitude and longitude, degrees, and ellipsoidal height, meters.
     """
     x, y, z = _geocentric(positions, origin)
     level = hypot(x, y)
@@ -489,10 +489,10 @@ def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
 def _geocentric(
     positions: Floats, origin: tuple[float, float, float]
 ) -> tuple[Floats, Floats, Floats]:
-    """Return geocentric x, y and z (k,), metres, of positions (k, 3) in metres.
+    """Return geocentric x, y and z (k,), meters, of positions (k, 3) in meters.
 
     Positions are east, north and up of the origin: latitude and longitude, degrees, and ellipsoidal
-    height, metres.
+    height, meters.
     """
     sp, cp = sin_cos_of(math.radians(origin[0]))
     sl, cl = sin_cos_of(math.radians(origin[1]))
@@ -505,14 +505,14 @@ def _geocentric(
 
 
 def local_positions(coordinates: Floats, origin: tuple[float, float, float]) -> Floats:
-    """Return positions east, north and up of an origin (k, 3), metres, the inverse of `geodetic`.
+    """Return positions east, north and up of an origin (k, 3), meters, the inverse of `geodetic`.
 
     Parameters
     ----------
     coordinates
-        (k, 3): latitudes and longitudes, degrees, and ellipsoidal heights, metres.
+        (k, 3): latitudes and longitudes, degrees, and ellipsoidal heights, meters.
     origin
-        Latitude and longitude, degrees, and ellipsoidal height, metres.
+        Latitude and longitude, degrees, and ellipsoidal height, meters.
     """
     (sp, cp), (sl, cl) = (sin_cos_of(math.radians(angle)) for angle in origin[:2])
     x, y, z = (_cartesian(coordinates) - _cartesian(np.array([origin], np.float64))).T
@@ -522,7 +522,7 @@ def local_positions(coordinates: Floats, origin: tuple[float, float, float]) -> 
 
 
 def _cartesian(coordinates: Floats) -> Floats:
-    """Return geocentric coordinates (k, 3), metres, of latitudes, longitudes and heights (k, 3)."""
+    """Return geocentric coordinates (k, 3), meters, of latitudes, longitudes and heights (k, 3)."""
     latitude, longitude, height = coordinates.T
     sp, cp = sin_cos(np.radians(latitude))
     sl, cl = sin_cos(np.radians(longitude))
@@ -531,7 +531,7 @@ def _cartesian(coordinates: Floats) -> Floats:
     return np.column_stack([level * cl, level * sl, (radius * (1 - _E2) + height) * sp])
 
 
-# WGS 84: semi-major axis in metres, flattening, and square of the eccentricity.
+# WGS 84: semi-major axis in meters, flattening, and square of the eccentricity.
 _A = 6378137.0
 _F = 1 / 298.257223563
 _E2 = _F * (2 - _F)

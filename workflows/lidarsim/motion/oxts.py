@@ -1,6 +1,6 @@
 """Folders «oxts» of the KITTI data set: positions and angles of an OXTS inertial navigation system.
 
-Each file has a row of 30 numbers: latitude and longitude in degrees, altitude in metres, and roll,
+Each file has a row of 30 numbers: latitude and longitude in degrees, altitude in meters, and roll,
 pitch and yaw in radians (dataformat.txt of KITTI's development kit). Yaw is counter-clockwise from
 east, pitch positive nose down and roll positive right side down, as of `Pose`; the unit's axes are
 x ahead, y left and z up.
@@ -45,7 +45,7 @@ def read_oxts(folder: Path, origin: Sequence[float] | None) -> tuple[Floats, Flo
 
     Returns
     -------
-    seconds since 1970 (k,), positions east, north and up of the origin (k, 3), metres, and
+    seconds since 1970 (k,), positions east, north and up of the origin (k, 3), meters, and
     quaternions (k, 4), x, y, z, w.
 
     Raises
@@ -80,7 +80,7 @@ def dates_of(text: str) -> Floats | None:
 
 
 def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Floats]:
-    """Return positions east, north and up of an origin (k, 3), metres, and quaternions (k, 4).
+    """Return positions east, north and up of an origin (k, 3), meters, and quaternions (k, 4).
 
     Positions are in KITTI's Mercator projection, whose scale is true at the latitude of the origin.
 
@@ -89,7 +89,7 @@ def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Fl
     rows
         (k, 30): rows of the files.
     origin
-        Latitude and longitude, degrees, and altitude, metres; by default of the first row.
+        Latitude and longitude, degrees, and altitude, meters; by default of the first row.
     """
     latitude, longitude, altitude = rows[:, :3].T
     if not ((np.abs(latitude) < 90) & (np.abs(longitude) <= 360)).all():
@@ -98,7 +98,7 @@ def oxts_poses(rows: Floats, origin: Sequence[float] | None) -> tuple[Floats, Fl
     scale = sin_cos_of(np.radians(float(origin_row[0])))[1]
 
     def projected(latitude: Floats, longitude: Floats) -> Floats:
-        """Return metres east and north (k, 2) of a latitude and longitude in degrees (k,)."""
+        """Return meters east and north (k, 2) of a latitude and longitude in degrees (k,)."""
         sine, cosine = sin_cos((90.0 + latitude) * (np.pi / 360.0))
         north = log(sine / cosine)
         return scale * _RADIUS_M * np.stack([np.radians(longitude), north], axis=-1)

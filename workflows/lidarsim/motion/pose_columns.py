@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.tables import DEGREES, METRES, NUMBERS, Quantity, TableFormat
+from ..base.tables import DEGREES, METERS, NUMBERS, Quantity, TableFormat
 from ..base.time_units import SECONDS
 
 # Prefixes that programs write before x, y and z of a position, and before the letters of a
@@ -32,9 +32,9 @@ def _spelled(prefixes: tuple[str, ...], axis: str, *spellings: str) -> tuple[str
 TIME = Quantity("time_s", ("time", "t", "timestamp", "stamp"), SECONDS, None)
 # World coordinates of the scene: z is up. Of compass directions, x is east and y north.
 POSITION = (
-    Quantity("x", _spelled(_POSITIONS, "x", "easting", "east"), METRES, "m"),
-    Quantity("y", _spelled(_POSITIONS, "y", "northing", "north"), METRES, "m"),
-    Quantity("z", _spelled(_POSITIONS, "z", "height", "up"), METRES, "m"),
+    Quantity("x", _spelled(_POSITIONS, "x", "easting", "east"), METERS, "m"),
+    Quantity("y", _spelled(_POSITIONS, "y", "northing", "north"), METERS, "m"),
+    Quantity("z", _spelled(_POSITIONS, "z", "height", "up"), METERS, "m"),
 )
 # Rotation from the carrier frame (x ahead, y left, z up) to the world frame.
 QUATERNION = tuple(

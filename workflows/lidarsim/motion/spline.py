@@ -51,12 +51,12 @@ def _stops(steps: Floats, slopes: Floats) -> Bools:
     `slopes` (d, n - 1) are the mean slopes in each step.
     """
     speeds = np.sqrt((slopes * slopes).sum(axis=0))
-    rests = speeds * steps <= 1e-9  # metres, or halves of radians
-    # Steps ten times as long as their neighbour, and as slow, are pauses without values. A curve
-    # with the neighbour's speed would swing far out in a pause.
-    for step, neighbour in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
-        longer = steps[step] > 10 * steps[neighbour]
-        rests[step] |= longer & (10 * speeds[step] < speeds[neighbour])
+    rests = speeds * steps <= 1e-9  # meters, or halves of radians
+    # Steps ten times as long as their neighbor, and as slow, are pauses without values. A curve
+    # with the neighbor's speed would swing far out in a pause.
+    for step, neighbor in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
+        longer = steps[step] > 10 * steps[neighbor]
+        rests[step] |= longer & (10 * speeds[step] < speeds[neighbor])
     return np.append(rests, False) | np.append(False, rests)
 
 

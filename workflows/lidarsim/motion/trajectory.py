@@ -58,7 +58,7 @@ class Pose:
     Angles are in degrees, in aerospace order.
     """
 
-    position: Annotated[tuple[float, float, float], written_as(Triple), about("x, y and z, metres")]
+    position: Annotated[tuple[float, float, float], written_as(Triple), about("x, y and z, meters")]
     yaw_deg: Annotated[AngleDeg, about("rotation about z, first")] = 0.0
     pitch_deg: Annotated[AngleDeg, about("rotation about the new y, second")] = 0.0
     roll_deg: Annotated[AngleDeg, about("rotation about the new x, last")] = 0.0
@@ -80,7 +80,7 @@ class Pose:
 
     def compose(self, mount: Pose) -> Pose:
         """Return the scene pose of an instrument whose pose in this pose's frame is `mount`."""
-        if mount == CENTRE:
+        if mount == CENTER:
             return self
         rotation = self.rotation_matrix
         position = self.position + applied(rotation, mount.position)
@@ -130,18 +130,18 @@ def pose_of(name: str, value: Any) -> Pose:
     return Pose(position)  # type: ignore[arg-type]  # it counts them
 
 
-CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
+CENTER = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
 
 
 @dataclass(frozen=True)
 class InstrumentPose(Pose):
     """Position and angles of an instrument in the carrier frame, as written in a file."""
 
-    position: Annotated[Triple, about("x, y and z, metres")] = (0, 0, 0)
+    position: Annotated[Triple, about("x, y and z, meters")] = (0, 0, 0)
 
 
 # A pose in a file, which may leave out the position, or be the position alone.
-AT_CENTRE = short(
+AT_CENTER = short(
     lambda v: isinstance(v, (dict, list)),
     lambda v: {"position": v} if isinstance(v, list) else {"position": [0] * 3} | v,
     Triple | InstrumentPose,
@@ -264,7 +264,7 @@ class StaticPose:
     Attributes
     ----------
     position
-        (3,), metres.
+        (3,), meters.
     rotation
         (3, 3): from the frame of the carrier to the scene frame.
     """
@@ -298,7 +298,7 @@ class Track:
     times_s
         float64 (k,): times of the poses, seconds, ascending; by any clock.
     positions
-        float64 (k, 3): metres, in scene coordinates.
+        float64 (k, 3): meters, in scene coordinates.
     quaternions
         float64 (k, 4): x, y, z, w of the rotations from the carrier frame to the scene frame, of
         unit length within 1e-3. None for a level carrier that faces its direction of travel, the
@@ -616,7 +616,7 @@ class Track:
 class Segments(NamedTuple):
     """Coefficients of poses between the poses of a track: a column for each of s segments."""
 
-    starts: Floats  # (3, s): positions at the start, metres
+    starts: Floats  # (3, s): positions at the start, meters
     velocities: Floats  # (3, s): m/s
     # (3, 9, s): the rotation is terms[0] + sin(a) terms[1] + cos(a) terms[2] (Rodrigues, 1840),
     # with a the angle since the start
@@ -655,7 +655,7 @@ class TrackBatch:
     times_s
         (s,): times of the poses, seconds; time 0 of the tracks is 0.
     positions
-        (k, s, 3): metres.
+        (k, s, 3): meters.
     quaternions
         (k, s, 4)
     beyond

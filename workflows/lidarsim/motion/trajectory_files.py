@@ -50,7 +50,7 @@ class PoseTable(NamedTuple):
     """Poses of a file."""
 
     seconds: Floats  # (k,)
-    positions: Floats  # (k, 3): metres
+    positions: Floats  # (k, 3): meters
     quaternions: Floats | None  # (k, 4): x, y, z, w; None if the file has no orientations
 
 
@@ -110,7 +110,7 @@ def load_trajectory(
         the Imu with its orientation, separated by a space.
     origin
         For latitudes and longitudes: latitude and longitude of the world's zero, degrees, and its
-        height, metres. By default the first position.
+        height, meters. By default the first position.
     camera_axes
         Whether to convert poses from a camera frame (z ahead, y down) to a carrier frame (x ahead,
         z up); by default for KITTI.

@@ -222,7 +222,7 @@ class PacketDecoder(ABC):
 
     @abstractmethod
     def columns(self, sensor: int, sweep: Any) -> dict[str, AnyArray]:
-        """Return the columns (n,) of a sweep's points, with x, y and z in metres."""
+        """Return the columns (n,) of a sweep's points, with x, y and z in meters."""
 
     @abstractmethod
     def time_ns(self, sweep: Any) -> float:

@@ -223,7 +223,7 @@ class LivoxEncoder(PacketEncoder):
         return Datagrams(_with_checksums(packets), due_ns, self.ports["points"], source_port)
 
     def _positions_m(self, shots: Shots) -> Floats:
-        """Return positions in the sensor frame, metres: (n, c, 3), or NaN without a return."""
+        """Return positions in the sensor frame, meters: (n, c, 3), or NaN without a return."""
         sensor = self.source.sensor
         channels = self.source.settings.channels
         positions = sensor.directions(shots.firings)[:, channels]

@@ -469,7 +469,7 @@ class OusterEncoder(PacketEncoder):
         }
 
     def _lidar_pose(self) -> Floats:
-        """Return the pose (4, 4) of the head in the sensor frame, millimetres."""
+        """Return the pose (4, 4) of the head in the sensor frame, millimeters."""
         sin, cos = sin_cos(np.radians(self.source.sensor.head.zero_deg))  # type: ignore[attr-defined]
         pose = np.eye(4)
         pose[:2, :2] = [[cos, -sin], [sin, cos]]
@@ -571,7 +571,7 @@ class OusterDecoder(PacketDecoder):
         return import_module("ouster.sdk").open_source(str(self._file))
 
     def _positions(self, sensor: int) -> Any:
-        """Return the function from a scan to positions (rings, columns, 3) in metres."""
+        """Return the function from a scan to positions (rings, columns, 3) in meters."""
         if sensor not in self._tables:
             core = import_module("ouster.sdk.core")
             self._tables[sensor] = core.XYZLut(self._infos[sensor], False)

@@ -47,9 +47,9 @@ def write_pixels(returns, valid, layout, units, pixels):
             written = 0
             for k in range(planes if layout == DUAL else 1):
                 plane = first ^ k
-                metres = range_m[plane, n, c]
-                number = np.rint((metres * 1000.0 + units.offset_mm) / units.unit_mm)
-                if not (metres > 0 and number <= units.max_number):  # no return is 0 or NaN
+                meters = range_m[plane, n, c]
+                number = np.rint((meters * 1000.0 + units.offset_mm) / units.unit_mm)
+                if not (meters > 0 and number <= units.max_number):  # no return is 0 or NaN
                     continue
                 distance = np.uint32(number)
                 reflectivity = np.uint32(returns.reflectivity[plane, n, c])

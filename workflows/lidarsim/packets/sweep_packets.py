@@ -8,7 +8,7 @@ from typing import Any
 from ..base.errors import LidarError
 from ..base.validation import checked
 from ..columns.cloud import Cloud
-from ..motion.trajectory import CENTRE
+from ..motion.trajectory import CENTER
 from ..sensor import Returns, Sensor
 from ..sensor.optics import TWO_RETURNS
 from ..simulator import Scanner
@@ -73,7 +73,7 @@ class Packets:
         mounted = sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)
         survey = Survey(
             sensors=[mounted],
-            poses=[CENTRE],
+            poses=[CENTER],
             steps=1,
             returns=returns,  # type: ignore[arg-type]
             start=start,

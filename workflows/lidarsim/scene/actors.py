@@ -16,7 +16,7 @@ from ..base.validation import checked, checked_fields
 from ..base.vectors import length, products, turned
 from ..motion.rotations import check_rotations, quaternions_of
 from ..motion.trajectory import (
-    CENTRE,
+    CENTER,
     StaticPose,
     Stations,
     Track,
@@ -25,7 +25,7 @@ from ..motion.trajectory import (
     presence_ns,
 )
 from . import face_materials
-from .colours import join_colours
+from .colors import join_colors
 from .scene_instances import SceneInstance, parts_of
 from .scene_mesh import SceneMesh, stacked
 
@@ -33,7 +33,7 @@ MAX_SAMPLES = 200_000  # poses of all actors
 # Poses and longest duration for measuring trajectories of unknown classes.
 TRAJECTORY_POSES = 10_001
 MAX_DURATION_NS = 1e12
-AT_ZERO = Stations((CENTRE,))
+AT_ZERO = Stations((CENTER,))
 CHECKED_TRAJECTORIES = (Track, Stations, StaticPose)  # classes whose rotations are rotations
 
 
@@ -41,7 +41,7 @@ class ActorSamples(NamedTuple):
     """Poses of an actor at a few times."""
 
     times_ns: Floats  # (k,), nanoseconds since the survey's start
-    positions: Floats  # (k, 3), metres, local
+    positions: Floats  # (k, 3), meters, local
     quaternions: Floats  # (k, 4)
 
 
@@ -103,7 +103,7 @@ class Actor:
         """
         actor = object.__new__(type(self))  # `copy` takes ten times as long
         vars(actor).update(vars(self), trajectory=trajectory)
-        vars(actor).pop("_travelled", None)
+        vars(actor).pop("_traveled", None)
         if not isinstance(trajectory, CHECKED_TRAJECTORIES):
             actor._check_first_pose()
         return actor
@@ -115,7 +115,7 @@ class Actor:
 
     @property
     def bounds(self) -> Floats:
-        """Corners of the actor's box in its frame, (2, 3), metres, in all poses if it deforms."""
+        """Corners of the actor's box in its frame, (2, 3), meters, in all poses if it deforms."""
         return (self.mesh.animation or self.mesh).bounds
 
     def placed(self, time_ns: float) -> SceneMesh:
@@ -129,7 +129,7 @@ class Actor:
         vertices = vertices if first <= time_ns <= last else 0 * vertices
         # Pictures, which call this, do not show masks.
         return SceneMesh(
-            self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours
+            self.name, vertices + positions[0], self.mesh.faces, colors=self.mesh.colors
         )
 
     def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
@@ -150,15 +150,15 @@ class Actor:
         assert animation is not None
         if (speed := animation.speed_m_s) is None:
             return times_ns / 1e9 + self.offset_s, np.ones(len(times_ns))
-        passed_ns, distances_m = self._travelled
+        passed_ns, distances_m = self._traveled
         speeds = np.diff(distances_m, prepend=distances_m[0], append=distances_m[-1])
         speeds[1:-1] /= np.diff(passed_ns) / 1e9
         rates = speeds[np.searchsorted(passed_ns, times_ns, "right")] / speed
         return interp(times_ns, passed_ns, distances_m) / speed + self.offset_s, rates
 
     @cached_property
-    def _travelled(self) -> tuple[Floats, Floats]:
-        """Times (k,), ns, and the distances (k,) travelled until these times, metres.
+    def _traveled(self) -> tuple[Floats, Floats]:
+        """Times (k,), ns, and the distances (k,) traveled until these times, meters.
 
         Distances driven backward count as negative. The actor is static before the first and after
         the last time.
@@ -237,7 +237,7 @@ def distinct_meshes(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
         arrays = (
             mesh.vertices,
             mesh.faces,
-            mesh.colours,
+            mesh.colors,
             mesh.materials,
             mesh.animation,
             *mesh.cutouts,
@@ -269,9 +269,9 @@ def join_meshes(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> Scen
     vertices, faces = stacked((part.vertices, part.faces) for part in parts)
     cutouts = [cutout for mesh in flat for cutout in mesh.cutouts]
     sizes = [len(part.faces) for part in parts]
-    colours = join_colours([part.colours for part in parts], sizes)
+    colors = join_colors([part.colors for part in parts], sizes)
     materials = face_materials.join_materials([part.materials for part in parts], sizes)
-    return SceneMesh(name, vertices, faces, tuple(cutouts), colours, materials=materials)
+    return SceneMesh(name, vertices, faces, tuple(cutouts), colors, materials=materials)
 
 
 def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
@@ -284,10 +284,10 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
     ]
     animation = replace(first, vertices=np.concatenate(poses, axis=1))
     sizes = [len(mesh.faces) for mesh in meshes]
-    colours = join_colours([mesh.colours for mesh in meshes], sizes)
+    colors = join_colors([mesh.colors for mesh in meshes], sizes)
     materials = face_materials.join_materials([mesh.materials for mesh in meshes], sizes)
     parts = stacked((mesh.vertices, mesh.faces) for mesh in meshes)
-    return SceneMesh(name, *parts, colours=colours, animation=animation, materials=materials)
+    return SceneMesh(name, *parts, colors=colors, animation=animation, materials=materials)
 
 
 @checked

@@ -28,7 +28,7 @@ class Animation:
     Parameters
     ----------
     vertices
-        float64 (f, v, 3): the mesh's vertices in at least two poses, metres, in the mesh's frame.
+        float64 (f, v, 3): the mesh's vertices in at least two poses, meters, in the mesh's frame.
     step_s
         Time from each pose to the next, seconds.
     speed_m_s
@@ -99,7 +99,7 @@ class Animation:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of all poses, metres: (2, 3)."""
+        """Lowest and highest corner of all poses, meters: (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def moved(self, linear: Floats, offset: Floats) -> Animation:

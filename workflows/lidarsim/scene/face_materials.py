@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.arrays import Integers, Ints32
 from ..base.errors import LidarError
-from .colours import are_indices
+from .colors import are_indices
 
 
 @dataclass(frozen=True, eq=False)

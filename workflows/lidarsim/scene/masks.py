@@ -1,4 +1,4 @@
-"""Images of materials: masks, which say where triangles stop light, and colours."""
+"""Images of materials: masks, which say where triangles stop light, and colors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..base.allowance import Allowance
 from ..base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
 from ..base.input_files import InputFileError, open_input
 from ..base.words import printable
-from .colours import Colours
+from .colors import Colors
 from .scene_mesh import MAX_UV, Cutout
 
 # Further formats of Pillow are left out, since some run programs.
@@ -26,7 +26,7 @@ HALF_OPACITY = 128  # least 8-bit opacity that stops light, unless a file states
 PIXEL_BYTES = 10  # memory of a pixel while its image is decoded
 FACE_BYTES = 120  # memory of a triangle while its texture coordinates are computed
 _MAX_NAMED = 3  # materials that a note names
-MAX_SIDE_PIXELS = 4096  # width and height of an image of colours; larger images are reduced
+MAX_SIDE_PIXELS = 4096  # width and height of an image of colors; larger images are reduced
 
 Wrap = Literal["repeat", "mirror", "clamp", "black"]  # or transparent, in a mask
 K = TypeVar("K", bound=Hashable)
@@ -37,8 +37,8 @@ class MaskError(Exception):
     """The reason why a mask cannot be read, as a clause."""
 
 
-def read_opacity(image: Path | bytes, allowance: Allowance, *, grey: bool = False) -> Bytes | None:
-    """Return the opacity of an image: its alpha channel, or else, with `grey`, its brightness.
+def read_opacity(image: Path | bytes, allowance: Allowance, *, gray: bool = False) -> Bytes | None:
+    """Return the opacity of an image: its alpha channel, or else, with `gray`, its brightness.
 
     Returns
     -------
@@ -50,7 +50,7 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, grey: bool = Fals
         If the image cannot be decoded, or takes more memory than allowed.
     """
     with _opened(image) as opened:
-        if not (grey or opened.has_transparency_data):
+        if not (gray or opened.has_transparency_data):
             return None
         pixels = opened.width * opened.height
         if not allowance.fits(PIXEL_BYTES * pixels):
@@ -61,11 +61,11 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, grey: bool = Fals
             alpha = np.asarray(rgba.getchannel("A"))
             if alpha.min() < 255:
                 return alpha
-        return np.asarray(_of_bytes(opened).convert("L")) if grey else None
+        return np.asarray(_of_bytes(opened).convert("L")) if gray else None
 
 
-def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Bytes:
-    """Return the colours of an image: (h, w, 3), sRGB.
+def read_colors(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Bytes:
+    """Return the colors of an image: (h, w, 3), sRGB.
 
     An image that is more than `MAX_SIDE_PIXELS` wide or high is reduced, which `notes` records.
 
@@ -101,8 +101,8 @@ def read_heights(image: Path, allowance: Allowance, bytes_per_pixel: int) -> Flo
         if not allowance.fits((PIXEL_BYTES + bytes_per_pixel) * pixels):
             raise _TooLargeError
         allowance.take((8 + bytes_per_pixel) * pixels)
-        is_grey = opened.mode in ("L", "I", "F") or opened.mode.startswith("I;16")
-        values = np.asarray(opened if is_grey else opened.convert("L"), np.float64)
+        is_gray = opened.mode in ("L", "I", "F") or opened.mode.startswith("I;16")
+        values = np.asarray(opened if is_gray else opened.convert("L"), np.float64)
     if not np.isfinite(values).all() or values.min() < 0:
         raise MaskError(f"{image.name} has no height channel")
     return values
@@ -195,10 +195,10 @@ class Texture:
         """Return the texture as the mask of triangles (`map_to_triangles`)."""
         return Cutout(*self.map_to_triangles(coordinates, corners))
 
-    def colours(self, coordinates: AnyArray, corners: Ints) -> Colours:
-        """Return the texture as the colours of triangles (`map_to_triangles`)."""
+    def colors(self, coordinates: AnyArray, corners: Ints) -> Colors:
+        """Return the texture as the colors of triangles (`map_to_triangles`)."""
         image, uv = self.map_to_triangles(coordinates, corners)
-        return Colours((image,), np.zeros(len(uv), np.int32), uv)
+        return Colors((image,), np.zeros(len(uv), np.int32), uv)
 
     def map_to_triangles(self, coordinates: AnyArray, corners: Ints) -> tuple[AnyArray, Floats32]:
         """Return a repeating image, and texture coordinates (k, 3, 2), as in glTF.
@@ -273,22 +273,22 @@ def _take(allowance: Allowance, count: int) -> None:
 
 
 class MaskNotes:
-    """Notes on masks and colours of a file's materials that are not read as stated."""
+    """Notes on masks and colors of a file's materials that are not read as stated."""
 
     def __init__(self) -> None:
         self.mask_errors: dict[str, str] = {}  # {material: why its triangles are solid}
-        self.colour_errors: dict[str, str] = {}  # {material: why its triangles have no colour}
+        self.color_errors: dict[str, str] = {}  # {material: why its triangles have no color}
         self.glass: dict[str, None] = {}  # {transparent material without holes: None}, in order
-        self.reduced_sizes: list[str] = []  # sizes of images of colours that are reduced
+        self.reduced_sizes: list[str] = []  # sizes of images of colors that are reduced
         self.missing_files: list[str] = []  # files of materials that cannot be read
 
     def without_mask(self, material: str) -> AbstractContextManager[None]:
         """Note MaskErrors of the body, and leave the triangles solid then."""
         return _noted(self.mask_errors, material)
 
-    def without_colour(self, material: str) -> AbstractContextManager[None]:
-        """Note errors of the body, and leave the triangles without colour then."""
-        return _noted(self.colour_errors, material)
+    def without_color(self, material: str) -> AbstractContextManager[None]:
+        """Note errors of the body, and leave the triangles without color then."""
+        return _noted(self.color_errors, material)
 
     def lines(self) -> list[str]:
         """Return notes, as clauses that follow the file's name."""
@@ -300,7 +300,7 @@ class MaskNotes:
             )
         for reasons, kind, consequence in (
             (self.mask_errors, "masks", "are opaque"),
-            (self.colour_errors, "colors", "have no color"),
+            (self.color_errors, "colors", "have no color"),
         ):
             if reasons:
                 shown = _listed([f"{name} ({why})" for name, why in reasons.items()])

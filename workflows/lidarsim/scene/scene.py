@@ -25,7 +25,7 @@ from ..base.words import listed, plural
 from ..media.materials import SurfaceKinds
 from ..motion.trajectory import Track
 from .actors import Actor
-from .colours import GREY, Colours, are_indices, join_colours
+from .colors import GRAY, Colors, are_indices, join_colors
 from .face_materials import ObjectMaterials
 from .files.mesh_options import MeshOptions
 from .files.meshfile import Objects, load_objects, warn
@@ -35,7 +35,7 @@ from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked
 from .shapes import seed_objects
 from .transform import Transform
 
-# Single precision, which ray casters use, resolves a millimetre up to this distance.
+# Single precision, which ray casters use, resolves a millimeter up to this distance.
 MAX_LOCAL_COORDINATE_M = 10_000.0
 
 _log = logging.getLogger(__name__)
@@ -48,12 +48,12 @@ class Scene:
 
     Coordinates are local: world = `vertices` + `origin`. The origin is zero unless the scene
     lies farther than 10 km from zero (georeferenced data); then the origin is a point of whole
-    metres in the scene's middle, so that single precision is enough for the local coordinates.
+    meters in the scene's middle, so that single precision is enough for the local coordinates.
 
     Parameters
     ----------
     vertices
-        float64 (v, 3), metres, Z-up, local.
+        float64 (v, 3), meters, Z-up, local.
     faces
         int32 (f, 3), indices into `vertices`; f >= 1 unless there are instances.
     face_object
@@ -62,9 +62,9 @@ class Scene:
         Names of the static objects, without duplicates; an object's number is its index.
         `object_names` has the actors, too.
     origin
-        float64 (3,), whole metres, plus `world_origin`.
+        float64 (3,), whole meters, plus `world_origin`.
     world_origin
-        float64 (3,), metres: what `georeferenced` has added to `origin`. Without it, world
+        float64 (3,), meters: what `georeferenced` has added to `origin`. Without it, world
         coordinates are as in the scene's files.
     actors
         Moving objects, numbered after the static objects; their meshes are not in `faces`.
@@ -72,8 +72,8 @@ class Scene:
         Static triangles that are not in `faces`: parts of meshes that are stored once and placed
         any number of times, or that have a mask (transparent pixels) or voxels (leaves). The
         triangles are numbered after `faces`, instance by instance; the triangles of actors follow.
-    colours
-        Colours of `faces`, or None; parts of instances and meshes of actors have their own.
+    colors
+        Colors of `faces`, or None; parts of instances and meshes of actors have their own.
     materials
         Names of the materials of the static objects' faces in the scene's files, or None.
     epsg
@@ -93,7 +93,7 @@ class Scene:
     origin: Floats
     actors: tuple[Actor, ...] = ()
     instances: Instances | None = None
-    colours: Colours | None = None
+    colors: Colors | None = None
     materials: ObjectMaterials | None = None
     world_origin: Floats = field(default_factory=lambda: np.zeros(3))
     epsg: int | None = None
@@ -146,8 +146,8 @@ class Scene:
             object.__setattr__(self, name, array)
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "actors", tuple(self.actors))
-        if self.colours is not None:
-            self.colours.check("the scene", len(faces))
+        if self.colors is not None:
+            self.colors.check("the scene", len(faces))
 
     @classmethod
     def seed(cls) -> Scene:
@@ -188,19 +188,19 @@ class Scene:
         ----------------
         unit
             Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes the unit
-            that the file states (.dae, .3mf, .usd, .glb and .gltf), else metres.
+            that the file states (.dae, .3mf, .usd, .glb and .gltf), else meters.
         up_axis
             Axis of the file that points up: x, y or z. None takes the axis that the file (.dae,
             .usd) or its format states (y of .glb and .gltf), else z.
         transform
-            Placement of the mesh in the world, in metres, after unit and up axis: a
+            Placement of the mesh in the world, in meters, after unit and up axis: a
             `lidarsim.scene.transform.Transform`.
         opacity
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
             .obj, .usd). With "ignore", triangles are solid, and no image is read.
-        colours
-            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON,
-            .xodr and .ifc without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off,
+        colors
+            Whether to read base colors and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON,
+            .xodr and .ifc without images), and colors of vertices (.glb, .gltf, .obj, .ply, .off,
             .usd).
         materials
             Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
@@ -290,7 +290,7 @@ class Scene:
             names=unique_names([item.name for item in objects]),
             origin=origin,
             instances=instances,
-            colours=join_colours([mesh.colours for mesh in split.meshes], sizes),
+            colors=join_colors([mesh.colors for mesh in split.meshes], sizes),
             materials=ObjectMaterials.from_meshes(
                 [
                     (item if isinstance(item, SceneMesh) else item.mesh).materials
@@ -323,7 +323,7 @@ class Scene:
         """Return the same scene at another place of the world.
 
         Local coordinates stay, and so do the poses of surveys; points that are written have
-        `world_origin` (3,), metres, added to the coordinates of the scene's files. Zero undoes it.
+        `world_origin` (3,), meters, added to the coordinates of the scene's files. Zero undoes it.
 
         Examples
         --------
@@ -339,7 +339,7 @@ class Scene:
     def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Scene:
         """Return the same scene with instances, by their indices (m,), at other poses.
 
-        A pose is the pose of the mesh's frame in local coordinates: positions (m, 3), metres, and
+        A pose is the pose of the mesh's frame in local coordinates: positions (m, 3), meters, and
         rotations (m, 3, 3). The instances keep their scales.
         """
         assert self.instances is not None
@@ -418,28 +418,28 @@ class Scene:
         return tuple(name for i, name in enumerate(self.object_names) if i in owners)
 
     @property
-    def coloured(self) -> list[Colours]:
-        """Colours of the faces, of parts of instances and of actors' meshes, empty if all are grey.
+    def colored(self) -> list[Colors]:
+        """Colors of the faces, of parts of instances and of actors' meshes, empty if all are gray.
 
-        Only colours that exist are listed, in this order.
+        Only colors that exist are listed, in this order.
         """
         parts = self.instances.mesh_parts if self.instances else ()
-        colours = [self.colours, *(part.colours for part in parts)]
-        colours += [actor.mesh.colours for actor in self.actors]
-        return [mesh_colours for mesh_colours in colours if mesh_colours is not None]
+        colors = [self.colors, *(part.colors for part in parts)]
+        colors += [actor.mesh.colors for actor in self.actors]
+        return [mesh_colors for mesh_colors in colors if mesh_colors is not None]
 
     @property
-    def has_colours(self) -> Bools:
-        """True for each object with a colour, actors after the static objects: (objects,)."""
-        has_colour = np.zeros(len(self.object_names), np.bool_)
-        if (colours := self.colours) is not None:
-            grey = np.array([image is GREY for image in colours.images])
-            # Faces without a colour have the image `GREY` if other faces are coloured.
-            has_colour[self.face_object[~grey[colours.image]]] = True
+    def has_colors(self) -> Bools:
+        """True for each object with a color, actors after the static objects: (objects,)."""
+        has_color = np.zeros(len(self.object_names), np.bool_)
+        if (colors := self.colors) is not None:
+            gray = np.array([image is GRAY for image in colors.images])
+            # Faces without a color have the image `GRAY` if other faces are colored.
+            has_color[self.face_object[~gray[colors.image]]] = True
         if (instances := self.instances) is not None:
-            has_colour[instances.owners(lambda part: part.colours is not None)] = True
-        has_colour[len(self.names) :] = [actor.mesh.colours is not None for actor in self.actors]
-        return has_colour
+            has_color[instances.owners(lambda part: part.colors is not None)] = True
+        has_color[len(self.names) :] = [actor.mesh.colors is not None for actor in self.actors]
+        return has_color
 
     @property
     def has_voxels(self) -> Bools:
@@ -502,7 +502,7 @@ class Scene:
             self.object_names,
             self.origin,
             world_origin=self.world_origin,
-            colours=join_colours([self.colours, *(mesh.colours for mesh in meshes)], sizes),
+            colors=join_colors([self.colors, *(mesh.colors for mesh in meshes)], sizes),
         )
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
@@ -536,7 +536,7 @@ class Scene:
             self.names[owner],
             points + self.origin,
             faces,
-            colours=self.colours and self.colours.take(face_indices),
+            colors=self.colors and self.colors.take(face_indices),
             materials=None
             if self.materials is None
             else self.materials.of_object(owner, face_indices),
@@ -554,14 +554,14 @@ class Scene:
             part.vertices,
             part.faces.astype(np.int64),
             cutouts,
-            part.colours,
+            part.colors,
             part.voxels,
             materials=part.materials,
         )
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of the static triangles, local, metres: (2, 3)."""
+        """Lowest and highest corner of the static triangles, local, meters: (2, 3)."""
         corners = self._face_bounds
         if self.instances:
             corners = np.concatenate([corners, self.instances.bounds.reshape(-1, 3)])
@@ -569,7 +569,7 @@ class Scene:
 
     @cached_property
     def _face_bounds(self) -> Floats:
-        """Lowest and highest corner of `faces`, local, metres: (2, 3), or (0, 3) without faces."""
+        """Lowest and highest corner of `faces`, local, meters: (2, 3), or (0, 3) without faces."""
         is_used = np.zeros(len(self.vertices), np.bool_)
         is_used[self.faces] = True
         used = self.vertices[is_used]
@@ -577,7 +577,7 @@ class Scene:
 
     @cached_property
     def object_bounds(self) -> Floats:
-        """Lowest and highest corner of each static object, local, metres: (objects, 2, 3).
+        """Lowest and highest corner of each static object, local, meters: (objects, 2, 3).
 
         An object without triangles has (+inf, -inf).
         """
@@ -595,19 +595,19 @@ class Scene:
     def footprints(self) -> Floats:
         """Circle around each static object, seen from above: x, y, radius: (objects, 3).
 
-        Local coordinates, metres.
+        Local coordinates, meters.
 
-        The circle is centred on the object's bounding rectangle and reaches its farthest
+        The circle is centered on the object's bounding rectangle and reaches its farthest
         vertex: exact for discs and rectangles, at most 1.42 times too wide for other outlines.
         """
-        centres = self.object_bounds[..., :2].mean(axis=1)
+        centers = self.object_bounds[..., :2].mean(axis=1)
         reach = np.zeros(len(self.names))
         for corner in range(3):
-            offset = self.vertices[self.faces[:, corner], :2] - centres[self.face_object]
+            offset = self.vertices[self.faces[:, corner], :2] - centers[self.face_object]
             np.maximum.at(reach, self.face_object, hypot(*offset.T))
         if (instances := self.instances) is not None:
-            np.maximum.at(reach, instances.owner, instances.reach(centres[instances.owner]))
-        return np.column_stack([centres, reach])
+            np.maximum.at(reach, instances.owner, instances.reach(centers[instances.owner]))
+        return np.column_stack([centers, reach])
 
 
 def _world_position(value: ArrayLike) -> Floats:
@@ -623,9 +623,9 @@ def _world_position(value: ArrayLike) -> Floats:
 
 
 def local_origin(vertices: Floats) -> Floats:
-    """Return the origin for world coordinates (v, 3): zero, or whole metres in their middle.
+    """Return the origin for world coordinates (v, 3): zero, or whole meters in their middle.
 
-    Whole metres are exact in double precision, so that subtracting and adding the origin again
+    Whole meters are exact in double precision, so that subtracting and adding the origin again
     gives the same coordinates.
     """
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
@@ -726,7 +726,7 @@ def _mesh_of_part(name: str, part: MeshPart) -> SceneMesh:
         name,
         part.vertices,
         part.faces.astype(np.int64),
-        colours=part.colours,
+        colors=part.colors,
         materials=part.materials,
     )
 

@@ -17,7 +17,7 @@ from ..base.errors import LidarError
 from ..base.validation import checked_fields
 from ..base.vectors import applied, determinant, inverse, matmul, rank
 from ..motion.trajectory import Pose
-from .colours import Colours
+from .colors import Colors
 from .face_materials import FaceMaterials
 from .scene_mesh import Cutout, SceneMesh, Voxels, compacted
 from .transform import Transform, affine
@@ -39,7 +39,7 @@ class SceneInstance:
         The mesh, in its own frame.
     transform
         Pose of the mesh's frame in world coordinates. Or a matrix (4, 4) from the mesh's
-        coordinates to the world's, metres: it may rotate, move, mirror and scale, also unevenly.
+        coordinates to the world's, meters: it may rotate, move, mirror and scale, also unevenly.
         Or a `lidarsim.scene.transform.Transform`.
     name
         Name of the object; by default the name of the mesh.
@@ -118,7 +118,7 @@ class MeshPart(NamedTuple):
     faces: Ints32  # (f, 3)
     mask: Bools | None = None  # (h, w), of a `Cutout`
     uv: Floats32 | None = None  # (f, 3, 2)
-    colours: Colours | None = None
+    colors: Colors | None = None
     voxels: Voxels | None = None  # leaves within the surface
     materials: FaceMaterials | None = None  # they include all names of the mesh
 
@@ -133,7 +133,7 @@ def parts_of(mesh: SceneMesh) -> Iterator[MeshPart]:
             *_compacted(mesh.vertices, mesh.faces[rows]),
             mask=None if cut is None else cut.mask,
             uv=None if cut is None else cut.uv,
-            colours=mesh.colours and mesh.colours.take(rows),
+            colors=mesh.colors and mesh.colors.take(rows),
             voxels=mesh.voxels,
             materials=mesh.materials and mesh.materials.take(rows),
         )
@@ -206,7 +206,7 @@ class Instances:
         return int(self.sizes.sum())
 
     def owners(self, condition: Callable[[MeshPart], bool]) -> Ints32:
-        """Return the objects of the instances whose part fulfils a condition."""
+        """Return the objects of the instances whose part fulfills a condition."""
         fulfilled = np.array([condition(part) for part in self.mesh_parts], np.bool_)
         return self.owner[fulfilled[self.part]]
 
@@ -229,7 +229,7 @@ class Instances:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of each instance, local, metres: (n, 2, 3)."""
+        """Lowest and highest corner of each instance, local, meters: (n, 2, 3)."""
         if self._earlier_bounds is not None:
             earlier, changed = self._earlier_bounds
             corners = earlier.copy()
@@ -246,11 +246,11 @@ class Instances:
             corners[rows] = np.stack([points.min(axis=2), points.max(axis=2)], axis=1)
         return corners
 
-    def reach(self, centres: Floats) -> Floats:
-        """Return the radius (n,), seen from above, of each instance around its centre (n, 2)."""
+    def reach(self, centers: Floats) -> Floats:
+        """Return the radius (n,), seen from above, of each instance around its center (n, 2)."""
         radii = np.empty(len(self))
         for rows, points in self.placed():
-            x, y = np.moveaxis(points[:, :2] - centres[rows, :, None], 1, 0)
+            x, y = np.moveaxis(points[:, :2] - centers[rows, :, None], 1, 0)
             radii[rows] = np.sqrt((x * x + y * y).max(axis=1))
         return radii
 

@@ -14,7 +14,7 @@ from ..base.errors import LidarError
 from ..base.validation import as_array, checked_fields
 from ..base.vectors import determinant, length, matmul, rank, turned
 from .animation import Animation
-from .colours import Colours
+from .colors import Colors
 from .face_materials import FaceMaterials
 
 MAX_UV = 1 << 30  # texture coordinates beyond this have no digits left
@@ -72,13 +72,13 @@ class SceneMesh:
     name
         Name of the object.
     vertices
-        float64 (v, 3), metres, Z-up, finite.
+        float64 (v, 3), meters, Z-up, finite.
     faces
         int64 (f, 3), indices into `vertices`, at least one face.
     cutouts
         Cutouts of the last faces, cutout by cutout.
-    colours
-        Colours of the faces (`lidarsim.scene.colours.Colours`), or None.
+    colors
+        Colors of the faces (`lidarsim.scene.colors.Colors`), or None.
     voxels
         Densities of leaves within the surface of the mesh, which is closed then and has no
         cutouts.
@@ -100,7 +100,7 @@ class SceneMesh:
     vertices: Floats
     faces: Ints
     cutouts: tuple[Cutout, ...] = ()
-    colours: Colours | None = None
+    colors: Colors | None = None
     voxels: Voxels | None = None
     animation: Animation | None = None
     materials: FaceMaterials | None = None
@@ -123,8 +123,8 @@ class SceneMesh:
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
         object.__setattr__(self, "cutouts", tuple(self.cutouts))
         _check_cutouts(self.name, self.cutouts, len(faces))
-        if self.colours is not None:
-            self.colours.check(self.name, len(faces))
+        if self.colors is not None:
+            self.colors.check(self.name, len(faces))
         if self.materials is not None:
             self.materials.check(self.name, len(faces))
         if self.voxels is not None:
@@ -142,7 +142,7 @@ class SceneMesh:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of the vertices, metres, (2, 3)."""
+        """Lowest and highest corner of the vertices, meters, (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
@@ -158,11 +158,11 @@ class SceneMesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
         faces = self.faces
         cutouts = self.cutouts
-        colours = self.colours
+        colors = self.colors
         if determinant(linear) < 0:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
-            colours = colours and colours.mirrored()
+            colors = colors and colors.mirrored()
         voxels = self.voxels and self.voxels.moved(linear, offset)
         animation = self.animation and self.animation.moved(linear, offset)
         vertices = turned(self.vertices, linear) + offset
@@ -171,7 +171,7 @@ class SceneMesh:
             vertices=vertices,
             faces=faces,
             cutouts=cutouts,
-            colours=colours,
+            colors=colors,
             voxels=voxels,
             animation=animation,
             materials=self.materials,

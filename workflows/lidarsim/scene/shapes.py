@@ -22,7 +22,7 @@ SEED_POSITIONS = (
     (5.0, 5.0),
 )
 
-# Control polygons from the lower pole to the upper one: (radius, height) in metres. The first
+# Control polygons from the lower pole to the upper one: (radius, height) in meters. The first
 # and the last leg are level, so that the surface is smooth at the axis; a doubled
 # point makes a tighter bend. The widest radius is stretched to SEED_RADIUS_M afterwards.
 SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
@@ -73,7 +73,7 @@ def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tupl
 def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneMesh:
     """Rotate a profile about the z axis to a closed surface.
 
-    `profile` (n, 2), n >= 3, has radius and height in metres, from the lower pole on the axis round
+    `profile` (n, 2), n >= 3, has radius and height in meters, from the lower pole on the axis round
     the outside to the upper pole. The radii of the first and last point are taken as zero, all
     other radii must be positive. There are at least 3 `segments` around the axis.
 
@@ -94,7 +94,7 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
 
 
 def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
-    """Make a ball around zero, stretched at its equator by a height, which may be zero, metres."""
+    """Make a ball around zero, stretched at its equator by a height, which may be zero, meters."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
     ball = radius * np.stack(sin_cos(angles)[::-1], axis=1)
     up = [0, height / 2]
@@ -131,7 +131,7 @@ def _revolved_faces(rings: int, segments: int) -> Ints:
 def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
     """Round off a polygon (n, 2) by cutting its corners (Chaikin 1974), but keep both ends.
 
-    The limit is a quadratic B-spline, which never leaves the convex hull of three neighbouring
+    The limit is a quadratic B-spline, which never leaves the convex hull of three neighboring
     control points, so radii stay positive.
     """
     line = np.asarray(outline, dtype=np.float64)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.arrays import AnyArray, Floats, Indices, Ints, Ints32
-from .colours import Colours, join_colours
+from .colors import Colors, join_colors
 from .face_materials import ObjectMaterials
 from .scene import Scene
 from .scene_instances import Instances, MeshPart
@@ -76,7 +76,7 @@ class _DrawnPart(NamedTuple):
 
     vertices: Floats  # (v, 3)
     faces: Ints32  # (f, 3)
-    colours: Colours | None  # a plain colour for each face
+    colors: Colors | None  # a plain color for each face
     materials: Ints32 | None  # (f,): row of the names of the object's materials; None for the first
 
 
@@ -87,7 +87,7 @@ class _CopiedInstances:
         self._scene = scene
         self._meshes = [(scene.vertices, scene.faces)]
         self._owners = [scene.face_object]
-        self._colours = [scene.colours]
+        self._colors = [scene.colors]
         self._materials = [None if scene.materials is None else scene.materials.index]
         self.counters = [np.arange(len(scene.faces))]
         assert scene.instances is not None
@@ -100,7 +100,7 @@ class _CopiedInstances:
         corners = part.faces[:, ::-1] if self._mirrored[row] else part.faces
         self._meshes.append((part.vertices @ matrix[:, :3].T + matrix[:, 3], corners))
         self._owners.append(np.full(count, shared.owner[row]))
-        self._colours.append(part.colours)
+        self._colors.append(part.colors)
         self._materials.append(part.materials)
         self.counters.append(np.full(count, len(self._scene.faces) + row))
 
@@ -114,7 +114,7 @@ class _CopiedInstances:
             self._scene.names,
             self._scene.origin,
             self._scene.actors,
-            colours=join_colours(self._colours, map(len, self._owners)),
+            colors=join_colors(self._colors, map(len, self._owners)),
             materials=self._object_materials(),
         )
 
@@ -130,16 +130,16 @@ class _CopiedInstances:
 
 
 def _drawn_part(part: MeshPart, share: float) -> _DrawnPart:
-    """Return a part with a share of its triangles, and the mean colour of each triangle."""
+    """Return a part with a share of its triangles, and the mean color of each triangle."""
     vertices = part.vertices
     faces = part.faces
     rows = np.arange(len(part.faces))
     count = max(MIN_PART_TRIANGLES, int(len(faces) * share))
     if count < len(faces):
         vertices, faces, rows = _simplified_part(part, count)
-    colours = part.colours and Colours.of_faces(part.colours.take(rows).means())
+    colors = part.colors and Colors.of_faces(part.colors.take(rows).means())
     materials = part.materials and part.materials.take(rows)
-    return _DrawnPart(vertices, faces, colours, None if materials is None else materials.index)
+    return _DrawnPart(vertices, faces, colors, None if materials is None else materials.index)
 
 
 def cut_masks(scene: Scene) -> Scene:
@@ -179,11 +179,11 @@ def _cut_part(part: MeshPart, max_pieces: float) -> MeshPart:
     opaque[0, 0] |= not opaque.any()  # no part is empty
     face, piece = np.nonzero(opaque)
     vertices = (corners[piece] @ part.vertices[part.faces[face]]).reshape(-1, 3)
-    colours = part.colours and part.colours.divided(face, corners[piece])
+    colors = part.colors and part.colors.divided(face, corners[piece])
     return MeshPart(
         vertices,
         np.arange(len(vertices), dtype=np.int32).reshape(-1, 3),
-        colours=colours,
+        colors=colors,
         materials=part.materials and part.materials.take(face),
     )
 
@@ -274,9 +274,9 @@ def simplified(scene: Scene, max_triangles: int) -> tuple[Scene, Ints]:
     """
     merged = _merge_vertices(scene.vertices, scene.faces, max_triangles)
     owners = scene.face_object[merged.face_indices]
-    colours = scene.colours and scene.colours.take(merged.face_indices)
+    colors = scene.colors and scene.colors.take(merged.face_indices)
     faces = merged.faces[merged.face_indices]
-    coarse = Scene(merged.vertices, faces, owners, scene.names, scene.origin, colours=colours)
+    coarse = Scene(merged.vertices, faces, owners, scene.names, scene.origin, colors=colors)
     return coarse, merged.substitutes
 
 

@@ -56,7 +56,7 @@ class Transform:
     linear
         float64 (3, 3), invertible.
     offset
-        float64 (3,), metres.
+        float64 (3,), meters.
 
     Raises
     ------
@@ -99,7 +99,7 @@ class Transform:
         Parameters
         ----------
         translation
-            Translation, metres.
+            Translation, meters.
         rotation_deg
             Rotations about x, y and z in this order, degrees.
         scale

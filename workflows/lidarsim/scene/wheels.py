@@ -84,7 +84,7 @@ def _check_names(wheels: Sequence[str], names: Sequence[str]) -> None:
 def _radii(
     meshes: Sequence[SceneMesh], wheels: Sequence[str]
 ) -> tuple[dict[int, float], list[str]]:
-    """Return the radii of round wheels, {index of the mesh: metres}, and notes on oval wheels."""
+    """Return the radii of round wheels, {index of the mesh: meters}, and notes on oval wheels."""
     radii: dict[int, float] = {}
     notes: list[str] = []
     for index, mesh in enumerate(meshes):

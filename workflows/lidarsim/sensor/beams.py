@@ -36,8 +36,8 @@ class Beams:
     time_ns
         float64 (c,): time of a beam within a firing, nanoseconds; 0 by default.
     origin
-        float64 (c, 3): start of a beam with the head at azimuth 0, metres, in the sensor frame; the
-        sensor's centre by default.
+        float64 (c, 3): start of a beam with the head at azimuth 0, meters, in the sensor frame; the
+        sensor's center by default.
 
     Raises
     ------

@@ -35,7 +35,7 @@ class Calibration:
     beams: Beams | None = None  # beams in the maker's order, with the times in the file, if any
     rays: Floats | None = None  # instead of beams, unit directions (n, 3) in the order of firing
     shot_ns: Floats | None = None  # times (n,) of the rays, if the file has times
-    starts: Floats | None = None  # starts of the rays (n, 3), metres; None for the sensor's centre
+    starts: Floats | None = None  # starts of the rays (n, 3), meters; None for the sensor's center
     cycle_ns: float | None = None  # duration of the list of rays, if the file states it
     range_m: tuple[float, float] | None = None  # shortest and longest, if the file states ranges
     sensor: str = ""  # name of the sensor, if the file states it
@@ -217,7 +217,7 @@ def _ouster_section(data: dict[str, Any], name: str, default: Any = None) -> dic
 
 
 def _ouster_origin_mm(data: dict[str, Any], beam: dict[str, Any]) -> Floats:
-    """Return the start (3,) of Ouster's beams at azimuth 0, in the sensor frame, millimetres."""
+    """Return the start (3,) of Ouster's beams at azimuth 0, in the sensor frame, millimeters."""
     beam_pose = np.reshape(beam.get("beam_to_lidar_transform", np.eye(4)), (4, 4))
     if not np.allclose(beam_pose[:3, :3], np.eye(3)):
         raise ValueError(

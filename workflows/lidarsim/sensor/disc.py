@@ -99,7 +99,7 @@ class Beam:
     angles
         float64 (k, 2): angles off the axis, across and up, radians.
     starts
-        float64 (k, 2): starts at the sensor, across and up, metres off the axis; None if all
+        float64 (k, 2): starts at the sensor, across and up, meters off the axis; None if all
         sub-rays start on the axis.
     oval
         Whether the beam is wider in one direction, so that across and up are directions of the
@@ -137,7 +137,7 @@ class Beam:
         profile
             Distribution of the light over the beam.
         exit_m
-            Width of the beam at the sensor, metres.
+            Width of the beam at the sensor, meters.
         """
         even = profile == "even" or count == 1
         points = _disc_points(count) if even else _gaussian_points(count)
@@ -153,8 +153,8 @@ class Beam:
 
 
 @cache
-def neighbours(count: int) -> Indices:
-    """Return the pairs of neighbouring sub-rays: (m, 2).
+def neighbors(count: int) -> Indices:
+    """Return the pairs of neighboring sub-rays: (m, 2).
 
     The circle whose diameter connects a pair is empty (Gabriel and Sokal 1969).
     """

@@ -325,7 +325,7 @@ class _EvenLine(NamedTuple):
 
 
 def _even_line(beams: Beams, radians_per_ns: float) -> _EvenLine | None:
-    """Return the line of beams, or None for beams that make no even line from the centre.
+    """Return the line of beams, or None for beams that make no even line from the center.
 
     `radians_per_ns` is the speed of the head, which turns while the beams fire.
     """

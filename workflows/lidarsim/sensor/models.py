@@ -88,10 +88,10 @@ class BeamTable(_ModelSection):
         )
 
     def origins(self, count: int) -> Floats:
-        """Return the starts of `count` beams: (count, 3), metres, or (0, 3) without origins.
+        """Return the starts of `count` beams: (count, 3), meters, or (0, 3) without origins.
 
         Beams that cross in a point `crossing_m` ahead of the axis, at the height of the sensor's
-        centre, start on the axis, above or below the centre.
+        center, start on the axis, above or below the center.
         """
         if self.crossing_m:
             up, level = sin_cos(np.radians(self.elevation_deg))

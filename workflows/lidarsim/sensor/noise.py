@@ -20,7 +20,7 @@ THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 MAX_ALARMS = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
-Metres = Annotated[float, Field(ge=0, le=1000)]
+Meters = Annotated[float, Field(ge=0, le=1000)]
 Bias = Annotated[float, Field(ge=-1000, le=1000)]
 DecayTime = Annotated[float, Field(gt=0, le=1e7)]
 AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
@@ -33,7 +33,7 @@ class Noise:
 
     Without arguments, there is none of these.
 
-    The standard deviation of a range of r metres is ``range_m + range_per_m * r``, and
+    The standard deviation of a range of r meters is ``range_m + range_per_m * r``, and
     `range_at_threshold_m` times the threshold of detection over the return's energy is added in
     squares. Rays are cast in directions with noise, and reported with angles without noise. Stated
     detection ranges are for surfaces at right angles in clear air.
@@ -44,9 +44,9 @@ class Noise:
         If a number is outside its range, or needs a detection range that is not given.
     """
 
-    range_m: Annotated[Metres, about("standard deviation of ranges, metres", 0.02)] = 0.0
+    range_m: Annotated[Meters, about("standard deviation of ranges, meters", 0.02)] = 0.0
     range_per_m: Annotated[
-        float, about("standard deviation added for each metre of range", 0.0002, ge=0, le=1)
+        float, about("standard deviation added for each meter of range", 0.0002, ge=0, le=1)
     ] = 0.0
     angle_deg: Annotated[
         AngleSigma, about("standard deviation of beam directions, in both axes", 0.05)
@@ -66,17 +66,17 @@ class Noise:
     ] = None
     seed: Annotated[Seed, about("the same seed gives the same noise")] = 0
     overlap_m: Annotated[
-        Metres,
+        Meters,
         about(
             "range from which on the receiver sees the whole beam; nearer, rain, snow, fog "
             "and dust do not return more"
         ),
     ] = 10.0
     range_at_threshold_m: Annotated[
-        Metres,
+        Meters,
         about(
             "standard deviation of the range of a return at the threshold of "
-            "detection, metres; falls as its energy grows, added in squares",
+            "detection, meters; falls as its energy grows, added in squares",
             0.05,
         ),
     ] = 0.0
@@ -125,11 +125,11 @@ class Noise:
         ),
     ] = None
     channel_bias_m: Annotated[
-        Metres | Several[Bias],
+        Meters | Several[Bias],
         allowed("a number from 0 to 1000, or a list of numbers, one for each channel"),
-        about("constant errors of channels' ranges, metres: standard deviation, or one for each"),
+        about("constant errors of channels' ranges, meters: standard deviation, or one for each"),
     ] = 0.0
-    warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, metres")] = 0.0
+    warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, meters")] = 0.0
     warm_up_s: Annotated[DecayTime, about("time in which the error falls to 37 %, seconds")] = 600.0
     ripple_deg: Annotated[AngleSigma, about("greatest error of azimuths, as the head turns")] = 0.0
     ripple_cycles: Annotated[int, about("repetitions in a revolution", ge=1, le=100_000)] = 1

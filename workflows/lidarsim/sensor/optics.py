@@ -151,7 +151,7 @@ class Returns:
         return across if across == up else float(np.sqrt(across * up))
 
     def min_gap_m(self, optics: Optics) -> float:
-        """Return the smallest distance between two returns, metres: half of the pulse's length."""
+        """Return the smallest distance between two returns, meters: half of the pulse's length."""
         return LIGHT_M_NS * self.length_ns(optics) / 2
 
     def beam(self, optics: Optics) -> Beam:
@@ -167,7 +167,7 @@ class Returns:
         return Beam.from_divergences(self.subrays, divergences, profile, self.exit_m(optics))
 
     def exit_m(self, optics: Optics) -> float:
-        """Return the width of the beam at the sensor, metres, or 0 if the width is unknown."""
+        """Return the width of the beam at the sensor, meters, or 0 if the width is unknown."""
         return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
     def _divergences(self, optics: Optics) -> tuple[float, float]:

@@ -47,7 +47,7 @@ class PrismSensor(Sensor):
 
     With a mirror, the axis of prisms and mirror is z instead, and y and z of the prisms are x and y
     of the sensor. The head is only the clock. Directions are exact by Snell's law at each face.
-    Prisms are thin: all rays start at the sensor's centre. The pattern has no useful period.
+    Prisms are thin: all rays start at the sensor's center. The pattern has no useful period.
     """
 
     # A beam along x by default; several beams enter the first prism at angles.
@@ -162,7 +162,7 @@ class ListedSensor(Sensor):
     rays: Floats = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
     shot_ns: Floats = field(default_factory=lambda: np.zeros(1))
     cycle_ns: float = 1e8  # duration of the list
-    starts: Floats | None = None  # (n, 3): starts of the rays, metres; None for the centre
+    starts: Floats | None = None  # (n, 3): starts of the rays, meters; None for the center
     cycle: ClassVar[str] = "frame"
 
     @property
@@ -180,9 +180,9 @@ class ListedSensor(Sensor):
         return self.rays[firings % len(self.rays)][:, None, :]
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return the starts of the rays of firings (k,), sensor frame: (k, 1, 3), metres.
+        """Return the starts of the rays of firings (k,), sensor frame: (k, 1, 3), meters.
 
-        None if all rays start at the sensor's centre.
+        None if all rays start at the sensor's center.
         """
         if self.starts is None:
             return None

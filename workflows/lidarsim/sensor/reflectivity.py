@@ -34,7 +34,7 @@ class ByteScale(NamedTuple):
 
     @property
     def _step(self) -> float:
-        """Logarithm of the ratio of the reflectances of neighbouring codes."""
+        """Logarithm of the ratio of the reflectances of neighboring codes."""
         return log_of(self.max_reflectance / self.reflectance) / max(255 - self.code, 1) or 1.0
 
 

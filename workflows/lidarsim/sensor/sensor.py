@@ -35,7 +35,7 @@ Sector = Annotated[
     about("for a grid: degrees that a revolution sweeps, half of it left of +x", gt=0, le=360),
 ]
 SAMPLED_FIRINGS = 2000  # firings that give the field of view
-MAX_GAP_DEG = 5.0  # between neighbouring azimuths of a sensor that looks all around
+MAX_GAP_DEG = 5.0  # between neighboring azimuths of a sensor that looks all around
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 
@@ -56,7 +56,7 @@ class Sensor:
     head
         The mechanism that moves the beams.
     min_range_m, max_range_m
-        Returns nearer or farther than these, in metres, are ignored. A ray passes through nearer
+        Returns nearer or farther than these, in meters, are ignored. A ray passes through nearer
         surfaces.
     name
         Name of the model, for reports; by default the name of the class.
@@ -124,7 +124,7 @@ class Sensor:
         firings = np.linspace(first, stop - 1, min(stop - first, SAMPLED_FIRINGS)).astype(np.int64)
         x, y, z = self.directions(firings).reshape(-1, 3).T
         azimuths = np.sort(np.degrees(arctan2(y, x)))
-        # All around, less the widest gap between neighbours.
+        # All around, less the widest gap between neighbors.
         gaps = np.diff(azimuths, append=azimuths[0] + 360)
         width = 360.0 if gaps.max() < MAX_GAP_DEG else 360.0 - float(gaps.max())
         elevations = np.degrees(arcsin(np.clip(z, -1, 1)))
@@ -193,7 +193,7 @@ class Sensor:
         step_deg
             Rotation in one time step, degrees, in (0, 360].
         min_range_m, max_range_m
-            Returns nearer or farther than these, in metres, are ignored.
+            Returns nearer or farther than these, in meters, are ignored.
         rate_hz
             Revolutions a second.
         horizontal_fov_deg
@@ -309,9 +309,9 @@ class Sensor:
         return self._rotated(firings, self.ahead)
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return starts of the rays of firings (k,), sensor frame: (k, channels, 3), metres.
+        """Return starts of the rays of firings (k,), sensor frame: (k, channels, 3), meters.
 
-        None if all rays start at the sensor's centre.
+        None if all rays start at the sensor's center.
         """
         if not self.beams.origin.any():
             return None
@@ -326,8 +326,8 @@ class Sensor:
         return np.column_stack([level * cos, level * sin, up])
 
     @cached_property
-    def centre(self) -> Floats | None:
-        """Common start of all beams in the head frame, (3,), metres, or None if starts differ."""
+    def center(self) -> Floats | None:
+        """Common start of all beams in the head frame, (3,), meters, or None if starts differ."""
         origin = self.beams.origin
         return origin[0] if (origin == origin[0]).all() else None
 

@@ -40,13 +40,13 @@ class FiredRays:
     channels
         int64 (n,): channel of each ray; 0 is the lowest.
     origins
-        float64 (n, 3): starts of the rays, metres; None if all start at the sensor's centre.
+        float64 (n, 3): starts of the rays, meters; None if all start at the sensor's center.
     cycle_ns
         Duration of the list, after which it may be repeated, nanoseconds; None if unknown.
     rate_hz
         Revolutions, lines or frames a second.
     range_m
-        Shortest and longest range, metres; the longest may be infinite.
+        Shortest and longest range, meters; the longest may be infinite.
     name
         Name of the sensor.
     repeats
@@ -86,8 +86,8 @@ class FiredRays:
         return np.degrees(arctan2(z, np.sqrt(x * x + y * y)))
 
     @property
-    def origins_or_centre(self) -> Floats:
-        """Starts of the rays (n, 3), metres, or zeros if all start at the sensor's centre."""
+    def origins_or_center(self) -> Floats:
+        """Starts of the rays (n, 3), meters, or zeros if all start at the sensor's center."""
         return np.zeros((len(self), 3)) if self.origins is None else self.origins
 
     def timed(self) -> FiredRays:

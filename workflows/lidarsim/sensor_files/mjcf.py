@@ -37,7 +37,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     sites = [
         f'      <site name="ray_{number}" pos="{_numbers(start)}" zaxis="{_numbers(direction)}"/>'
         for number, (start, direction) in enumerate(
-            zip(rays.origins_or_centre, rays.directions, strict=True)
+            zip(rays.origins_or_center, rays.directions, strict=True)
         )
     ]
     finders = [

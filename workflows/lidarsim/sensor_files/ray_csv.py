@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.tables import DEGREES, METRES, NUMBERS, Quantity, read_table
+from ..base.tables import DEGREES, METERS, NUMBERS, Quantity, read_table
 from ..base.textfile import read_text
 from ..base.time_units import SECONDS
 from .complete_files import write_text_of
@@ -25,7 +25,7 @@ QUANTITIES = (
     Quantity("azimuth_deg", ("azimuth",), DEGREES, None),
     Quantity("elevation_deg", ("elevation",), DEGREES, None),
     *(Quantity(name, (name, name[-1], f"d{name[-1]}"), NUMBERS, "") for name in DIRECTION),
-    *(Quantity(name, (name.removesuffix("_m"),), METRES, "m") for name in ORIGIN),
+    *(Quantity(name, (name.removesuffix("_m"),), METERS, "m") for name in ORIGIN),
 )
 
 

@@ -77,7 +77,7 @@ def columns_of(rays: FiredRays) -> dict[str, Floats | Ints]:
     timed = rays.timed()
     assert timed.times_ns is not None  # of timed rays
     angles = (rays.azimuths_deg, rays.elevations_deg)
-    vectors = (*rays.directions.T, *rays.origins_or_centre.T)
+    vectors = (*rays.directions.T, *rays.origins_or_center.T)
     values = (timed.times_ns, rays.channels, *angles, *vectors)
     return dict(zip(COLUMNS, values, strict=True))
 

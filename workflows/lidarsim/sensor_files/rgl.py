@@ -34,7 +34,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "rays": "rgl_node_rays_from_mat3x4f: rows of matrices; column 3 is the direction",
         "ring_ids": "rgl_node_rays_set_ring_ids",
         "time_offsets": "rgl_node_rays_set_time_offsets: milliseconds since the start of the list",
-        "ranges": "rgl_node_rays_set_range: shortest and longest, metres",
+        "ranges": "rgl_node_rays_set_range: shortest and longest, meters",
         "rate_hz": rays.rate_hz,
         "cycle_ns": rays.cycle_ns,
         "not_in_this_file": list(left_out),
@@ -61,7 +61,7 @@ def _matrices(rays: FiredRays) -> Floats:
     up = np.where(np.abs(ahead[:, 2:]) > _STEEP, [[1.0, 0, 0]], [[0.0, 0, 1]])
     right = np.cross(ahead, up)
     right /= np.sqrt((right * right).sum(axis=1))[:, None]
-    return np.stack([right, np.cross(ahead, right), ahead, rays.origins_or_centre], axis=2)
+    return np.stack([right, np.cross(ahead, right), ahead, rays.origins_or_center], axis=2)
 
 
 def read(path: Path) -> FiredRays | None:

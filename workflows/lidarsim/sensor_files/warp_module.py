@@ -13,7 +13,7 @@ from .complete_files import write_text_of
 from .fired_rays import AXES, FiredRays
 from .python_file import array_code, python_text, times_code
 
-_WORDS = f"""Axes: {AXES}. Directions are float32 unit vectors, origins metres, times
+_WORDS = f"""Axes: {AXES}. Directions are float32 unit vectors, origins meters, times
 nanoseconds since the start of the pattern.
 
     origins, directions, times_ns = rays(frame=0)"""

@@ -12,7 +12,7 @@ from ..base.arrays import Bools, Floats
 from ..base.errors import LidarError, prefixed
 from ..base.value_texts import shown
 from ..motion.rotations import check_rotations
-from ..motion.trajectory import CENTRE, Pose, StaticPose, Track, Trajectory, pose_of
+from ..motion.trajectory import CENTER, Pose, StaticPose, Track, Trajectory, pose_of
 
 ROW_SLACK = 1e-8  # tolerance of the last rows of matrices
 
@@ -20,7 +20,7 @@ ROW_SLACK = 1e-8  # tolerance of the last rows of matrices
 class BodyPoses(NamedTuple):
     """Poses of k bodies, and the trajectories of the bodies that have one."""
 
-    positions: Floats  # (k, 3), metres; not used of bodies with a trajectory that moves
+    positions: Floats  # (k, 3), meters; not used of bodies with a trajectory that moves
     rotations: Floats  # (k, 3, 3), from the frame of the body to the scene frame; as above
     trajectories: Sequence[Trajectory | None]  # (k,); None for a body that stands at its pose
 
@@ -112,7 +112,7 @@ def _listed_poses(poses: Sequence[Any]) -> BodyPoses:
     for value in poses:
         trajectory = value if hasattr(value, "poses") else None
         if trajectory is not None and trajectory.moves:
-            pose = CENTRE  # not used: only actors have such trajectories
+            pose = CENTER  # not used: only actors have such trajectories
         else:
             pose = pose_of("pose", value) if trajectory is None else trajectory.pose(0)
         trajectories.append(trajectory)

@@ -42,7 +42,7 @@ RETURNS_LEAFY = 3.8  # the same, if all are reported and sub-rays meet leaves; 3
 # A point, and each byte of its columns, whose sources are float64.
 POINT = 64
 POINT_BYTE = 3.2
-COLOUR = 16  # bytes of a ray, if colours are reflectances
+COLOR = 16  # bytes of a ray, if colors are reflectances
 # Copies of columns from a device: CuPy rounds page-locked memory up to powers of two, and columns
 # of several runs of scans, by station and sensor, are joined.
 PAGE_LOCKED = 2
@@ -56,7 +56,7 @@ HIT_COUNTER = 16  # bytes of a hit counter (`Scene.counters`): two counts
 SCENE_TRIANGLE = 80  # bytes of a triangle, in every process that knows the scene
 # Of a triangle while a caster is built: tiles 250, NumPy 310 (2026-11-28), CUDA 360.
 CASTER_TRIANGLE = 360
-COLOURED_TRIANGLE = 160  # bytes of a triangle with colours
+COLORED_TRIANGLE = 160  # bytes of a triangle with colors
 IMAGE_BYTE = 4  # bytes for each byte of an image
 INSTANCE = 2000  # bytes of an instance, in every process that knows the scene
 POSED_TRIANGLE = 40  # bytes of a triangle in each pose of an animation, in boxes of the tree
@@ -68,8 +68,8 @@ def rig_bytes(scene: Scene, survey: Survey) -> int:
     # Sensors that see different static objects have separate trees.
     trees = len({static_key(scene, mask) for mask in unseen_objects(scene, survey)})
     triangles = (SCENE_TRIANGLE + CASTER_TRIANGLE * trees) * scene.kept_triangles
-    images = {id(image): image.nbytes for mesh in scene.coloured for image in mesh.images}
-    colours = COLOURED_TRIANGLE * sum(map(len, scene.coloured)) + IMAGE_BYTE * sum(images.values())
+    images = {id(image): image.nbytes for mesh in scene.colored for image in mesh.images}
+    colors = COLORED_TRIANGLE * sum(map(len, scene.colored)) + IMAGE_BYTE * sum(images.values())
     instances = INSTANCE * len(scene.instances or ())
     patterns = 0
     for carried in survey.carried:
@@ -82,7 +82,7 @@ def rig_bytes(scene: Scene, survey: Survey) -> int:
         if mesh.animation is not None:
             vertices = mesh.animation.vertices
             poses += vertices.nbytes + POSED_TRIANGLE * len(vertices) * len(mesh.faces)
-    return triangles + colours + instances + patterns + poses
+    return triangles + colors + instances + patterns + poses
 
 
 def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool = False) -> int:
@@ -131,7 +131,7 @@ def _casting_memory(setup: Setup, sizes: Sizes, firings: int, on_device: bool) -
     textured = any(material.reflectance == "texture" for material in survey.materials)
     bodies = RAY_AMONG_BODIES * bool(scene.actors or scene.instances)
     rig_memory = Memory(
-        retained=(RAY + COLOUR * textured) * host_rays
+        retained=(RAY + COLOR * textured) * host_rays
         + POSE_RETAINED * poses
         + COMPUTED_RAY_RETAINED * computed_rays
     )

@@ -217,7 +217,7 @@ class PulseCaster:
         return Scanned(returns, hits.hit_counts, hits.tally)
 
     def _with_light(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
-        """Add energy, colour and velocity to returns of deflected beams, by cast directions."""
+        """Add energy, color and velocity to returns of deflected beams, by cast directions."""
         surfaces = self._surfaces
         setup = self.setup
         poses = batch.poses
@@ -225,7 +225,7 @@ class PulseCaster:
         times = poses.times(returns.ray)
         distance = returns.distance
         triangle = returns.triangle
-        colour = velocity = None
+        color = velocity = None
         if setup.has_velocities:
             velocity = radial_velocities(
                 surfaces,
@@ -239,7 +239,7 @@ class PulseCaster:
         if surfaces.materials.textured:
             points = directions * distance[:, None]
             points += origins
-            colour = surfaces.colours(triangle, points, times, poses.actor_trajectories)
+            color = surfaces.colors(triangle, points, times, poses.actor_trajectories)
             del points  # which takes as much memory as the normals
         sensor_light = sensor_light_of(setup.survey, setup.sensor)
         lit = surfaces.lit(
@@ -249,9 +249,9 @@ class PulseCaster:
             sensor_light=sensor_light,
             times=times,
             trajectories=poses.actor_trajectories,
-            colours=colour,
+            colors=color,
         )
-        return returns._replace(energy=lit.energy, colour=colour, velocity=velocity)
+        return returns._replace(energy=lit.energy, color=color, velocity=velocity)
 
     def _thin_out(self, returns: PulseReturns, scan_starts: Ints, tally: bool) -> Scanned:
         """Count the returns of each scan, and keep every n-th return of a scan."""

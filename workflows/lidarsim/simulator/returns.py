@@ -21,7 +21,7 @@ from ..base.arrays import (
     UInts32,
 )
 from ..columns.table import CAUSES
-from ..scene.colours import GREY, packed
+from ..scene.colors import GRAY, packed
 
 T = TypeVar("T")
 
@@ -39,7 +39,7 @@ def selected(columns: Iterable[Any], row_selection: Any) -> Iterator[Any]:
 
 
 # Columns of every hit and return.
-RETURN_COLUMNS = "ray", "distance", "triangle", "energy", "colour", "cause"
+RETURN_COLUMNS = "ray", "distance", "triangle", "energy", "color", "cause"
 
 
 class PulseReturns(NamedTuple):
@@ -50,13 +50,13 @@ class PulseReturns(NamedTuple):
     """
 
     ray: Integers
-    distance: Floats  # metres, without noise
+    distance: Floats  # meters, without noise
     triangle: Ints32
     # Received (`Surfaces.energy`); None if `BatchPoints` computes it from the reported rays.
     energy: Floats | None = None
-    # Packed (`Surfaces.colours`); None if it is not needed, or `BatchPoints` looks it up at the
+    # Packed (`Surfaces.colors`); None if it is not needed, or `BatchPoints` looks it up at the
     # ends of the rays.
-    colour: UInts32 | None = None
+    color: UInts32 | None = None
     cause: Bytes | None = None  # indices into `CAUSES`; None if all hits are on surfaces
     velocity: Floats | None = None  # radial, m/s, if a column stores it; NaN if unknown
     # Full width at half maximum in the waveform, ns, and its height; None without waveforms.
@@ -66,7 +66,7 @@ class PulseReturns(NamedTuple):
     waveform: Records | None = None
     number: Bytes | None = None  # among the reported returns of its pulse, from 1
     return_counts: Bytes | None = None  # number of reported returns of its pulse
-    reported: Floats | None = None  # distance with noise, metres
+    reported: Floats | None = None  # distance with noise, meters
 
     @classmethod
     def empty(cls) -> PulseReturns:
@@ -131,7 +131,7 @@ def returns_without_surface(
 ) -> PulseReturns:
     """Return a table of returns (n,) that are not from a surface, all of one cause.
 
-    The table has the columns `colour` and `amplitude` if the table `template` has these columns.
+    The table has the columns `color` and `amplitude` if the table `template` has these columns.
     """
     count = len(ray)
     return PulseReturns(
@@ -139,7 +139,7 @@ def returns_without_surface(
         distance,
         np.full(count, NO_SURFACE, np.int32),
         energy,
-        None if template.colour is None else np.full(count, packed(GREY[0])[0]),
+        None if template.color is None else np.full(count, packed(GRAY[0])[0]),
         np.full(count, cause, np.uint8),
         amplitude=None if template.amplitude is None else energy,
     )

@@ -111,7 +111,7 @@ class Rig:
             repeats, by_head = rays_repeat(sensor, moves)
             rays = _Rays(None)
             if by_head:
-                origin = sensor.beams.origin if sensor.centre is None else None
+                origin = sensor.beams.origin if sensor.center is None else None
                 pattern = Pattern(sensor.ahead, origin, step=sensor.ring_step)
                 rays = _Rays(pattern, by_head=True)
             elif repeats:
@@ -308,9 +308,9 @@ class Rig:
         """Return the ranges of the same firings from several poses of a static carrier.
 
         `specs` are consecutive scans of one station; for random numbers, the scans of the next pose
-        have the next numbers. The poses are positions (k, 3), metres, and rotations (k, 3, 3) from
+        have the next numbers. The poses are positions (k, 3), meters, and rotations (k, 3, 3) from
         the carrier frame to the scene frame; they are not checked here. Ranges belong to the
-        nearest reported returns, metres: float32 (k, firings, channels); inf without a return.
+        nearest reported returns, meters: float32 (k, firings, channels); inf without a return.
         """
         number = specs[0].sensor
         sensor = self.survey.carried[number].sensor

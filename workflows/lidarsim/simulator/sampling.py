@@ -65,7 +65,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
 
 
 def sample_ranges(scene: Scene, survey: Survey, scans: range | None = None) -> Floats:
-    """Return the distances from sampled rays of a survey to the nearest surfaces, metres: (n,).
+    """Return the distances from sampled rays of a survey to the nearest surfaces, meters: (n,).
 
     Sensors have neither limits of range nor noise, faults or weather. Rays that meet no surface are
     left out. `scans` are the scans of the survey that are sampled, by default all.

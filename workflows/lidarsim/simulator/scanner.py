@@ -25,7 +25,7 @@ from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column
 from ..media.materials import Material
 from ..media.weather import FOG_LIDAR_RATIO_SR
-from ..motion.trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
+from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, pose_of
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Noise, Returns, Sensor
@@ -34,7 +34,7 @@ from .body_poses import ROW_SLACK, poses_of_bodies, poses_of_body
 from .casting.motion import check_trajectory
 from .casting.scene_caster import check_backend_here
 from .casting.static_bodies import warn_of_reach
-from .casting.surfaces import warn_of_grey
+from .casting.surfaces import warn_of_gray
 from .points.batch_columns import columns_of
 from .rig import Rig
 
@@ -127,7 +127,7 @@ class Scanner:
             mounted = replace(mounted, unseen=(*mounted.unseen, *names))
         survey = Survey(
             sensors=[mounted],
-            poses=[CENTRE],
+            poses=[CENTER],
             steps=1,
             precision_m=precision_m,  # type: ignore[arg-type]  # None: of the sensor, as below
             columns=columns,
@@ -143,7 +143,7 @@ class Scanner:
             wet=wet,
             spray_g_m3=spray_g_m3,
         )
-        warn_of_grey(scene, survey)
+        warn_of_gray(scene, survey)
         warn_of_reach(scene, survey)
         self._assemble(scene, survey, {"backend": backend, "threads": threads, "device": device})
 
@@ -194,7 +194,7 @@ class Scanner:
 
     @property
     def origin(self) -> Floats:
-        """World coordinates of the scene's local origin, metres: (3,)."""
+        """World coordinates of the scene's local origin, meters: (3,)."""
         return self._rig.scene.origin
 
     @property
@@ -293,7 +293,7 @@ class Scanner:
         Parameters
         ----------
         poses
-            A pose or a list of poses; positions (k, 3), metres; or matrices (k, 4, 4) from the
+            A pose or a list of poses; positions (k, 3), meters; or matrices (k, 4, 4) from the
             frame of the sensor, or of its carrier, to the scene frame. The sensor is static.
         number
             Number of the revolution, as in `sweep`. The image of pose i has the random numbers of
@@ -304,7 +304,7 @@ class Scanner:
         Returns
         -------
         float32 (k, firings, channels)
-            Range of the nearest reported return of each ray, metres; inf without a return.
+            Range of the nearest reported return of each ray, meters; inf without a return.
 
         Raises
         ------
@@ -369,7 +369,7 @@ class Scanner:
         >>> names = [car.name for car in cars]
         >>> scanner.move(names, [(4, 0, 0), (8, 4, 0), (8, -4, 0)])
         >>> matrices = np.tile(np.eye(4), (3, 2, 1, 1))
-        >>> matrices[:, 1, 0, 3] = 1.5  # a metre and a half in a tenth of a second
+        >>> matrices[:, 1, 0, 3] = 1.5  # a meter and a half in a tenth of a second
         >>> scanner.move(names, matrices, times_s=[0, 0.1])
         """
         names = [name] if isinstance(name, str) else list(name)

@@ -35,7 +35,7 @@ from ..columns.table import (
 from ..media.materials import ClassNames, Material
 from ..media.weather import EXIT_M, FAINTEST, Air, Weather, reach
 from ..motion.navigation import Navigation, check_navigation
-from ..motion.trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
+from ..motion.trajectory import CENTER, Pose, Stations, Trajectory, pose_of
 from ..sensor.noise import MAX_ALARMS, Noise
 from ..sensor.optics import WINDOW_SIGMAS, Precision, Returns
 from ..sensor.sensor import Sensor
@@ -83,7 +83,7 @@ class Mounted:
     """
 
     sensor: Sensor
-    mount: Pose = CENTRE
+    mount: Pose = CENTER
     name: str = ""
     steps: StepCount | None = None
     returns: Returns | None = None
@@ -165,7 +165,7 @@ class CloudOptions:
         Precision,
         FILLED_IN,
         about(
-            "step in metres that points are rounded to; by default the sensor's resolution of "
+            "step in meters that points are rounded to; by default the sensor's resolution of "
             "ranges; if it states none 0.001, and in Python 0.01",
             0.001,
         ),

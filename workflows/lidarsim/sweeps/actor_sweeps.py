@@ -22,7 +22,7 @@ _POSES = 100_000  # poses that are computed at a time
 class ActorSweeps(NamedTuple):
     """Actors during n sweeps, in fields of `Sweeps`."""
 
-    positions: Floats  # (a, n, 3): at the starts of the sweeps, metres, world coordinates
+    positions: Floats  # (a, n, 3): at the starts of the sweeps, meters, world coordinates
     rotations: Floats  # (a, n, 3, 3): from the actor's frame to the world frame
     velocities: Floats  # (a, n, 3): of the centers of the boxes, m/s
     bounds: Floats  # (a, 2, 3)
@@ -61,7 +61,7 @@ class ActorSweeps(NamedTuple):
 class _OneActor(NamedTuple):
     """An actor during n sweeps."""
 
-    positions: Floats  # (n, 3): scene frame, metres
+    positions: Floats  # (n, 3): scene frame, meters
     rotations: Floats  # (n, 3, 3)
     velocities: Floats  # (n, 3): of the center of the box, m/s
     present: Bools  # (n,)
@@ -96,7 +96,7 @@ class _OneActor(NamedTuple):
 class _Poses(NamedTuple):
     """Poses of an actor at times (k,), and their derivatives."""
 
-    positions: Floats  # (k, 3): scene frame, metres
+    positions: Floats  # (k, 3): scene frame, meters
     rotations: Floats  # (k, 3, 3)
     speeds: Floats  # (k, 3): m/s
     rates: Floats  # (k, 3): rad/s

@@ -22,7 +22,7 @@ INSTRUMENT_FILES = (IMU_FILE, GNSS_FILE)
 class Instrument:
     """Mount and noise of an instrument, which bags state beside its samples."""
 
-    position: list[float]  # place on the carrier, metres
+    position: list[float]  # place on the carrier, meters
     quaternion: list[float]  # x, y, z, w
     # Variances of white noise: of angular velocities and specific forces; or of positions to the
     # east, the north and up, including drift.

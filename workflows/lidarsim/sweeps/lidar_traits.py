@@ -49,7 +49,7 @@ class LidarTraits:
     mode: str  # mode of its returns (`Returns`)
     zero_deg: float = 0.0  # azimuth at which its head starts: counter-clockwise from x
     firing_ns: float = 0.0  # time from the first beam of a firing to the last
-    # Difference between the manufacturer's ranges and distances from the beam's origin, metres.
+    # Difference between the manufacturer's ranges and distances from the beam's origin, meters.
     range_offset_m: float = 0.0
     lines: MirrorLines | None = None  # lines of sensors that sweep across the direction of flight
     # The maker's number of the laser of each channel, from 0; empty if unknown.

@@ -23,17 +23,17 @@ STILL = np.zeros((0, 0, 7), np.float32)  # knots of sensors that are static whil
 class FiringPoses:
     """Poses of a sensor or actor at the firings of points (k,) of a sweep, or at other times."""
 
-    position: Floats  # (3,): at the start of the sweep, metres, world coordinates
+    position: Floats  # (3,): at the start of the sweep, meters, world coordinates
     rotation: Floats  # (3, 3): from the sensor frame at the start to the world frame
-    # (3, k): metres from `position`, in the world frame; None if the sensor is static.
+    # (3, k): meters from `position`, in the world frame; None if the sensor is static.
     offsets: Floats | None = None
     quaternions: Floats | None = None  # (4, k): x, y, z, w of the rotations since the start
-    # (3, k): motion of the sensor between the knots around the firing, metres.
+    # (3, k): motion of the sensor between the knots around the firing, meters.
     steps: Floats | None = None
 
     @property
     def positions(self) -> Floats:
-        """Positions (k, 3), or (3,) of a static sensor, metres, world coordinates."""
+        """Positions (k, 3), or (3,) of a static sensor, meters, world coordinates."""
         return self.position if self.offsets is None else self.position + self.offsets.T
 
     def inward(self, points: Floats) -> Floats:
@@ -125,7 +125,7 @@ def knots_of(survey: Survey, lidars: Sequence[LidarTraits], rotations: Floats) -
 
     Returns
     -------
-    (n, m, 7): position relative to the start of the sweep, metres, in the world frame; and
+    (n, m, 7): position relative to the start of the sweep, meters, in the world frame; and
     quaternion x, y, z, w of the rotation since the start, in the sensor frame. `STILL` if no
     sensor moves while it sweeps.
     """

@@ -74,7 +74,7 @@ def numbered_places(positions: Floats) -> Ints:
 class SweepPoses:
     """Poses of a sensor, carrier or actor at the start of each sweep."""
 
-    positions: Floats  # (n, 3): metres, world coordinates
+    positions: Floats  # (n, 3): meters, world coordinates
     quaternions: Floats  # (n, 4): x, y, z, w of the rotation from the body's frame to the world's
 
     @cached_property
@@ -126,7 +126,7 @@ class Sweeps:
     actors: tuple[str, ...]  # names; actors follow the objects in the column `object`
     actor_poses: SweepPoses  # poses of the actors (a, n)
     actor_velocities: Floats  # (a, n, 3): of the middles of the actors' boxes, m/s, world
-    # (a, 2, 3): corners of each actor's box in the actor's frame, metres; of all poses if its mesh
+    # (a, 2, 3): corners of each actor's box in the actor's frame, meters; of all poses if its mesh
     # deforms.
     actor_bounds: Floats
     actor_there: Bools  # (a, n): whether each actor is in the scene when each sweep begins
@@ -360,7 +360,7 @@ class Sweeps:
 
     @classmethod
     def unknown(cls) -> Sweeps:
-        """Return no sweeps, for points of an unknown survey, in steps of a millimetre."""
+        """Return no sweeps, for points of an unknown survey, in steps of a millimeter."""
         none = SweepPoses(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
             scans=np.zeros(1, np.int64),
@@ -608,7 +608,7 @@ def plain_names(names: Iterable[str]) -> list[str]:
 class _SensorSweeps(NamedTuple):
     """Sweeps of a sensor: arrays (n, …)."""
 
-    positions: Floats  # (n, 3): of the sensor at the start of each sweep, scene frame, metres
+    positions: Floats  # (n, 3): of the sensor at the start of each sweep, scene frame, meters
     rotations: Floats  # (n, 3, 3)
     first_steps: Ints  # (n,): first time step of each sweep, counted from the start of its station
 

@@ -138,7 +138,7 @@ class Follower:
         pose
             (4, 4): matrix from the frame of the sensor, or of its carrier, to the world.
         matrices
-            (k, 4, 4): matrices from the frames of the bodies to the world, metres.
+            (k, 4, 4): matrices from the frames of the bodies to the world, meters.
         number
             Number of the sweep, as of `Scanner.sweep`; by default each call has new noise.
 
@@ -174,7 +174,7 @@ class Follower:
         Returns
         -------
         float32 (s, firings, channels)
-            Metres; inf without a return (`Scanner.ranges`).
+            Meters; inf without a return (`Scanner.ranges`).
 
         Raises
         ------
@@ -198,7 +198,7 @@ class Follower:
         pose
             (4, 4): matrix from the frame of the sensor, or of its carrier, to the world.
         matrices
-            (k, 4, 4): matrices from the frames of the bodies to the world, metres. Between two
+            (k, 4, 4): matrices from the frames of the bodies to the world, meters. Between two
             steps, bodies move straight and rotate evenly.
 
         Returns

@@ -13,12 +13,12 @@ from ..base.errors import LidarError
 from ..base.vectors import applied, length, matmul, turned
 from ..base.words import name_hint, plural
 from ..motion.rotations import matrices as rotations_of_quaternions
-from ..scene.colours import LINEAR, Colours, as_bytes, as_srgb
+from ..scene.colors import LINEAR, Colors, as_bytes, as_srgb
 from ..scene.face_materials import FaceMaterials
 from ..scene.scene_mesh import SceneMesh, stacked
 from .mujoco_geoms import PLANE_M, SAG_M, GeomMesh, mesh_of_geom
 
-_TEXTURE_OF_COLOURS = 1  # mjTEXROLE_RGB, column of mat_texid
+_TEXTURE_OF_COLORS = 1  # mjTEXROLE_RGB, column of mat_texid
 
 Objects = Literal["body", "geom"]
 
@@ -116,7 +116,7 @@ def bodies_of(model: Any, choice: Choice) -> ModelBodies:
         groups = list(by_body.values())
     is_static = _static_bodies(model)
     names = names_of(model, choice.objects)
-    colours = _colours(model)
+    colors = _colors(model)
     meshes: dict[Hashable, SceneMesh] = {}  # equal bodies have the mesh of the first
     static = []
     moving = []
@@ -124,7 +124,7 @@ def bodies_of(model: Any, choice: Choice) -> ModelBodies:
         body = int(model.geom_bodyid[group[0]])
         key = tuple(_key(model, geom) for geom in group)
         if key not in meshes:
-            meshes[key] = _mesh_of_geoms(model, group, colours, choice)
+            meshes[key] = _mesh_of_geoms(model, group, colors, choice)
         name = names[group[0] if choice.objects == "geom" else body]
         if is_static[body]:
             rotation, position = _rest_pose(model, body)
@@ -141,31 +141,31 @@ def _static_bodies(model: Any) -> Any:
 
 def seen_geoms(model: Any, choice: Choice) -> list[int]:
     """Return the numbers of the geoms that a lidar may see."""
-    colours = _colours(model)
-    seen = np.isin(model.geom_group, choice.groups) & (colours[:, 3] > 0)
+    colors = _colors(model)
+    seen = np.isin(model.geom_group, choice.groups) & (colors[:, 3] > 0)
     seen &= ~np.isin(model.geom_bodyid, choice.excluded_bodies)
     seen[[*choice.excluded_geoms]] = False
     return np.flatnonzero(seen).tolist()
 
 
-def _colours(model: Any) -> Floats:
-    """Return the colours and opacities of geoms: (geoms, 4), 0 to 1."""
-    colours = np.array(model.geom_rgba, np.float64).reshape(-1, 4)
+def _colors(model: Any) -> Floats:
+    """Return the colors and opacities of geoms: (geoms, 4), 0 to 1."""
+    colors = np.array(model.geom_rgba, np.float64).reshape(-1, 4)
     material = np.asarray(model.geom_matid)
-    # As MuJoCo does: the material counts, unless the geom's own colour differs from the default.
-    by_material = (material >= 0) & (colours == [0.5, 0.5, 0.5, 1]).all(axis=1)
-    colours[by_material] = np.asarray(model.mat_rgba)[material[by_material]]
-    return colours
+    # As MuJoCo does: the material counts, unless the geom's own color differs from the default.
+    by_material = (material >= 0) & (colors == [0.5, 0.5, 0.5, 1]).all(axis=1)
+    colors[by_material] = np.asarray(model.mat_rgba)[material[by_material]]
+    return colors
 
 
-def _srgb_of(model: Any, geom: int, colour: Floats) -> Bytes:
-    """Return the colour of a geom, multiplied by the mean of its texture: sRGB (3,)."""
-    srgb = as_bytes(colour[:3])
+def _srgb_of(model: Any, geom: int, color: Floats) -> Bytes:
+    """Return the color of a geom, multiplied by the mean of its texture: sRGB (3,)."""
+    srgb = as_bytes(color[:3])
     material = int(model.geom_matid[geom])
     if material < 0:
         return srgb
     texture_numbers = np.atleast_1d(model.mat_texid[material])
-    role = _TEXTURE_OF_COLOURS if len(texture_numbers) > 1 else 0
+    role = _TEXTURE_OF_COLORS if len(texture_numbers) > 1 else 0
     texture = int(texture_numbers[role])
     if texture < 0:
         return srgb
@@ -177,20 +177,20 @@ def _srgb_of(model: Any, geom: int, colour: Floats) -> Bytes:
     return as_srgb(LINEAR[srgb] * light)
 
 
-def _mesh_of_geoms(model: Any, geoms: list[int], colours: Floats, choice: Choice) -> SceneMesh:
+def _mesh_of_geoms(model: Any, geoms: list[int], colors: Floats, choice: Choice) -> SceneMesh:
     """Return the mesh of geoms of a body, in the frame of the body, without a name.
 
-    `colours` (geoms, 4) are the colours of all geoms of the model.
+    `colors` (geoms, 4) are the colors of all geoms of the model.
     """
     shapes = [_placed_geom(model, geom, choice) for geom in geoms]
     counts = [len(shape.faces) for shape in shapes]
     vertices, faces = stacked((shape.vertices, shape.faces) for shape in shapes)
-    face_colours = [_srgb_of(model, geom, colours[geom]) for geom in geoms]
+    face_colors = [_srgb_of(model, geom, colors[geom]) for geom in geoms]
     return SceneMesh(
         "",
         vertices,
         faces,
-        colours=Colours.of_faces(np.repeat(face_colours, counts, axis=0)),
+        colors=Colors.of_faces(np.repeat(face_colors, counts, axis=0)),
         materials=_materials_of(model, geoms, counts),
     )
 

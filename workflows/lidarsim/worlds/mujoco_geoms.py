@@ -15,10 +15,10 @@ from ..scene.actors import box
 from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import capsule, cylinder
 
-# Half of the side of planes without a size, metres: far beyond the range of lidars on robots, and
-# so small that single precision resolves a millimetre.
+# Half of the side of planes without a size, meters: far beyond the range of lidars on robots, and
+# so small that single precision resolves a millimeter.
 PLANE_M = 4000.0
-# Largest distance of triangles from the surface of cylinders, metres; of balls twice that.
+# Largest distance of triangles from the surface of cylinders, meters; of balls twice that.
 SAG_M = 2.5e-4
 _MAX_SEGMENTS = 1024
 
@@ -40,7 +40,7 @@ class GeomType(IntEnum):
 class GeomMesh(NamedTuple):
     """Triangles of a geom, in its frame."""
 
-    vertices: Floats  # (v, 3), metres
+    vertices: Floats  # (v, 3), meters
     faces: Ints  # (f, 3)
 
 
@@ -48,7 +48,7 @@ def mesh_of_geom(model: Any, geom: int, sag_m: float, plane_m: float = PLANE_M) 
     """Return the triangles of a geom, by its number.
 
     Triangles of round surfaces are up to `sag_m` within the surface, twice that on balls. Planes
-    without a size end `plane_m` from their centre.
+    without a size end `plane_m` from their center.
 
     Raises
     ------

@@ -43,7 +43,7 @@ class MujocoScanner:
     objects
         What the column `object` tells apart: bodies, or geoms, which takes longer.
     sag_m
-        Largest distance of the triangles of cylinders and capsules from the surface, metres; of
+        Largest distance of the triangles of cylinders and capsules from the surface, meters; of
         balls and ellipsoids twice that.
     options
         Options of `Scanner`, such as columns, materials, noise and threads.
@@ -144,7 +144,7 @@ class MujocoScanner:
         Returns
         -------
         float32 (firings, channels), or (lidars, firings, channels)
-            Metres; inf without a return. With the lidars' axis if `body` or `site` is a list.
+            Meters; inf without a return. With the lidars' axis if `body` or `site` is a list.
         """
         poses = self._poses(data)
         images = self.follower.ranges(poses, self._matrices(data), number=number)

@@ -14,7 +14,7 @@ from .picture_page import Page
 from .shot import SIZE
 from .theme import mapped
 
-COLOURS = "viridis"
+COLORS = "viridis"
 MAX_FIRINGS = 8  # firings of sensors of several channels
 
 
@@ -27,7 +27,7 @@ class _BeamPlot(NamedTuple):
 
 
 def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
-    """Draw the directions of a sensor's first rays, coloured by time.
+    """Draw the directions of a sensor's first rays, colored by time.
 
     The rays come from some firings, but for sensors of a single channel from a frame, or from two
     cycles of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over
@@ -59,8 +59,8 @@ def beam_page(sensor: Sensor, size: tuple[int, int] = SIZE) -> Page:
         axes.set_aspect("equal")
     norm = Normalize(0, max(float(times.max()), 1e-3))
     area = (10 if has_channels else 2) * page.unit**2
-    axes.scatter(plot.x_values, plot.y_values, s=area, c=mapped(COLOURS, norm(times)), linewidths=0)
-    page.colour_bar(mapped(COLOURS, np.linspace(0, 1, 256)), norm, f"time, {unit}")
+    axes.scatter(plot.x_values, plot.y_values, s=area, c=mapped(COLORS, norm(times)), linewidths=0)
+    page.color_bar(mapped(COLORS, np.linspace(0, 1, 256)), norm, f"time, {unit}")
     page.title(sensor.name, f"{sensor.channels:,} channel{'s' * has_channels} · {words}")
     return page
 

@@ -14,19 +14,19 @@ from lidarsim.base.arrays import AnyArray, Floats
 class Camera:
     """A pinhole camera.
 
-    Pixel coordinates are continuous: x to the right, y down, the centre of the first pixel at
+    Pixel coordinates are continuous: x to the right, y down, the center of the first pixel at
     (0.5, 0.5).
     """
 
-    eye: Floats  # (3,) metres
+    eye: Floats  # (3,) meters
     axes: Floats  # (3, 3), rows: unit vectors to the right, up and forward
     focal: float  # length in pixels
-    centre: Floats  # (2,) pixel that looks straight ahead; it may lie outside the image
+    center: Floats  # (2,) pixel that looks straight ahead; it may lie outside the image
     size: tuple[int, int]  # width and height in pixels
 
     def rays(self, pixels: ArrayLike) -> Floats:
         """Return unit directions (n, 3) through pixel coordinates (n, 2)."""
-        plane = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
+        plane = (np.asarray(pixels, dtype=np.float64) - self.center) / self.focal
         rays = plane[:, :1] * self.axes[0] - plane[:, 1:] * self.axes[1] + self.axes[2]
         return rays / np.sqrt(np.einsum("ij,ij->i", rays, rays))[:, None]
 
@@ -38,7 +38,7 @@ class Camera:
         offset = np.asarray(points, dtype=np.float64) - self.eye
         side, up, ahead = (offset @ self.axes.T).T
         ahead = np.where(ahead > 1e-9 * np.abs(offset).max(initial=0.0), ahead, np.nan)
-        pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.centre
+        pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.center
         return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
     def look_up(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
@@ -49,7 +49,7 @@ class Camera:
         return np.where(inside, image[row, column], outside)
 
     def footprint(self, distance: ArrayLike) -> Floats:
-        """Return the width in metres that a pixel covers at a distance, seen face on."""
+        """Return the width in meters that a pixel covers at a distance, seen face on."""
         return np.asarray(distance, dtype=np.float64) / self.focal
 
 
@@ -63,7 +63,7 @@ def fit_camera(
     """Place a camera so that points (n, 3) at two positions or more fill a frame within the image.
 
     Seen from the points, the eye is in the direction of azimuth and elevation, at 7 times their
-    radius, which keeps uprights upright; focal length and image centre are then chosen so that the
+    radius, which keeps uprights upright; focal length and image center are then chosen so that the
     projected points touch the frame: left, top, right and bottom as fractions of the image.
     """
     corners = np.asarray(points, dtype=np.float64)

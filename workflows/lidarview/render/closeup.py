@@ -15,7 +15,7 @@ from raybeam import RayCaster
 from .surface import spiral
 
 # Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's
-# lowest point, and a minimum in metres.
+# lowest point, and a minimum in meters.
 _MARGIN_SHARE = 0.35
 _MARGIN_HEIGHTS = 2.0
 _MIN_MARGIN_M = 25.0
@@ -34,7 +34,7 @@ def surrounding_box(bounds: Floats, trajectories: Sequence[Floats]) -> Floats | 
 
     The box reaches down to the ground.
 
-    `bounds` (2, 3) are the scene's. All values are in metres.
+    `bounds` (2, 3) are the scene's. All values are in meters.
     """
     if not trajectories:
         return None
@@ -56,7 +56,7 @@ def floor_and_cut(
 ) -> tuple[float | None, float | None]:
     """Return the heights of the floor under positions (p, 3) and of the cut that opens the scene.
 
-    Both in metres. The cut is halfway up to the roof, None under the sky; the floor is None over an
+    Both in meters. The cut is halfway up to the roof, None under the sky; the floor is None over an
     abyss.
     """
     sampled = positions[
@@ -134,14 +134,14 @@ class ShownPart:
         if not len(faces):
             return self
         face_object = scene.face_object[parents]
-        colours = scene.colours and scene.colours.take(parents)
+        colors = scene.colors and scene.colors.take(parents)
         part = Scene(
             vertices,
             faces.astype(np.int32),
             face_object,
             scene.names,
             scene.origin,
-            colours=colours,
+            colors=colors,
         )
         full_areas = triangle_areas(scene.vertices[scene.faces[parents]])
         areas = triangle_areas(vertices[faces])

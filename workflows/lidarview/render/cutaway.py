@@ -27,7 +27,7 @@ class Cutaway:
     """
 
     surface: Surface
-    sensors: Floats  # (p, 3) metres
+    sensors: Floats  # (p, 3) meters
     eye: Floats  # (3,) the camera
     surrounds: Bools  # (objects,) whether the sensors are within the object, seen from above
     core: Floats  # (objects, 2, 3) box inside each object's shell
@@ -129,7 +129,7 @@ def cast_through(
 def blocked(
     surface: Surface, cutaway: Cutaway | None, origins: Floats, directions: Floats, reach: float
 ) -> Bools:
-    """Mark rays (n, 3) that hit a surface within `reach` metres that is not removed."""
+    """Mark rays (n, 3) that hit a surface within `reach` meters that is not removed."""
     hits = surface.caster.cast(origins, directions, t_max=reach)
     is_hit = np.asarray(hits.triangle >= 0)
     if cutaway is not None:

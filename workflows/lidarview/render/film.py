@@ -30,7 +30,7 @@ _BEHIND = 1.7
 _ABOVE = 0.95
 _AHEAD = 1.6
 _HEADING_SHARE = 0.12  # share of the film, before and after, where the heading is measured
-# of a camera that circles: its distance, times the size, and its rise for a metre of distance
+# of a camera that circles: its distance, times the size, and its rise for a meter of distance
 _CIRCLE_RADIUS = 1.25
 _CIRCLE_SLOPE = 0.62
 # times the focus: closer surfaces are left out, distant surfaces fade
@@ -44,15 +44,15 @@ _NOISE = 0.02  # share of the distance that a point may lie beside its surface
 
 
 class _Shape(NamedTuple):
-    """Triangles in a single colour."""
+    """Triangles in a single color."""
 
     caster: RayCaster
     normals: Floats  # (f, 3)
-    colour: Floats  # (4,)
+    color: Floats  # (4,)
 
 
 class _Sights(NamedTuple):
-    """Positions and targets of the camera in all frames, metres."""
+    """Positions and targets of the camera in all frames, meters."""
 
     eyes: Floats  # (k, 3)
     targets: Floats  # (k, 3)
@@ -72,20 +72,20 @@ class _FilmPoints:
     """Points that a frame shows, of the frame and of earlier frames."""
 
     positions: Floats = field(default_factory=lambda: np.empty((0, 3)))
-    colours: Floats = field(default_factory=lambda: np.empty((0, 4)))
+    colors: Floats = field(default_factory=lambda: np.empty((0, 4)))
     first_frame: Floats = field(default_factory=lambda: np.empty(0))
 
-    def add(self, number: int, positions: Floats, colours: Floats) -> None:
+    def add(self, number: int, positions: Floats, colors: Floats) -> None:
         """Add the points of a frame."""
         self.positions = np.vstack([self.positions, positions])
-        self.colours = np.vstack([self.colours, colours])
+        self.colors = np.vstack([self.colors, colors])
         new = np.full(len(self.positions) - len(self.first_frame), number)
         self.first_frame = np.append(self.first_frame, new)
 
     def select(self, chosen: Bools) -> None:
         """Keep chosen points (n,) only."""
         self.positions = self.positions[chosen]
-        self.colours = self.colours[chosen]
+        self.colors = self.colors[chosen]
         self.first_frame = self.first_frame[chosen]
 
 
@@ -93,11 +93,11 @@ class _FilmPoints:
 class Film:
     """Content of a film.
 
-    Coordinates are local, in metres. Times are since the survey's start.
+    Coordinates are local, in meters. Times are since the survey's start.
     """
 
     moments_ns: Floats  # (k,) of the frames
-    # for each frame, its new points (n, 3) and their colours (n, 4), 0 to 1
+    # for each frame, its new points (n, 3) and their colors (n, 4), 0 to 1
     new_points: Iterable[tuple[Floats, Floats]]
     keep_share: float  # share of the points that later frames show, too
     scene_triangles: AnyFloats  # (f, 3, 3): triangles of the scene
@@ -176,8 +176,8 @@ def _draw_points(
     fade = _OLD_BRIGHTNESS + (1 - _OLD_BRIGHTNESS) * np.exp(-age / _FADE_FRAMES)
     rows = np.flatnonzero(shown)  # the newest points on a surface are drawn last
     rows = rows[np.argsort((fade * slack - distance)[rows], kind="stable")]
-    colours = BACK + (points.colours[rows] - BACK) * fade[rows, None]
-    return splat(image, pixels[rows], colours, _POINT_RADIUS)
+    colors = BACK + (points.colors[rows] - BACK) * fade[rows, None]
+    return splat(image, pixels[rows], colors, _POINT_RADIUS)
 
 
 def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> None:
@@ -190,11 +190,11 @@ def _draw_trajectory(frame: Image.Image, camera: Camera, positions: Floats) -> N
         pen.ellipse((x - 5, y - 5, x + 5, y + 5), _RED, _WHITE, 2)
 
 
-def _shape(corners: AnyFloats, colour: Floats) -> _Shape:
+def _shape(corners: AnyFloats, color: Floats) -> _Shape:
     """Prepare triangles with corners (f, 3, 3) for rays."""
     normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     faces = np.arange(3 * len(corners)).reshape(-1, 3)
-    return _Shape(RayCaster(corners.reshape(-1, 3), faces), normals, colour)
+    return _Shape(RayCaster(corners.reshape(-1, 3), faces), normals, color)
 
 
 def _draw_surfaces(
@@ -202,7 +202,7 @@ def _draw_surfaces(
 ) -> tuple[AnyFloats, Floats]:
     """Draw surfaces.
 
-    Returns the image (height, width, 4), and the depth (height, width), metres.
+    Returns the image (height, width, 4), and the depth (height, width), meters.
     """
     width, height = SIZE
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -213,14 +213,14 @@ def _draw_surfaces(
         start = np.maximum(start, (top - camera.eye[2]) / np.minimum(rays[:, 2], -1e-6))
     depth = np.full(len(rays), np.inf)
     image = np.tile(BACK, (len(rays), 1))
-    for caster, normals, colour in shapes:
+    for caster, normals, color in shapes:
         hits = caster.cast(camera.eye + start[:, None] * rays, rays)
         nearer = np.flatnonzero(hits.distance + start < depth)
         depth[nearer] = (hits.distance + start)[nearer]
         normal = normals[hits.triangle[nearer]]
         light = 0.2 + 0.4 * np.abs(dot(normal, rays[nearer])) + 0.4 * np.abs(normal[:, 2])
         light *= np.exp(-depth[nearer] / (_HAZE_FOCUS * focus))
-        image[nearer] = BACK + light[:, None] * (colour - BACK)
+        image[nearer] = BACK + light[:, None] * (color - BACK)
     edge = _edges((1 / (depth * forward)).reshape(height, width))
     image = BACK + (image.reshape(height, width, 4) - BACK) * (1 - edge)
     return image.astype(np.float32), depth.reshape(height, width)

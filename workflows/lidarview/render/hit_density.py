@@ -1,4 +1,4 @@
-"""Colours of a scene's surfaces by hits per square metre."""
+"""Colors of a scene's surfaces by hits per square meter."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from lidarsim.base.arrays import AnyArray, Bools, Floats, Floats32, Indices, Int
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import triangle_areas
 
-from .colouring import TURBO
+from .coloring import TURBO
 from .theme import UNSEEN, rgb
 
-HITS_TITLE = "hits per square metre; grey: none"  # title of the scale
+HITS_TITLE = "hits per square meter; gray: none"  # title of the scale
 _GRID_LEVELS = 24  # levels of a grid whose cells are half as wide each time
 _MIN_HITS = 12  # hits that suffice for an estimate of density; points in a cell of the grid
 _MAX_ROUNDS = 12
-_MAX_RATIO = 300.0  # densest to sparsest colour
+_MAX_RATIO = 300.0  # densest to sparsest color
 
 
-def hit_colours(
+def hit_colors(
     scene: Scene, corners: Floats32, hit_counts: Floats, points: Floats32, max_pieces: int
 ) -> tuple[Floats32, Ints, Floats, tuple[float, float]]:
-    """Colour triangles by hits per square metre.
+    """Color triangles by hits per square meter.
 
     Large triangles with many hits are divided.
 
     Large triangles have the density of a grid of points, the finest grid with enough points in its
-    cells; small triangles share their hits with neighbours, as in `hit_density`.
+    cells; small triangles share their hits with neighbors, as in `hit_density`.
 
     Parameters
     ----------
     corners, hit_counts
-        (f, 3, 3), metres, and (f,): the drawn triangles of the scene, and the hits of each.
+        (f, 3, 3), meters, and (f,): the drawn triangles of the scene, and the hits of each.
     points
         (n, 3): an evenly spaced sample of hit points, which may lack some places.
     max_pieces
@@ -46,10 +46,10 @@ def hit_colours(
         (k, 3, 3): corners of the pieces; the first piece of each triangle has its number.
     owner
         (k,): the triangle of each piece.
-    colours
+    colors
         (k, 3, 3) at the corners.
     limits
-        Ends of the logarithmic scale, hits per square metre; its colours are `TURBO`.
+        Ends of the logarithmic scale, hits per square meter; its colors are `TURBO`.
     """
     triangle_density = hit_density(scene, hit_counts)
     pieces, owner, areas, point_density = _divide(corners, hit_counts > 0, points, max_pieces)
@@ -65,17 +65,17 @@ def hit_colours(
         corner_density[is_counted] = _corner_means(
             pieces[is_counted], areas[is_counted], corner_density[is_counted]
         )
-    # Where points were counted, none are grey; elsewhere the hits are known.
-    colours = _density_colours(
+    # Where points were counted, none are gray; elsewhere the hits are known.
+    colors = _density_colors(
         corner_density, (~is_counted & (hit_counts[owner] > 0))[:, None], limits
     )
-    return pieces, owner, colours, limits
+    return pieces, owner, colors, limits
 
 
 def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
     """Return the mean density of all pieces around each corner, for smooth transitions: (k, 3).
 
-    `pieces` (k, 3, 3) are corners, `areas` (k,) square metres, `density` (k, 3) at the corners.
+    `pieces` (k, 3, 3) are corners, `areas` (k,) square meters, `density` (k, 3) at the corners.
     """
     corner_keys = np.ascontiguousarray(pieces).view("V12").ravel()
     _, corner = np.unique(corner_keys, return_inverse=True)
@@ -86,9 +86,9 @@ def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:
 
 
 def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
-    """Return the hits per square metre of triangles (f,), from their hits (f,).
+    """Return the hits per square meter of triangles (f,), from their hits (f,).
 
-    If triangles are so small that most have one hit or none, hits are shared with neighbours:
+    If triangles are so small that most have one hit or none, hits are shared with neighbors:
     each triangle gives a third of its hits to each corner, each corner returns hits by area, until
     a density is estimated from a dozen hits. The total stays the same.
     """
@@ -100,7 +100,7 @@ def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
 
 
 def _rounds(hit_counts: Floats) -> int:
-    """Choose how many times to share hits with the neighbours."""
+    """Choose how many times to share hits with the neighbors."""
     hit = hit_counts[hit_counts > 0]
     if not len(hit):
         return 0
@@ -141,16 +141,16 @@ def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
     return float(lower), float(max(upper, 2 * lower))
 
 
-def _density_colours(density: Floats, hit: Bools, limits: tuple[float, float]) -> Floats:
-    """Return colours (..., 3) by densities and masks of hits, both (...,).
+def _density_colors(density: Floats, hit: Bools, limits: tuple[float, float]) -> Floats:
+    """Return colors (..., 3) by densities and masks of hits, both (...,).
 
-    Shared hits fade out to grey; triangles that were hit themselves are never grey.
+    Shared hits fade out to gray; triangles that were hit themselves are never gray.
     """
     lower, upper = limits
     share = np.log(np.maximum(density, lower) / lower) / np.log(upper / lower)
-    colours = TURBO[np.clip(share * 255, 0, 255).astype(np.int64)]
+    colors = TURBO[np.clip(share * 255, 0, 255).astype(np.int64)]
     opacity = np.where(hit, 1.0, np.clip(density / lower / 0.6 - 0.3, 0, 1))[..., None]
-    return np.asarray(rgb(UNSEEN) * (1 - opacity) + colours * opacity)
+    return np.asarray(rgb(UNSEEN) * (1 - opacity) + colors * opacity)
 
 
 def _divide(
@@ -158,7 +158,7 @@ def _divide(
 ) -> tuple[Floats32, Ints, Floats, Floats]:
     """Divide triangles that were hit (f,) while there are enough points in the cells of a grid.
 
-    Returns pieces, owners and areas, and points per square metre, NaN for whole triangles.
+    Returns pieces, owners and areas, and points per square meter, NaN for whole triangles.
     """
     owner = np.arange(len(pieces))
     areas = triangle_areas(pieces)
@@ -227,7 +227,7 @@ class _WeightGrid:
 
 def _keys(cells: Ints) -> Ints:
     """Return a number (n,) for each cell (n, 3)."""
-    cells = cells + 1  # the neighbours of the lowest cell are not negative
+    cells = cells + 1  # the neighbors of the lowest cell are not negative
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 

@@ -19,7 +19,7 @@ SUN_LIGHTS = 4
 ROTATIONS = (
     0.12,
     0.02,
-)  # radians from a grid point's light to its neighbour's, of the sky and the sun
+)  # radians from a grid point's light to its neighbor's, of the sky and the sun
 SUN_RADIUS_RAD = 0.045  # radians: ten times the real one, for soft edges
 SUN_SHARE = 0.4  # share of the light on open horizontal ground
 THIN_OPENNESS = 0.5  # openness of surfaces too thin for a grid point
@@ -36,7 +36,7 @@ class LightMap:
     camera: Camera
     sun: Floats  # (3,) unit vector towards the sun
     openness: Floats32  # (rows, columns) in 0 to 1: the unblocked share of the light
-    position: Floats32  # (rows, columns, 3) metres; NaN without a surface
+    position: Floats32  # (rows, columns, 3) meters; NaN without a surface
     normal: Floats32  # (rows, columns, 3)
 
     def brightness(
@@ -45,7 +45,7 @@ class LightMap:
         """Return the brightness (n,) of points by Lambert's law, and the open part of the sky.
 
         `pixels` (n, 2) are the coordinates of points (n, 3) in the picture, and `ground` (n,) marks
-        points on the ground, whose open parts keep their colour.
+        points on the ground, whose open parts keep their color.
         """
         openness = self._openness_at(pixels, position, normal)
         facing = np.clip(normal @ self.sun.astype(np.float32), 0, None)
@@ -59,7 +59,7 @@ class LightMap:
         start = ((pixels - 0.5) / STRIDE - 0.5).astype(np.float32) - (STRIDE // 2) / STRIDE
         cell = np.floor(start).astype(np.int64)
         part = start - cell
-        # The mean of two by two, because neighbours rotate the lights, interpolated.
+        # The mean of two by two, because neighbors rotate the lights, interpolated.
         shares = 1 - part, np.ones_like(part), part
         total = np.full(len(pixels), 1e-3, np.float32)
         summed = np.full(len(pixels), 1e-3 * THIN_OPENNESS, np.float32)
@@ -80,7 +80,7 @@ def surface_similarity(
 ) -> Floats32:
     """Return how well points (n, 3) share a surface with spots (n, 3), from 0 to 0.4.
 
-    Points of the same surface lie within `tolerance` (n,), metres, of each other's plane.
+    Points of the same surface lie within `tolerance` (n,), meters, of each other's plane.
     """
     with np.errstate(invalid="ignore"):
         in_plane = np.abs(dot(spot - position, normal)) < tolerance
@@ -88,7 +88,7 @@ def surface_similarity(
 
 
 def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
-    """Return the tolerance (n,), metres, for points of a plane at a distance of `stride` pixels."""
+    """Return the tolerance (n,), meters, for points of a plane at a distance of `stride` pixels."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
     return (3 * stride * camera.footprint(distance)).astype(np.float32)
@@ -113,7 +113,7 @@ def make_light_map(
 
     All points have the same lights: steps in brightness are invisible, while random directions
     would need smoothing. Positions and normals are (rows, columns, 3), NaN without a surface.
-    Surfaces that the cutaway removes cast no shadow, nor do surfaces farther than `reach`, metres.
+    Surfaces that the cutaway removes cast no shadow, nor do surfaces farther than `reach`, meters.
     """
     sun = _sun_direction(camera)
     has_surface = np.isfinite(position[..., 0])
@@ -125,7 +125,7 @@ def make_light_map(
         * camera.footprint(np.sqrt(dot(origins - camera.eye, origins - camera.eye)))[:, None]
         * facing
     )
-    # Neighbours rotate the lights differently, and are averaged: like four times as many lights.
+    # Neighbors rotate the lights differently, and are averaged: like four times as many lights.
     quarter = _quarters(has_surface)
     total_light = np.full(len(origins), 1e-9)
     open_light = np.full(len(origins), 1e-9)
@@ -142,7 +142,7 @@ def make_light_map(
 
 
 def _quarters(has_surface: Bools) -> Ints:
-    """Return 0 to 3 for each point of a grid (rows, columns) with a surface, by its neighbours."""
+    """Return 0 to 3 for each point of a grid (rows, columns) with a surface, by its neighbors."""
     row, column = np.nonzero(has_surface)
     return np.asarray(row % 2 + 2 * (column % 2))
 

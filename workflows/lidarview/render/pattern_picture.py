@@ -16,7 +16,7 @@ from lidarsim.sensor import LineSensor, Sensor
 from lidarsim.sensor.ray_sensors import PrismSensor
 
 from . import theme
-from .beam_picture import COLOURS, beam_page
+from .beam_picture import COLORS, beam_page
 from .picture_page import Page
 from .theme import mapped
 
@@ -24,7 +24,7 @@ TIMES_S = (0.1, 0.5, 2.0)
 CELL_DEG = 0.28  # cell of the coverage: the width of a beam of Livox
 FIELD_S = 4.0  # cells that are met in this time are the field of view
 CONVENTIONS = "azimuth: degrees from x, forward, to y, left; elevation: above the xy plane"
-_COVERED = to_rgb(theme.OBJECT_COLOURS[0])
+_COVERED = to_rgb(theme.OBJECT_COLORS[0])
 _FIRST_FIRINGS = 8  # firings of sensors of several channels
 _MAX_FRAME_RAYS = 300_000  # limit for a frame; a longer frame has every n-th firing
 _CHUNK_RAYS = 1_000_000
@@ -72,7 +72,7 @@ def draw_pattern(path: Path, sensor: Sensor) -> None:
 
 
 def pattern_page(sensor: Sensor) -> Page:
-    """Draw a sensor's frame, coloured by time, and the directions covered after `TIMES_S`.
+    """Draw a sensor's frame, colored by time, and the directions covered after `TIMES_S`.
 
     For sensors with prisms, whose patterns do not repeat, the covered shares of the field of view
     are stated. A sensor that looks down has its angles over time instead, as in `beam_page`.
@@ -213,7 +213,7 @@ def _charts(page: Page, count: int, is_wide: bool, window: _Window) -> list[Axes
 
 
 class _TimeScale(NamedTuple):
-    """Unit of the times of a picture, and their colours."""
+    """Unit of the times of a picture, and their colors."""
 
     unit: str
     per_s: float
@@ -221,7 +221,7 @@ class _TimeScale(NamedTuple):
 
 
 def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> None:
-    """Draw the rays of a frame, coloured by time."""
+    """Draw the rays of a frame, colored by time."""
     last_s = float(pattern.times_s.max())
     unit, per_s = ("s", 1.0) if last_s > 5 else ("ms", 1e3)
     scale = _TimeScale(unit, per_s, Normalize(0, max(per_s * last_s, 1e-3)))
@@ -229,8 +229,8 @@ def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> No
     _draw_rays(
         page, axes, (pattern.azimuths_deg, pattern.elevations_deg), pattern.times_s, scale, area
     )
-    colours = mapped(COLOURS, np.linspace(0, 1, 256))
-    page.colour_bar(colours, scale.norm, f"time of a ray, {unit}")
+    colors = mapped(COLORS, np.linspace(0, 1, 256))
+    page.color_bar(colors, scale.norm, f"time of a ray, {unit}")
     words = "one frame" if sensor.cycle == "frame" else "one revolution"
     if pattern.every > 1:
         words += f", each {pattern.every}th firing"
@@ -238,7 +238,7 @@ def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> No
 
 
 def _draw_firings(page: Page, axes: Axes, sensor: Sensor) -> None:
-    """Draw the first firings of a sensor, coloured by their own times, where they are."""
+    """Draw the first firings of a sensor, colored by their own times, where they are."""
     firings = np.arange(_FIRST_FIRINGS)
     angles_deg = _angles_deg(sensor, firings)
     times_s = _times_s(sensor, firings)
@@ -250,7 +250,7 @@ def _draw_firings(page: Page, axes: Axes, sensor: Sensor) -> None:
     _draw_rays(page, axes, (azimuths_deg, angles_deg[1]), times_s, stretched, 8.0)
     axes.autoscale()
     duration = f"{per_s * last_s:,.0f} {unit}"
-    page.heading(axes, f"the first {_FIRST_FIRINGS} firings, {duration}, from the first colour on")
+    page.heading(axes, f"the first {_FIRST_FIRINGS} firings, {duration}, from the first color on")
 
 
 def _draw_rays(
@@ -261,10 +261,10 @@ def _draw_rays(
     scale: _TimeScale,
     area: float,
 ) -> None:
-    """Draw rays as dots of an area, coloured by their times (n,)."""
+    """Draw rays as dots of an area, colored by their times (n,)."""
     axes.scatter(
         *angles_deg,
         s=area * page.unit**2,
-        c=mapped(COLOURS, scale.norm(scale.per_s * times_s)),
+        c=mapped(COLORS, scale.norm(scale.per_s * times_s)),
         linewidths=0,
     )

@@ -1,4 +1,4 @@
-"""The finished picture: a rendered image with axes, legend, colour bar and title."""
+"""The finished picture: a rendered image with axes, legend, color bar and title."""
 
 from __future__ import annotations
 
@@ -70,9 +70,9 @@ class Page:
 
         The returned axes have the shot's pixels as coordinates.
         """
-        colours = image[..., :3]
+        colors = image[..., :3]
         opacity = image[..., 3:]
-        plain = np.divide(colours, opacity, out=np.zeros_like(colours), where=opacity > 0)
+        plain = np.divide(colors, opacity, out=np.zeros_like(colors), where=opacity > 0)
         bytes_ = np.round(255 * np.concatenate([plain, opacity], axis=2)).astype(np.uint8)
         self.figure.figimage(bytes_, zorder=-1)
         axes = self.figure.add_axes((0, 0, 1, 1))
@@ -133,10 +133,10 @@ class Page:
         position: Any,
         text: str,
         size: float,
-        colour: str,
+        color: str,
         **options: Any,
     ) -> None:
-        style = {"ha": "center", "va": "center", "color": colour, "family": FONT} | options
+        style = {"ha": "center", "va": "center", "color": color, "family": FONT} | options
         text_artist = parent.text(
             float(position[0]), float(position[1]), text, fontsize=size * self.unit, **style
         )
@@ -205,7 +205,7 @@ class Page:
         for k in np.argsort(-pixels[:, 1]).tolist():  # the front first
             pixel = pixels[k]
             name = names[k]
-            colour = theme.INK if is_visible[k] else theme.LINE
+            color = theme.INK if is_visible[k] else theme.LINE
             position = pixel - (0, NAME_ABOVE * self.unit)
             while (
                 (np.abs(label_positions - position) < np.array(NAME_SIZE) * self.unit)
@@ -216,7 +216,7 @@ class Page:
             label_positions = np.vstack([label_positions, position])
             axes.plot(
                 *np.stack([pixel, position]).T,
-                color=colour,
+                color=color,
                 lw=0.7 * self.unit,
                 zorder=6,
                 path_effects=halo,
@@ -252,7 +252,7 @@ class Page:
     def lines(
         self, axes: Axes, shot: SurfaceView, segments: Floats, width: float, alpha: float
     ) -> None:
-        """Draw the visible parts of segments (n, 2, 3), in the sensors' colour."""
+        """Draw the visible parts of segments (n, 2, 3), in the sensors' color."""
         runs = shot.runs(segments, shot.visible)
         axes.add_collection(
             LineCollection(
@@ -328,13 +328,13 @@ class Page:
     def legend(
         self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor", **options: Any
     ) -> None:
-        """Draw a legend of (name, colour) in the right margin, with options of `key`.
+        """Draw a legend of (name, color) in the right margin, with options of `key`.
 
         The last line counts the rest.
 
         An empty name of the sensor leaves the sensor out.
         """
-        rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
+        rows = [("s", name, color) for name, color in entries[:LEGEND_ROWS]]
         if sensor:
             rows.append(("o", sensor, theme.SENSOR))
         if len(entries) > LEGEND_ROWS:
@@ -347,12 +347,12 @@ class Page:
                     [],
                     ls="",
                     marker=marker,
-                    color=colour,
+                    color=color,
                     ms=0.85 * size * self.unit,
                     mec="none",
                     label=shortened(name),
                 )
-                for marker, name, colour in rows
+                for marker, name, color in rows
             ],
             size,
             **options,
@@ -383,16 +383,16 @@ class Page:
             text.set_parse_math(False)
             text.set_text(str(handle.get_label()))
 
-    def colour_bar(
+    def color_bar(
         self,
-        colours: Floats,
+        colors: Floats,
         norm: Normalize,
         title: str,
         frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
     ) -> None:
-        """Draw a colour bar of colours (n, 3) in the right margin, beside its title."""
+        """Draw a color bar of colors (n, 3) in the right margin, beside its title."""
         axes = self.figure.add_axes(frame)
-        bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
+        bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colors)), cax=axes)
         bar.outline.set_visible(False)
         bar.set_label(
             title,
@@ -419,7 +419,7 @@ class Page:
             _label_in_full(axes.yaxis)
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG, in its light colours.
+        """Write the page as a PNG, in its light colors.
 
         A link at the path is replaced.
 
@@ -433,7 +433,7 @@ class Page:
             Storage.at(path.parent, durable=False).write(path.name, self.png())
 
     def png(self) -> bytes:
-        """Return the page as a PNG, in its light colours."""
+        """Return the page as a PNG, in its light colors."""
         image = io.BytesIO()
         self.figure.savefig(image, dpi=DPI, format="png")
         return image.getvalue()
@@ -441,7 +441,7 @@ class Page:
     def svg(self) -> str:
         """Return the page as an element of HTML, whose ink may follow the style of a document.
 
-        The colours of `theme.STYLED` are variables of CSS, such as --picture-ink.
+        The colors of `theme.STYLED` are variables of CSS, such as --picture-ink.
         """
         text = io.StringIO()
         with matplotlib.rc_context({"svg.hashsalt": "lidarpool"}):
@@ -450,8 +450,8 @@ class Page:
         svg = re.sub(r"<!--.*?-->|<style.*?</style>", "", text.getvalue(), flags=re.DOTALL)
         svg = re.sub(r'^.*?<svg[^>]*(viewBox="[^"]*")[^>]*>', r"<svg \1>", svg, flags=re.DOTALL)
         svg = re.sub(r' id="[a-zA-Z]+_\d+"|<metadata>.*?</metadata>', "", svg, flags=re.DOTALL)
-        for colour, name in theme.STYLED.items():
-            svg = svg.replace(colour, f"var(--picture-{name}, {colour})")
+        for color, name in theme.STYLED.items():
+            svg = svg.replace(color, f"var(--picture-{name}, {color})")
         return svg
 
 

@@ -1,4 +1,4 @@
-"""A shot: the surface in each pixel of a camera, before colouring."""
+"""A shot: the surface in each pixel of a camera, before coloring."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .stage import PlotBox
 from .surface import Surface, separate_objects, unit
 
 SIZE = (1600, 1000)  # pixels of a finished picture
-# Frame of the scene; the title is above, legend and colour bar are on the right.
+# Frame of the scene; the title is above, legend and color bar are on the right.
 FRAME = (0.08, 0.115, 0.79, 0.91)
 # instead of a triangle
 SKY = -1
@@ -46,8 +46,8 @@ class Samples:
     """
 
     triangle: Ints  # (n,) or SKY, GROUND
-    distance: Floats32  # (n,) metres, infinite for the sky
-    position: Floats32  # (n, 3) metres, NaN for the sky
+    distance: Floats32  # (n,) meters, infinite for the sky
+    position: Floats32  # (n, 3) meters, NaN for the sky
     normal: Floats32  # (n, 3) unit length, NaN for the sky
     light: Floats32  # (n,) brightness: 1 on open ground
     weights: Floats32  # (n, 3) of the triangle's corners
@@ -66,18 +66,18 @@ class Samples:
             getattr(result, field.name)[which] = getattr(self, field.name)
         return result
 
-    def paint(self, face_colours: Floats, contrast: float) -> Floats32:
-        """Return colours (n, 4) of the samples: red, green and blue times opacity, and opacity.
+    def paint(self, face_colors: Floats, contrast: float) -> Floats32:
+        """Return colors (n, 4) of the samples: red, green and blue times opacity, and opacity.
 
-        `face_colours` are (f, 3), or (f, 3, 3) at the corners; `contrast` is the strength of light.
+        `face_colors` are (f, 3), or (f, 3, 3) at the corners; `contrast` is the strength of light.
         """
         image = np.zeros((len(self.triangle), 4), np.float32)
         surface = np.flatnonzero(self.triangle >= 0)
         ground = np.flatnonzero(self.triangle == GROUND)
-        colours = face_colours.astype(np.float32)[self.triangle[surface]]
-        if colours.ndim == 3:
-            colours = np.einsum("nc,nck->nk", self.weights[surface], colours)
-        image[surface, :3] = colours * (1 - contrast * (1 - self.light[surface, None]))
+        colors = face_colors.astype(np.float32)[self.triangle[surface]]
+        if colors.ndim == 3:
+            colors = np.einsum("nc,nck->nk", self.weights[surface], colors)
+        image[surface, :3] = colors * (1 - contrast * (1 - self.light[surface, None]))
         image[surface, 3] = 1
         light = self.light[ground, None]
         image[ground, :3] = theme.VEIL * light * theme.rgb(theme.MUTED)
@@ -91,9 +91,9 @@ class SurfaceView:
 
     part: ShownPart
     uncut: Scene  # the part before it was cut open
-    sensors: Floats  # (p, 3) metres, local coordinates
+    sensors: Floats  # (p, 3) meters, local coordinates
     paths: tuple[Floats, ...]  # paths of moving sensors, (k, 3) each
-    actors: int  # number of actors, the last objects of the scene, which are labelled
+    actors: int  # number of actors, the last objects of the scene, which are labeled
     caption: str  # number of sensors, and the time
     models: str  # models of the sensors, for a caption
     stage: PlotBox
@@ -109,22 +109,22 @@ class SurfaceView:
 
     @property
     def depth(self) -> Floats32:
-        """Depth (height, width) from the eye to surfaces, metres, or infinite without a surface."""
+        """Depth (height, width) from the eye to surfaces, meters, or infinite without a surface."""
         return self.pixel_samples.distance.reshape(self.camera.size[::-1])
 
-    def paint(self, face_colours: Floats, contrast: float = 1.0) -> Floats32:
-        """Colour the shot.
+    def paint(self, face_colors: Floats, contrast: float = 1.0) -> Floats32:
+        """Color the shot.
 
-        `face_colours` are (f, 3) in 0 to 1, or (f, 3, 3) at the corners; a `contrast` of 0 is for
-        flat colours, of 1 for full light and shade.
+        `face_colors` are (f, 3) in 0 to 1, or (f, 3, 3) at the corners; a `contrast` of 0 is for
+        flat colors, of 1 for full light and shade.
 
         Returns
         -------
         (height, width, 4) in 0 to 1: red, green and blue times opacity, and opacity. The page
         shows through the ground, and where there is nothing.
         """
-        image = self.pixel_samples.paint(face_colours, contrast)
-        finer = self.edge_samples.paint(face_colours, contrast)
+        image = self.pixel_samples.paint(face_colors, contrast)
+        finer = self.edge_samples.paint(face_colors, contrast)
         if len(self.edges):
             image[self.edges] = finer.reshape(len(self.edges), -1, 4).mean(axis=1)
         return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 4)
@@ -159,7 +159,7 @@ class SurfaceView:
         )
 
     def visible(self, points: ArrayLike) -> tuple[Floats, Bools]:
-        """Return pixel coordinates (n, 2) of points (n, 3), local metres, and a visibility mask."""
+        """Return pixel coordinates (n, 2) of points (n, 3), local meters, and a visibility mask."""
         pixels, distance = self.camera.project(points)
         depth = self.camera.look_up(self.depth, pixels, -np.inf)
         return pixels, distance <= depth + 2 * self.camera.footprint(distance)
@@ -239,14 +239,14 @@ def take_shot(
     stage = _stage(opened.bounds, positions, scene.origin)
     viewpoint = _choose_viewpoint(opened.surface, stage, positions, size, bool(paths or actors))
     camera = viewpoint.camera
-    centres = _pixel_centres(size)
+    centers = _pixel_centers(size)
     inside = np.flatnonzero(_outline(stage, camera))
-    pixel_samples = viewpoint.sample(centres[inside]).scattered(inside, len(centres))
+    pixel_samples = viewpoint.sample(centers[inside]).scattered(inside, len(centers))
     light = viewpoint.light_map(pixel_samples)
     edges = np.flatnonzero(_edges(pixel_samples, opened.part.scene, camera))
-    edge_pixels = (centres[edges, None] + _EDGE_OFFSETS).reshape(-1, 2)
+    edge_pixels = (centers[edges, None] + _EDGE_OFFSETS).reshape(-1, 2)
     edge_samples = viewpoint.sample(edge_pixels)
-    for samples, pixels in ((pixel_samples, centres), (edge_samples, edge_pixels)):
+    for samples, pixels in ((pixel_samples, centers), (edge_samples, edge_pixels)):
         _add_light(samples, pixels, light)
     return SurfaceView(
         part=opened.part,
@@ -316,7 +316,7 @@ class _Viewpoint:
     cutaway: Cutaway | None
     stage: PlotBox
     camera: Camera
-    reach: float  # metres; surfaces farther from a point cast no shadow
+    reach: float  # meters; surfaces farther from a point cast no shadow
 
     def sample(self, pixels: Floats) -> Samples:
         """Cast rays through pixel coordinates (n, 2).
@@ -365,7 +365,7 @@ def _choose_viewpoint(
     return _Viewpoint(surface, cutaway, stage, camera, 0.15 * stage.size)
 
 
-def _pixel_centres(size: tuple[int, int]) -> Floats:
+def _pixel_centers(size: tuple[int, int]) -> Floats:
     """Return the coordinates (pixels, 2) of the middles of all pixels."""
     width, height = size
     grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -413,7 +413,7 @@ def _outline(stage: PlotBox, camera: Camera) -> Bools:
 
 
 def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
-    """Return distances (n,), metres, from the eye to the ground along directions (n, 3)."""
+    """Return distances (n,), meters, from the eye to the ground along directions (n, 3)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (stage.level - eye[2]) / directions[:, 2]
         position = eye[:2] + distance[:, None] * directions[:, :2]
@@ -422,17 +422,17 @@ def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
 
 
 def _edges(samples: Samples, scene: Scene, camera: Camera) -> Bools:
-    """Return a mask (pixels,) of pixels that show another surface than a neighbour."""
+    """Return a mask (pixels,) of pixels that show another surface than a neighbor."""
     width, height = camera.size
     kind = np.append(scene.face_object, [GROUND, SKY])[samples.triangle]
     number = np.arange(width * height).reshape(height, width)
     edge = np.zeros(width * height, np.bool_)
     surface = samples.triangle != SKY
     tolerance = plane_tolerance(camera, samples.position, 1)
-    for pixels, neighbours in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
-        has_surface = surface[pixels] | surface[neighbours]
+    for pixels, neighbors in ((number[:, :-1], number[:, 1:]), (number[:-1], number[1:])):
+        has_surface = surface[pixels] | surface[neighbors]
         a = pixels[has_surface]
-        b = neighbours[has_surface]
+        b = neighbors[has_surface]
         spot = samples.position[b], samples.normal[b], tolerance[a]
         is_same = surface_similarity(samples.position[a], samples.normal[a], *spot) > 0.3
         differs = (kind[a] != kind[b]) | ~is_same & (kind[a] != SKY)

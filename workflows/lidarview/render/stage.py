@@ -9,7 +9,7 @@ import numpy as np
 
 from lidarsim.base.arrays import Floats
 
-# Longer numbers are hard to read: coordinates with more digits are labelled from an offset.
+# Longer numbers are hard to read: coordinates with more digits are labeled from an offset.
 MAX_DIGITS = 5
 
 
@@ -18,13 +18,13 @@ class Axis:
     """Ticks of an axis."""
 
     title: str  # name, offset of the labels, and unit
-    ticks: Floats  # (n,) local metres; round numbers in world coordinates
+    ticks: Floats  # (n,) local meters; round numbers in world coordinates
     labels: tuple[str, ...]  # world coordinates, less the offset in the title
 
 
 @dataclass(frozen=True, eq=False)
 class PlotBox:
-    """A box with round ticks on its axes, above a ground rectangle, in local metres."""
+    """A box with round ticks on its axes, above a ground rectangle, in local meters."""
 
     bounds: Floats  # (2, 3) lowest and highest corner of the shown part
     ground: Floats  # (2, 2) lowest and highest corner of the ground
@@ -33,7 +33,7 @@ class PlotBox:
 
     @property
     def size(self) -> float:
-        """Diagonal of the box in metres."""
+        """Diagonal of the box in meters."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0]))
 
     @property
@@ -44,7 +44,7 @@ class PlotBox:
 
     @classmethod
     def from_bounds(cls, bounds: Floats, origin: Floats) -> PlotBox:
-        """Build the stage of a box (2, 3), local metres, which may be flat or a single point."""
+        """Build the stage of a box (2, 3), local meters, which may be flat or a single point."""
         lower, upper = bounds
         widest = float((upper - lower).max()) or 1.0
         # A flat or pointlike box gets some width, so that there is something to look at.

@@ -12,7 +12,7 @@ from raybeam import RayCaster
 
 # Faces that meet at a flatter angle than this are shaded as one smooth surface.
 CREASE_COSINE = np.cos(np.radians(35))
-_DEPTH_LEVELS = 5  # levels for objects that are neighbours
+_DEPTH_LEVELS = 5  # levels for objects that are neighbors
 _MIN_SQUARE = 0.1  # squared length of the mean normal at corners that move no farther
 
 
@@ -59,8 +59,8 @@ def separate_objects(scene: Scene, objects: Integers, step: float) -> Scene:
     """Move surfaces inwards a little, so that objects in contact do not show through.
 
     Each vertex moves against the mean of the normals around it, weighted by angle (Thürmer and
-    Wüthrich, 1998), so that the sides of a box all move by `step` metres, or up to three times as
-    far: neighbours in the list of objects (f,) differ, as walls that cross have sides in one plane.
+    Wüthrich, 1998), so that the sides of a box all move by `step` meters, or up to three times as
+    far: neighbors in the list of objects (f,) differ, as walls that cross have sides in one plane.
     """
     vertices = scene.vertices
     a, b, c = (vertices[scene.faces[:, k]] for k in range(3))

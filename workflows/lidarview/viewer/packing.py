@@ -1,6 +1,6 @@
 """Packs columns of points for a page in one file, so that they compress well.
 
-A column becomes whole numbers, the differences of neighbours in zigzag (0, -1, 1, -2, …), and
+A column becomes whole numbers, the differences of neighbors in zigzag (0, -1, 1, -2, …), and
 planes of their bytes, the lowest first. The module `ask.js` of the page unpacks them.
 """
 

@@ -277,7 +277,7 @@ def even_shares(counts: AnyArray, max_points: int) -> Floats:
 
 
 def positions(points: Points, row_selection: Ints | slice) -> Floats:
-    """Return the positions at rows, float64 (n, 3), world coordinates, metres."""
+    """Return the positions at rows, float64 (n, 3), world coordinates, meters."""
     # The matrix product of a camera is fastest on contiguous columns.
     return np.stack([points.values(axis, row_selection) for axis in AXES], dtype=np.float64).T
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from lidarsim.base.arrays import Bytes, Floats, Ints
-from lidarsim.scene.colours import as_bytes
+from lidarsim.scene.colors import as_bytes
 
-from ..render.theme import RANGE_COLOURS, mapped
+from ..render.theme import RANGE_COLORS, mapped
 
 _IMAGE_WIDTH = 1024  # most columns of a range image
 
@@ -31,8 +31,8 @@ def range_image(
 ) -> Bytes:
     """Return a range image of points, RGBA (rows, columns, 4).
 
-    `points` (n, 3) are in the sensor frame, `ranges` (n,) their distances from the sensor, metres;
-    `channels` (n,) are None if unknown; `limits` are the ranges at the ends of the colour scale.
+    `points` (n, 3) are in the sensor frame, `ranges` (n,) their distances from the sensor, meters;
+    `channels` (n,) are None if unknown; `limits` are the ranges at the ends of the color scale.
 
     Of several points in a pixel the nearest is shown. Rows are channels, the highest above, or
     steps of elevation if the sensor has few or very many channels. Columns are steps of azimuth
@@ -59,7 +59,7 @@ def range_image(
     column = ((left_rad - azimuth) * (width / max(field_rad, 1e-9))).astype(np.int64)
     image = np.zeros((row_count, width, 4), np.uint8)
     order = np.argsort(-ranges, kind="stable")  # the nearest is written last
-    image[row[order], np.minimum(column, width - 1)[order]] = _range_colours(ranges, limits)[order]
+    image[row[order], np.minimum(column, width - 1)[order]] = _range_colors(ranges, limits)[order]
     return image
 
 
@@ -75,13 +75,13 @@ def _image_rows(points: Floats, ranges: Floats, channels: Ints | None) -> tuple[
     return row, _IMAGE_ROWS
 
 
-def _range_colours(ranges: Floats, limits: tuple[float, float]) -> Bytes:
-    """Return the colours (n, 4) of ranges (n,) between limits."""
+def _range_colors(ranges: Floats, limits: tuple[float, float]) -> Bytes:
+    """Return the colors (n, 4) of ranges (n,) between limits."""
     lower, upper = limits
     shade = np.clip((ranges - lower) / max(upper - lower, 1e-9), 0, 1)
-    colours = np.full((len(ranges), 4), 255, np.uint8)
-    colours[:, :3] = as_bytes(mapped(RANGE_COLOURS, shade))
-    return colours
+    colors = np.full((len(ranges), 4), 255, np.uint8)
+    colors[:, :3] = as_bytes(mapped(RANGE_COLORS, shade))
+    return colors
 
 
 def are_around(sensors: Floats, bounds: Floats) -> bool:

@@ -24,11 +24,11 @@ from lidarsim.base.arrays import AnyArray, Floats, Ints
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.writing_progress import WritingProgress
-from lidarsim.scene.colours import as_bytes
+from lidarsim.scene.colors import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..picture_file import SensorPositions
-from ..render.colouring import TURBO
+from ..render.coloring import TURBO
 from ..render.film import Film
 from .legends import legend_of
 from .packing import pack_column, pack_positions
@@ -36,7 +36,7 @@ from .point_selection import PointFinder, ScanRanges, even_shares, positions
 from .server import VIEWER, Answer, bundle
 from .view import View
 
-_FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colours or quality)}
+_FILMS = {".gif": (30, 96), ".webp": (40, 40)}  # {suffix: (maximum of frames, colors or quality)}
 _MIN_FRAMES = 30
 _FRAME_MS = 100
 FILM_BYTES = 3_000_000  # maximum of a film
@@ -113,10 +113,10 @@ def film_of(view: View, suffix: str, show: WritingProgress = _show_nothing) -> b
 def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) -> bytes:
     """Encode frames in a width in pixels.
 
-    `quality` is the number of colours of a .gif.
+    `quality` is the number of colors of a .gif.
     """
     scaled = [f.resize((width, width * 9 // 16), Image.Resampling.LANCZOS) for f in frames]
-    if suffix == ".gif":  # colours would flicker with a palette for each frame
+    if suffix == ".gif":  # colors would flicker with a palette for each frame
         pixels = np.concatenate([np.asarray(frame)[::2, ::2] for frame in scaled])
         palette = Image.fromarray(pixels).quantize(quality, Image.Quantize.FASTOCTREE)
         scaled = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in scaled]
@@ -135,11 +135,11 @@ def _encode(frames: list[Image.Image], suffix: str, width: int, quality: int) ->
 
 @dataclass(frozen=True, eq=False)
 class _FilmSource:
-    """Points of a view for a film, coloured by height."""
+    """Points of a view for a film, colored by height."""
 
     view: View
     finder: PointFinder
-    top: float  # height above which the scene is cut open, metres
+    top: float  # height above which the scene is cut open, meters
 
     def positions(self, max_points: int, scans: ScanRanges | None = None) -> Floats:
         """Return local positions (n, 3) of points below the top."""
@@ -150,16 +150,16 @@ class _FilmSource:
     def points(
         self, box: Floats, max_points: int, scans: ScanRanges | None = None
     ) -> tuple[Floats, Floats]:
-        """Return local positions (n, 3), and colours (n, 4) by the height in a box (2, 3)."""
+        """Return local positions (n, 3), and colors (n, 4) by the height in a box (2, 3)."""
         local = self.positions(max_points, scans)
         share = np.clip((local[:, 2] - box[0, 2]) / max(np.ptp(box[:, 2]), 1e-9), 0, 1)
-        colours = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]  # darker colours are lost
-        return local, np.pad(colours, ((0, 0), (0, 1)), constant_values=1)
+        colors = TURBO[(24 + 231 * np.sqrt(share)).astype(np.int64)]  # darker colors are lost
+        return local, np.pad(colors, ((0, 0), (0, 1)), constant_values=1)
 
     def new_points(
         self, box: Floats, spans: Sequence[ScanRanges]
     ) -> Iterator[tuple[Floats, Floats]]:
-        """Yield the points and colours of each frame's scans."""
+        """Yield the points and colors of each frame's scans."""
         for scans in spans:
             yield self.points(box, _FRAME_POINTS, scans)
 
@@ -174,7 +174,7 @@ def _film(view: View, max_frames: int) -> Film:
     triangles = np.empty((0, 3, 3))
     top = np.inf
     if view.pictured is not None and len(view.pictured.scene.faces):
-        header, arrays = view.answer("surface", {"colour": "grey"}, _never_abandoned)
+        header, arrays = view.answer("surface", {"color": "gray"}, _never_abandoned)
         triangles = arrays["corners"]
         top = header["roof_cut"] or top
     source = _FilmSource(view, PointFinder(view.points, view.origin), top)
@@ -315,7 +315,7 @@ def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:
     """Return the answers to all questions of a page but for points: {question: packed answer}."""
     header, arrays = view.answer("state", {}, _never_abandoned)
     answers = {"state?": _packed(header | {"offline": True, "exports": []}, arrays)}
-    questions = [("surface", "colour", value) for value in header["scene_colours"] or ()]
+    questions = [("surface", "color", value) for value in header["scene_colors"] or ()]
     questions += [("column", "name", value) for value in view.columns]
     labels = [name for name, column in view.columns.items() if column.kind == "label"]
     questions += [("counts", "name", name) for name in labels]
@@ -351,26 +351,26 @@ def _thinned(view: View, max_points: int) -> Answer:
 
 
 def _compact_order(columns: Mapping[str, AnyArray], count: int) -> Ints:
-    """Return an order with similar neighbours: by sensor and channel, then as they are."""
+    """Return an order with similar neighbors: by sensor and channel, then as they are."""
     keys = [columns[name] for name in ("channel", "sensor") if name in columns]
     return np.lexsort(keys) if keys else np.arange(count)
 
 
 def _packed_points(view: View, local: Floats, columns: Mapping[str, AnyArray]) -> Answer:
-    """Return points with their packed columns, and the colours and legend of each column."""
+    """Return points with their packed columns, and the colors and legend of each column."""
     packed_columns = dict(zip("xyz", pack_positions(local), strict=True))
     packed_columns |= {name: pack_column(values) for name, values in columns.items()}
     arrays: dict[str, AnyArray] = {name: c.planes for name, c in packed_columns.items()}
     legends = dict[str, Any]()
-    for name in view.answer("state", {}, _never_abandoned)[0]["colours"]:
-        colouring = view.colouring(name)
-        legends[name] = legend_of(colouring) | {"column": name, "divisor": colouring.divisor}
-        if colouring.limits is not None:
-            arrays[f"{name} scale"] = as_bytes(colouring.scale)
+    for name in view.answer("state", {}, _never_abandoned)[0]["colors"]:
+        coloring = view.coloring(name)
+        legends[name] = legend_of(coloring) | {"column": name, "divisor": coloring.divisor}
+        if coloring.limits is not None:
+            arrays[f"{name} scale"] = as_bytes(coloring.scale)
         elif name in columns:
             values = np.unique(columns[name])
             arrays[f"{name} labels"] = values.astype(np.float64)
-            arrays[f"{name} palette"] = as_bytes(colouring.paint(values))
+            arrays[f"{name} palette"] = as_bytes(coloring.paint(values))
     described = {
         name: {
             "base": column.base,

@@ -1,4 +1,4 @@
-"""Triangles of a scene as the page draws them, and their colours."""
+"""Triangles of a scene as the page draws them, and their colors."""
 
 from __future__ import annotations
 
@@ -8,36 +8,36 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from lidarsim.columns.table import OBJECT, TABLE
-from lidarsim.scene.colours import as_bytes
+from lidarsim.scene.colors import as_bytes
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import simplified
 
-from ..render.colouring import (
+from ..render.coloring import (
     NORMALS,
-    colours_of,
-    colours_of_normals,
+    colors_of,
+    colors_of_normals,
 )
-from ..render.hit_density import HITS_TITLE, hit_colours
+from ..render.hit_density import HITS_TITLE, hit_colors
 from ..render.surface import separate_objects
 from ..render.theme import mapped
 from .legends import Legend, legend_of, scale_legend
 
 # Surfaces are moved inwards by this share of the scene's diagonal, or of `_MAX_SIZE_M` if that is
-# smaller: two centimetres.
+# smaller: two centimeters.
 _INWARD_SHARE = 1e-4
 _MAX_SIZE_M = 200.0
 HITS_SAMPLE = 500_000  # sample for the density of hits on large triangles
 
-MAX_TRIANGLES = 300_000  # triangles sent to the page, 50 bytes each, at each change of colours
+MAX_TRIANGLES = 300_000  # triangles sent to the page, 50 bytes each, at each change of colors
 
 MAX_PIECES = 60_000  # further triangles from dividing large triangles, to show hits
 
 
 class ShownSurface:
-    """A scene's triangles in chosen colours, simplified to a maximum number.
+    """A scene's triangles in chosen colors, simplified to a maximum number.
 
     Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
-    triangle that vanishes go to a neighbour. `reflectance` is the share of the light that each
+    triangle that vanishes go to a neighbor. `reflectance` is the share of the light that each
     object reflects, (objects,), if known; `face_materials` (f,) are indices into the names of
     materials, -1 for none.
     """
@@ -67,80 +67,80 @@ class ShownSurface:
         moved = separate_objects(self.coarse, self._objects, _INWARD_SHARE * min(size, _MAX_SIZE_M))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
 
-    def coloured(
+    def colored(
         self, by: str, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners, and a legend.
+        """Return corners (k, 3, 3), objects (k,), colors (k, 3, 3) at the corners, and a legend.
 
-        Corners are local, metres; objects are indices of static objects.
+        Corners are local, meters; objects are indices of static objects.
 
-        `by` is a name of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
-        a sample of the hit points, (n, 3). Colours of "grey" are left out: the page has them.
+        `by` is a name of `colors_for` the scene; "hits" needs the hits (f,) of its triangles, and
+        a sample of the hit points, (n, 3). Colors of "gray" are left out: the page has them.
         """
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend: Legend | None = None
         if by == "hits":
-            return self._coloured_by_hits(hit_counts, points)
+            return self._colored_by_hits(hit_counts, points)
         if by == "object":
-            colouring = colours_of(self._objects, OBJECT, self.coarse.names)
-            colours = colouring.paint(self._objects)
-            legend = legend_of(colouring)
+            coloring = colors_of(self._objects, OBJECT, self.coarse.names)
+            colors = coloring.paint(self._objects)
+            legend = legend_of(coloring)
         elif by == "reflectance" and self._reflectance is not None:
-            colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
-            greys = mapped("gray", np.linspace(0.1, 1.0, 9))
-            legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
+            colors = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
+            grays = mapped("gray", np.linspace(0.1, 1.0, 9))
+            legend = scale_legend("reflectance", ("0", "0.5", "1"), grays)
         elif by == "material" and self._materials is not None:
-            colouring = colours_of(self._materials, TABLE["material"], self._material_names)
-            colours = colouring.paint(self._materials)
-            legend = legend_of(colouring)
+            coloring = colors_of(self._materials, TABLE["material"], self._material_names)
+            colors = coloring.paint(self._materials)
+            legend = legend_of(coloring)
         elif by == "normals":
             a, b, c = self.coarse.vertices[self.coarse.faces].swapaxes(0, 1)
             normals = np.cross(b - a, c - a)
             lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            colours = colours_of_normals(normals / np.where(lengths > 0, lengths, np.nan)) / 255
+            colors = colors_of_normals(normals / np.where(lengths > 0, lengths, np.nan)) / 255
             legend = scale_legend(NORMALS.meaning, (), np.empty((0, 3)))
-        elif by == "colour" and self.coarse.colours is not None:
-            colours = self.coarse.colours.means() / 255
+        elif by == "color" and self.coarse.colors is not None:
+            colors = self.coarse.colors.means() / 255
         else:
             return arrays, None
-        corners = as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3)
-        return arrays | {"colours": corners}, legend
+        corners = as_bytes(colors).repeat(3, axis=0).reshape(-1, 3, 3)
+        return arrays | {"colors": corners}, legend
 
-    def _coloured_by_hits(
+    def _colored_by_hits(
         self, hit_counts: AnyArray, points: Floats32
     ) -> tuple[dict[str, AnyArray], Legend | None]:
-        """Return the arrays and the legend of `coloured`, for hits per square metre.
+        """Return the arrays and the legend of `colored`, for hits per square meter.
 
         `hit_counts` (f,) are of the original scene's triangles; `points` (n, 3) are a sample of
-        hits, local, metres. Large triangles are divided, so that pieces show where the hits are.
+        hits, local, meters. Large triangles are divided, so that pieces show where the hits are.
         """
         is_shown = self._replacements >= 0
         hits = np.bincount(self._replacements[is_shown], hit_counts[is_shown], len(self.corners))
         max_pieces = len(self.corners) + MAX_PIECES
-        corners, owner, colours, (lower, upper) = hit_colours(
+        corners, owner, colors, (lower, upper) = hit_colors(
             self.coarse, self.corners, hits.astype(float), points, max_pieces
         )
         arrays: dict[str, AnyArray] = {
             "corners": corners,
             "objects": self._objects[owner],
-            "colours": as_bytes(colours),
+            "colors": as_bytes(colors),
         }
         densities = (lower, (lower * upper) ** 0.5, upper)
         marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in densities]
         return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
 
 
-def colours_for(
+def colors_for(
     scene: Scene, reflectance: Floats | None, face_materials: Ints32 | None = None
 ) -> tuple[str, ...]:
-    """Return the names that `ShownSurface.coloured` accepts for a scene.
+    """Return the names that `ShownSurface.colored` accepts for a scene.
 
-    "reflectance" needs several values (objects,), "material" materials of faces, "colour" a scene
-    with colours.
+    "reflectance" needs several values (objects,), "material" materials of faces, "color" a scene
+    with colors.
     """
-    scene_colours = ("colour",) if scene.coloured else ()
+    scene_colors = ("color",) if scene.colored else ()
     reflectances = (
         ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     )
     materials = () if face_materials is None else ("material",)
-    return ("grey", "hits", "object", "normals", *reflectances, *materials, *scene_colours)
+    return ("gray", "hits", "object", "normals", *reflectances, *materials, *scene_colors)

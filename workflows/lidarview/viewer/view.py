@@ -23,7 +23,7 @@ from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, value_names
 from lidarsim.motion.trajectory import presence_ns
 from lidarsim.scene.actors import Actor, distinct_meshes, samples_per_actor
-from lidarsim.scene.colours import as_bytes
+from lidarsim.scene.colors import as_bytes
 from lidarsim.sweeps.sweeps import Sweeps
 from raybeam import RayCaster
 
@@ -34,16 +34,16 @@ from ..picture_file import (
     moving_positions,
 )
 from ..render.closeup import floor_and_cut, surrounding_box
-from ..render.colouring import (
+from ..render.coloring import (
     MAX_UNNAMED_LABELS,
-    Colouring,
-    colours_of,
+    Coloring,
+    colors_of,
     values_of,
     with_composed,
     word_of,
 )
 from ..render.surface import spiral
-from ..render.theme import object_colours
+from ..render.theme import object_colors
 from .legends import Legend, legend_of
 from .point_selection import (
     BLOCK_ROWS,
@@ -64,15 +64,15 @@ from .point_selection import (
 )
 from .range_pictures import are_around, range_image
 from .server import Answer, Arguments
-from .shown_surface import HITS_SAMPLE, MAX_TRIANGLES, ShownSurface, colours_for
+from .shown_surface import HITS_SAMPLE, MAX_TRIANGLES, ShownSurface, colors_for
 
 MAX_POINTS = 20_000_000  # points in an answer, and in a download
 MAX_RAYS = 150  # rays that are drawn; more would hide the surfaces
-_SAMPLE = 100_000  # points for colour scales and limits
+_SAMPLE = 100_000  # points for color scales and limits
 _MAX_COUNTED = 20_000_000  # points whose labels are counted; of more, a sample
 _CORNERS = 200  # directions whose outermost points of a cloud are in the first picture
 _MAX_BEYOND = 0.5  # points farther outside the middle 99 % than this share of it are outliers
-_MAX_COLOURINGS = 64  # colour scales that are kept, of columns and filters
+_MAX_COLORINGS = 64  # color scales that are kept, of columns and filters
 _MAX_NAMES = 2000  # named values of a column that a menu of the page lists
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
@@ -113,9 +113,9 @@ class View:
 
     def __post_init__(self) -> None:
         self.version = 0  # counts the replacements of the points by `show`
-        # (n, 2, 3): both ends of sample rays, local, metres
+        # (n, 2, 3): both ends of sample rays, local, meters
         self.rays: Floats32 = np.zeros((0, 2, 3), np.float32)
-        self.path: Floats | None = None  # (w, 2): corners of the planned path, local, metres
+        self.path: Floats | None = None  # (w, 2): corners of the planned path, local, meters
         sources = (source for source in (self.pictured, self.sweeps) if source is not None)
         if any(source.coordinates != "world" for source in sources):
             self.note = f"{self.note} {IN_SENSOR_AXES}".strip()
@@ -135,18 +135,18 @@ class View:
     def show(self, points: Points, *, keep_scales: bool = False) -> None:
         """Replace the points.
 
-        With `keep_scales`, the colour scales of earlier points stay.
+        With `keep_scales`, the color scales of earlier points stay.
         """
         self.points = points
         self._finder = PointFinder(self._with_stations(points), self.origin)
         other_columns = {
             column.name: column for column in self._finder.points.table if column not in POSITION
         }
-        self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # columns to colour and filter by
-        self._coloured = with_composed(self.columns)
+        self.columns = {"z": Z, "x": X, "y": Y, **other_columns}  # columns to color and filter by
+        self._colored = with_composed(self.columns)
         if not keep_scales:
-            # {(column, filter, limits of the scale): colour scale}
-            self._colourings: dict[tuple[Any, ...], Colouring] = {}
+            # {(column, filter, limits of the scale): color scale}
+            self._colorings: dict[tuple[Any, ...], Coloring] = {}
         self.version += 1
 
     def _with_stations(self, points: Points) -> Points:
@@ -168,7 +168,7 @@ class View:
 
     @cached_property
     def sensors(self) -> Sequence[SensorPositions]:
-        """Positions of the sensors, local, metres: as pictured, else at the starts of sweeps.
+        """Positions of the sensors, local, meters: as pictured, else at the starts of sweeps.
 
         A sensor moves if it is at a new position in more than half of at least three sweeps.
         """
@@ -245,9 +245,9 @@ class View:
     def _extent(self) -> tuple[Floats, Floats, Floats]:
         """Return the origin (3,), and what to show: the box (2, 3) and points (k, 3).
 
-        The origin is in world metres.
+        The origin is in world meters.
 
-        The box contains the points, local, metres. The points are the corners of the scene, the
+        The box contains the points, local, meters. The points are the corners of the scene, the
         positions of the sensors unless these are around an object, and both ends of the planned
         path: closer together than the corners of the box, which around an object is mostly empty.
         """
@@ -279,7 +279,7 @@ class View:
             "point": lambda arguments, _: self._point(int(arguments["row"])),
             "column": lambda arguments, _: self._column(arguments["name"]),
             "counts": lambda arguments, gone: self._label_counts(arguments["name"], gone),
-            "surface": lambda arguments, _: self._scene(arguments["colour"]),
+            "surface": lambda arguments, _: self._scene(arguments["color"]),
             "range": lambda arguments, _: self._range(int(arguments["sweep"])),
             "export": self._export,
         }
@@ -289,7 +289,7 @@ class View:
         """Return the header and arrays of the view, without points and surfaces.
 
         In the header, "bounds" contain the scene, and "box" the part to look at first: around the
-        trajectories in a large scene, where "cut" is the z of its top. Local metres, and seconds.
+        trajectories in a large scene, where "cut" is the z of its top. Local meters, and seconds.
         """
         # None: look at all of the scene
         shown_box = surrounding_box(
@@ -325,14 +325,14 @@ class View:
                 }
                 for name, column in self.columns.items()
             ],
-            "colours": [*self._coloured],
+            "colors": [*self._colored],
             "origin": self.origin.tolist(),
             "epsg": self.epsg,
             "box": box.tolist(),
             "bounds": self._bounds.tolist(),
             "cut": None if shown_box is None else float(shown_box[1, 2]),
-            "scene_colours": pictured
-            and colours_for(pictured.scene, pictured.reflectance, pictured.face_materials),
+            "scene_colors": pictured
+            and colors_for(pictured.scene, pictured.reflectance, pictured.face_materials),
             "sensors": [
                 {
                     "name": sensor.name,
@@ -349,9 +349,9 @@ class View:
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             # Actors move with the time, which stations alone do not need.
             "stations": [] if self.actors else self._station_names,
-            "results": legend_of(colours_of(result_numbers, RESULT, self.results))["labels"],
+            "results": legend_of(colors_of(result_numbers, RESULT, self.results))["labels"],
             "exports": self._export_formats,
-            "actor_colours": as_bytes(object_colours(object_count))[static_count:].tolist(),
+            "actor_colors": as_bytes(object_colors(object_count))[static_count:].tolist(),
             "statics": static_count,
             "duration": self.duration_ns / _NS,
             "path": self.planned,
@@ -367,7 +367,7 @@ class View:
 
         Distinct meshes are numbered ``mesh0``, ``mesh1``, …; animated meshes have the vertices
         (p, v, 3) of each pose of the animation, actors the number of the pose at each time, with
-        fractions (``actor0_frames``). Local metres, seconds.
+        fractions (``actor0_frames``). Local meters, seconds.
         """
         meshes, mesh_indices = distinct_meshes(self.actors)
         arrays: dict[str, AnyArray] = {
@@ -375,8 +375,8 @@ class View:
         }  # no int64 in pages
         for k, mesh in enumerate(meshes):
             arrays[f"mesh{k}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
-            if mesh.colours is not None:  # at the corners
-                arrays[f"mesh{k}_colours"] = mesh.colours.means().repeat(3, axis=0)
+            if mesh.colors is not None:  # at the corners
+                arrays[f"mesh{k}_colors"] = mesh.colors.means().repeat(3, axis=0)
             if mesh.animation is not None:
                 arrays[f"mesh{k}_poses"] = mesh.animation.vertices.astype(np.float32)
                 arrays[f"mesh{k}_faces"] = mesh.faces.astype(np.int32)
@@ -397,19 +397,19 @@ class View:
 
     @property
     def rays_shown(self) -> Floats32:
-        """Both ends of at most `MAX_RAYS` sample rays, local, metres: (n, 2, 3)."""
+        """Both ends of at most `MAX_RAYS` sample rays, local, meters: (n, 2, 3)."""
         return self.rays[:: len(self.rays) // MAX_RAYS + 1]
 
     @property
     def planned(self) -> dict[str, Any] | None:
-        """Planned path and discs (x, y, radius) of obstacles, local metres.
+        """Planned path and discs (x, y, radius) of obstacles, local meters.
 
         The answer is None without a path.
         """
         planning = None if self.pictured is None else self.pictured.planning
         if self.path is None or planning is None:
             return None
-        discs = np.column_stack([planning.centres, planning.radii])
+        discs = np.column_stack([planning.centers, planning.radii])
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
     def _classes_of_objects(self) -> dict[int, int]:
@@ -473,62 +473,62 @@ class View:
         return point_filter, read_scans(arguments["scans"]) if "scans" in arguments else None
 
     def _points(self, arguments: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Return points for a filter, ranges of scans and a camera (`Eye`), with their colours.
+        """Return points for a filter, ranges of scans and a camera (`Eye`), with their colors.
 
-        Positions are local, metres; rows are indices of the points. "count" is the number of points
+        Positions are local, meters; rows are indices of the points. "count" is the number of points
         before the points are thinned out.
         """
         finder = self._finder
         version = self.version
         selection = self._read_selection(arguments)
-        name = arguments["colour"]
-        column = self._coloured[name]
+        name = arguments["color"]
+        column = self._colored[name]
         eye = Eye.read(arguments["eye"]) if "eye" in arguments else None
         max_points = max(1, min(int(arguments["most"]), MAX_POINTS))
         rows, count = finder.find(max_points, *selection, eye, abandoned)
         limits = _read_limits(arguments["limits"]) if "limits" in arguments else None
-        colouring = self._colouring(finder, name, selection[0].without(name), limits, abandoned)
+        coloring = self._coloring(finder, name, selection[0].without(name), limits, abandoned)
         values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
-        colours = np.full((len(rows), 4), 255, np.uint8)
-        colours[:, :3] = as_bytes(colouring.paint(values))
+        colors = np.full((len(rows), 4), 255, np.uint8)
+        colors[:, :3] = as_bytes(coloring.paint(values))
         arrays: dict[str, AnyArray] = {
             "positions": (positions(finder.points, rows) - self.origin).astype(np.float32),
-            "colours": colours,
+            "colors": colors,
             "rows": rows.astype(np.uint32),
         }
         legend: Legend | None = None
         if len(finder.points):
-            legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
+            legend = legend_of(coloring) | {"column": name, "meaning": column.meaning}
         return {"version": version, "count": count, "legend": legend}, arrays
 
-    def colouring(self, name: str) -> Colouring:
-        """Return the colour scale of a column for all points."""
-        return self._colouring(self._finder, name, Filter(), None, _never_abandoned)
+    def coloring(self, name: str) -> Coloring:
+        """Return the color scale of a column for all points."""
+        return self._coloring(self._finder, name, Filter(), None, _never_abandoned)
 
-    def _colouring(
+    def _coloring(
         self,
         finder: PointFinder,
         name: str,
         point_filter: Filter,
         limits: tuple[float, float] | None,
         abandoned: Callable[[], bool],
-    ) -> Colouring:
-        """Return the colour scale of a column, the same for all scans.
+    ) -> Coloring:
+        """Return the color scale of a column, the same for all scans.
 
         The scale is taken from a sample of all points that the filter keeps, or has given limits.
         """
-        colourings = self._colourings
-        colouring = colourings.get((name, point_filter, limits))
-        if colouring is None:
+        colorings = self._colorings
+        coloring = colorings.get((name, point_filter, limits))
+        if coloring is None:
             rows, _ = finder.find(_SAMPLE, point_filter, None, None, abandoned)
-            column = self._coloured[name]
+            column = self._colored[name]
             values = values_of(column, lambda column_name: finder.points.values(column_name, rows))
-            colouring = colours_of(values, column, self._names(name), limits)
+            coloring = colors_of(values, column, self._names(name), limits)
             with self._lock:
-                while len(colourings) >= _MAX_COLOURINGS:
-                    del colourings[next(iter(colourings))]  # the oldest
-                colourings[name, point_filter, limits] = colouring
-        return colouring
+                while len(colorings) >= _MAX_COLORINGS:
+                    del colorings[next(iter(colorings))]  # the oldest
+                colorings[name, point_filter, limits] = coloring
+        return coloring
 
     def _column(self, name: str) -> Answer:
         """Return the limits of a column, or its labels and their values, for the page's filters."""
@@ -603,11 +603,11 @@ class View:
         number = f"{value:.6g}" if np.issubdtype(type(value), np.floating) else f"{value}"
         return f"{number} {column.unit}".rstrip()
 
-    def _scene(self, colour: str) -> Answer:
-        """Return the static triangles of the scene in their colours.
+    def _scene(self, color: str) -> Answer:
+        """Return the static triangles of the scene in their colors.
 
         The header has the legend, and the heights of the floor and of the cut that takes off a
-        roof. `colour` is a name of `colours_for`.
+        roof. `color` is a name of `colors_for`.
         """
         pictured = self.pictured
         if pictured is None:
@@ -622,7 +622,7 @@ class View:
             )
         hit_counts = pictured.hit_counts
         hit_points = np.zeros((0, 3), np.float32)
-        if colour == "hits":
+        if color == "hits":
             hit_counts = hit_counts if self.read_hit_counts is None else self.read_hit_counts()
             if not len(hit_counts):  # before a run
                 hit_counts = np.zeros(len(pictured.scene.faces), np.int64)
@@ -632,14 +632,14 @@ class View:
                 owners = self._finder.points.values("object", rows)
                 rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
             hit_points = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
-        arrays, legend = surface.coloured(colour, hit_counts, hit_points)
+        arrays, legend = surface.colored(color, hit_counts, hit_points)
         return {"legend": legend} | self._floor_and_roof_cut, arrays
 
     @cached_property
     def _floor_and_roof_cut(self) -> dict[str, float | None]:
         """Heights of the floor under the sensors, and of the cut that takes off a roof above them.
 
-        Local z, metres. None without sensors, floor or roof. Asked for after `_surface` is set.
+        Local z, meters. None without sensors, floor or roof. Asked for after `_surface` is set.
         """
         surface = self._surface
         pictured = self.pictured
@@ -654,7 +654,7 @@ class View:
     def _range(self, sweep: int) -> Answer:
         """Return the range image of a sweep (number in `sweeps`), as of `range_image`.
 
-        "low" and "high" are the ends of the scale of ranges, metres, for all sweeps of a sensor.
+        "low" and "high" are the ends of the scale of ranges, meters, for all sweeps of a sensor.
         """
         sweeps = self.sweeps
         finder = self._finder
@@ -685,13 +685,13 @@ def _never_abandoned() -> bool:
 
 
 def _read_limits(text: str) -> tuple[float, float]:
-    """Read the ends of a colour scale, ``lowest,highest``.
+    """Read the ends of a color scale, ``lowest,highest``.
 
     Raises ValueError if the ends are in disorder.
     """
     lower, upper = map(float, text.split(","))
     if not -math.inf < lower < upper < math.inf:
-        raise ValueError(f"{text!r} are no ends of a colour scale")
+        raise ValueError(f"{text!r} are no ends of a color scale")
     return lower, upper
 
 
@@ -702,10 +702,10 @@ def _add_counts(counts: Counter[int], values: AnyArray) -> None:
 
 
 def _cloud_extent(points: Points) -> tuple[Floats, Floats, Floats]:
-    """Return an origin (3,) for points, their local box (2, 3) and points (k, 3), metres.
+    """Return an origin (3,) for points, their local box (2, 3) and points (k, 3), meters.
 
     The box is without outliers; the points are the outermost of the others in all directions.
-    Each coordinate of the origin is 0, or whole metres for points farther than 10 km from 0.
+    Each coordinate of the origin is 0, or whole meters for points farther than 10 km from 0.
     """
     sample = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(sample):

@@ -11,8 +11,8 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints, Records
 from lidarsim.columns.cloud import Cloud
-from lidarsim.columns.table import COLOURS, SURFACE_COLUMNS, VELOCITY
-from lidarsim.scene.colours import as_float
+from lidarsim.columns.table import COLORS, SURFACE_COLUMNS, VELOCITY
+from lidarsim.scene.colors import as_float
 from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.sensor.reflectivity import COUNTS
 from lidarsim.sweeps.lidar_traits import LidarTraits
@@ -29,7 +29,7 @@ _XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
 _XYZI = [*_XYZ, ("intensity", "<f4")]
 # Additional fields after the layout: {name: (type, columns that the field needs)}.
 EXTRA_FIELDS = {
-    "rgb": ("<f4", {*COLOURS}),
+    "rgb": ("<f4", {*COLORS}),
     VELOCITY: ("<f4", {VELOCITY}),
     "label": ("<u4", {"class"}),
     **{name: ("<f4", {name}) for name in SURFACE_COLUMNS},
@@ -40,7 +40,7 @@ EXTRA_FIELDS = {
 class SweepPoints(NamedTuple):
     """Points of a sweep in the sensor frame, for the rows of layouts."""
 
-    positions: Floats32  # (n, 3): metres
+    positions: Floats32  # (n, 3): meters
     columns: Mapping[str, AnyArray]  # columns of the cloud
     traits: LidarTraits  # traits of the sensor
 
@@ -206,7 +206,7 @@ class OusterLayout(_CountedNanoseconds):
     lines = "channels"
 
     def values(self, points: SweepPoints) -> dict[str, AnyArray]:
-        """Return the signal, the reflectivity, and the sensor's range in millimetres."""
+        """Return the signal, the reflectivity, and the sensor's range in millimeters."""
         columns = points.columns
         range_m = columns["range"].astype(np.float64) + points.traits.range_offset_m
         return {
@@ -338,7 +338,7 @@ def point_rows(
         since_ns = since_stamp_ns(points, sweeps, sweep)
         values[layout.time_field] = layout.times(since_ns, message_stamp_ns(sweeps, sweep))
     if "rgb" in (row.names or ()):
-        values["rgb"] = as_float(*(columns[name] for name in COLOURS))
+        values["rgb"] = as_float(*(columns[name] for name in COLORS))
     same_names = ((name, name) for name in (VELOCITY, *SURFACE_COLUMNS, "material"))
     for name, column in (*same_names, ("label", "class")):
         if name in (row.names or ()):

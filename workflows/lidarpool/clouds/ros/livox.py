@@ -43,7 +43,7 @@ def check_lines(channels: int) -> None:
 def custom_message(
     store: Typestore, header: Any, stamp_ns: int, since_ns: AnyArray, rows: Records
 ) -> bytes:
-    """Return a serialised CustomMsg of points.
+    """Return a serialized CustomMsg of points.
 
     `rows` (n,) are the points in the layout `livox`. `since_ns` (n,) are nanoseconds from the stamp
     to the firings.

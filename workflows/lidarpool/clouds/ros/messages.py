@@ -1,4 +1,4 @@
-"""Messages of ROS 2 of a survey, in the order of their times, serialised."""
+"""Messages of ROS 2 of a survey, in the order of their times, serialized."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class RosMessage(NamedTuple):
     topic: str
     kind: str  # such as "sensor_msgs/msg/PointCloud2"
     time_ns: int  # when it is sent
-    cdr: bytes | memoryview  # serialised, with the header of its encoding
+    cdr: bytes | memoryview  # serialized, with the header of its encoding
 
 
-class Serialised(NamedTuple):
-    """The content of a message that is serialised already."""
+class Serialized(NamedTuple):
+    """The content of a message that is serialized already."""
 
     kind: str
     cdr: bytes
@@ -194,7 +194,7 @@ class SurveyMessages:
             if not self._laid_out.compensated:
                 since_ns = since_stamp_ns(points, sweeps, sweep)
             data = custom_message(message_store(), header, stamp_ns, since_ns, rows)
-            contents["livox"] = Serialised(CUSTOM_MSG, data)
+            contents["livox"] = Serialized(CUSTOM_MSG, data)
         return contents
 
     def _frames_in_world(self, sweep: int) -> list[tuple[str, str, SweepPoses, int]]:
@@ -293,7 +293,7 @@ def sweep_topic(sweeps: Sweeps, sweep: int) -> str:
 
 def _sent(topic: str, content: Any, time_ns: int) -> RosMessage:
     """Return a message that is sent at a time."""
-    if isinstance(content, Serialised):
+    if isinstance(content, Serialized):
         return RosMessage(topic, content.kind, time_ns, content.cdr)
     kind = content.__msgtype__
     return RosMessage(topic, kind, time_ns, message_store().serialize_cdr(content, kind))
@@ -444,7 +444,7 @@ class _Messages:
                     type=marker.CUBE,
                     action=marker.ADD if boxes.present[number] else marker.DELETE,
                     pose=pose(
-                        point(*boxes.centres[number].tolist()),
+                        point(*boxes.centers[number].tolist()),
                         quaternion(*boxes.quaternions[number].tolist()),
                     ),
                     scale=vector(*boxes.sizes[number].tolist()),

@@ -73,6 +73,6 @@ def _draw_curve(page: Page, axes: Axes, name: str, points: Sequence[Mapping[str,
     if is_share:
         lower, upper = np.clip((lower, upper), 0, 100)
     axes.vlines(x, lower, upper, color=theme.UNSEEN, lw=1.8 * page.unit)
-    axes.plot(x, value, "o", color=theme.OBJECT_COLOURS[0], ms=3.2 * page.unit, mew=0)
+    axes.plot(x, value, "o", color=theme.OBJECT_COLORS[0], ms=3.2 * page.unit, mew=0)
     if is_share:
         axes.set_ylim(*np.clip(axes.get_ylim(), -1, 101))

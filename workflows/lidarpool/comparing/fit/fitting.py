@@ -49,7 +49,7 @@ class Fit:
 
     __signature__ = ReadableSignature()
 
-    figures: dict[str, Any]  # numbers and texts of the page; lengths in metres
+    figures: dict[str, Any]  # numbers and texts of the page; lengths in meters
     model: SensorModel  # the sensor with the fitted performance
 
     def __repr__(self) -> str:

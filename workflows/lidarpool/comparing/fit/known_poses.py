@@ -38,7 +38,7 @@ class KnownPoses:
     numbers: Ints  # (n,): numbers of the sweeps
     matrices: Floats  # (n, 4, 4): from the sensor frame at the start of each sweep
     are_given: bool  # whether the user gave the poses
-    origin: Floats  # (3,): of the scene in the world, metres
+    origin: Floats  # (3,): of the scene in the world, meters
 
     @classmethod
     def of_recording(
@@ -113,7 +113,7 @@ class KnownPoses:
 
         def read_from_pose(number: int) -> FiredPoints:
             points, columns, _ = recording.read(number)
-            positions = np.asarray(points, np.float64) * recording.metres
+            positions = np.asarray(points, np.float64) * recording.meters
             # Drivers write NaN or zeros for pulses without a return.
             valid = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
             poses = FiringPoses(matrices[number, :3, 3], matrices[number, :3, :3])

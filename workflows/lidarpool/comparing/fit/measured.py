@@ -49,7 +49,7 @@ class Measured:
     # {figure: estimate}: fields of `Noise` (`fit_performance`), and for a sensor that stands also
     # `false_alarms`, a field of `Performance`; empty for a single sweep of such a sensor
     estimates: dict[str, Estimate]
-    bias: dict[int, Estimate]  # {row: metres}
+    bias: dict[int, Estimate]  # {row: meters}
     lost_by_range: Curve | None = None  # share by the range of the scene; None without a scene
     moves: bool = False  # whether the sensor moves
 
@@ -170,7 +170,7 @@ def _check_rays(count: int, name: str) -> None:
 
 
 def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> Floats:
-    """Cast a ray into each cell, and return ranges of the scene (r, c), metres.
+    """Cast a ray into each cell, and return ranges of the scene (r, c), meters.
 
     The range of a ray that meets nothing is NaN.
     """
@@ -214,10 +214,10 @@ def _pulse_energies(rays: SmoothRays, white: float | None, are_energies: bool) -
 def _bias(
     stack: SweepStack, rays: SmoothRays, sigma: Floats, expected: Floats | None
 ) -> dict[int, Estimate]:
-    """Estimate the bias of each row of the stack, {row: metres}, by rays that are not steep.
+    """Estimate the bias of each row of the stack, {row: meters}, by rays that are not steep.
 
     Bias is the difference from the scene's ranges `expected` (r, c), or from large planes. Ranges
-    have standard deviations `sigma` (r, c), metres.
+    have standard deviations `sigma` (r, c), meters.
     """
     flat = rays.select(rays.slope < FLAT_TANGENT * rays.distance)
     cell = flat.row, flat.column
@@ -228,13 +228,13 @@ def _bias(
 
 
 def _pulse_bias(pulses: Pulses) -> dict[int, Estimate]:
-    """Estimate the bias of each row, {row: metres}, by returns of pulses that are not steep."""
+    """Estimate the bias of each row, {row: meters}, by returns of pulses that are not steep."""
     returned = np.isfinite(pulses.residual) & (pulses.slope < FLAT_TANGENT * pulses.expected)
     return _mean_by_row(pulses.row[returned], pulses.residual[returned])
 
 
 def _mean_by_row(row: Ints, errors: Floats) -> dict[int, Estimate]:
-    """Estimate the mean of the errors (k,) of each row (k,): {row: metres}."""
+    """Estimate the mean of the errors (k,) of each row (k,): {row: meters}."""
     return {number: Estimate.from_values(errors[row == number]) for number in set(row.tolist())}
 
 

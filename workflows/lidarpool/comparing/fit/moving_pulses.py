@@ -30,7 +30,7 @@ from .smooth_surfaces import (
     MAX_TANGENT,
     MIN_RANGE_M,
     SCENE_TOLERANCE_M,
-    Neighbours,
+    Neighbors,
     SmoothRays,
     among_smooth,
 )
@@ -50,14 +50,14 @@ class Pulses:
 
     row: Ints
     column: Ints
-    expected: Floats  # range of the scene, metres
-    slope: Floats  # growth of the range with the direction, metres in a radian
-    residual: Floats  # range less `expected`, metres; NaN of a lost pulse
+    expected: Floats  # range of the scene, meters
+    slope: Floats  # growth of the range with the direction, meters in a radian
+    residual: Floats  # range less `expected`, meters; NaN of a lost pulse
     intensity: Floats  # mean of the returns beside the pulse; NaN if unknown
     difference: Floats  # residual less the residual of the next pulse of the ring; NaN if unknown
 
     def rough_sigma(self) -> Floats:
-        """Estimate the standard deviations (n,) of ranges, metres, for the choice of outliers."""
+        """Estimate the standard deviations (n,) of ranges, meters, for the choice of outliers."""
         scatter_m = float(np.nanmedian(np.abs(self.difference))) / (0.6745 * np.sqrt(2))
         return np.hypot(scatter_m, ASSUMED_DIRECTION_NOISE_RAD * self.slope)
 
@@ -73,7 +73,7 @@ class Pulses:
     def rays(self, sigma: Floats) -> SmoothRays:
         """Return the pulses as rays of one pulse each, with standard deviations (n,) of ranges.
 
-        The variances belong to differences of neighbouring pulses: errors of poses and of the
+        The variances belong to differences of neighboring pulses: errors of poses and of the
         scene are alike in both.
         """
         returned = np.isfinite(self.residual)
@@ -124,7 +124,7 @@ def measure_pulses(
         points = fired(number)
         return points.points, points.columns, None
 
-    as_fired = replace(recording, read=read, firing_key="", metres=(1.0, 1.0, 1.0))
+    as_fired = replace(recording, read=read, firing_key="", meters=(1.0, 1.0, 1.0))
     stack = SweepStack.read(as_fired)
     caster = _CellCaster.of_stack(stack, scene)
     sweeps = enumerate(stack.numbers.tolist())
@@ -136,11 +136,11 @@ def measure_pulses(
 class _CellReturns(NamedTuple):
     """For each cell of a sweep, its return, or the return of the ring nearest in azimuth."""
 
-    points: Floats  # (r, c, 3): in the sensor frame at their firings, metres
+    points: Floats  # (r, c, 3): in the sensor frame at their firings, meters
     beside: Floats  # (2, r, c, 3): returns of the ring before and after the cell, like `points`
     own: Bools  # (r, c): whether the return belongs to the cell
     known: Bools  # (r, c): whether the pose of the cell's pulse is known
-    positions: Floats  # (r c, 3): of the sensor at the firings, scene frame, metres
+    positions: Floats  # (r c, 3): of the sensor at the firings, scene frame, meters
     rotations: Floats  # (r c, 3, 3): from the sensor frame to the scene frame
 
     @classmethod
@@ -276,23 +276,21 @@ class _CellCaster:
             points = positions.reshape(shape) + path
             smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
             tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance
-            smooth &= Neighbours.from_points(points).are_coplanar(
-                points, scaled_normal, tolerance_m
-            )
+            smooth &= Neighbors.from_points(points).are_coplanar(points, scaled_normal, tolerance_m)
         return _SceneSurfaces(distance, slope, path, scaled_normal, smooth)
 
 
 class _SceneSurfaces(NamedTuple):
     """Surfaces of a scene in the cells of a sweep."""
 
-    distance: Floats  # (r, c): metres; NaN without a hit
-    slope: Floats  # (r, c): growth of the range with the direction, metres in a radian
-    path: Floats  # (r, c, 3): from the sensor to the surface, scene frame, metres
+    distance: Floats  # (r, c): meters; NaN without a hit
+    slope: Floats  # (r, c): growth of the range with the direction, meters in a radian
+    path: Floats  # (r, c, 3): from the sensor to the surface, scene frame, meters
     scaled_normal: Floats  # (r, c, 3): normal n, as n / (n · d) for the direction d
-    smooth: Bools  # (r, c): whether the neighbours lie in one plane with the cell
+    smooth: Bools  # (r, c): whether the neighbors lie in one plane with the cell
 
     def range_errors(self, points: Floats, rotations: Floats) -> Floats:
-        """Return the ranges (r, c) of points less the ranges of the planes of the cells, metres.
+        """Return the ranges (r, c) of points less the ranges of the planes of the cells, meters.
 
         Ranges are along the points (r, c, 3), in the sensor frame: pulses are beside the middle of
         their cell. `rotations` (r c, 3, 3) turn the sensor frame into the scene frame.

@@ -61,7 +61,7 @@ def fit_performance(
         `range_at_threshold_m`; `detection_range_m` and `dropout`. Without a field that the rays do
         not determine.
     sigma
-        Standard deviations of the ranges of rays (k,), metres, by the likelier of range and energy.
+        Standard deviations of the ranges of rays (k,), meters, by the likelier of range and energy.
     """
     threshold, dropout = _fit_detection(rays, energy, all_known)
     scatter = fit_scatter(rays, "range_per_m", rays.distance, 1)
@@ -131,19 +131,19 @@ class ScatterFit(NamedTuple):
 
     # {`range_m`, `angle_deg` or the name of the increase, fields of `Noise`: estimate}
     estimates: dict[str, Estimate]
-    sigma: Floats  # (k,): fitted standard deviation of the range of each ray, metres
+    sigma: Floats  # (k,): fitted standard deviation of the range of each ray, meters
     deviance: float  # deviance of the fit to all rays; a smaller deviance is likelier
 
 
 class _VarianceSamples(NamedTuple):
     """Variances of the ranges of rays that lose few pulses, (k,) each."""
 
-    variance: Floats  # square metres
+    variance: Floats  # square meters
     freedom: Ints  # degrees of freedom of the variance
     growth: Floats  # a quantity that noise of ranges grows with, such as the range
-    slope: Floats  # metres in a radian
-    distance: Floats  # metres
-    patch: Ints  # number of the patch of neighbouring rays, whose errors may be alike
+    slope: Floats  # meters in a radian
+    distance: Floats  # meters
+    patch: Ints  # number of the patch of neighboring rays, whose errors may be alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,12 +158,12 @@ class _VarianceModel:
 
     power: int  # power of σ and of the growth: 1 if noise adds, 2 if variances add
     fitted: Bools  # (3,): which parameters are fitted
-    variance_scale: float  # usual variance v, square metres
+    variance_scale: float  # usual variance v, square meters
     growth_scale: float  # usual growth, in its unit
-    slope_scale: float  # usual slope, metres in a radian
+    slope_scale: float  # usual slope, meters in a radian
 
     def variance(self, parameters: Floats, growth: Floats, slope: Floats) -> Floats:
-        """Return the variances (k,) of the ranges of rays, square metres."""
+        """Return the variances (k,) of the ranges of rays, square meters."""
         theta = np.zeros(3)
         theta[self.fitted] = parameters
         range_term = theta[0] + theta[1] * (growth / self.growth_scale) ** self.power
@@ -171,7 +171,7 @@ class _VarianceModel:
         return np.asarray(self.variance_scale * (range_term ** (2 / self.power) + direction_term))
 
     def expected(self, parameters: Floats, samples: _VarianceSamples) -> Floats:
-        """Return the variances (k,) that the model gives samples, square metres."""
+        """Return the variances (k,) that the model gives samples, square meters."""
         return self.variance(parameters, samples.growth, samples.slope)
 
 
@@ -313,8 +313,8 @@ def fit_threshold(
     (fitted,) = brute(lambda guess: deviance(guess).sum(), [(lower - 2, upper)], Ns=60)
     if (detection(fitted) < 0.9 * (1 - dropout)).sum() < _MIN_WEAK_RAYS:
         return None
-    below, centre, above = (deviance(fitted + step) for step in (-_LOG_STEP, 0, _LOG_STEP))
-    information = (above - 2 * centre + below).sum() / _LOG_STEP**2
+    below, center, above = (deviance(fitted + step) for step in (-_LOG_STEP, 0, _LOG_STEP))
+    information = (above - 2 * center + below).sum() / _LOG_STEP**2
     score = (((above - below) / (2 * _LOG_STEP)) ** 2).sum()
     return Estimate(*np.exp(Estimate.from_variance(fitted, score / information**2)).tolist())
 
@@ -323,7 +323,7 @@ def alarm_share(stack: SweepStack) -> Estimate | None:
     """Estimate the share of pulses into the sky that return.
 
     A pulse counts as a pulse into the sky if no other pulse of its ray returns, and no ray in its
-    neighbourhood returns twice; rays of fewer than three pulses do not count. None with little sky,
+    neighborhood returns twice; rays of fewer than three pulses do not count. None with little sky,
     or with two sweeps.
     """
     from scipy.ndimage import maximum_filter

@@ -20,8 +20,8 @@ from .smooth_surfaces import FLAT_TANGENT, MAX_KINK_PER_M, Surfaces, find_surfac
 from .stack import SweepStack, finite_median
 
 SWEEP_PAIRS = 8  # pairs of sweeps that are compared
-ARM_M = 10.0  # distance at which rotations are expressed in metres
-# noise of ranges, and motion, for which rays are weighted, metres
+ARM_M = 10.0  # distance at which rotations are expressed in meters
+# noise of ranges, and motion, for which rays are weighted, meters
 _ASSUMED_NOISE_M = 0.02
 _ASSUMED_SHIFT_M = 0.5
 _MIN_EXPLAINED_SHARE = 0.5  # share of the rays that a motion changes
@@ -29,7 +29,7 @@ _MAX_FACE_M = 0.3  # shift beyond which rays leave the faces of cars
 _VEHICLE_M = 4.0  # no front of a vehicle is as wide
 _CALM_FACTOR = 4.0  # a change above this multiple of the median is of something that moves
 _CALM_SIGMAS = 6.0
-# change of a range that may be noise, at least, and for each metre
+# change of a range that may be noise, at least, and for each meter
 _STAYED_M = 0.05
 _STAYED_PER_M = 0.01
 
@@ -53,8 +53,8 @@ class RangeChanges:
     surfaces: Surfaces  # surfaces of the first sweep
     # (r, c): rays that meet smooth surfaces, not steeply, in the first sweep and return in both
     chosen: Bools
-    change: Floats  # (r, c): metres, second less first, without the change by shifted azimuths
-    points: Floats  # (r, c, 3): of the first sweep, metres
+    change: Floats  # (r, c): meters, second less first, without the change by shifted azimuths
+    points: Floats  # (r, c, 3): of the first sweep, meters
     sigma_m: Floats  # (r, c): rough standard deviation of ranges
 
     @classmethod
@@ -75,14 +75,14 @@ class RangeChanges:
     def design(self) -> Floats:
         """Changes (k, 4) of the ranges of chosen rays with the motion: shift, and yaw at `ARM_M`.
 
-        Yaw is in metres, so that the unknowns are of about the same size.
+        Yaw is in meters, so that the unknowns are of about the same size.
         """
         yaw = self.surfaces.azimuth_slope[self.chosen] / ARM_M
         return np.column_stack([-self.surfaces.scaled_normal[self.chosen], yaw])
 
     @cached_property
     def distance(self) -> Floats:
-        """Ranges (k,) of the chosen rays in the first sweep, metres."""
+        """Ranges (k,) of the chosen rays in the first sweep, meters."""
         return np.linalg.norm(self.points[self.chosen], axis=1)
 
     @cached_property
@@ -96,7 +96,7 @@ class RangeChanges:
 
     @cached_property
     def noise(self) -> Floats:
-        """Assumed noise (k,) of the changes of the chosen rays, metres."""
+        """Assumed noise (k,) of the changes of the chosen rays, meters."""
         noise = _ASSUMED_NOISE_M + MAX_KINK_PER_M * self.distance
         return np.asarray(np.hypot(noise, _ASSUMED_SHIFT_M * self.normal_error))
 
@@ -168,7 +168,7 @@ class RangeChanges:
 
 
 def range_scatter(stack: SweepStack, lag: int) -> float:
-    """Return the typical size of the change of a smooth surface's range in `lag` sweeps, metres.
+    """Return the typical size of the change of a smooth surface's range in `lag` sweeps, meters.
 
     The size in a pair of sweeps is a mean without the changes of things that move: ranges may be
     rounded to more than their noise, so that a median is 0. The result is the median over the
@@ -186,10 +186,10 @@ def range_scatter(stack: SweepStack, lag: int) -> float:
 
 
 def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
-    """Fit a motion (4,) to changes of ranges (k,): shift x, y, z and yaw at `ARM_M`, metres.
+    """Fit a motion (4,) to changes of ranges (k,): shift x, y, z and yaw at `ARM_M`, meters.
 
     A row of `design` (k, 4) is the change of the range with the motion; `noise` (k,) is the noise
-    of `change`, metres. Components along principal axes of the covariance that are not significant
+    of `change`, meters. Components along principal axes of the covariance that are not significant
     are 0. Huber's estimate: few rays of things that move count little.
     """
     motion: Floats = np.zeros(4)
@@ -211,7 +211,7 @@ def _rigid_motion(design: Floats, change: Floats, noise: Floats) -> Floats:
 class Creep(NamedTuple):
     """Steady motion of a sensor over a recording, 0 where noise may explain the changes."""
 
-    shift: Floats  # (3,): metres from sweep to sweep
+    shift: Floats  # (3,): meters from sweep to sweep
     rotation: Floats  # (3,): rotation vector from sweep to sweep, radians
     spread_m: float  # standard deviation by the motion of the ranges that the motion changes
     effect: float  # the same, over the standard deviation by noise
@@ -262,8 +262,8 @@ class _CreepRays:
     numbers: Ints  # (t,): numbers of the sweeps
     # (k, 7): changes of ranges with the shift, with the rotation at `ARM_M`, and with the offset
     design: Floats
-    change: Floats  # (t, k): ranges less their medians, metres; NaN without a return
-    sigma: Floats  # (k,): standard deviation of noise, metres
+    change: Floats  # (t, k): ranges less their medians, meters; NaN without a return
+    sigma: Floats  # (k,): standard deviation of noise, meters
     sector: Ints  # (k,)
 
     @classmethod

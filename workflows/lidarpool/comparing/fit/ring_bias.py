@@ -19,7 +19,7 @@ _MIN_PLANE_RAYS = 300
 _MAX_PLANE_POINTS = 20_000
 _MIN_RING_RAYS = 20  # rays of a ring on a plane that its bias needs
 _MAX_MEDIAN_OFFSET = 0.4  # median distance of points from their plane, over the tolerance
-_MAX_DIRECTION_GAP = 0.1  # distance of neighbouring directions of one piece of a plane
+_MAX_DIRECTION_GAP = 0.1  # distance of neighboring directions of one piece of a plane
 _OUTLIER_SIGMAS = 4.0  # beyond, points are not of their planes
 _STRICT_SIGMAS = 2.0  # the limit of a second solution, whose change is an error of the planes
 
@@ -32,11 +32,11 @@ class _PlaneRays(NamedTuple):
 
 
 def ring_bias(rays: SmoothRays, directions: Floats, error_m: Floats) -> dict[int, Estimate]:
-    """Estimate by how much the ranges of rows differ from the mean of all: {row: metres}.
+    """Estimate by how much the ranges of rows differ from the mean of all: {row: meters}.
 
     Large planes u · x = 1 and offsets b of the rows are fitted at once to the ranges r of rays with
     `directions` d (k, 3): 1 / r = u · d − b / r², times r². Ranges have standard deviations
-    `error_m` (k,), metres. A row that meets a single plane has no offset. Surfaces are not quite
+    `error_m` (k,), meters. A row that meets a single plane has no offset. Surfaces are not quite
     plane: intervals hold noise, and the changes of the offsets if points far from their planes, or
     any of the planes, are left out (jackknife; Efron, 1982).
     """
@@ -83,18 +83,18 @@ def _solve_offsets(design: Floats, values: Floats, plane: Ints) -> tuple[Floats,
     first = 3 * plane_count
     row_count = design.shape[1] - first
     # One offset of all rows is nearly the same as other planes: the mean of the rows is 0.
-    centred = np.eye(row_count) - 1 / row_count
+    centered = np.eye(row_count) - 1 / row_count
     solution, inliers = _solve_without_outliers(design, values, _OUTLIER_SIGMAS)
-    offsets = centred @ solution[first:]
+    offsets = centered @ solution[first:]
     strict_solution, _ = _solve_without_outliers(design, values, _STRICT_SIGMAS)
     used = design[inliers]
     covariance = sandwich(used, values[inliers] - used @ solution)[first:, first:]
-    shift = centred @ strict_solution[first:] - offsets
+    shift = centered @ strict_solution[first:] - offsets
     replicates = [
-        centred @ np.linalg.lstsq(design[chosen], values[chosen], rcond=None)[0][first:]
+        centered @ np.linalg.lstsq(design[chosen], values[chosen], rcond=None)[0][first:]
         for chosen in (inliers & (plane != number) for number in range(plane_count))
     ]
-    variances = np.diag(centred @ covariance @ centred) + shift**2
+    variances = np.diag(centered @ covariance @ centered) + shift**2
     variances += (plane_count - 1) * np.var(replicates, axis=0)
     return offsets, variances
 

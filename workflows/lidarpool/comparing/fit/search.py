@@ -30,9 +30,9 @@ _YAW_STEP_DEG = 0.25
 _COARSE_POINTS = 120
 _CANDIDATES = 20
 _BATCH = 2000  # motions that are tried at once
-_REFINEMENTS_M = (0.1, 0.05, 0.02)  # steps, metres at a distance of `ARM_M`
+_REFINEMENTS_M = (0.1, 0.05, 0.02)  # steps, meters at a distance of `ARM_M`
 _FINE_POINTS = 600
-_CENTRE_STEPS = 15  # steps of the last size, to a side
+_CENTER_STEPS = 15  # steps of the last size, to a side
 _SIMILAR_POINTS = 10  # difference of scores around the middle of a motion, at most
 _THINGS = 3  # things that are tried, the largest first
 
@@ -55,7 +55,7 @@ def motion_between(
     by_sight = _shown_by_sight(pair, changes, max_shift_m)
     if by_sight is None:
         return by_planes
-    by_sight = _centred(pair, by_sight)
+    by_sight = _centered(pair, by_sight)
     if by_planes is None:
         return by_sight
     # Planes are more exact, unless the rays have left them.
@@ -155,14 +155,14 @@ def _highest(
 
 
 def _moved_by(motion: RigidMotion, offsets: Floats) -> RigidMotion:
-    """Add shifts, and yaws at `ARM_M`, (…, 4) in metres, to a motion."""
+    """Add shifts, and yaws at `ARM_M`, (…, 4) in meters, to a motion."""
     return RigidMotion(motion.shift + offsets[..., :3], motion.yaw_rad + offsets[..., 3] / ARM_M)
 
 
-def _centred(pair: SightPair, motion: RigidMotion) -> RigidMotion:
+def _centered(pair: SightPair, motion: RigidMotion) -> RigidMotion:
     """Return the middle of the motions that explain two sweeps about as well as a motion."""
     sample = pair.sample(_FINE_POINTS)
-    steps_m = np.arange(-_CENTRE_STEPS, _CENTRE_STEPS + 1) * _REFINEMENTS_M[-1]
+    steps_m = np.arange(-_CENTER_STEPS, _CENTER_STEPS + 1) * _REFINEMENTS_M[-1]
     for axis in np.eye(4):
         offsets = steps_m[:, None] * axis
         scores = pair.score(_moved_by(motion, offsets), *sample)

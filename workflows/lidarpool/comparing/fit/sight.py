@@ -19,7 +19,7 @@ from lidarsim.base.even_samples import even_indices
 
 from .stack import SweepStack
 
-# Tolerance of ranges: at least, for each standard deviation of noise, and for each metre.
+# Tolerance of ranges: at least, for each standard deviation of noise, and for each meter.
 _TOLERANCE_M = 0.05
 _TOLERANCE_SIGMAS = 6.0
 _TOLERANCE_PER_M = 0.01
@@ -49,7 +49,7 @@ class RigidMotion(NamedTuple):
     Leading axes (…) are of several motions.
     """
 
-    shift: Floats  # (…, 3): metres
+    shift: Floats  # (…, 3): meters
     yaw_rad: Floats  # (…)
 
     def to_first(self, points: Floats) -> Floats:
@@ -76,8 +76,8 @@ class Sight:
     elevation_rad: Floats  # (r,): of the rows, descending
     step_rad: float  # width of a column
     row_phase: Floats  # (r,): azimuths of pulses less azimuths of columns, in steps
-    points: Floats  # (n, 3): points on objects wider than a column, metres
-    # (r - 1, c), metres: smallest and largest range in the rows i and i + 1, and in the columns
+    points: Floats  # (n, 3): points on objects wider than a column, meters
+    # (r - 1, c), meters: smallest and largest range in the rows i and i + 1, and in the columns
     # beside; inf where rays passed without a return, -inf where nothing is known
     lower_m: Floats
     upper_m: Floats
@@ -197,7 +197,7 @@ class SightPair:
         return cls(first, second, second.look_up(first.points), first.look_up(second.points))
 
     def sample(self, count: int) -> tuple[Floats, Floats]:
-        """Sample points of the first sweep and of the second: (a, 3) and (b, 3), metres.
+        """Sample points of the first sweep and of the second: (a, 3) and (b, 3), meters.
 
         Points are in the sensor frames of their sweeps. If the sensor stands, the other sweep says
         of some points that they are in empty space, and of some that they are on surfaces. About

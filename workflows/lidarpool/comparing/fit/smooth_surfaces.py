@@ -15,7 +15,7 @@ MIN_RANGE_M = 0.1  # nearer points are on the sensor's cover
 _MAX_BEAM_ORIGIN_M = 0.1  # how far from zero the beams of a head may meet
 MAX_TANGENT = 5.7  # tangent of incidence: beyond, a beam meets several surfaces
 FLAT_TANGENT = 1.7  # tangent of incidence: beyond, noise of directions makes mean ranges longer
-MAX_KINK_PER_M = 0.001  # added to `MAX_KINK_M` for each metre of range
+MAX_KINK_PER_M = 0.001  # added to `MAX_KINK_M` for each meter of range
 SCENE_TOLERANCE_M = 0.3  # how far surfaces may be from the scene's
 # Noise of directions before the noise is estimated, for the choice of outliers.
 ASSUMED_DIRECTION_NOISE_RAD = 0.002
@@ -26,14 +26,14 @@ MIN_RETURN_SHARE = 0.8  # share of a ray's returns that belong to one surface
 class Surfaces(NamedTuple):
     """Surfaces of a range image, (r, c) each."""
 
-    azimuth_slope: Floats  # growth of the range with the azimuth, metres in a radian
-    slope: Floats  # growth of the range with the direction of steepest growth, metres in a radian
-    smooth: Bools  # whether the neighbours lie in one plane with the cell
+    azimuth_slope: Floats  # growth of the range with the azimuth, meters in a radian
+    slope: Floats  # growth of the range with the direction of steepest growth, meters in a radian
+    smooth: Bools  # whether the neighbors lie in one plane with the cell
     scaled_normal: Floats  # (r, c, 3): normal n of the plane, as n / (n · d) for the direction d
 
 
-class Neighbours(NamedTuple):
-    """Points (r, c, 3) of the cells beside each cell of a range image, metres."""
+class Neighbors(NamedTuple):
+    """Points (r, c, 3) of the cells beside each cell of a range image, meters."""
 
     next_1: Floats
     previous_1: Floats
@@ -43,7 +43,7 @@ class Neighbours(NamedTuple):
     below: Floats
 
     @classmethod
-    def from_points(cls, points: Floats) -> Neighbours:
+    def from_points(cls, points: Floats) -> Neighbors:
         """Shift points (r, c, 3) along columns, which are a revolution, and rows."""
         row_numbers = np.arange(len(points))
         columns = (np.roll(points, shift, axis=1) for shift in (-1, 1, -2, 2))
@@ -57,42 +57,42 @@ class Neighbours(NamedTuple):
         return np.cross(run, rise)
 
     def are_coplanar(self, points: Floats, normal: Floats, tolerance_m: Floats) -> Bools:
-        """Mark points (r, c, 3) whose neighbours lie in the plane of the point and its normal.
+        """Mark points (r, c, 3) whose neighbors lie in the plane of the point and its normal.
 
-        Tolerances (r, c) are for neighbours in the next column; for others they are doubled.
+        Tolerances (r, c) are for neighbors in the next column; for others they are doubled.
         """
         means_1 = (self.next_1 + self.previous_1) / 2
         means_2 = (self.next_2 + self.previous_2) / 2
         coplanar = np.ones(points.shape[:2], bool)
         pairs = ((means_1, 1), (means_2, 2), (self.above, 2), (self.below, 2))
-        for neighbours, tolerance_factor in pairs:
-            offset = np.abs(((neighbours - points) * normal).sum(axis=-1))
+        for neighbors, tolerance_factor in pairs:
+            offset = np.abs(((neighbors - points) * normal).sum(axis=-1))
             coplanar &= offset < tolerance_factor * tolerance_m
         return coplanar
 
 
 def find_surfaces(stack: SweepStack, distance: Floats, error_m: Floats) -> Surfaces:
-    """Find slopes and edges of a range image `distance` (r, c) with errors (r, c), metres."""
+    """Find slopes and edges of a range image `distance` (r, c) with errors (r, c), meters."""
     points = distance[..., None] * stack.directions
     with np.errstate(invalid="ignore", divide="ignore"):
         beams = points - _beam_origins(points)
         length = np.linalg.norm(beams, axis=-1, keepdims=True)
         directions = beams / length
-        neighbours = Neighbours.from_points(points)
-        normal = neighbours.normals()
+        neighbors = Neighbors.from_points(points)
+        normal = neighbors.normals()
         # The range of a plane n · x = c in the direction d is c / (n · d).
         normal /= (normal * directions).sum(axis=-1, keepdims=True)
         gradient = length * (directions - normal)
         slope = np.linalg.norm(gradient, axis=-1)
         tolerance_m = MAX_KINK_M + MAX_KINK_PER_M * distance + 5 * error_m
         smooth = (slope < MAX_TANGENT * distance) & (distance > MIN_RANGE_M)
-        smooth &= neighbours.are_coplanar(points, normal, tolerance_m)
+        smooth &= neighbors.are_coplanar(points, normal, tolerance_m)
     azimuth_slope = gradient[..., 1] * directions[..., 0] - gradient[..., 0] * directions[..., 1]
     return Surfaces(azimuth_slope, slope, smooth, normal)
 
 
 def _beam_origins(points: Floats) -> Floats:
-    """Return the origins (r, 1, 3) of the beams of each row of points (r, c, 3), metres.
+    """Return the origins (r, 1, 3) of the beams of each row of points (r, c, 3), meters.
 
     Beams of a row meet on the z axis, near zero: heights grow linearly with the distance from the
     axis, and the height at distance 0 is the origin.
@@ -113,12 +113,12 @@ class SmoothRays(NamedTuple):
 
     row: Ints
     column: Ints
-    distance: Floats  # mean of the ranges, metres
-    slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, metres in a radian
+    distance: Floats  # mean of the ranges, meters
+    slope: Floats  # growth of the range with the direction, as `Surfaces.slope`, meters in a radian
     intensity: Floats  # mean; NaN if unknown
     return_counts: Ints  # number of sweeps with a return
     trials: Ints  # number of sweeps that cover the ray, as in `SweepStack`
-    variance: Floats  # variance of the range over the sweeps, square metres
+    variance: Floats  # variance of the range over the sweeps, square meters
     freedom: Ints  # degrees of freedom of the variance: its returns, less 1
 
     def select(self, chosen: Bools | Indices) -> SmoothRays:
@@ -129,9 +129,9 @@ class SmoothRays(NamedTuple):
 class _RayStatistics(NamedTuple):
     """Statistics of the returns of rays, without returns that are outliers, (k,) each."""
 
-    mean_range: Floats  # metres
+    mean_range: Floats  # meters
     mean_intensity: Floats
-    variance: Floats  # variance of the range, square metres
+    variance: Floats  # variance of the range, square meters
     return_count: Ints
 
 
@@ -141,9 +141,9 @@ def select_smooth_rays(
     """Choose rays away from edges, and compute the statistics of their returns.
 
     A return is an outlier if the range is more than `MAX_SIGMAS` standard deviations from the
-    median of the ray, by the noise of ranges `sigma` (r, c), metres, and of directions. Outliers
+    median of the ray, by the noise of ranges `sigma` (r, c), meters, and of directions. Outliers
     are left out, and rays with many outliers. Slopes are taken from a scene's ranges `expected`
-    (r, c), metres, if known.
+    (r, c), meters, if known.
     """
     median = finite_median(stack.ranges, 0)
     return_count = np.isfinite(stack.ranges).sum(axis=0)
@@ -180,8 +180,8 @@ def among_smooth(smooth: Bools) -> Bools:
 
     A cell that is smooth by chance, as in leaves, has none.
     """
-    neighbours = np.sum([np.roll(smooth, shift, axis=1) for shift in (-2, -1, 1, 2)], axis=0)
-    return np.asarray(smooth & (neighbours >= 3))
+    neighbors = np.sum([np.roll(smooth, shift, axis=1) for shift in (-2, -1, 1, 2)], axis=0)
+    return np.asarray(smooth & (neighbors >= 3))
 
 
 def _ray_statistics(
@@ -194,7 +194,7 @@ def _ray_statistics(
     """Compute the statistics of returns within a distance (k,) from the median range (k,).
 
     `cell` has the rows and columns (k,) of the rays. Ranges are corrected for the azimuths of
-    their pulses by `azimuth_slope` (k,), as of `Surfaces`; all distances are in metres.
+    their pulses by `azimuth_slope` (k,), as of `Surfaces`; all distances are in meters.
     """
     row, column = cell
     ranges = stack.ranges[:, row, column].astype(np.float64)

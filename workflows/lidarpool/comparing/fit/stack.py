@@ -24,7 +24,7 @@ from ..range_image import RangeImages, range_images
 
 MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are chosen evenly
 _MAX_FOREIGN_SHARE = 0.1  # share of a sweep's points in rings that the reference does not have
-_NEIGHBOUR_RAYS = 5  # rays on either side whose scatter counts
+_NEIGHBOR_RAYS = 5  # rays on either side whose scatter counts
 _MIN_CELL_SHARE = 0.3  # a cell that returns in a smaller share of sweeps shows no gap
 _MAX_LOG_CHANCE = -16.0  # pulses missing together are a gap if losing them is unlikelier
 _STEADY_PATCH = (3, 9)  # rows and columns of cells whose returns are counted together
@@ -39,10 +39,10 @@ class SweepStack:
     rings: Ints  # (r,): numbers of the rings
     elevation_deg: Floats  # (r,): of the rings
     directions: Floats  # (r, c, 3): mean unit directions of the cells
-    ranges: Floats32  # (s, r, c): metres
+    ranges: Floats32  # (s, r, c): meters
     intensities: Floats32  # (s, r, c)
     azimuth_offsets: Floats32  # (s, r, c): azimuths of pulses less `directions`, radians
-    rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, metres
+    rough_sigma: Floats  # (r, c): rough standard deviation of ranges over the sweeps, meters
     covered: Bools  # (s, r, c): whether the sweep sent a pulse into the cell, returned or lost
     notes: tuple[str, ...]
 
@@ -119,7 +119,7 @@ class _CommonCells:
     images: RangeImages  # range images of the reference
     rings: Ints  # (r,)
     elevation_deg: Floats  # (r,)
-    values: Floats32  # (4, s, r, c): range, metres; intensity; azimuth and elevation, degrees
+    values: Floats32  # (4, s, r, c): range, meters; intensity; azimuth and elevation, degrees
 
     @classmethod
     def read(cls, recording: Recording) -> _CommonCells:
@@ -232,20 +232,20 @@ def finite_median(values: Floats32, axis: int | tuple[int, ...]) -> Any:
 
 
 def rough_scatter(ranges: Floats32) -> Floats:
-    """Estimate the standard deviation (r, c) over the sweeps of ranges (s, r, c), metres.
+    """Estimate the standard deviation (r, c) over the sweeps of ranges (s, r, c), meters.
 
-    The estimate is a median over neighbouring rays, and at least the median of the ring. Ranges of
+    The estimate is a median over neighboring rays, and at least the median of the ring. Ranges of
     weak or steep surfaces scatter more than ranges of other surfaces of the ring.
     """
     changes = np.abs(np.diff(ranges, axis=0)) / (0.6745 * np.sqrt(2))
     ring_scatter = finite_median(changes, (0, 2))[:, None]
     ray_scatter = finite_median(changes, 0)
-    shifts = range(-_NEIGHBOUR_RAYS, _NEIGHBOUR_RAYS + 1)
-    neighbourhood = finite_median(
+    shifts = range(-_NEIGHBOR_RAYS, _NEIGHBOR_RAYS + 1)
+    neighborhood = finite_median(
         np.stack([np.roll(ray_scatter, shift, axis=1) for shift in shifts]), 0
     )
     ring_scatter = np.where(np.isnan(ring_scatter), MAX_KINK_M, np.maximum(ring_scatter, 1e-4))
-    return np.fmax(neighbourhood, ring_scatter)
+    return np.fmax(neighborhood, ring_scatter)
 
 
 def covered_cells(returned: Bools) -> Bools:

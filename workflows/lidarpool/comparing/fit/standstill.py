@@ -52,7 +52,7 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
     if (change := finite_median(changes, (0, 1, 2))) > _MAX_CHANGE_M:
         raise LidarError(
             f"{name} has ranges that change by {rounded(change, 2)} m from sweep to sweep, in the "
-            "median, and no motion of the sensor explains that: give points in metres, of a place "
+            "median, and no motion of the sensor explains that: give points in meters, of a place "
             "that stands still."
         )
     return stack

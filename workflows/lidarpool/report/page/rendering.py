@@ -227,7 +227,7 @@ def _template(name: str) -> Template:
         formatted,
         code,
         markdown,
-        millimetres,
+        millimeters,
         ratio,
         sentence,
         data_set_title,
@@ -449,12 +449,12 @@ def formatted(value: Any) -> str:
 
 
 def numbers(values: Sequence[float]) -> str:
-    """Return coordinates in metres, to the millimetre."""
+    """Return coordinates in meters, to the millimeter."""
     return ", ".join(f"{round(value, 3) + 0.0:,.10g}" for value in values).replace("-", MINUS)
 
 
-def millimetres(value: float | None) -> str:
-    """Return a length in metres or millimetres, or "unknown" for None."""
+def millimeters(value: float | None) -> str:
+    """Return a length in meters or millimeters, or "unknown" for None."""
     if value is None:
         return "unknown"
     text = f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"

@@ -101,7 +101,7 @@ class CastingWorkers:
 
     Each task is bound to one worker. Dask lets such a task wait for ever when the worker is gone,
     so `look` checks every second which workers exist. In return, Dask never fails a task for the
-    deaths of its neighbours, and the driver knows which batches a dead worker had.
+    deaths of its neighbors, and the driver knows which batches a dead worker had.
 
     `run` is the run's id; `software` is the software that workers must have (`base.software`).
     """

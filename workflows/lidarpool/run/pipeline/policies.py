@@ -167,7 +167,7 @@ def offers(
 
     The worker with the least work for its slots gets the next task, of up to `per_task` batches of
     jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. If a worker died
-    with a batch, the batch gets a task for itself, or its neighbours would share the blame for the
+    with a batch, the batch gets a task for itself, or its neighbors would share the blame for the
     next death. A suspect batch gets a worker for itself, and later batches wait for the suspect:
     they must not occupy all workers. Waiting batches are taken in their order.
 

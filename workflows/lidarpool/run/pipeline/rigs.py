@@ -256,7 +256,7 @@ def leaving_with_device(rig: Rig) -> Iterator[None]:
 
 
 def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
-    """Return sample points spread over each scan, (scans, samples, 3), metres.
+    """Return sample points spread over each scan, (scans, samples, 3), meters.
 
     Missing points are NaN.
     """

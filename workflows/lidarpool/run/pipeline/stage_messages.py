@@ -37,7 +37,7 @@ def samples_of_scan(scan_count: int) -> int:
 def summary_type(samples: int) -> np.dtype[np.void]:
     """Return the dtype of the summary of a scan with a number of sample rays.
 
-    A summary has the number of hits and of points kept, and the ends of the sample rays, metres,
+    A summary has the number of hits and of points kept, and the ends of the sample rays, meters,
     local coordinates. Missing samples are NaN.
     """
     return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
@@ -181,7 +181,7 @@ class ScanFrame:
     rays, hit_count, count
         Rays fired, rays that hit a surface, and points of the cloud.
     samples
-        float32 (m, 3): ends of a few rays, metres, local coordinates.
+        float32 (m, 3): ends of a few rays, meters, local coordinates.
     """
 
     __signature__ = ReadableSignature()

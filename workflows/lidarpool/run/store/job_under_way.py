@@ -163,7 +163,7 @@ class JobUnderWay(PipelineJob):
         return counts
 
     def sample_rays(self) -> Floats32:
-        """Return starts and ends of sample rays, (k, 2, 3), metres, local coordinates."""
+        """Return starts and ends of sample rays, (k, 2, 3), meters, local coordinates."""
         survey = self.job.survey
         samples = samples_of_scan(survey.scan_count)
         dtype = summary_type(samples)

@@ -99,8 +99,8 @@ def _with_known_names(
     for name, values in columns.items():
         if name == "rgb":  # a column of PCL: bytes in the bits of a float
             bits = values.astype(np.float32).view(np.uint32) if values.dtype.kind == "f" else values
-            for colour, shift in (("red", 16), ("green", 8), ("blue", 0)):
-                named[colour] = ((bits >> shift) & 255).astype(np.uint8)
+            for color, shift in (("red", 16), ("green", 8), ("blue", 0)):
+                named[color] = ((bits >> shift) & 255).astype(np.uint8)
             continue
         known_name = "channel" if name in _RINGS else _NAMES.get(name, name)
         known_name = re.sub(r"\W", "_", known_name)
@@ -185,7 +185,7 @@ def sampled_view(recording: Recording, title: str) -> tuple[View, Pieces]:
     assert recording.sample is not None
     with reading(recording.name):
         positions, columns, _ = recording.sample(_SAMPLE_POINTS)
-        pieces.add(positions * recording.metres, columns)
+        pieces.add(positions * recording.meters, columns)
     names = {"class": ASPRS_CLASSES}
     view = View(
         HeldPoints(pieces.cloud()),
@@ -225,8 +225,8 @@ def _cloud_of(recording: Recording, on_part: OnPart) -> Cloud:
         with reading(recording.name):
             positions, columns, _ = recording.read(number)
             positions = np.asarray(positions, np.float64)[::step]
-            if recording.metres != (1.0, 1.0, 1.0):
-                positions = positions * recording.metres
+            if recording.meters != (1.0, 1.0, 1.0):
+                positions = positions * recording.meters
             columns = {name: np.asarray(values)[::step] for name, values in columns.items()}
             pieces.add(positions, columns)
         on_part(positions, columns, (number + 1) / recording.count)
@@ -306,7 +306,7 @@ def _add_sweep(
     with reading(recording.name):
         positions, columns, pose = recording.read(number)
         pose = frame_pose if pose is None else pose
-        local = np.asarray(positions, np.float64) * recording.metres
+        local = np.asarray(positions, np.float64) * recording.meters
     is_return = local.any(axis=1)  # drivers write zeros for pulses without a return
     local = local[is_return]
     if pose is not None:

@@ -48,7 +48,7 @@ from .cpu_share import CpuShare
 
 SHARE = 0.02  # share of a core, for points; sending them takes as much again
 NEWS_MS = 60  # at least, from a question of a page for news to the next
-SCALES_S = 5.0  # colour scales stay so long, so that colours of surfaces do not flicker
+SCALES_S = 5.0  # color scales stay so long, so that colors of surfaces do not flicker
 MAX_TRAIL = 500  # sweeps whose positions are shown as the trajectory of a sensor
 _RATE_SWEEPS = 20  # over which the rate of sweeps is averaged
 
@@ -153,7 +153,7 @@ class _Sensor:
     scanner: Scanner
     cloud: Cloud | None = None  # None before the first sweep
     pose: Pose = field(default_factory=lambda: Pose((0.0, 0.0, 0.0)))  # pose of the sensor
-    # (seconds since the page began, x, y, z): local, metres
+    # (seconds since the page began, x, y, z): local, meters
     trail: deque[tuple[float, ...]] = field(default_factory=lambda: deque(maxlen=MAX_TRAIL))
 
     @property
@@ -309,7 +309,7 @@ class SweepFeed:
         return Cloud(np.concatenate([positions for positions, _ in parts]), columns, custom)
 
     def _moved(self) -> dict[str, AnyArray]:
-        """Return the positions of sensors and actors, local metres, and seconds, as arrays."""
+        """Return the positions of sensors and actors, local meters, and seconds, as arrays."""
         with self._lock:
             scene = self._scene
             time_ns = self._time_ns

@@ -1,4 +1,4 @@
-"""Topics of ROS 2 without ROS: cyclonedds sends messages that are serialised already."""
+"""Topics of ROS 2 without ROS: cyclonedds sends messages that are serialized already."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ class RosPublisher:
             self._writers[message.topic] = self._writer(message.topic, message.kind)
         writer = self._writers[message.topic]
         try:
-            writer.write(_serialised(writer.data_type, bytes(message.cdr)))
+            writer.write(_serialized(writer.data_type, bytes(message.cdr)))
         except DDSException as error:
             if error.code != DDSException.DDS_RETCODE_TIMEOUT:
                 raise
@@ -192,8 +192,8 @@ class RosPublisher:
         return DataWriter(self._participant, dds_topic, qos=qos)
 
 
-def _serialised(kind: Any, cdr: bytes) -> Any:
-    """Return a message of a class that is serialised already.
+def _serialized(kind: Any, cdr: bytes) -> Any:
+    """Return a message of a class that is serialized already.
 
     cyclonedds would take 72 to 96 ms for a cloud of 2 MB.
     """

@@ -38,14 +38,14 @@ _SCENE = "/scene"
 _TRAJECTORIES = "/trajectories"
 _PATH = "/path"
 _SCENE_ALPHA = 0.4  # points on a surface, and behind a wall, can be seen
-_GREY = messages.Color(r=0.6, g=0.6, b=0.6, a=_SCENE_ALPHA)
+_GRAY = messages.Color(r=0.6, g=0.6, b=0.6, a=_SCENE_ALPHA)
 _ORANGE = messages.Color(r=1.0, g=0.6, b=0.0, a=0.4)
 _WHITE = messages.Color(r=1.0, g=1.0, b=1.0, a=1.0)
 _BLUE = messages.Color(r=0.2, g=0.6, b=1.0, a=1.0)
 _GREEN = messages.Color(r=0.1, g=0.8, b=0.3, a=1.0)
 _LINE_PIXELS = 2.0
 _TEXT_PIXELS = 12.0
-_COLOUR_BITS = 4  # bits of each of red, green and blue of the scene
+_COLOR_BITS = 4  # bits of each of red, green and blue of the scene
 _UNIT = messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
@@ -142,7 +142,7 @@ class FoxgloveServer(Viewer):
             self.show_path(surroundings.path)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path, (w, 3), metres, world coordinates."""
+        """Show a planned path, (w, 3), meters, world coordinates."""
         self._send_entities(_PATH, [_entity("path", lines=[_line(path, _GREEN)])])
 
     def show_sweep(self, shown: ShownSweep) -> None:
@@ -261,10 +261,10 @@ def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
         if not boxes.present[number]:
             deletions.append(messages.SceneEntityDeletion(timestamp=stamp, id=name))
             continue
-        pose = _pose(boxes.centres[number], boxes.quaternions[number])
+        pose = _pose(boxes.centers[number], boxes.quaternions[number])
         size = _vector(boxes.sizes[number])
         cube = messages.CubePrimitive(pose=pose, size=size, color=_ORANGE)
-        above = boxes.centres[number] + [0, 0, boxes.sizes[number, 2] / 2 + 0.5]
+        above = boxes.centers[number] + [0, 0, boxes.sizes[number, 2] / 2 + 0.5]
         text = messages.TextPrimitive(
             pose=_pose(above),
             billboard=True,
@@ -282,42 +282,42 @@ def _actors(boxes: ActorBoxes, stamp: Any) -> Any:
 
 
 def _triangles(surface: Surface) -> Iterable[Any]:
-    """Yield the triangles of a scene, a primitive for each colour."""
+    """Yield the triangles of a scene, a primitive for each color."""
     pose = _pose(surface.origin)
-    if surface.colours is None:
-        yield _triangle_list(surface, slice(None), pose, _GREY)
+    if surface.colors is None:
+        yield _triangle_list(surface, slice(None), pose, _GRAY)
         return
-    step = 8 - _COLOUR_BITS
-    levels = surface.colours >> step
-    colours, numbers = np.unique(levels, axis=0, return_inverse=True)
-    for number, level in enumerate(colours):
-        yield _triangle_list(surface, numbers.ravel() == number, pose, _colour(level))
+    step = 8 - _COLOR_BITS
+    levels = surface.colors >> step
+    colors, numbers = np.unique(levels, axis=0, return_inverse=True)
+    for number, level in enumerate(colors):
+        yield _triangle_list(surface, numbers.ravel() == number, pose, _color(level))
 
 
-def _colour(level: Bytes) -> Any:
-    red, green, blue = (level / (2**_COLOUR_BITS - 1)).tolist()
+def _color(level: Bytes) -> Any:
+    red, green, blue = (level / (2**_COLOR_BITS - 1)).tolist()
     return messages.Color(r=red, g=green, b=blue, a=_SCENE_ALPHA)
 
 
-def _triangle_list(surface: Surface, face_indices: Any, pose: Any, colour: Any) -> Any:
+def _triangle_list(surface: Surface, face_indices: Any, pose: Any, color: Any) -> Any:
     used, indices = np.unique(surface.faces[face_indices], return_inverse=True)
     return messages.TriangleListPrimitive(
         pose=pose,
         points=_points(surface.vertices[used]),
-        color=colour,
+        color=color,
         indices=indices.ravel().tolist(),
     )
 
 
-def _line(positions: Floats, colour: Any) -> Any:
-    """Return a line through positions (k, 3), metres, relative to the first position."""
+def _line(positions: Floats, color: Any) -> Any:
+    """Return a line through positions (k, 3), meters, relative to the first position."""
     return messages.LinePrimitive(
         type=messages.LinePrimitiveLineType.LineStrip,
         pose=_pose(positions[0]),
         thickness=_LINE_PIXELS,
         scale_invariant=True,
         points=_points(positions - positions[0]),
-        color=colour,
+        color=color,
     )
 
 

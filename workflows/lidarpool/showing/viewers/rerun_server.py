@@ -66,7 +66,7 @@ class RerunServer(Viewer):
         self._log.show_surroundings(surroundings)
 
     def show_path(self, path: Floats) -> None:
-        """Show a planned path, (w, 3), metres, world coordinates."""
+        """Show a planned path, (w, 3), meters, world coordinates."""
         self._log.show_path(path)
 
     def show_sweep(self, shown: ShownSweep) -> None:

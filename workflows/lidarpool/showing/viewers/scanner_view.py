@@ -211,7 +211,7 @@ def _boxes(scanner: Scanner, cloud: Cloud, poses: list[Pose], time_ns: float) ->
     return ActorBoxes(
         names=names,
         types=[type_of(name) for name in names],
-        centres=positions + middles,
+        centers=positions + middles,
         quaternions=quaternions_of(rotations),
         sizes=np.ptp(bounds, axis=1),
         points=counts.tolist(),

@@ -41,7 +41,7 @@ class Viewer(ABC):
 
     @abstractmethod
     def show_path(self, path: Floats) -> None:
-        """Show a planned path, (w, 3), metres, world coordinates."""
+        """Show a planned path, (w, 3), meters, world coordinates."""
 
     @abstractmethod
     def show_sweep(self, shown: ShownSweep) -> None:

@@ -1,4 +1,4 @@
-"""Coordinate systems on Earth: where their metres are metres on the ground, by rasterio's PROJ.
+"""Coordinate systems on Earth: where their meters are meters on the ground, by rasterio's PROJ.
 
 A map projection stretches lengths. National grids and UTM zones do so by less than 1 % where they
 are meant to be used; Web Mercator (EPSG:3857) by 47 % in Zurich, with heights as they are.
@@ -40,7 +40,7 @@ _POLAR_DEG = 84.0  # from this latitude on, the polar stereographic projection r
 _AREA_MARGIN_DEG = 5.0
 _ELSEWHERE_DEG = 20.0  # coordinates this far from the area are likely those of another system
 _AREA_LETTERS = 90  # of the name of an area in messages
-# Northings within the zones of each family of UTM codes, in metres, for places that need no
+# Northings within the zones of each family of UTM codes, in meters, for places that need no
 # registry to be recognized.
 _UTM_NORTHINGS_M = {
     range(32601, 32661): (0.0, 9.4e6),
@@ -49,7 +49,7 @@ _UTM_NORTHINGS_M = {
     range(26901, 26924): (1.6e6, 9.4e6),
 }
 _UTM_ZONE_HALF_WIDTH_M = 400_000.0  # a zone at the equator reaches to 333 km from its middle
-_WGS84_ELLIPSOID = (6378137.0, 298.257223563)  # semi-major axis in metres, inverse flattening
+_WGS84_ELLIPSOID = (6378137.0, 298.257223563)  # semi-major axis in meters, inverse flattening
 
 # Projections that are made for lengths of countries, by letters of their names.
 _OF_COUNTRIES = re.compile(
@@ -61,10 +61,10 @@ _OF_COUNTRIES = re.compile(
 
 @dataclass(frozen=True)
 class GroundScale:
-    """True lengths of a metre of a coordinate system at a place, by its direction."""
+    """True lengths of a meter of a coordinate system at a place, by its direction."""
 
-    shortest: float  # metres
-    longest: float  # metres
+    shortest: float  # meters
+    longest: float  # meters
 
     @property
     def error(self) -> float:
@@ -176,7 +176,7 @@ def _unbound(described: dict[str, Any]) -> dict[str, Any]:
 
 
 def horizontal_part(crs: Any) -> tuple[Any, float | None]:
-    """Return the horizontal system of a system on Earth, and metres in its unit of heights.
+    """Return the horizontal system of a system on Earth, and meters in its unit of heights.
 
     The unit is None for a system without heights.
     """
@@ -209,9 +209,9 @@ def linear_unit(crs: Any) -> tuple[str, float] | None:
         return unit, 1.0
     if not isinstance(unit, dict) or unit.get("type") != "LinearUnit":
         return None
-    metres = float(unit["conversion_factor"])
+    meters = float(unit["conversion_factor"])
     name = str(unit["name"])[:40]
-    return f"{metres:g} m" if name in UNNAMED else name, metres
+    return f"{meters:g} m" if name in UNNAMED else name, meters
 
 
 def is_geocentric(crs: Any) -> bool:
@@ -345,7 +345,7 @@ def zone_in_area(epsg: int, x: float, y: float) -> int | None:
         return None
     longitudes = np.arange(area.west, area.west + area.width, 1.0).tolist()
     latitude = (area.south + area.north) / 2
-    codes = {zone_in_metres((at + 180) % 360 - 180, latitude) for at in longitudes}
+    codes = {zone_in_meters((at + 180) % 360 - 180, latitude) for at in longitudes}
     places = {code: longitude_latitude(crs_of_code(code), x, y) for code in codes - {epsg}}
     fitting = [code for code, at in places.items() if at is not None and area.reaches(*at)]
     return fitting[0] if len(fitting) == 1 else None
@@ -374,7 +374,7 @@ def ground_scale(crs: Any, x: float, y: float) -> GroundScale | None:
     if degrees is None:
         return None
     degrees = degrees * _degrees_per_unit(base or {})
-    east_m, north_m = _ground_metres_of_degrees(base or {}, degrees[:, 1].mean())
+    east_m, north_m = _ground_meters_of_degrees(base or {}, degrees[:, 1].mean())
     longitude = (np.diff(degrees[:, 0])[::2] + 180) % 360 - 180  # steps may cross the date line
     latitude = np.diff(degrees[:, 1])[::2]
     steps = np.stack([longitude * east_m, latitude * north_m]) / _GROUND_STEP_M
@@ -400,8 +400,8 @@ def _degrees_per_unit(base: dict[str, Any]) -> float:
     return 1.0 if isinstance(unit, str) else float(np.degrees(unit["conversion_factor"]))
 
 
-def _ground_metres_of_degrees(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
-    """Return the lengths of a degree of longitude and of latitude on an ellipsoid, metres."""
+def _ground_meters_of_degrees(base: dict[str, Any], latitude_deg: float) -> tuple[float, float]:
+    """Return the lengths of a degree of longitude and of latitude on an ellipsoid, meters."""
     datum = base.get("datum") or base.get("datum_ensemble") or {}
     ellipsoid = datum.get("ellipsoid", {})
     axis, inverse = _WGS84_ELLIPSOID
@@ -420,7 +420,7 @@ def _ground_metres_of_degrees(base: dict[str, Any], latitude_deg: float) -> tupl
     )
 
 
-def zone_in_metres(longitude: float, latitude: float) -> int:
+def zone_in_meters(longitude: float, latitude: float) -> int:
     """Return the EPSG code of the UTM zone (WGS 84) of a place, beyond 84 degrees of a polar one.
 
     Universal polar stereographic has a scale of 0.994 to 0.997 there.
@@ -432,7 +432,7 @@ def zone_in_metres(longitude: float, latitude: float) -> int:
 
 
 def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
-    """Return the EPSG code of a system in true metres at a place, or None if it is not on Earth.
+    """Return the EPSG code of a system in true meters at a place, or None if it is not on Earth.
 
     None also for a place far outside the system's area of use, whose coordinates are likely those
     of another system.
@@ -441,7 +441,7 @@ def suggested_epsg(crs: Any, x: float, y: float) -> int | None:
     if missed_area(horizontal, x, y) is not None:
         return None
     place = longitude_latitude(horizontal, x, y)
-    return None if place is None else zone_in_metres(*place)
+    return None if place is None else zone_in_meters(*place)
 
 
 def projection_kind(name: str) -> bool | None:
@@ -475,8 +475,8 @@ def _middle(item: SceneMesh | SceneInstance) -> Floats:
 def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) -> str:
     """Return why lengths are not true at a place of a system, as a clause, empty if they are.
 
-    For systems of meshes, in metres. The clause follows the name of the system, such as «whose
-    metre is 0.68 m long on the ground here».
+    For systems of meshes, in meters. The clause follows the name of the system, such as «whose
+    meter is 0.68 m long on the ground here».
 
     Parameters
     ----------
@@ -491,7 +491,7 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
     """
     if not has_registry():
         is_known = system.removeprefix("EPSG:") in map(str, WORLD_EPSG)
-        return "whose metres are not true to scale" if is_known else ""
+        return "whose meters are not true to scale" if is_known else ""
     crs = crs_of_text(system)
     horizontal = None if crs is None else horizontal_part(crs)[0]
     scale = None if crs is None else ground_scale(horizontal, x, y)
@@ -499,7 +499,7 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
         return ""
     if (area := missed_area(horizontal, x, y)) is not None:
         return f"whose area of use ({area}) is not where the coordinates are"
-    clause = f"whose metre is {scale} long on the ground here"
+    clause = f"whose meter is {scale} long on the ground here"
     if scale.is_even and in_system:
         factor = f"{(scale.shortest + scale.longest) / 2:.6g}"
         clause += f": scale [{factor}, {factor}, 1] makes its lengths true"
@@ -515,7 +515,7 @@ def world_advice(x: float, y: float, z: float) -> str:
 
 
 def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str:
-    """Return why lengths in a chosen system are not true metres at a place of that system.
+    """Return why lengths in a chosen system are not true meters at a place of that system.
 
     A clause that begins with the code, such as «EPSG:3857 (WGS 84 / Pseudo-Mercator), whose …»;
     empty if lengths are true within `MAX_SCALE_ERROR`. Systems of the whole Earth (`WORLD_EPSG`)
@@ -532,7 +532,7 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
     name = f"EPSG:{epsg} ({projjson(crs)['name']})"
     horizontal, _ = horizontal_part(crs)
     if not horizontal.is_projected or horizontal.linear_units_factor[1] != 1:
-        return f"{name}, which is not in metres"
+        return f"{name}, which is not in meters"
     if epsg in WORLD_EPSG:
         return f"{name}, {OF_THE_WORLD}"
     scale = ground_scale(horizontal, x, y)
@@ -542,8 +542,8 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
         return ""
     advice = "choose a system for this place"
     if place := longitude_latitude(horizontal, x, y):
-        advice = f"EPSG:{zone_in_metres(*place)} has true metres there"
-    return f"{name}, whose metre is {scale} long at x {x:.9g}, y {y:.9g}{why_there}: {advice}"
+        advice = f"EPSG:{zone_in_meters(*place)} has true meters there"
+    return f"{name}, whose meter is {scale} long at x {x:.9g}, y {y:.9g}{why_there}: {advice}"
 
 
 def is_utm(epsg: int) -> bool:
@@ -552,5 +552,5 @@ def is_utm(epsg: int) -> bool:
 
 
 def is_true_in_utm(eastings: Floats) -> bool:
-    """Return True if lengths at all eastings (n,) of a UTM zone, metres, are true."""
+    """Return True if lengths at all eastings (n,) of a UTM zone, meters, are true."""
     return bool((np.abs(eastings - _UTM_MIDDLE_M) <= _UTM_HALF_WIDTH_M).all())

@@ -1,9 +1,9 @@
 """glTF 2.0 files, .glb and .gltf, after the specification by the Khronos Group (2021).
 
 trimesh 5.2 is not used, since it places a node of several parents only once, loses the children of
-a camera, ignores sparse and normalised positions, skins and required extensions, and reads neither
+a camera, ignores sparse and normalized positions, skins and required extensions, and reads neither
 fans nor files without scenes; nor is assimp, which skips content that it cannot read. Only
-triangles are read, and masks and base colours of materials.
+triangles are read, and masks and base colors of materials.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from .scene_graph import (
 def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read the default scene of a file, or all nodes of a file without scenes.
 
-    Without the option masks, triangles are solid; without masks and colours, no image is read.
+    Without the option masks, triangles are solid; without masks and colors, no image is read.
     """
     header, body = chunks(data)
     check_readable(header)
@@ -118,7 +118,7 @@ class _NodeReader:
         return bake_animation(self._poses(animation, times_s), times_s.tolist(), self._allowance)
 
     def _poses(self, animation: dict[str, Any], times_s: Floats) -> Generator[Content]:
-        """Yield the content at each time of an animation, with colours in the first only."""
+        """Yield the content at each time of an animation, with colors in the first only."""
         self._channels = sample_channels(animation, times_s, self._file.accessor)
         if not self._channels:
             raise MeshFileError("has an animation that moves no node: choose another")
@@ -132,7 +132,7 @@ class _NodeReader:
             yield placed_content(
                 placed_nodes(roots, self.node, self._file.path.stem), copy_all=True
             )
-            self._materials.options = self._materials.options._replace(colours=False)
+            self._materials.options = self._materials.options._replace(colors=False)
 
     def _read_local(self, index: int) -> Floats:
         """Return the matrix (4, 4) of a node, at the frame of the animation, if any."""
@@ -323,7 +323,7 @@ class _NodeReader:
         return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
-        """Return the triangles of a primitive, with mask, colours and material."""
+        """Return the triangles of a primitive, with mask, colors and material."""
         position = primitive["attributes"].get("POSITION")
         index = primitive.get("indices")
         packed = primitive.get("extensions", {}).get(DRACO)

@@ -29,7 +29,7 @@ _READ = re.compile(
     r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization|"
     rf"({DRACO}|{INSTANCING}|{VISIBILITY})$"
 )
-# Extensions that change neither shapes nor colours, and are not worth a note.
+# Extensions that change neither shapes nor colors, and are not worth a note.
 _WITHOUT_SHAPE = re.compile(
     r"(KHR_xmp(_json_ld)?|KHR_node_(selectability|hoverability)|KHR_audio_emitter|EXT_lights_\w+|"
     r"EXT_(structural_metadata|mesh_features|instance_features)|CESIUM_primitive_outline)$"
@@ -152,9 +152,9 @@ class GltfFile:
             rows = self._array(changed, index_type, sparse["count"], 1)[:, 0]
             numbers = numbers.copy()
             numbers[rows] = self._array(values, kind, sparse["count"], width)
-        return self.normalised(numbers) if accessor.get("normalized") else numbers
+        return self.normalized(numbers) if accessor.get("normalized") else numbers
 
-    def normalised(self, numbers: AnyArray) -> AnyArray:
+    def normalized(self, numbers: AnyArray) -> AnyArray:
         """Return the fractions that integers encode, by glTF 2.0, 3.6.2.2."""
         if numbers.dtype.kind not in "iu":
             return numbers

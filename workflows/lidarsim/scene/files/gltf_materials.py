@@ -1,4 +1,4 @@
-"""Materials of glTF 2.0 files: base colours, and masks of where they are transparent."""
+"""Materials of glTF 2.0 files: base colors, and masks of where they are transparent."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 from ...base.arrays import AnyArray, Bytes, Ints
 from ...base.elementary_scalars import sin_cos_of
 from ...base.vectors import matmul
-from ..colours import LINEAR, Colours, as_srgb
+from ..colors import LINEAR, Colors, as_srgb
 from ..masks import (
     FACE_BYTES,
     MaskError,
     MaskNotes,
     Texture,
     Wrap,
-    read_colours,
+    read_colors,
     read_opacity,
     remembered,
 )
@@ -35,7 +35,7 @@ _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
 class GltfMaterials:
-    """Masks, base colours and names of the materials of a file, with each texture made once."""
+    """Masks, base colors and names of the materials of a file, with each texture made once."""
 
     def __init__(self, file: GltfFile, options: ReadOptions) -> None:
         self._file = file
@@ -54,40 +54,40 @@ class GltfMaterials:
         return any(m.get("alphaMode") in _CUT for m in self._file.header.get("materials", ()))
 
     def with_material(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
-        """Return a piece with mask, colours and material, for `mesh`, unpacked by Draco."""
+        """Return a piece with mask, colors and material, for `mesh`, unpacked by Draco."""
         if self.options.materials and (number := primitive.get("material")) is not None:
             piece = piece._replace(material=self._material_name(number))
-        if self.options.colours and len(piece.faces):
-            with self.notes.without_colour(self._material_name(primitive.get("material"))):
-                piece = piece._replace(colours=self._face_colours(primitive, piece.faces, mesh))
+        if self.options.colors and len(piece.faces):
+            with self.notes.without_color(self._material_name(primitive.get("material"))):
+                piece = piece._replace(colors=self._face_colors(primitive, piece.faces, mesh))
         return self._with_mask(piece, primitive, mesh)
 
-    def _face_colours(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colours | None:
-        """Return the colours of a primitive's triangles, or None."""
+    def _face_colors(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colors | None:
+        """Return the colors of a primitive's triangles, or None."""
         number = primitive.get("material")
         corners = None
-        colours = None
+        colors = None
         if not self._allowance.fits(FACE_BYTES * len(faces)):
             raise MaskError("there are too many triangles")
         if "COLOR_0" in primitive["attributes"]:
-            light = self._file.normalised(self._attribute("COLOR_0", primitive, mesh))
+            light = self._file.normalized(self._attribute("COLOR_0", primitive, mesh))
             check_corners(faces, len(light))
             if light.shape[1] < 3:
                 raise MaskError("its COLOR_0 is not red, green and blue")
             corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
-            colours = Colours.of_corners(corners)
+            colors = Colors.of_corners(corners)
         if number is not None:
             base, info = self._base(natural(number))
             if isinstance(base, Texture):
-                colours = base.colours(self._coordinates(info, primitive, mesh), faces)
+                colors = base.colors(self._coordinates(info, primitive, mesh), faces)
             else:
-                colours = Colours.plain(base, len(faces))
-        return colours and replace(colours, corners=corners)
+                colors = Colors.plain(base, len(faces))
+        return colors and replace(colors, corners=corners)
 
     def _read_base(self, number: int) -> tuple[Texture | Bytes, dict[str, Any]]:
-        """Return the texture of a material's base colour and its texture info.
+        """Return the texture of a material's base color and its texture info.
 
-        The base colour of a material without a texture is a plain colour (1, 1, 3).
+        The base color of a material without a texture is a plain color (1, 1, 3).
         """
         material = self._file.part("materials", number)
         info, factor = _base_of(material)
@@ -102,11 +102,11 @@ class GltfMaterials:
     def _read_tinted(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
         """Return the texture of a tinted image, by keys (image, linear tint, wraps)."""
         image, light, wrap_u, wrap_v = key
-        colours = self._file.image(image, partial(read_colours, notes=self.notes))
+        colors = self._file.image(image, partial(read_colors, notes=self.notes))
         if light != (1.0, 1.0, 1.0):
             scaled = [as_srgb(LINEAR * share) for share in light]
-            colours = np.stack([table[colours[..., k]] for k, table in enumerate(scaled)], axis=-1)
-        return Texture(colours, (wrap_u, wrap_v), self._allowance)
+            colors = np.stack([table[colors[..., k]] for k, table in enumerate(scaled)], axis=-1)
+        return Texture(colors, (wrap_u, wrap_v), self._allowance)
 
     def _wraps(self, texture: dict[str, Any]) -> tuple[Wrap, Wrap]:
         """Return the continuation of a texture beyond its edges, along u and along v."""
@@ -193,11 +193,11 @@ class GltfMaterials:
         packed = primitive["extensions"][DRACO]["attributes"][name]
         rows = np.asarray(mesh.get_attribute_by_unique_id(packed)["data"])
         normal = self._file.part("accessors", accessor).get("normalized")
-        return self._file.normalised(rows) if normal else rows
+        return self._file.normalized(rows) if normal else rows
 
 
 def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
-    """Return the texture info of a material's base colour, or None, and the colour's factors."""
+    """Return the texture info of a material's base color, or None, and the color's factors."""
     usual = material.get("pbrMetallicRoughness", {})
     glossy = extension(material, _GLOSSY)
     info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")

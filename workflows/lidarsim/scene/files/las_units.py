@@ -36,7 +36,7 @@ _GEOGRAPHIC = 2
 _GEOCENTRIC = 3
 USER_DEFINED = 32767
 
-_EPSG_UNITS = {  # {EPSG code: (name, metres)}
+_EPSG_UNITS = {  # {EPSG code: (name, meters)}
     1025: ("millimetre", 0.001),
     1033: ("centimetre", 0.01),
     9001: ("metre", 1.0),
@@ -83,7 +83,7 @@ _OVERRIDE = "give its unit (--unit, in Python unit=; of compare --unit-a and uni
 
 
 def advice_to_project(epsg: int | None) -> str:
-    """Return a clause on how to bring a cloud to a system in metres: a code, or any."""
+    """Return a clause on how to bring a cloud to a system in meters: a code, or any."""
     code = epsg or "CODE"
     return (
         f"give lidarpool scene points --epsg {code} (in Python epsg=), or project it first (pdal "
@@ -95,7 +95,7 @@ class CoordinateUnit(NamedTuple):
     """A unit of length."""
 
     name: str
-    metres: float
+    meters: float
 
 
 METRE = CoordinateUnit("metre", 1.0)
@@ -117,28 +117,28 @@ class CoordinateUnits:
 
     @property
     def factors(self) -> tuple[float, float, float]:
-        """Metres in the units of x, y and z."""
-        return self.horizontal.metres, self.horizontal.metres, self.vertical.metres
+        """Meters in the units of x, y and z."""
+        return self.horizontal.meters, self.horizontal.meters, self.vertical.meters
 
     @property
     def metric(self) -> bool:
-        """Whether all coordinates are in metres."""
+        """Whether all coordinates are in meters."""
         return self.factors == (1.0, 1.0, 1.0)
 
     def note(self) -> str:
-        """Return a clause on the conversion to metres, empty for metres."""
+        """Return a clause on the conversion to meters, empty for meters."""
         if self.metric:
             return ""
         if not self.vertical_stated:
             return (
-                f"is in the unit {self.horizontal.name} and was converted to metres; it states no "
+                f"is in the unit {self.horizontal.name} and was converted to meters; it states no "
                 f"unit of heights, which are taken in the same: if they are not, {_OVERRIDE}"
             )
         if self.horizontal == self.vertical:
-            return f"is in the unit {self.horizontal.name} and was converted to metres"
+            return f"is in the unit {self.horizontal.name} and was converted to meters"
         return (
             f"is in the unit {self.horizontal.name} with heights in the unit {self.vertical.name}, "
-            "and was converted to metres"
+            "and was converted to meters"
         )
 
 
@@ -302,12 +302,12 @@ def _third_unit(system: _Node) -> CoordinateUnit | None:
 def _unit_of(node: _Node) -> CoordinateUnit:
     """Return the unit of length of a node.
 
-    Raises LidarError without a length in metres.
+    Raises LidarError without a length in meters.
     """
     name, *factors = node.values
-    metres = float(factors[0]) if factors else 0.0
-    if not 1e-6 <= metres <= 1e6:
-        raise LidarError(f"its unit {name[:40]!r} has no length in metres: {_OVERRIDE}.")
+    meters = float(factors[0]) if factors else 0.0
+    if not 1e-6 <= meters <= 1e6:
+        raise LidarError(f"its unit {name[:40]!r} has no length in meters: {_OVERRIDE}.")
     return CoordinateUnit(name[:40], metres)
 
 

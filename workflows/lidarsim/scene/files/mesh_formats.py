@@ -36,7 +36,7 @@ MeshReader = Callable[[bytes, Path, ReadOptions], Content]
 
 @dataclass(frozen=True)
 class MeshFormat:
-    """A format of mesh files: how its files are recognised and read.
+    """A format of mesh files: how its files are recognized and read.
 
     Parameters
     ----------
@@ -353,7 +353,7 @@ def advice_on(path: str | Path) -> str:
 def endings(
     condition: Callable[[MeshFormat], bool] = lambda row: not row.advice,
 ) -> tuple[str, ...]:
-    """Return the endings of the known formats that fulfil a condition, by default formats read.
+    """Return the endings of the known formats that fulfill a condition, by default formats read.
 
     Examples
     --------

@@ -18,7 +18,7 @@ LengthUnit = Annotated[
     Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,  # of UNITS_M
     about(
         "length unit of the file, or of a raster's heights; by default the one it states, else "
-        "metres"
+        "meters"
     ),
 ]
 UpAxis = Annotated[
@@ -44,7 +44,7 @@ class MeshOptions:
     up_axis: UpAxis = None
     transform: Transform | None = None  # placement in the world, after unit and up axis
     opacity: Opacity = "mask"
-    colours: bool = False  # whether base colours are read
+    colors: bool = False  # whether base colors are read
     materials: bool = False  # whether faces keep the names of their materials
     # Folders whose files may be read, besides the folder of the file.
     assets: str | Path | Sequence[str | Path] | None = None

@@ -1,4 +1,4 @@
-"""Reading of scene files, in the formats of `mesh_formats`, as named meshes in metres, Z-up."""
+"""Reading of scene files, in the formats of `mesh_formats`, as named meshes in meters, Z-up."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ...base.words import as_python, listed, plural, printable, rounded
 from ...motion.rotations import quaternions_of
 from ...motion.trajectory import Track
 from ..actors import Actor, join_meshes
-from ..colours import colours_summary
+from ..colors import colors_summary
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance
 from ..scene_mesh import SceneMesh
 from ..transform import UP_AXES, Transform
@@ -52,7 +52,7 @@ from .scene_graph import (
 from .text_cloud import is_text_raster
 
 # Comment at the start of files written by lidarpool in formats without a generator.
-FORMAT_COMMENT = "lidarpool: metres, Z-up"
+FORMAT_COMMENT = "lidarpool: meters, Z-up"
 
 _MAX_UNEVENNESS = 1e-6  # difference between axes of the square of a scale
 _ZIP = b"PK\x03\x04"  # first bytes of an archive
@@ -72,7 +72,7 @@ class Objects(NamedTuple):
 
     static: tuple[SceneMesh | SceneInstance, ...]
     actors: tuple[Actor, ...] = ()  # each along a `Track`
-    summary: str = ""  # objects, triangles, unit, axes and colours
+    summary: str = ""  # objects, triangles, unit, axes and colors
     raster: Raster | None = None  # description, if the file is a raster
     classes: Mapping[int, ObjectClass] = {}  # {number of ASPRS LAS: class}, of formats with types
     is_landscape: bool = False  # whether the file is of land, never of a single object
@@ -134,7 +134,7 @@ def load_objects(
     shared, own = options_of(row, path, options)
     wanted = ReadOptions(
         masks=shared.opacity == "mask" and shared.animation is None,
-        colours=shared.colours,
+        colors=shared.colors,
         folders=tuple(folder.resolve() for folder in (path.parent, *shared.asset_folders)),
         unit=shared.unit,
         up_axis=shared.up_axis,
@@ -181,7 +181,7 @@ def _in_world(
 ) -> Objects:
     """Place the objects of a file in the world.
 
-    `upright` converts the file's unit and axes to metres and Z-up, before `transform`. Objects that
+    `upright` converts the file's unit and axes to meters and Z-up, before `transform`. Objects that
     are farther away than anything on Earth are left out, which `content.notes` say; LidarError if
     all are.
     """
@@ -189,7 +189,7 @@ def _in_world(
     placement = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
     static = []
     actors = []
-    reaches_m: dict[str, float] = {}  # {name of a remote object: metres from the origin}
+    reaches_m: dict[str, float] = {}  # {name of a remote object: meters from the origin}
     with prefixed(path):
         for mesh in content.meshes:
             item, reach_m = _placed_object(mesh, path.stem, transforms)
@@ -253,14 +253,14 @@ def _summary(
         for mesh in meshes_once
         if mesh.voxels is not None
     ]
-    names = [name for name, metres in UNITS_M.items() if metres == unit_m]
+    names = [name for name, meters in UNITS_M.items() if meters == unit_m]
     words += [
         plural(sum(len(mesh.faces) for mesh in meshes_once), "triangle"),
         f"in {names[0] if names else f'units of {unit_m:g} m'}",
         f"{up_axis.upper()}-up",
     ]
-    if options.colours:
-        words.append(colours_summary(mesh.colours for mesh in meshes_once))
+    if options.colors:
+        words.append(colors_summary(mesh.colors for mesh in meshes_once))
     if options.materials:
         materials = [mesh.materials for mesh in meshes_once if mesh.materials is not None]
         distinct = {name for mesh_materials in materials for name in mesh_materials.names if name}
@@ -269,7 +269,7 @@ def _summary(
 
 
 def written_by_lidarpool(path: Path) -> bool:
-    """Return True if lidarpool wrote a file of a format without a unit, which is in metres then."""
+    """Return True if lidarpool wrote a file of a format without a unit, which is in meters then."""
     with open_input(path) as file:
         return FORMAT_COMMENT.encode() in file.read(_HEAD_BYTES)
 
@@ -441,7 +441,7 @@ def _other_format(path: Path, data: bytes) -> str:
 def _placed_object(
     item: SceneMesh | SceneInstance, stem: str, transforms: Sequence[Transform]
 ) -> tuple[SceneMesh | SceneInstance | None, float]:
-    """Return an object in the world, and how far it reaches from the origin, metres.
+    """Return an object in the world, and how far it reaches from the origin, meters.
 
     The name of the object is safe for terminals and files. None if the object is too far away.
     """
@@ -464,7 +464,7 @@ def _actor_of_part(
     """Return a moving part as an actor, with its frame rotated as the axes of the file are.
 
     The mesh of the actor has all scales, since a trajectory only rotates and moves. None if the
-    actor moves too far away. The number is how far, metres from the origin.
+    actor moves too far away. The number is how far, meters from the origin.
     """
     name = printable(part.name) or printable(stem)
     unit_m, scale = (cbrt(determinant(transform.linear)) for transform in (upright, placement))

@@ -1,4 +1,4 @@
-"""Materials of Wavefront files: colours, and images that make them transparent in places."""
+"""Materials of Wavefront files: colors, and images that make them transparent in places."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats, Ints
 from ...base.input_files import InputFileError, read_input
 from ...base.words import as_text
-from ..colours import Colours, as_bytes
-from ..masks import HALF_OPACITY, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
+from ..colors import Colors, as_bytes
+from ..masks import HALF_OPACITY, MaskNotes, Texture, Wrap, read_colors, read_opacity, remembered
 from ..scene_mesh import Cutout
 from .companions import image_file, named_file
 from .scene_graph import SMALLER, MeshFileError, ReadOptions
@@ -71,18 +71,18 @@ class _Image:
 
 @dataclass
 class _Entry:
-    """Images and colour of a material in a file."""
+    """Images and color of a material in a file."""
 
     images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
-    colour: Bytes | None = None  # uint8 (1, 1, 3)
+    color: Bytes | None = None  # uint8 (1, 1, 3)
 
 
 class MtlMaterials:
-    """Masks and colours of the materials of a .obj file, each read once.
+    """Masks and colors of the materials of a .obj file, each read once.
 
     The materials are in files named by the lines `libraries`. Masks are the images `map_d`, or else
     the alpha channels of `map_Kd`. Constant opacities, `d` and `Tr`, are ignored: some programs
-    mistake `d` for `Tr`. Colours are the images `map_Kd`, or else `Kd`; with an image, `Kd` is
+    mistake `d` for `Tr`. Colors are the images `map_Kd`, or else `Kd`; with an image, `Kd` is
     ignored, since some programs write black there.
     """
 
@@ -123,28 +123,26 @@ class MtlMaterials:
                 return texture.cutout(image.coordinates(vt), corners)
         return None
 
-    def colours(
-        self, name: bytes, vt: Floats, corners: Ints, tints: Bytes | None
-    ) -> Colours | None:
-        """Return the colours of triangles, or None.
+    def colors(self, name: bytes, vt: Floats, corners: Ints, tints: Bytes | None) -> Colors | None:
+        """Return the colors of triangles, or None.
 
-        Colours are of the material's image, else of the corners, `tints` (k, 3, 3), else the plain
-        colour of the material. `vt` (c, 2) are texture coordinates, and `corners` (k, 3) rows of
+        Colors are of the material's image, else of the corners, `tints` (k, 3, 3), else the plain
+        color of the material. `vt` (c, 2) are texture coordinates, and `corners` (k, 3) rows of
         `vt`.
         """
         entry = self._entries.get(name, _Entry())
-        if not self._options.colours:
+        if not self._options.colors:
             return None
-        colours = None
+        colors = None
         if (image := entry.images.get(b"map_kd")) is not None:
-            with self.notes.without_colour(as_text(name)):
+            with self.notes.without_color(as_text(name)):
                 texture = self._image((image.name, image.wrap))
-                colours = texture.colours(image.coordinates(vt), corners)
+                colors = texture.colors(image.coordinates(vt), corners)
         elif tints is not None:
-            colours = Colours.of_corners(tints)
-        elif entry.colour is not None:
-            colours = Colours.plain(entry.colour, len(corners))
-        return colours
+            colors = Colors.of_corners(tints)
+        elif entry.color is not None:
+            colors = Colors.plain(entry.color, len(corners))
+        return colors
 
     def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
         """Yield the contents of the files that lines name: a file, or several between spaces."""
@@ -183,16 +181,16 @@ class MtlMaterials:
 
     def _texture(self, name: str, images: dict[bytes, _Image]) -> Texture | None:
         """Return the mask of a material, or None for a solid material."""
-        colour = images.get(b"map_kd")
-        image = images.get(b"map_d", colour)
+        color = images.get(b"map_kd")
+        image = images.get(b"map_d", color)
         if image is None:
             return None
-        if image is colour and image.name.lower().endswith(_WITHOUT_ALPHA):
+        if image is color and image.name.lower().endswith(_WITHOUT_ALPHA):
             return None
-        # Some programs name the same image twice: then its brightness belongs to its colour.
-        grey = image is not colour and not (colour and colour.name == image.name)
+        # Some programs name the same image twice: then its brightness belongs to its color.
+        gray = image is not color and not (color and color.name == image.name)
         base, gain = map(float, image.options.get(b"-mm", (0, 1)))
-        texture = self._mask((image.name, grey, base, gain, image.wrap))
+        texture = self._mask((image.name, gray, base, gain, image.wrap))
         if texture == "glass":
             self.notes.glass[name] = None
         return texture if isinstance(texture, Texture) else None
@@ -201,8 +199,8 @@ class MtlMaterials:
         self, key: tuple[str, bool, float, float, Wrap]
     ) -> Texture | Literal["solid", "glass"]:
         """Return the mask of an image, or the kind of a material without a mask."""
-        name, grey, base, gain, wrap = key
-        opacity = self._opacity((name, grey))
+        name, gray, base, gain, wrap = key
+        opacity = self._opacity((name, gray))
         if opacity is None:
             return "solid"
         mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF_OPACITY
@@ -212,15 +210,15 @@ class MtlMaterials:
 
     def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
         """Return the opacity of an image, or None, by keys (name, whether brightness counts)."""
-        name, grey = key
+        name, gray = key
         file = image_file(self._mesh, name, self._options, self._allowance)
-        return read_opacity(file, self._allowance, grey=grey)
+        return read_opacity(file, self._allowance, gray=gray)
 
     def _read_image(self, key: tuple[str, Wrap]) -> Texture:
-        """Return the texture of an image of colours, by keys (name, continuation)."""
+        """Return the texture of an image of colors, by keys (name, continuation)."""
         name, wrap = key
         file = image_file(self._mesh, name, self._options, self._allowance)
-        image = read_colours(file, self._allowance, self.notes)
+        image = read_colors(file, self._allowance, self.notes)
         return Texture(image, (wrap, wrap), self._allowance)
 
 
@@ -237,5 +235,5 @@ def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
             entry.images[key.lower()] = _Image.parse(value)
         elif key == b"Kd":
             with suppress(ValueError):  # spectra, which programs do not write
-                entry.colour = as_bytes([*map(float, value.split()[:3])]).reshape(1, 1, 3)
+                entry.color = as_bytes([*map(float, value.split()[:3])]).reshape(1, 1, 3)
     return entries

@@ -44,7 +44,7 @@ _HEADER_MAX_BYTES = 1 << 20
 _MAX_NUMBERS = 10_000  # numbers of a point; descriptors of PCL have up to 1,980
 _MAX_QUATERNION_ERROR = 0.01  # error of the length of VIEWPOINT's quaternion
 _SMALLER = "write it uncompressed"
-_COLOURS = ("red", "green", "blue")
+_COLORS = ("red", "green", "blue")
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
@@ -114,7 +114,7 @@ def read_pcd(path: Path) -> list[CloudScan]:
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     pose = _pose(header.viewpoint)
     scanner = None if header.viewpoint == _NO_VIEWPOINT else pose[:3, 3]
-    return [CloudScan(positions, _with_colours(columns), pose, scanner)]
+    return [CloudScan(positions, _with_colors(columns), pose, scanner)]
 
 
 def pcd_bytes(
@@ -130,7 +130,7 @@ def pcd_bytes(
     fields
         Names and arrays (n,) of numbers.
     position, quaternion
-        VIEWPOINT: metres, and w, x, y, z.
+        VIEWPOINT: meters, and w, x, y, z.
     comment
         First line of the file.
     """
@@ -464,14 +464,14 @@ def _named_columns(fields: Sequence[_Field], arrays: Sequence[AnyArray]) -> dict
     }
 
 
-def _with_colours(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
+def _with_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
     """Return columns with red, green and blue in place of the bits of `rgb` or `rgba`."""
     for name in ("rgb", "rgba"):
-        if name not in columns or not columns.keys().isdisjoint(_COLOURS):
+        if name not in columns or not columns.keys().isdisjoint(_COLORS):
             continue
         bits = _bits(columns.pop(name))
-        for shift, colour in zip((16, 8, 0), _COLOURS, strict=True):
-            columns[colour] = (bits >> shift & 255).astype(np.uint8)
+        for shift, color in zip((16, 8, 0), _COLORS, strict=True):
+            columns[color] = (bits >> shift & 255).astype(np.uint8)
         alpha = (bits >> 24).astype(np.uint8)
         if (alpha != alpha[:1]).any():
             columns["alpha"] = alpha
@@ -479,10 +479,10 @@ def _with_colours(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
 
 
 def _bits(values: AnyArray) -> AnyArray:
-    """Return packed colours 0xAARRGGBB (n,): whole numbers, or the bits of real numbers.
+    """Return packed colors 0xAARRGGBB (n,): whole numbers, or the bits of real numbers.
 
-    The first versions of PCL wrote the whole number of a colour as a real number, 4.2108e+06 for a
-    grey. Bits of a colour without alpha are far smaller than 1.
+    The first versions of PCL wrote the whole number of a color as a real number, 4.2108e+06 for a
+    gray. Bits of a color without alpha are far smaller than 1.
     """
     if values.dtype.kind in "iu":
         return values.astype(np.uint32)

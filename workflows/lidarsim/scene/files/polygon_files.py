@@ -3,7 +3,7 @@
 trimesh reads all four, but fills non-convex polygons beyond their outline, drops what it does not
 understand, and refuses negative indices in .obj files of several objects and binary .ply files with
 triangles and quadrangles. assimp and Open3D keep single precision. plyfile trusts the counts of
-headers, and its licence would apply to a program that uses it.
+headers, and its license would apply to a program that uses it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from ...base.arrays import AnyArray, Bytes, Floats, Ints
 from ...base.errors import CutShortError
 from ...base.words import as_text
-from ..colours import Colours, as_bytes
+from ..colors import Colors, as_bytes
 from ..scene_mesh import SceneMesh
 from .mtl import MtlMaterials
 from .polygons import check_corners, triangulated
@@ -99,11 +99,11 @@ class _ObjContent:
         return np.frombuffer(self.coordinates).reshape(-1, 2)
 
     @cached_property
-    def vertex_colours(self) -> Bytes | None:
-        """Colours of the vertices, (v, 3), or None unless all vertices have a colour."""
+    def vertex_colors(self) -> Bytes | None:
+        """Colors of the vertices, (v, 3), or None unless all vertices have a color."""
         if not self.tints or len(self.tints) != len(self.positions):
             return None
-        return as_bytes(_colour_shares(np.frombuffer(self.tints).reshape(-1, 3)))
+        return as_bytes(_color_shares(np.frombuffer(self.tints).reshape(-1, 3)))
 
 
 def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
@@ -111,26 +111,26 @@ def read_obj(data: bytes, path: Path, options: ReadOptions) -> Content:
 
     A repeated name starts another object after 'o', and continues the group after 'g', as the
     format says. Objects are in order of their first face; materials do not divide objects. Without
-    the option masks, triangles are solid; without masks, colours and materials, neither files of
+    the option masks, triangles are solid; without masks, colors and materials, neither files of
     materials nor images are read.
     """
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
-    libraries = _obj_names(b"mtllib", text) if options.masks or options.colours else []
+    libraries = _obj_names(b"mtllib", text) if options.masks or options.colors else []
     materials = MtlMaterials(path, len(data), libraries, options)
-    with_materials = materials.has_masks or options.colours or options.materials
+    with_materials = materials.has_masks or options.colors or options.materials
     meshes = list[SceneMesh]()
     try:
-        content = _parse_obj(text, path.stem, options.colours, with_materials)
+        content = _parse_obj(text, path.stem, options.colors, with_materials)
         for (name, _), polygons in content.objects.items():
             pieces = _obj_pieces(content, polygons, materials, options)
             meshes += join_pieces(name, pieces)
     except (ValueError, OverflowError) as error:  # OverflowError: of numbers beyond 64 bits
-        raise ValueError(_obj_mistake(data, options.colours) or str(error)) from error
+        raise ValueError(_obj_mistake(data, options.colors) or str(error)) from error
     return Content(meshes, notes=materials.notes.lines())
 
 
-def _parse_obj(text: bytes, stem: str, with_colours: bool, with_materials: bool) -> _ObjContent:
+def _parse_obj(text: bytes, stem: str, with_colors: bool, with_materials: bool) -> _ObjContent:
     """Parse the lines of a file.
 
     Without a name, polygons belong to the object `stem`.
@@ -144,11 +144,11 @@ def _parse_obj(text: bytes, stem: str, with_colours: bool, with_materials: bool)
     for line in text.split(b"\n"):
         key, _, value = line.lstrip(b" ").partition(b" ")
         if key == b"v":
-            words = value.partition(b"#")[0].split()  # a weight or a colour may follow
+            words = value.partition(b"#")[0].split()  # a weight or a color may follow
             if len(words) < 3:
                 raise ValueError("a vertex has fewer than three numbers")
             positions.extend(map(float, words[:3]))
-            if with_colours and len(words) >= 6:
+            if with_colors and len(words) >= 6:
                 content.tints.extend(map(float, words[-3:]))
         elif key == b"f":
             value = value.partition(b"#")[0]
@@ -177,7 +177,7 @@ def _obj_pieces(
     """Return the triangles of an object as a piece for each material."""
     vertices = content.vertices
     uv = content.uv
-    tints = content.vertex_colours
+    tints = content.vertex_colors
     triangles = polygons.triangles(vertices)
     pieces = []
     for number in np.unique(triangles.materials).tolist():
@@ -186,10 +186,10 @@ def _obj_pieces(
         faces = triangles.vertices[rows]
         coordinates = triangles.coordinates[rows]
         cutout = materials.cutout(material, uv, coordinates)
-        corner_colours = None if tints is None else tints[faces]
-        colours = materials.colours(material, uv, coordinates, corner_colours)
+        corner_colors = None if tints is None else tints[faces]
+        colors = materials.colors(material, uv, coordinates, corner_colors)
         name = as_text(material) if options.materials else ""
-        pieces.append(Piece(vertices, faces, cutout, colours, name))
+        pieces.append(Piece(vertices, faces, cutout, colors, name))
     return pieces
 
 
@@ -237,7 +237,7 @@ def _obj_corners(value: bytes, count: int) -> list[int]:
     return [number - 1 for number in numbers]
 
 
-def _obj_mistake(data: bytes, with_colours: bool) -> str | None:
+def _obj_mistake(data: bytes, with_colors: bool) -> str | None:
     """Return which line of a file is wrong, or None if each line is right by itself."""
     total = len(re.findall(rb"^[ \t]*v[ \t]", data, re.MULTILINE))
     count = 0  # vertices so far
@@ -245,8 +245,8 @@ def _obj_mistake(data: bytes, with_colours: bool) -> str | None:
         key, *words = line.partition(b"#")[0].split() or [b""]
         if key == b"v":
             count += 1
-            colours = words[-3:] if with_colours and len(words) >= 6 else []
-            if len(words) < 3 or not all(map(_is_real, [*words[:3], *colours])):
+            colors = words[-3:] if with_colors and len(words) >= 6 else []
+            if len(words) < 3 or not all(map(_is_real, [*words[:3], *colors])):
                 return f"line {number} is '{_shown(line)}', and three numbers were expected after v"
         elif key == b"f":
             vertices = [word.partition(b"/")[0] for word in words]
@@ -296,13 +296,13 @@ def _shown(line: bytes) -> str:
 
 # -- .off ----------------------------------------------------------------------------------------
 
-# Normals (N), colours (C) and texture coordinates (ST) may follow the position of a vertex. Some
+# Normals (N), colors (C) and texture coordinates (ST) may follow the position of a vertex. Some
 # files have the counts on the line of the word.
 _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
 def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
-    """Read an Object File Format file as a single mesh, with the colours of vertices (COFF)."""
+    """Read an Object File Format file as a single mesh, with the colors of vertices (COFF)."""
     uncommented = re.sub(rb"#[^\r\n]*", b"", data).replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = uncommented.lstrip()
     keyword = _OFF.match(text)
@@ -311,14 +311,14 @@ def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
         raise MeshFileError("is binary OFF, which is not supported: export it as text, or as .ply")
     first_line = 1 + uncommented[: len(uncommented) - len(text)].count(b"\n")
     vertex_lines, face_lines = _off_lines(text, first_line)
-    is_coloured = options.colours and keyword is not None and keyword[0].upper() == b"COFF"
-    vertices, tints = _off_vertices(vertex_lines, is_coloured=is_coloured)
+    is_colored = options.colors and keyword is not None and keyword[0].upper() == b"COFF"
+    vertices, tints = _off_vertices(vertex_lines, is_colored=is_colored)
     corners, sizes = _off_faces(face_lines, len(vertices))
     faces = triangulated(vertices, corners, sizes)
-    colours = None
-    if is_coloured and len(tints) == len(vertices):
-        colours = _vertex_colours(_colour_shares(tints), faces)
-    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
+    colors = None
+    if is_colored and len(tints) == len(vertices):
+        colors = _vertex_colors(_color_shares(tints), faces)
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colors)]))
 
 
 _NumberedLine = tuple[int, list[bytes]]  # number of the line, and its words
@@ -349,14 +349,14 @@ def _off_lines(text: bytes, first_line: int) -> tuple[list[_NumberedLine], list[
     return lines[:points], lines[points:]
 
 
-def _off_vertices(lines: Sequence[_NumberedLine], *, is_coloured: bool) -> tuple[Floats, Floats]:
-    """Return the vertices (v, 3) of lines, and the colours (k, 3) that follow them."""
+def _off_vertices(lines: Sequence[_NumberedLine], *, is_colored: bool) -> tuple[Floats, Floats]:
+    """Return the vertices (v, 3) of lines, and the colors (k, 3) that follow them."""
     numbers = array("d")
     tints = array("d")
     for number, words in lines:
         try:
             x, y, z = map(float, words[:3])
-            if is_coloured and len(words) >= 6:
+            if is_colored and len(words) >= 6:
                 tints.extend(map(float, words[3:6]))
         except ValueError as error:
             raise ValueError(_off_mistake(number, words, "x, y and z of a vertex")) from error
@@ -394,17 +394,17 @@ def _off_mistake(number: int, words: Sequence[bytes], expected: str) -> str:
     return f"line {number} is '{_shown(b' '.join(words))}', and {expected} were expected"
 
 
-def _colour_shares(colours: Floats) -> Floats:
-    """Return colours as 0 to 1.
+def _color_shares(colors: Floats) -> Floats:
+    """Return colors as 0 to 1.
 
     If a number is above 1.5, all are written as 0 to 255.
     """
-    return colours / (255 if (colours > 1.5).any() else 1)
+    return colors / (255 if (colors > 1.5).any() else 1)
 
 
-def _vertex_colours(shares: Floats, faces: Ints) -> Colours:
-    """Return the colours of faces whose vertices have colours (v, 3), 0 to 1."""
-    return Colours.of_corners(as_bytes(shares)[faces])
+def _vertex_colors(shares: Floats, faces: Ints) -> Colors:
+    """Return the colors of faces whose vertices have colors (v, 3), 0 to 1."""
+    return Colors.of_corners(as_bytes(shares)[faces])
 
 
 # -- .stl ----------------------------------------------------------------------------------------
@@ -480,7 +480,7 @@ _PLY_LINE = (
     "was expected"
 )
 _PLY_LISTS = ("vertex_indices", "vertex_index")
-_PLY_COLOURS = ("red", "green", "blue")
+_PLY_COLORS = ("red", "green", "blue")
 
 
 @dataclass
@@ -516,7 +516,7 @@ class _PlyHeader(NamedTuple):
 def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
     """Read a Stanford polygon file: text or binary, faces of any mixture.
 
-    Colours are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
+    Colors are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
     """
     header = _ply_header(data)
     counts = {element.name: element.count for element in header.elements}
@@ -531,10 +531,10 @@ def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
     rows = _ply_rows(header)
     vertices = _ply_vertices(rows)
     faces = _ply_faces(rows, vertices)
-    colours = None
-    if options.colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
-        colours = _ply_colours(rows, types["vertex"]["red"][0], faces)
-    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colours)]))
+    colors = None
+    if options.colors and all(name in rows["vertex"] for name in _PLY_COLORS):
+        colors = _ply_colors(rows, types["vertex"]["red"][0], faces)
+    return Content(join_pieces(path.stem, [Piece(vertices, faces, None, colors)]))
 
 
 def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
@@ -552,15 +552,15 @@ def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
     return triangulated(vertices, corners, sizes)
 
 
-def _ply_colours(rows: _PlyRows, type_name: str, faces: Ints) -> Colours:
-    """Return the colours of faces whose vertices have colours of a type."""
-    columns = [rows["vertex"][name].numbers for name in _PLY_COLOURS]
-    colours = np.stack(columns, axis=1).astype(np.float64)
+def _ply_colors(rows: _PlyRows, type_name: str, faces: Ints) -> Colors:
+    """Return the colors of faces whose vertices have colors of a type."""
+    columns = [rows["vertex"][name].numbers for name in _PLY_COLORS]
+    colors = np.stack(columns, axis=1).astype(np.float64)
     kind = np.dtype(type_name)
     # Integers of four bytes hold 0 to 255, as real numbers may do.
     if kind.kind in "iu" and kind.itemsize < 4:
-        return _vertex_colours(colours / np.iinfo(kind).max, faces)
-    return _vertex_colours(_colour_shares(colours), faces)
+        return _vertex_colors(colors / np.iinfo(kind).max, faces)
+    return _vertex_colors(_color_shares(colors), faces)
 
 
 def read_ply_points(data: bytes) -> Floats:

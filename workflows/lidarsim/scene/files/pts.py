@@ -1,7 +1,7 @@
 """Clouds of Leica's .pts: the number of points, and a point in each line, often several times.
 
 Leica Cyclone writes x, y, z, an intensity from -2048 to 2047, and red, green and blue; other
-programs leave out the intensity, the colours, or the number of points.
+programs leave out the intensity, the colors, or the number of points.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from .cloud_scan import CloudScan
 from .intensity_scales import LEICA_LOWEST
 from .text_rows import RowReader
 
-COLOURS = ("red", "green", "blue")
+COLORS = ("red", "green", "blue")
 _NAMES = {  # {cells of a line: names}
     3: ("x", "y", "z"),
     4: ("x", "y", "z", "intensity"),
-    6: ("x", "y", "z", *COLOURS),
-    7: ("x", "y", "z", "intensity", *COLOURS),
+    6: ("x", "y", "z", *COLORS),
+    7: ("x", "y", "z", "intensity", *COLORS),
 }
 
 
@@ -105,10 +105,10 @@ def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) ->
 
 
 def point_columns(values: Floats, names: Sequence[str]) -> dict[str, AnyArray]:
-    """Return the columns of rows (n, k) after x, y and z, with colours of 0 to 255 as bytes."""
+    """Return the columns of rows (n, k) after x, y and z, with colors of 0 to 255 as bytes."""
     columns: dict[str, AnyArray] = {}
     for index, name in enumerate(names[3:], 3):
         columns[name] = values[:, index]
-        if name in COLOURS:
+        if name in COLORS:
             columns[name] = np.clip(np.rint(values[:, index]), 0, 255).astype(np.uint8)
     return columns

@@ -21,12 +21,12 @@ from ...base.vectors import matmul
 from ...base.words import plural, printable
 from ..transform import affine
 from .cloud_scan import CloudScan
-from .pts import COLOURS, names_of_cells, next_line, point_columns
+from .pts import COLORS, names_of_cells, next_line, point_columns
 from .text_rows import RowReader
 
 _NAMES = {  # {cells of a line: names}
     4: ("x", "y", "z", "intensity"),
-    7: ("x", "y", "z", "intensity", *COLOURS),
+    7: ("x", "y", "z", "intensity", *COLORS),
 }
 _HEADER_LINES = (  # numbers of each line, and their meaning
     (1, "the number of columns"),

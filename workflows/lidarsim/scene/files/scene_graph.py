@@ -16,9 +16,9 @@ from ...base.allowance import Allowance, bytes_of, memory_share
 from ...base.arrays import AnyArray, Floats, Ints
 from ...base.named_files import is_inside
 from ...base.vectors import matmul, rank
-from .. import colours, face_materials
+from .. import colors, face_materials
 from ..animation import Animation
-from ..colours import Colours
+from ..colors import Colors
 from ..face_materials import FaceMaterials
 from ..scene_instances import MAX_COORDINATE_M, SceneInstance
 from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
@@ -58,7 +58,7 @@ class ReadOptions(NamedTuple):
     """Content to read from a mesh file, besides triangles."""
 
     masks: bool
-    colours: bool
+    colors: bool
     # Resolved folders: files that the mesh file names are read only from these and below.
     folders: tuple[Path, ...]
     # Unit and up axis that the user gives, else None. They are applied to the content, except the
@@ -98,7 +98,7 @@ class Content:
 
     meshes: Sequence[SceneMesh | SceneInstance]
     moving: list[RigidPart] = field(default_factory=list)
-    unit_m: float | None = None  # metres in the file's unit; None if unknown
+    unit_m: float | None = None  # meters in the file's unit; None if unknown
     up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither file nor format states an axis
     generator: str = ""  # the program that wrote the file, if known
     turned: str = ""  # why a Y-up file is rotated, for a note; empty for no note
@@ -106,7 +106,7 @@ class Content:
     skipped: list[str] = field(default_factory=list)  # names of objects without an area
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
     raster: Raster | None = None
-    epsg: int | None = None  # code of the coordinate system in metres, if the file states it
+    epsg: int | None = None  # code of the coordinate system in meters, if the file states it
     is_landscape: bool = False  # whether the file is of land, never of a single object
     # {number of ASPRS LAS: class} of formats whose objects have types
     classes: Mapping[int, ObjectClass] = field(default_factory=dict)
@@ -272,7 +272,7 @@ class Piece(NamedTuple):
     vertices: AnyArray  # (v, 3)
     faces: Ints  # (f, 3)
     cutout: Cutout | None = None
-    colours: Colours | None = None
+    colors: Colors | None = None
     material: str = ""  # name of the material of all faces, if `ReadOptions.materials`
 
 
@@ -314,7 +314,7 @@ def join_pieces(
             vertices,
             faces,
             tuple(cutouts),
-            colours.join_colours([piece.colours for piece in ordered], sizes),
+            colors.join_colors([piece.colors for piece in ordered], sizes),
             materials=face_materials.join_materials(
                 [FaceMaterials.named(piece.material) for piece in ordered], sizes
             ),
@@ -324,13 +324,13 @@ def join_pieces(
 
 def _compacted_piece(piece: Piece, allowance: Allowance | None) -> Piece:
     """Return a piece without unused vertices, which many pieces may share."""
-    vertices, faces, cutout, face_colours, material = piece
+    vertices, faces, cutout, face_colors, material = piece
     check_corners(faces, len(vertices))
     if allowance is not None:
         extra = 0 if cutout is None else cutout.uv.nbytes
-        extra += 0 if face_colours is None else 40 * len(faces)
+        extra += 0 if face_colors is None else 40 * len(faces)
         allowance.take(faces.nbytes + extra)
     vertices, faces = compacted(vertices, faces)
     if allowance is not None:
         allowance.take(24 * len(vertices))  # double precision
-    return Piece(vertices, faces, cutout, face_colours, material)
+    return Piece(vertices, faces, cutout, face_colors, material)

@@ -1,6 +1,6 @@
-"""The coordinate system that a cloud states, and positions in true metres by that system.
+"""The coordinate system that a cloud states, and positions in true meters by that system.
 
-Coordinates are taken as they are if their metres, feet or other units are true to scale; else they
+Coordinates are taken as they are if their meters, feet or other units are true to scale; else they
 are refused, or brought to a system that the user chooses.
 """
 
@@ -68,7 +68,7 @@ _COMMENT = re.compile(
     r"(?:epsg\s*[:=]?\s*(?P<code>\d{4,6})|"
     rf"(?P<wkt>(?:{'|'.join(sorted(WKT_KEYWORDS))})\s*\[.*))"
 )
-Metres = tuple[float, float, float]  # metres in the units of x, y and z
+Meters = tuple[float, float, float]  # meters in the units of x, y and z
 
 
 class _TiffTag(NamedTuple):
@@ -133,7 +133,7 @@ class StatedSystem:
         if self.text:
             try:
                 return wkt_code(self.text)
-            except ValueError:  # no WKT, which counts as metres where the user gives the unit
+            except ValueError:  # no WKT, which counts as meters where the user gives the unit
                 return None
         code = int(self._keys.get(PROJECTED_CRS, 0))
         return None if code in (0, USER_DEFINED) else code
@@ -144,8 +144,8 @@ class StatedSystem:
         return self._code
 
     @property
-    def epsg_in_metres(self) -> int | None:
-        """EPSG code of a projected system in metres, or None if none is known."""
+    def epsg_in_meters(self) -> int | None:
+        """EPSG code of a projected system in meters, or None if none is known."""
         if self.crs is None:
             return self._code if self._stated_m == 1.0 else None
         code = self._code or crs_key(self.crs)[1]
@@ -180,19 +180,19 @@ class StatedSystem:
 
     @property
     def horizontal_m(self) -> float | None:
-        """Metres in the unit of x and y, or None for angles, and if the unit is not known."""
+        """Meters in the unit of x and y, or None for angles, and if the unit is not known."""
         if self.crs is not None:
             return float(self.crs.linear_units_factor[1]) if self.crs.is_projected else None
         return self._stated_m
 
     @property
     def _stated_m(self) -> float | None:
-        """Metres in the unit of x and y by the text or keys themselves, or None."""
+        """Meters in the unit of x and y by the text or keys themselves, or None."""
         try:
             units = self.units()
         except (LidarError, ValueError):  # angles, or a text that is no WKT
             return None
-        return None if units is None else units.horizontal.metres
+        return None if units is None else units.horizontal.meters
 
     @property
     def angles(self) -> str:
@@ -218,30 +218,30 @@ class StatedSystem:
         else:
             try:
                 method = wkt_method(self.text)
-            except ValueError:  # no WKT, which counts as metres where the user gives the unit
+            except ValueError:  # no WKT, which counts as meters where the user gives the unit
                 return None
             has_projection = bool(method)
         return projection_kind(method) if has_projection else True  # local systems are true
 
     def is_in_utm_zone(self, positions: Floats) -> bool:
-        """Return True for a UTM zone whose metres are true at all positions (n, 3)."""
+        """Return True for a UTM zone whose meters are true at all positions (n, 3)."""
         if self._code is None or not is_utm(self._code) or self._stated_m != 1:
             return False
         return not len(positions) or is_true_in_utm(positions[:, 0])
 
     def height_m(self) -> tuple[float, str]:
-        """Return the metres in the unit of heights, and a clause if the unit is not stated."""
+        """Return the meters in the unit of heights, and a clause if the unit is not stated."""
         stated = height_unit_of_keys(self._keys) if not self.text else None
         if stated is not None:
-            return stated.metres, ""
+            return stated.meters, ""
         horizontal, up_m = horizontal_part(self.crs)
         if up_m is not None:
             return up_m, ""
         if horizontal.is_projected:
-            name, metres = horizontal.linear_units_factor
+            name, meters = horizontal.linear_units_factor
             note = f"states no unit of heights, which are taken in the unit {name} of x and y"
-            return float(metres), note if metres != 1 else ""
-        return 1.0, "states no unit of heights, which are taken in metres"
+            return float(meters), note if meters != 1 else ""
+        return 1.0, "states no unit of heights, which are taken in meters"
 
     @property
     def name(self) -> str:
@@ -268,19 +268,19 @@ class _Scale:
     """What is known of the scale of a system where positions are."""
 
     problem: str = ""  # why lengths are not true, as a clause that follows a file's name
-    epsg: int | None = None  # code of a system with true metres
+    epsg: int | None = None  # code of a system with true meters
     note: str = ""  # clause on lengths at the edges, or on a scale that is unknown
 
 
-def stated_metres(
+def stated_meters(
     system: StatedSystem | None, positions: Floats, unit: str | None
-) -> tuple[Metres, list[str]]:
-    """Return the metres in the units of x, y and z, and notes as clauses that follow a file's name.
+) -> tuple[Meters, list[str]]:
+    """Return the meters in the units of x, y and z, and notes as clauses that follow a file's name.
 
     Parameters
     ----------
     system
-        The system that the file states; None counts as metres.
+        The system that the file states; None counts as meters.
     positions
         (n, 3): points of the file, or a sample, in its units.
     unit
@@ -293,10 +293,10 @@ def stated_metres(
         a map whose scale is not true.
     """
     if unit is not None or system is None:
-        metre = UNITS_M[unit or "m"]
+        meter = UNITS_M[unit or "m"]
         problem = "" if system is None else system.angles or _scale_of(system, positions).problem
         note = f"{problem}; its coordinates are taken in {unit} of true length, as you say"
-        return (metre, metre, metre), [note] if problem else []
+        return (meter, meter, meter), [note] if problem else []
     scale = _scale_of(system, positions)
     if scale.problem:
         raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
@@ -307,9 +307,9 @@ def stated_metres(
 
 
 def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[str]:
-    """Check the system of a file whose format has true metres, such as E57, and return notes.
+    """Check the system of a file whose format has true meters, such as E57, and return notes.
 
-    `positions` (n, 3) are points of the file, or a sample, in metres.
+    `positions` (n, 3) are points of the file, or a sample, in meters.
 
     Raises
     ------
@@ -320,15 +320,15 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
         return []
     if system.crs is not None and is_geocentric(system.crs):
         raise LidarError(f"it is in {system.name}, geocentric: {advice_to_project(None)}.")
-    metre = system.horizontal_m
-    if metre is None:
-        return [f"states the coordinate system {system.name!r}, and is taken in metres"]
-    scale = _scale_of(system, positions / metre)
+    meter = system.horizontal_m
+    if meter is None:
+        return [f"states the coordinate system {system.name!r}, and is taken in meters"]
+    scale = _scale_of(system, positions / meter)
     if scale.problem:
         raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
     notes = [scale.note] if scale.note else []
-    if metre != 1.0:
-        notes.append(f"is in {system.name}, and is taken in metres, as its format has them")
+    if meter != 1.0:
+        notes.append(f"is in {system.name}, and is taken in meters, as its format has them")
     return notes
 
 
@@ -349,7 +349,7 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
     if scale is None:
         return _Scale() if horizontal.is_geographic else _scale_by_name(system)
     if not scale.is_true:
-        problem = f"is in {system.name}, whose metre is {scale} long on the ground here"
+        problem = f"is in {system.name}, whose meter is {scale} long on the ground here"
         if (area := missed_area(horizontal, *middle.tolist())) is not None:
             x, y = middle.tolist()
             problem = (
@@ -385,13 +385,13 @@ def _scale_by_name(system: StatedSystem) -> _Scale:
     if is_true is None:
         why = "" if has_registry() else f": {install_command('lidarpool[geo]')} to have it checked"
         return _Scale(note=f"is in {system.name}, whose scale is taken as true{why}")
-    return _Scale(f"is in {system.name}, whose metres are not true to scale")
+    return _Scale(f"is in {system.name}, whose meters are not true to scale")
 
 
 class Reprojection:
-    """Brings positions from the system that a file states to a system in true metres.
+    """Brings positions from the system that a file states to a system in true meters.
 
-    Heights are converted to metres and stay as in the file, with their vertical datum; heights of
+    Heights are converted to meters and stay as in the file, with their vertical datum; heights of
     geocentric coordinates are above the ellipsoid.
 
     Parameters
@@ -399,7 +399,7 @@ class Reprojection:
     system
         The system that the file states.
     epsg
-        Code of a projected system in metres.
+        Code of a projected system in meters.
 
     Attributes
     ----------
@@ -438,7 +438,7 @@ class Reprojection:
             self.notes += [note] if note else []
 
     def check(self, positions: Floats) -> None:
-        """Check that the chosen system is in true metres in the middle of positions (n, 3).
+        """Check that the chosen system is in true meters in the middle of positions (n, 3).
 
         LidarError if it is not.
         """
@@ -449,7 +449,7 @@ class Reprojection:
                 raise LidarError(f"it cannot be brought to {problem}.")
 
     def apply(self, positions: Floats) -> Floats:
-        """Return positions (n, 3) in metres of the chosen system, NaN for positions not finite.
+        """Return positions (n, 3) in meters of the chosen system, NaN for positions not finite.
 
         LidarError for a position that is outside of one of the systems.
         """

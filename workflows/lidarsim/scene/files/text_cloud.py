@@ -223,7 +223,7 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
         names = names[:-1]
     if len(names) == count:
         return [name or f"column_{index + 1}" for index, name in enumerate(names)]
-    # A remark in prose, «x y z in metres», says nothing else than that.
+    # A remark in prose, «x y z in meters», says nothing else than that.
     if not names or (head.is_remark and [name.lower() for name in names[:3]] == ["x", "y", "z"]):
         return ["x", "y", "z", *(f"column_{index + 1}" for index in range(3, count))]
     hint = ""
@@ -237,7 +237,7 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
 
 
 def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, float, float] | None]:
-    """Return the indices of x, y and z, and their units in metres, or None without any.
+    """Return the indices of x, y and z, and their units in meters, or None without any.
 
     ValueError if the columns belong to a trajectory, or have no lengths.
     """

@@ -18,7 +18,7 @@ _NO_ROWS = np.zeros(0, np.intp)
 class DeformedCorners(NamedTuple):
     """Corners of triangles of actors that deform, in the frames of the actors: (n, 3, 3) each."""
 
-    corners: Floats  # metres
+    corners: Floats  # meters
     velocities: Floats  # m/s
     at_rest: Floats  # corners of the mesh at rest
 

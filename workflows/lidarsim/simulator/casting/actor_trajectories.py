@@ -159,7 +159,7 @@ class ActorTrajectories(tuple[Trajectory, ...]):
     def table(self, number: Integers, times_ns: Floats) -> Floats:
         """Return the poses of trajectories `number` (n,) at times (n,), nanoseconds: (12, n).
 
-        A pose is a position, metres, and a rotation matrix by rows, with the bits of
+        A pose is a position, meters, and a rotation matrix by rows, with the bits of
         `Trajectory.poses`. Times count from the start of the trajectory: for actors, the survey's.
 
         Raises

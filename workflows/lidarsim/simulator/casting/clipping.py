@@ -102,7 +102,7 @@ def _cut_polygon(polygon: Sequence[_Corner], plane: list[float]) -> list[_Corner
 def _crossing(first: tuple[_Corner, float], second: tuple[_Corner, float]) -> _Corner:
     """Return the point of an edge on a plane, for `first` and `second`, corners with heights.
 
-    Neighbouring triangles get the same point of their common edge: its corners are sorted.
+    Neighboring triangles get the same point of their common edge: its corners are sorted.
     """
     (start, start_height), (stop, stop_height) = sorted((first, second))
     share = start_height / (start_height - stop_height)

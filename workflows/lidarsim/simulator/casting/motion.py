@@ -94,7 +94,7 @@ class CastPoses:
     Rotations are from the frame of the head or carrier to the scene frame.
     """
 
-    positions: Floats  # (p, 3), or (3,) for all rays, metres
+    positions: Floats  # (p, 3), or (3,) for all rays, meters
     rotations: Floats | None = None  # (p, 3, 3), or (3, 3) for all rays; None for the identity
     rays_per_pose: int | None = None  # None for a single pose
     motion: PoseMotion | None = None  # motion from each pose to the next
@@ -180,10 +180,10 @@ class CastPoses:
 
 
 def along_rings(ray: Ints, channels: int) -> Indices:
-    """Return the order of rays (n,) that puts neighbours along a ring behind each other.
+    """Return the order of rays (n,) that puts neighbors along a ring behind each other.
 
     `ray` (n,) are numbers of rays, in the order of firings and channels. The rays of every
-    `RING_FIRINGS` firings are ordered by channels, and within a channel as before: such neighbours
+    `RING_FIRINGS` firings are ordered by channels, and within a channel as before: such neighbors
     are near each other in the scene.
     """
     ring = ray // (RING_FIRINGS * channels) * channels + ray % channels
@@ -210,7 +210,7 @@ def poses_of_firings(
     If a head rotates all beams (`Sensor.spins`), the poses are of the head, and the rays of one
     firing serve for all firings. Otherwise the poses are of the carrier. A pose is at the time of
     the first beam of a firing. If all beams start at the same point of a head, the positions are
-    this point's, `Sensor.centre`, else of the head frame's origin.
+    this point's, `Sensor.center`, else of the head frame's origin.
 
     Later beams of a firing start from the carrier's position at the time of the beam: the carrier
     moves evenly from each firing to the next. A pose for each beam would take as long as casting.
@@ -238,9 +238,9 @@ def poses_of_firings(
             positions = positions + into_axes(mount_positions, carrier_rotations.transpose(0, 2, 1))
         rotations = _head_rotations(carried, rotations, spins)
     ray_positions = positions[:-1]
-    if spins is not None and sensor.centre is not None and sensor.centre.any():
-        centre = np.broadcast_to(sensor.centre, ray_positions.shape)
-        ray_positions = ray_positions + into_axes(centre, rotations.transpose(0, 2, 1))
+    if spins is not None and sensor.center is not None and sensor.center.any():
+        center = np.broadcast_to(sensor.center, ray_positions.shape)
+        ray_positions = ray_positions + into_axes(center, rotations.transpose(0, 2, 1))
     delays = (sensor.beams.time_ns - sensor.lead_ns) / 1e9
     if not path.moves or not delays.any():
         return CastPoses(ray_positions, rotations, sensor.channels, by_head=spins is not None)

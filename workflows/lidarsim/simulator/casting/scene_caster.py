@@ -42,7 +42,7 @@ class _NearestHits(NamedTuple):
     """Nearest hits of the rays that hit: arrays (k,), in the order of rays."""
 
     ray: Ints  # number of the ray, from 0 at the window's start
-    distance: Floats  # metres
+    distance: Floats  # meters
     triangle: Ints32
 
 
@@ -54,7 +54,7 @@ class _ActorShapes(NamedTuple):
     """
 
     casters: tuple[RayCaster | Deforming, ...]  # (s,): in the frame of the mesh
-    boxes: Floats  # (s, 2, 3): bounds of the shapes in all frames of animations, metres
+    boxes: Floats  # (s, 2, 3): bounds of the shapes in all frames of animations, meters
     part_triangles: Ints32  # (s, p): first triangle of each part, among the triangles of its mesh
     shape: Indices  # (a,): shape of each actor
 
@@ -95,7 +95,7 @@ class SceneCaster:
     bodies
         Trees of the static bodies and shapes of the actors.
     range_m
-        Largest range of the sensors, metres: of a scene of hundreds of kilometres, what is far
+        Largest range of the sensors, meters: of a scene of hundreds of kilometers, what is far
         beyond the range is left out. Before scans, `cover` says where sensors are.
     unseen
         (objects,): True for objects that rays pass through; `bodies` lacks the static objects among
@@ -205,7 +205,7 @@ class SceneCaster:
 
         The arguments are as in `RayCaster.scan`; if there are actors, `poses` have a clock.
         `window` are start and stop of the rows of `pattern`, by default all. Hits are at distances
-        `t_min` to `t_max`, metres; of each group of rays every n-th is returned, by `keep_every`.
+        `t_min` to `t_max`, meters; of each group of rays every n-th is returned, by `keep_every`.
         `groups` are the first rays of the groups. `room` (6, n) receives origins and
         directions of all rays; without actors also (3, n), directions alone.
 
@@ -265,7 +265,7 @@ class SceneCaster:
         """Return whether points are visible from origins (n, 3), in the scene frame: (n,).
 
         `towards` are vectors from the origins to the points, (n, 3), of lengths `distance` (n,),
-        metres. `times` (n,) are the times of the actors, nanoseconds since the survey's start.
+        meters. `times` (n,) are the times of the actors, nanoseconds since the survey's start.
         """
         visible = np.ones(len(distance), np.bool_)
         if len(distance):
@@ -418,7 +418,7 @@ def move_instances(
 
 
 def _clear_m(scene: Scene) -> float:
-    """Return the distance behind a surface at which light continues, metres.
+    """Return the distance behind a surface at which light continues, meters.
 
     At this distance a ray does not hit the surface again, wherever its start is rounded to.
     """

@@ -24,10 +24,10 @@ from .clipping import CutMesh, box_planes, cut
 
 _log = logging.getLogger(__name__)
 
-# Half of the longest side of a scene above which bodies beyond the range are cut, metres: up to
+# Half of the longest side of a scene above which bodies beyond the range are cut, meters: up to
 # here the size of a scene costs no time.
 MAX_REACH_M = 50_000.0
-# Distance, beyond twice the range of the sensors, at which triangles are cut, metres: sensors may
+# Distance, beyond twice the range of the sensors, at which triangles are cut, meters: sensors may
 # move that far before trees are built again.
 MARGIN_M = 10_000.0
 _NO_ROWS = np.zeros(0, np.int64)
@@ -35,7 +35,7 @@ _SLACK_M = 200.0  # part of the margin for sensors beside their carrier
 
 
 def largest_range_m(survey: Survey) -> float:
-    """Return the largest range of the sensors of a survey, metres."""
+    """Return the largest range of the sensors of a survey, meters."""
     return max(carried.sensor.max_range_m for carried in survey.carried)
 
 
@@ -67,7 +67,7 @@ class _Trees(NamedTuple):
     """A caster of the static bodies, or of those within a region, with numbers of the scene."""
 
     caster: RayCaster
-    region: Floats | None  # (2, 3), metres; None for the whole scene
+    region: Floats | None  # (2, 3), meters; None for the whole scene
     # (b,): first triangle of each instance of the caster; None for a caster of faces alone
     first_triangles: Ints32 | None
     # (r,): indices in the scene's instances of the last r instances of the caster, ascending
@@ -103,9 +103,9 @@ class StaticBodies:
     scene
         Faces and instances.
     vertices
-        (v, 3): vertices of the scene's faces, metres.
+        (v, 3): vertices of the scene's faces, meters.
     range_m
-        Largest range of the sensors, metres; inf leaves out no body for its distance.
+        Largest range of the sensors, meters; inf leaves out no body for its distance.
     options
         Arguments of `RayCaster`.
     unseen
@@ -135,7 +135,7 @@ class StaticBodies:
                 self._instance_is_seen = ~unseen[scene.instances.owner]
         self._options = options
         self._lock = threading.Lock()
-        self._centre = scene.bounds.mean(axis=0)
+        self._center = scene.bounds.mean(axis=0)
         on_device = choose(options.get("backend", "auto")).on_device
         # Whether bodies may be left out once some are remote, and whether some are.
         self._can_cut = _is_short(range_m) and not on_device
@@ -199,7 +199,7 @@ class StaticBodies:
         trees = self._trees
         if trees is None or not len(instance_indices):
             return
-        offsets = instances.transforms[instance_indices, :, 3] - self._centre
+        offsets = instances.transforms[instance_indices, :, 3] - self._center
         is_remote = np.any(np.abs(offsets) > MAX_REACH_M, axis=1)
         if trees.region is None and is_remote.any() and self._can_cut:
             self._may_cut = True

@@ -11,7 +11,7 @@ import numpy as np
 from ...base.arrays import Floats, Floats32, Indices, Integers, Ints, Ints32, owned
 from ...base.vectors import inverse, length
 from ...scene.actors import distinct_meshes
-from ...scene.colours import Colours
+from ...scene.colors import Colors
 from ...scene.scene import Scene
 
 if TYPE_CHECKING:
@@ -157,16 +157,16 @@ class StoredTriangles:
         return np.bincount(self.counter(triangle), minlength=self.counters)
 
     @property
-    def stored_bodies(self) -> list[tuple[Floats, Integers, Colours | None]]:
-        """Vertices, faces and colours of stored triangles: scene, meshes of actors, and parts."""
+    def stored_bodies(self) -> list[tuple[Floats, Integers, Colors | None]]:
+        """Vertices, faces and colors of stored triangles: scene, meshes of actors, and parts."""
         scene = self._scene
-        bodies: list[tuple[Floats, Integers, Colours | None]] = [
-            (scene.vertices, scene.faces, scene.colours)
+        bodies: list[tuple[Floats, Integers, Colors | None]] = [
+            (scene.vertices, scene.faces, scene.colors)
         ]
-        bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in self.meshes]
+        bodies += [(mesh.vertices, mesh.faces, mesh.colors) for mesh in self.meshes]
         if scene.instances is not None:
             mesh_parts = scene.instances.mesh_parts
-            bodies += [(part.vertices, part.faces, part.colours) for part in mesh_parts]
+            bodies += [(part.vertices, part.faces, part.colors) for part in mesh_parts]
         return bodies
 
     @cached_property

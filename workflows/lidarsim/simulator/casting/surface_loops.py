@@ -95,7 +95,7 @@ class OnwardHits(NamedTuple):
     cosines: Floats  # cosines of either sign
     film: Bools  # whether there may be water; empty without water
     share: Floats  # share of the energy, after the earlier surfaces: light passes each out and back
-    distance: Floats  # optical path from the sensor, metres
+    distance: Floats  # optical path from the sensor, meters
 
 
 class OnwardLimits(NamedTuple):
@@ -123,7 +123,7 @@ class JoinedHits(NamedTuple):
     """Arrays that the nearest hits are written to: (n,) each."""
 
     ray: Ints
-    distance: Floats  # metres
+    distance: Floats  # meters
     triangle: Ints32
 
 
@@ -137,7 +137,7 @@ class TrackTable(NamedTuple):
     # outside these a time may be; inf for any time.
     limits: Floats
     times: Floats  # (s,): start of each segment, seconds
-    start: Floats  # (3, s): position at the start of each segment, metres
+    start: Floats  # (3, s): position at the start of each segment, meters
     speed: Floats  # (3, s): velocity, m/s
     # (3, 9, s): a rotation, by rows, is term 0 + sin(a) term 1 + cos(a) term 2, where a is the
     # angle since the start of the segment (`Segments`).
@@ -265,7 +265,7 @@ def meet(hits, directions, tables, reflectance, retro, output):  # noqa: PLR0914
 def at_right_angles(distance, extinction):
     """Return the energy from a white surface at normal incidence, as `materials.at_right_angles`.
 
-    `distance` is in metres, `extinction` in 1/m.
+    `distance` is in meters, `extinction` in 1/m.
     """
     range_m = max(distance, NEAREST_M)
     nearer = REFERENCE_M / range_m
@@ -342,7 +342,7 @@ def divide_light(row_indices, reflected, hits, shares, optics, limits, onward_sh
 
 @compiled()
 def start_behind(origins, directions, step_m, clear_m, starts, onward):
-    """Write where light starts `clear_m` (n,) behind its ends, and normalise its directions.
+    """Write where light starts `clear_m` (n,) behind its ends, and normalize its directions.
 
     The light ends `step_m` (n,) from `origins` along `directions`, and goes on along `onward`,
     which becomes unit vectors; `starts` is written. Vectors are (3, n).

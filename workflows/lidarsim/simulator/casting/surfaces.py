@@ -1,4 +1,4 @@
-"""Surfaces: normals and colours of triangles, and the light that materials send back."""
+"""Surfaces: normals and colors of triangles, and the light that materials send back."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 from ...base.arrays import Bools, Floats, Integers, Ints, Ints32, UInts32, owned
 from ...base.vectors import into_axes
 from ...media.materials import NEAR_NM, Material, MaterialTable, at_right_angles
-from ...scene.colours import GREY, Lookup, join_colours, luminance, packed
+from ...scene.colors import GRAY, Lookup, join_colors, luminance, packed
 from ...scene.scene import Scene
 from ...sensor import Sensor
 from ...survey.survey import Survey
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 LEVEL = math.sqrt(0.75)  # smallest z of the normals of surfaces that hold water: 30 degrees
-BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
+BLOCK_HITS = 1 << 14  # hits whose colors are looked up at a time, to fit a cache
 _NO_NORMALS = np.zeros((0, 3), np.float32)
 
 
@@ -61,12 +61,12 @@ def sensor_light_of(survey: Survey, sensor: Sensor) -> SensorLight:
     return SensorLight(sensor.optics.wavelength_nm, survey.extinction(sensor), float(survey.wet))
 
 
-def warn_of_grey(scene: Scene, survey: Survey) -> None:
-    """Warn if a survey takes colours for reflectance, and the scene has no colours."""
-    if not scene.coloured and any(m.reflectance == "texture" for m in survey.materials):
+def warn_of_gray(scene: Scene, survey: Survey) -> None:
+    """Warn if a survey takes colors for reflectance, and the scene has no colors."""
+    if not scene.colored and any(m.reflectance == "texture" for m in survey.materials):
         _log.warning(
             "a material has reflectance: texture, but the scene has no colors, so all surfaces "
-            "are gray. In Python, read colors with Scene.load(path, colours=True)"
+            "are gray. In Python, read colors with Scene.load(path, colors=True)"
         )
 
 
@@ -74,7 +74,7 @@ class Surfaces:
     """Optical properties of triangles.
 
     `StoredTriangles` numbers the triangles, and `TriangleKinds` has the kinds of their surfaces,
-    rows of the table of materials. `wavelengths` are the wavelengths of all sensors, nanometres.
+    rows of the table of materials. `wavelengths` are the wavelengths of all sensors, nanometers.
 
     Raises
     ------
@@ -181,14 +181,14 @@ class Surfaces:
         sensor_light: SensorLight,
         times: Floats | Ints,
         trajectories: ActorTrajectories,
-        colours: UInts32 | None = None,
+        colors: UInts32 | None = None,
     ) -> LitHits:
         """Return normals, cosines, kinds of surfaces and received energies of hits of rays (n,).
 
         Parameters
         ----------
         triangle, distance
-            (n,): triangles on which the rays end, and the rays' lengths (optical paths), metres.
+            (n,): triangles on which the rays end, and the rays' lengths (optical paths), meters.
         directions
             (n, 3): unit directions of the rays, scene frame.
         sensor_light
@@ -197,7 +197,7 @@ class Surfaces:
             (n,): nanoseconds, for the poses of actors.
         trajectories
             Trajectories of the actors.
-        colours
+        colors
             (n,): packed, needed where materials are `textured`.
         """
         from . import surface_loops
@@ -205,7 +205,7 @@ class Surfaces:
         table = self.at_wavelength(sensor_light.wavelength_nm)
         incidence, kinds = self._meet(triangle, directions, table, times, trajectories)
         normals, cosines, back = incidence
-        bright = luminance(colours) if table.textured and colours is not None else None
+        bright = luminance(colors) if table.textured and colors is not None else None
         if table.textured or table.roughness.any():
             back = table.scattered(kinds, np.abs(cosines), bright)
         film = None
@@ -219,32 +219,32 @@ class Surfaces:
         surface_loops.fade(owned(distance), sensor_light.extinction, back)
         return LitHits(normals.T, cosines, kinds, back, film)
 
-    def colours(
+    def colors(
         self,
         triangle: Integers,
         points: Floats,
         times: Floats | Ints,
         trajectories: ActorTrajectories,
     ) -> UInts32:
-        """Return the colours of points (n, 3) on triangles (n,), packed: (n,).
+        """Return the colors of points (n, 3) on triangles (n,), packed: (n,).
 
-        Points are in the scene frame, metres. Without colours in the scene, all points are grey.
+        Points are in the scene frame, meters. Without colors in the scene, all points are gray.
         Actors have their poses at times (n,), nanoseconds.
         """
         if self._lookup is None:
-            return np.full(len(triangle), packed(GREY[0])[0])
+            return np.full(len(triangle), packed(GRAY[0])[0])
         result = np.empty(len(triangle), np.uint32)
         for begin in range(0, len(triangle), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
-            result[block] = self._block_colours(
+            result[block] = self._block_colors(
                 triangle[block], points[block], times[block], trajectories
             )
         return result
 
-    def _block_colours(
+    def _block_colors(
         self, triangle: Integers, points: Floats, times: Any, trajectories: ActorTrajectories
     ) -> UInts32:
-        """Return the colours of points of a block of hits, for `colours`."""
+        """Return the colors of points of a block of hits, for `colors`."""
         assert self._lookup is not None
         stored_rows, _, instance = self.triangles.locate(triangle)
         on_instances = np.flatnonzero(instance >= 0)
@@ -259,22 +259,22 @@ class Surfaces:
             )
             points[on_instances] = into_axes(from_origins, normal_matrices)
         self.on_actors.move_to_rest(points, triangle, stored_rows, times, trajectories)
-        return self._lookup.colours_at(stored_rows, points)
+        return self._lookup.colors_at(stored_rows, points)
 
     @cached_property
     def _lookup(self) -> Lookup | None:
-        """Colours of the stored triangles, or None if the scene has no colours."""
+        """Colors of the stored triangles, or None if the scene has no colors."""
         bodies = self.triangles.stored_bodies
         sizes = [len(faces) for _, faces, _ in bodies]
-        colours = join_colours([colours for _, _, colours in bodies], sizes)
-        if colours is None:
+        colors = join_colors([colors for _, _, colors in bodies], sizes)
+        if colors is None:
             return None
         corners = (
             vertices[faces[begin : begin + BLOCK_FACES]]
             for vertices, faces, _ in bodies
             for begin in range(0, len(faces), BLOCK_FACES)
         )
-        return Lookup(colours, corners)
+        return Lookup(colors, corners)
 
     def kinds(self, triangle: Integers) -> Ints32:
         """Return the kinds of surfaces of triangles (n,): (n,), or -1 without a surface."""
@@ -286,16 +286,16 @@ class Surfaces:
         cosine: Floats,
         distance: Floats,
         sensor_light: SensorLight,
-        colours: UInts32 | None = None,
+        colors: UInts32 | None = None,
     ) -> Floats:
-        """Return the received energy of rays that end on triangles (n,), at distances in metres.
+        """Return the received energy of rays that end on triangles (n,), at distances in meters.
 
         ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; for a
         retro-reflector, a gain replaces the cosine; rough surfaces add gloss; distances below
-        `NEAREST_M` count as `NEAREST_M`. Where materials are `textured`, the colours (n,) are
+        `NEAREST_M` count as `NEAREST_M`. Where materials are `textured`, the colors (n,) are
         needed.
         """
         table = self.at_wavelength(sensor_light.wavelength_nm)
-        bright = luminance(colours) if table.textured and colours is not None else None
+        bright = luminance(colors) if table.textured and colors is not None else None
         scattered = table.scattered(self.kinds(triangle), cosine, bright)
         return np.asarray(scattered * at_right_angles(distance, sensor_light.extinction))

@@ -52,7 +52,7 @@ def static_key(scene: Scene, unseen: Bools | None) -> bytes:
 def without_objects(scene: Scene, unseen: Bools) -> Scene | None:
     """Return the static objects of a scene that are seen, by a mask (objects,).
 
-    Objects keep their numbers; colours, materials and actors are left out. None if no object is
+    Objects keep their numbers; colors, materials and actors are left out. None if no object is
     left.
     """
     faces = np.flatnonzero(~unseen[scene.face_object])

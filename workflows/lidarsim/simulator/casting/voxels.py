@@ -12,16 +12,16 @@ from ...base.vectors import applied, inverse, matmul
 from ...scene.scene_instances import Instances
 
 BLOCK_RAYS = 1 << 13  # rays that are followed at a time, to fit a cache
-_LEVEL = 1e-30  # voxels a metre: along an axis, slower light stays in its layer of voxels
+_LEVEL = 1e-30  # voxels a meter: along an axis, slower light stays in its layer of voxels
 
 
 class GridPassage(NamedTuple):
     """Passage of n rays of light through k grids each."""
 
-    metres: Floats  # (n,): from the start to the leaf that light meets; inf without a leaf
+    meters: Floats  # (n,): from the start to the leaf that light meets; inf without a leaf
     # (n,): optical depth that is left until a leaf, at the path's end; -inf if light meets a leaf.
     remaining_depth: Floats
-    density: Floats  # (n, k): optical depth per metre of each grid at the leaf; 0 without a leaf
+    density: Floats  # (n, k): optical depth per meter of each grid at the leaf; 0 without a leaf
 
 
 class _GridRays(NamedTuple):
@@ -31,17 +31,17 @@ class _GridRays(NamedTuple):
     """
 
     row: Indices  # (n,): number of the ray among those that entered
-    uniform_density: Floats  # (n,): optical depth per metre of the media that are not grids
-    length: Floats  # (n,): length of the path, metres
+    uniform_density: Floats  # (n,): optical depth per meter of the media that are not grids
+    length: Floats  # (n,): length of the path, meters
     depth: Floats  # (n,): remaining optical depth until a leaf
-    metres: Floats  # (n,): distance from the start
+    meters: Floats  # (n,): distance from the start
     cell: Floats  # (3, k, n): indices of the voxel of the light; outside of the grid too
     step: Floats  # (3, k, n): -1, 0 or 1, the sign of the light's direction
-    pace: Floats  # (3, k, n): metres for each voxel; 0 for light that stays in its layer
-    shift: Floats  # (3, k, n): the border ahead of `cell` is at `cell * pace + shift` metres
+    pace: Floats  # (3, k, n): meters for each voxel; 0 for light that stays in its layer
+    shift: Floats  # (3, k, n): the border ahead of `cell` is at `cell * pace + shift` meters
     size: Floats  # (3, k, n): number of voxels of the grid
     first: Floats  # (k, n): index of the grid's first voxel among the densities of all grids
-    # (k, n): optical depth per metre for a leaf area density of 1, which is the mean projection of
+    # (k, n): optical depth per meter for a leaf area density of 1, which is the mean projection of
     # the leaves; 0 without a grid.
     projection: Floats
 
@@ -105,11 +105,11 @@ class Grids:
         starts, directions
             (n, 3): origins of the light, and directions, in the scene frame.
         projection
-            (n, k): optical depth per metre for a leaf area density of 1 in each grid.
+            (n, k): optical depth per meter for a leaf area density of 1 in each grid.
         uniform_density
-            (n,): optical depth per metre of the media that are not grids.
+            (n,): optical depth per meter of the media that are not grids.
         length
-            (n,): length of the path, metres.
+            (n,): length of the path, meters.
         depth
             (n,): optical depth after which the light meets a leaf.
         """
@@ -162,11 +162,11 @@ class Grids:
                 total += grid_density
             border = _border(rays, inside)
             border_m = np.minimum.reduce(border.reshape(-1, len(rays.row)))
-            passed_depth = total * np.maximum(np.minimum(border_m, rays.length) - rays.metres, 0)
+            passed_depth = total * np.maximum(np.minimum(border_m, rays.length) - rays.meters, 0)
             meets_leaf = passed_depth > rays.depth
             row = rays.row[meets_leaf]
-            passage.metres[row] = (
-                rays.metres[meets_leaf] + rays.depth[meets_leaf] / total[meets_leaf]
+            passage.meters[row] = (
+                rays.meters[meets_leaf] + rays.depth[meets_leaf] / total[meets_leaf]
             )
             passage.density[row] = density[:, meets_leaf].T
             remaining = rays.depth - passed_depth
@@ -175,7 +175,7 @@ class Grids:
             rays = rays._replace(
                 depth=remaining,
                 # A first border may be before the start, by rounding.
-                metres=np.maximum(border_m, 0),
+                meters=np.maximum(border_m, 0),
                 cell=np.where(border <= border_m, rays.cell + rays.step, rays.cell),
             )
             followed = ~(meets_leaf | at_end)
@@ -211,7 +211,7 @@ class Grids:
             uniform_density=uniform_density,
             length=length,
             depth=depth,
-            metres=np.zeros(len(depth)),
+            meters=np.zeros(len(depth)),
             cell=np.floor(position),
             step=step,
             pace=pace,
@@ -235,7 +235,7 @@ class Grids:
 
 
 def _border(rays: _GridRays, inside: Bools) -> Floats:
-    """Return the distances from the start to the borders of voxels ahead, (3, k, n), metres.
+    """Return the distances from the start to the borders of voxels ahead, (3, k, n), meters.
 
     Light that leaves a grid for ever, by `inside` (k, n), has no borders ahead: `rays.shift` is
     set to inf.

@@ -17,7 +17,7 @@ from ...base.vectors import products, turned
 from ...columns.table import Column
 from ...columns.waveforms import column_type
 from ...media.materials import at_right_angles
-from ...scene.colours import unpacked
+from ...scene.colors import unpacked
 from ...scene.scene import Scene
 from ...sensor.optics import LIGHT_M_NS
 from ...sensor.reflectivity import COUNTS, SCALES
@@ -165,7 +165,7 @@ class BatchPoints:
 
     @property
     def origins(self) -> Floats:
-        """Starts of the rays, metres, the scene's local coordinates: (n, 3)."""
+        """Starts of the rays, meters, the scene's local coordinates: (n, 3)."""
         return np.broadcast_to(self._rays[0], (len(self), 3))
 
     @property
@@ -175,12 +175,12 @@ class BatchPoints:
 
     @property
     def range(self) -> Floats:
-        """Distance from the start of the ray, metres, with noise."""
+        """Distance from the start of the ray, meters, with noise."""
         return required(self.pulse_returns.reported)
 
     @cached_property
     def positions(self) -> Floats:
-        """Ends of the rays, metres, the scene's local coordinates: (n, 3).
+        """Ends of the rays, meters, the scene's local coordinates: (n, 3).
 
         The points that a frozen sensor sends again stay fixed in the sensor frame, and move with
         the sensor.
@@ -202,7 +202,7 @@ class BatchPoints:
 
     @cached_property
     def ray_origins(self) -> Floats:
-        """Starts of the rays in the coordinates of the survey's points, metres: (n, 3)."""
+        """Starts of the rays in the coordinates of the survey's points, meters: (n, 3)."""
         if self.survey.coordinates == "sensor":
             return self._in_sensor(np.zeros(len(self)))
         return self._moved_with_frozen_sensor(self.origins) + self.scene.origin
@@ -224,7 +224,7 @@ class BatchPoints:
 
     @cached_property
     def _scene_positions(self) -> Floats:
-        """Ends of the rays when they were fired, metres, scene frame: (n, 3)."""
+        """Ends of the rays when they were fired, meters, scene frame: (n, 3)."""
         origins, directions = self._rays
         positions = directions * self.range[:, None]
         return np.add(positions, origins, out=positions)
@@ -249,17 +249,17 @@ class BatchPoints:
 
     @property
     def cell_x(self) -> Ints32:
-        """Quantised x of each return, multiples of the precision from the local origin."""
+        """Quantized x of each return, multiples of the precision from the local origin."""
         return self.cells[0]
 
     @property
     def cell_y(self) -> Ints32:
-        """Quantised y of each return, multiples of the precision from the local origin."""
+        """Quantized y of each return, multiples of the precision from the local origin."""
         return self.cells[1]
 
     @property
     def cell_z(self) -> Ints32:
-        """Quantised z of each return, multiples of the precision from the local origin."""
+        """Quantized z of each return, multiples of the precision from the local origin."""
         return self.cells[2]
 
     @cached_property
@@ -274,19 +274,19 @@ class BatchPoints:
 
     @cached_property
     def sensor_positions(self) -> Floats:
-        """Ends of the rays in the sensor frame at the firing, metres: (n, 3)."""
+        """Ends of the rays in the sensor frame at the firing, meters: (n, 3)."""
         return self._in_sensor(self.range)
 
     def _in_sensor(self, distance: Floats) -> Floats:
-        """Return points of the rays at distances (n,), sensor frame, metres: (n, 3)."""
+        """Return points of the rays at distances (n,), sensor frame, meters: (n, 3)."""
         origins = self._pattern.origins
         points = self._pattern.directions[self._pattern_rows] * distance[:, None]
         if origins is not None:
             points += origins[self._pattern_rows]
         if not self._poses.by_head:
             points -= self.carried.mount.position
-        elif self.sensor.centre is not None:
-            points += self.sensor.centre
+        elif self.sensor.center is not None:
+            points += self.sensor.center
         return self._to_sensor(points)
 
     def _to_sensor(self, vectors: Floats) -> Floats:
@@ -417,7 +417,7 @@ class BatchPoints:
         """Cosines of incidence, of either sign, and energies, in blocks to save memory."""
         sensor_light = sensor_light_of(self.survey, self.sensor)
         cosines, energy = np.empty((2, len(self)))
-        colours = self._colours if self._surfaces.materials.textured else None
+        colors = self._colors if self._surfaces.materials.textured else None
         for begin in range(0, len(self), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
             lit = self._surfaces.lit(
@@ -427,7 +427,7 @@ class BatchPoints:
                 sensor_light=sensor_light,
                 times=self._actor_times_ns[block],
                 trajectories=self._poses.actor_trajectories,
-                colours=None if colours is None else colours[block],
+                colors=None if colors is None else colors[block],
             )
             cosines[block] = lit.cosines
             energy[block] = lit.energy
@@ -441,14 +441,14 @@ class BatchPoints:
         return self._lit[1]
 
     @cached_property
-    def _colours(self) -> UInts32:
-        """Packed colours of the surfaces, from `Surfaces.colours`."""
-        if self.pulse_returns.colour is not None:
-            return self.pulse_returns.colour
+    def _colors(self) -> UInts32:
+        """Packed colors of the surfaces, from `Surfaces.colors`."""
+        if self.pulse_returns.color is not None:
+            return self.pulse_returns.color
         points = self._scene_positions
         if self.pulse_returns.reported is not self.pulse_returns.distance:
             points = self.directions * self.pulse_returns.distance[:, None] + self._rays[0]
-        return self._surfaces.colours(
+        return self._surfaces.colors(
             self.pulse_returns.triangle,
             points,
             self._actor_times_ns,
@@ -458,17 +458,17 @@ class BatchPoints:
     @property
     def red(self) -> Bytes:
         """Red of the surface, sRGB."""
-        return unpacked(self._colours)[:, 0]
+        return unpacked(self._colors)[:, 0]
 
     @property
     def green(self) -> Bytes:
         """Green of the surface, sRGB."""
-        return unpacked(self._colours)[:, 1]
+        return unpacked(self._colors)[:, 1]
 
     @property
     def blue(self) -> Bytes:
         """Blue of the surface, sRGB."""
-        return unpacked(self._colours)[:, 2]
+        return unpacked(self._colors)[:, 2]
 
     @property
     def _clipped_energy(self) -> Floats:

@@ -54,10 +54,10 @@ KERNEL columns(
 {
     const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (k >= count) return;
-    const double metres = distance[k];
+    const double meters = distance[k];
     int* const cells[] = {x, y, z};
     for (int axis = 0; axis < 3 && WANTED(X); ++axis) {
-        const double end = directions[axis * count + k] * metres + origins[axis * count + k];
+        const double end = directions[axis * count + k] * meters + origins[axis * count + k];
         cells[axis][k] = (int)rint(end / precision);
     }
     const unsigned int number = ray[k], beam = number % channels;
@@ -74,7 +74,7 @@ KERNEL columns(
         ray_of_scan[k] = (unsigned int)(number - firsts[scan]);
     }
     if (WANTED(TIME)) time[k] = start_ns + (Count)rint(begins[number / channels] + delays[beam]);
-    if (WANTED(RANGE)) range[k] = (float)metres;
+    if (WANTED(RANGE)) range[k] = (float)meters;
 
     const Count* body = bodies + 3 * (Count)instance[k];
     const Count face = triangle[k];
@@ -86,7 +86,7 @@ KERNEL columns(
         const double* turn = body[1] < 0 ? 0 : turns + 9 * (Count)instance[k];
         const double along = cosine(normals + 3 * (body[2] + face), turn, directions + k, count);
         const double scattered = reflectance[owner] * (retro[owner] ? retro_gain : along);
-        const double share = reference / fmax(metres, nearest);
+        const double share = reference / fmax(meters, nearest);
         const double lost = share * share;
         if (WANTED(INTENSITY)) intensity[k] = (float)(scattered * lost);
         if (WANTED(REFLECTANCE)) share_back[k] = (float)(scattered * lost / lost);

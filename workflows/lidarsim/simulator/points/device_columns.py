@@ -101,7 +101,7 @@ class DevicePoints:
         return np.full(len(self), value, column.dtype)
 
     def positions_of(self, row_indices: Ints) -> Floats:
-        """Return the positions of points by their rows (k,), metres: (k, 3).
+        """Return the positions of points by their rows (k,), meters: (k, 3).
 
         Positions are rounded to the precision unless NumPy computes columns.
         """
@@ -230,7 +230,7 @@ class DeviceColumns:
     def write_ranges(
         self, number: int, pattern: Pattern, poses: CastPoses, image: Floats32
     ) -> None:
-        """Write the ranges of rays of sensor `number` to `image` (n,), metres.
+        """Write the ranges of rays of sensor `number` to `image` (n,), meters.
 
         Ray i is row ``i % len(pattern)`` of the pattern. `image` has inf before; a ray without a
         return keeps inf.

@@ -16,9 +16,9 @@ from raybeam import Pattern
 from ...base.arrays import Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32, owned
 from ...base.random_numbers import Purpose, raw
 from ...base.vectors import into_axes, products
-from ...columns.table import CAUSES, COLOURS
+from ...columns.table import CAUSES, COLORS
 from ...media.weather import FAINTEST
-from ...scene.colours import luminance
+from ...scene.colors import luminance
 from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses, Clock, along_rings
 from ..casting.scene_caster import SceneCaster
@@ -44,11 +44,11 @@ class LightPaths:
 
     ray: Ints  # number of the sub-ray, from 0 at the start of the batch
     times: Floats  # firing times, nanoseconds since the survey's start; 0 without actors
-    origins: Floats  # starts of the pieces, metres
+    origins: Floats  # starts of the pieces, meters
     directions: Floats  # unit vectors
     # Share of the energy that the earlier surfaces pass, on the way out and back: 1 at the sensor.
     share: Floats
-    optical_start: Floats  # optical path from the sensor to the origins, metres
+    optical_start: Floats  # optical path from the sensor to the origins, meters
     # (n, 3, 3): product of the reflections so far, which turns directions as they were fired into
     # directions of the pieces. None if no light is reflected, and for beams of a single sub-ray.
     mirror_matrices: Floats | None = None
@@ -63,7 +63,7 @@ class LightPaths:
         return LightPaths(*selected(vars(self).values(), row_indices))
 
     def optical_end(self, step_m: Floats) -> Floats:
-        """Return the optical paths from the sensor to distances (n,) from the origins, metres."""
+        """Return the optical paths from the sensor to distances (n,) from the origins, meters."""
         return self.optical_start + (
             step_m if self.in_media is None else self.in_media.optical(step_m)
         )
@@ -78,20 +78,20 @@ class CastLight(NamedTuple):
     """Light that hits a surface, and the surfaces that it hits: arrays (n,)."""
 
     light: LightPaths
-    # Leaves are met from here on, metres from the origin: from the sensor's smallest range, or
+    # Leaves are met from here on, meters from the origin: from the sensor's smallest range, or
     # from the surface that the light left, which is at or below 0.
     start_m: Floats
-    step_m: Floats  # distance of the hit from the origin, metres
+    step_m: Floats  # distance of the hit from the origin, meters
     triangle: Ints32  # number of the triangle (`SceneCaster`)
 
 
 class SurfaceHits(NamedTuple):
     """Hits of light, one for each row of the light: arrays (n,), vectors (n, 3)."""
 
-    step_m: Floats  # metres from the origin of the last piece of the path
+    step_m: Floats  # meters from the origin of the last piece of the path
     triangle: Ints32  # triangle of a leaf: where the light entered the crown
-    distance: Floats  # optical path from the sensor, metres
-    colour: UInts32 | None  # packed (`Surfaces.colours`); None if not needed
+    distance: Floats  # optical path from the sensor, meters
+    color: UInts32 | None  # packed (`Surfaces.colors`); None if not needed
     normals: Floats  # unit vectors, scene frame; of a leaf: the direction of the light
     cosines: Floats  # cosines of the angles between normals and directions, of either sign
     kinds: Ints32  # kinds of surfaces: rows of the table of materials
@@ -116,8 +116,8 @@ class Crossings(NamedTuple):
     A surface that does both is in two rows.
     """
 
-    step_m: Floats  # metres from the origin
-    distance: Floats  # optical path from the sensor, metres
+    step_m: Floats  # meters from the origin
+    distance: Floats  # optical path from the sensor, meters
     triangle: Ints32
     normals: Floats
     cosines: Floats  # cosines of the angles between normals and directions, of either sign
@@ -147,7 +147,7 @@ class OnwardLight(NamedTuple):
     """Light behind the surfaces of its last hits, before its next cast: arrays (n,)."""
 
     light: LightPaths
-    start_m: Floats  # positions of those surfaces along the light, metres, at or below 0
+    start_m: Floats  # positions of those surfaces along the light, meters, at or below 0
     pattern: Pattern  # the rays to cast: origins and directions of `light`
 
 
@@ -185,11 +185,11 @@ class CastStep(PulseStep):
         white = np.ones(len(table.reflectance))
         # Largest energy that a kind of surface sends back from 10 m.
         self._brightest = float(table.scattered(np.arange(len(white)), white, white).max())
-        shown = any(column.name in COLOURS for column in survey.stored_columns)
-        self._coloured = shown or surfaces.materials.textured
+        shown = any(column.name in COLORS for column in survey.stored_columns)
+        self._colored = shown or surfaces.materials.textured
         # Whether the origins of rays are needed, and not only their directions.
         self._needs_origins = (
-            self._coloured
+            self._colored
             or setup.has_velocities
             or setup.has_onward_light
             or self._media is not None
@@ -229,7 +229,7 @@ class CastStep(PulseStep):
         1. `_cast_first` casts all sub-rays from the sensor. `CastLight` has a row for each sub-ray
            that hits a surface: the path of its light (`LightPaths`), and the triangle.
         2. `_surface_hits` computes what each row meets: a surface, or a leaf before the surface.
-           `SurfaceHits` has the colour, the normal and the energy of each row.
+           `SurfaceHits` has the color, the normal and the energy of each row.
         3. `_visible_hits` chooses the rows that the sensor sees, as `PulseReturns`, and marks rows
            whose light continues: `VisibleHits`.
         4. `_continue` takes these rows (`OnwardRows`), twice where light is both transmitted and
@@ -265,7 +265,7 @@ class CastStep(PulseStep):
 
     @property
     def _reach_m(self) -> float:
-        """Greatest length of a cast ray, metres, or inf if there are crowns.
+        """Greatest length of a cast ray, meters, or inf if there are crowns.
 
         The path through a crown ends at the surface on its far side, at any distance.
         """
@@ -347,10 +347,10 @@ class CastStep(PulseStep):
         step_m = cast.step_m
         triangle = cast.triangle
         distance = light.optical_end(step_m)
-        colour = None
-        if self._coloured:
+        color = None
+        if self._colored:
             points = light.origins + step_m[:, None] * light.directions
-            colour = surfaces.colours(triangle, points, light.times, actor_trajectories)
+            color = surfaces.colors(triangle, points, light.times, actor_trajectories)
         normals, cosines, kinds, energy, film = surfaces.lit(
             triangle,
             light.directions,
@@ -358,12 +358,12 @@ class CastStep(PulseStep):
             sensor_light=self._sensor_light,
             times=light.times,
             trajectories=actor_trajectories,
-            colours=colour,
+            colors=color,
         )
         if leaves is not None and len(leaves.row_indices):
             # Leaves face the light: two leaves behind each other are then never one surface.
             normals[leaves.row_indices] = light.directions[leaves.row_indices]
-            energy[leaves.row_indices] = self._leaf_energy(leaves, triangle, distance, colour)
+            energy[leaves.row_indices] = self._leaf_energy(leaves, triangle, distance, color)
         energy *= light.share
         if light.in_media is not None:
             light.in_media.advance(step_m)
@@ -372,7 +372,7 @@ class CastStep(PulseStep):
             step_m=step_m,
             triangle=triangle,
             distance=distance,
-            colour=colour,
+            color=color,
             normals=normals,
             cosines=cosines,
             kinds=kinds,
@@ -399,26 +399,26 @@ class CastStep(PulseStep):
             self._draw(batch),
         )
         step_m = cast.step_m.copy()
-        step_m[leaves.row_indices] = cast.start_m[leaves.row_indices] + leaves.metres
+        step_m[leaves.row_indices] = cast.start_m[leaves.row_indices] + leaves.meters
         triangle = cast.triangle.copy()
         triangle[leaves.row_indices] = leaves.triangles
         return cast._replace(step_m=step_m, triangle=triangle), leaves
 
     def _leaf_energy(
-        self, leaves: Leaves, triangle: Ints32, distance: Floats, colour: UInts32 | None
+        self, leaves: Leaves, triangle: Ints32, distance: Floats, color: UInts32 | None
     ) -> Floats:
         """Return the energies received from leaves (k,).
 
-        `triangle`, `distance` (metres) and `colour` are of all hits (n,), with those on leaves.
+        `triangle`, `distance` (meters) and `color` are of all hits (n,), with those on leaves.
         """
         row_indices = leaves.row_indices
-        leaf_colour = None if colour is None else colour[row_indices]
+        leaf_color = None if color is None else color[row_indices]
         return self.surfaces.energy(
             triangle[row_indices],
             leaves.cosines,
             distance[row_indices],
             self._sensor_light,
-            leaf_colour,
+            leaf_color,
         )
 
     def _velocities(
@@ -459,7 +459,7 @@ class CastStep(PulseStep):
             distance=surface_hits.distance,
             triangle=surface_hits.triangle,
             energy=surface_hits.energy,
-            colour=surface_hits.colour,
+            color=surface_hits.color,
             cause=cause,
             velocity=velocity,
         )
@@ -539,8 +539,8 @@ class CastStep(PulseStep):
 
         materials = self.surfaces.at_wavelength(self._sensor_light.wavelength_nm)
         bright = None
-        if materials.textured and surface_hits.colour is not None:
-            bright = luminance(surface_hits.colour[row_indices])
+        if materials.textured and surface_hits.color is not None:
+            bright = luminance(surface_hits.color[row_indices])
         in_media = light.in_media
         drops_faint = light.mirrored is not None and not (
             in_media is not None and in_media.differentials
@@ -715,7 +715,7 @@ def _pattern_behind(
 ) -> tuple[Pattern, Floats]:
     """Return rays that start `clear_m` (n,) behind the ends of light, and their origins (n, 3).
 
-    Light ends at distances `step_m` (n,) from its origins, metres. `outgoing` (n, 3) are the
+    Light ends at distances `step_m` (n,) from its origins, meters. `outgoing` (n, 3) are the
     directions of the rays, of any length close to 1.
     """
     from ..casting import surface_loops

@@ -41,7 +41,7 @@ class ReceivedPulses(NamedTuple):
     """Foreign pulses that rays receive: arrays (k,)."""
 
     row: Indices  # row of the receiving rays
-    distance: Floats  # at which the pulse appears to the receiver, metres
+    distance: Floats  # at which the pulse appears to the receiver, meters
     energy: Floats  # 1 for a white surface at `REFERENCE_M`
 
 
@@ -59,10 +59,10 @@ class _Spots(NamedTuple):
     """Points on surfaces that the pulses of a sensor light: arrays (n,)."""
 
     time: Floats  # at which the pulse lights the spot, nanoseconds since the start of the station
-    position: Floats  # (n, 3), metres, scene frame
+    position: Floats  # (n, 3), meters, scene frame
     normal: Floats  # (n, 3), unit vectors
     triangle: Ints32
-    distance: Floats  # distance from the sensor, metres
+    distance: Floats  # distance from the sensor, meters
 
 
 class _Candidates(NamedTuple):
@@ -140,7 +140,7 @@ class CrosstalkStep(PulseStep):
     ) -> ReceivedPulses:
         """Return the foreign pulses that consecutive rays (n,) receive.
 
-        `rays` are numbers counted from the first ray of scan `scan`. Origins, metres, and unit
+        `rays` are numbers counted from the first ray of scan `scan`. Origins, meters, and unit
         directions are (n, 3), in the scene frame.
         """
         spec = self._survey.scan(scan)

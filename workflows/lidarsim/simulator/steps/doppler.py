@@ -57,7 +57,7 @@ def radial_velocities(
     rays
         Origins and unit directions of the rays, (n, 3) each, in the scene frame.
     distance
-        (n,): lengths of the rays, metres; without noise.
+        (n,): lengths of the rays, meters; without noise.
     triangle
         (n,): triangles at the ends; ends in the air, -1, are at rest.
     times
@@ -83,7 +83,7 @@ def velocities_of_ends(
 ) -> Floats:
     """Return the velocities of actors' surfaces at the ends of rays, scene frame, m/s: (n, 3).
 
-    `rays` are origins and unit directions (n, 3) in the scene frame; `distance` (n,) is in metres,
+    `rays` are origins and unit directions (n, 3) in the scene frame; `distance` (n,) is in meters,
     `times` (n,) are firing times in nanoseconds since the survey's start.
     """
     directions = rays[1]

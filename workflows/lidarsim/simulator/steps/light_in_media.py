@@ -46,7 +46,7 @@ Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 class MediaRays(NamedTuple):
     """Light of sub-rays at its origin, and the trajectories of actors."""
 
-    origins: Floats  # (n, 3): metres, scene frame
+    origins: Floats  # (n, 3): meters, scene frame
     directions: Floats  # (n, 3): unit vectors, scene frame
     times: Floats  # (n,): nanoseconds, for the poses of actors
     actor_trajectories: ActorTrajectories
@@ -120,7 +120,7 @@ class RayDifferentials:
         return RayDifferentials(*selected(vars(self).values(), row_indices))
 
     def advance(self, step: Floats, attenuation: Floats) -> None:
-        """Move the light straight on by steps (n,), metres, through an attenuation (n,), 1/m."""
+        """Move the light straight on by steps (n,), meters, through an attenuation (n,), 1/m."""
         shift = step[:, None, None] * self.direction_derivatives
         self.position_derivatives = self.position_derivatives + shift
         self.attenuation_depth = self.attenuation_depth + attenuation * step
@@ -153,7 +153,7 @@ class RayDifferentials:
         """
         incoming_cosine = _away_from_zero(products(incoming.T, normals.T))
         outgoing_cosine = _away_from_zero(products(outgoing.T, normals.T))
-        # Neighbouring rays meet the plane of the surface before or behind the central ray.
+        # Neighboring rays meet the plane of the surface before or behind the central ray.
         shift = applied(self.position_derivatives, normals) / incoming_cosine[:, None]
         self.position_derivatives = self.position_derivatives - shift[..., None] * incoming[:, None]
         ratio = np.where(mirrored, 1.0, self.index / index)
@@ -332,7 +332,7 @@ class Media:
         return behind
 
     def density(self, stack: MediaStack, upright: Floats) -> Floats:
-        """Return the optical depth of leaves per metre, in each medium around light.
+        """Return the optical depth of leaves per meter, in each medium around light.
 
         `upright` (n,) are cosines between the light and the vertical, 0 to 1. Returns
         (n, MAX_MEDIA); for grids of voxels, values are for a leaf area density of 1 m²/m³.
@@ -360,9 +360,9 @@ class LightInGrids(NamedTuple):
     """Light among all light that passes grids of voxels: arrays (k,)."""
 
     row_indices: Indices  # rows of the light
-    metres: Floats  # metres to the leaf that the light meets; inf without a leaf
+    meters: Floats  # meters to the leaf that the light meets; inf without a leaf
     remaining_depth: Floats  # optical depth to a leaf after the passage; -inf if there is a leaf
-    # (k, MAX_MEDIA): optical depth per metre; of a grid in the voxel where light meets a leaf, or 0
+    # (k, MAX_MEDIA): optical depth per meter; of a grid in the voxel where light meets a leaf, or 0
     density: Floats
 
 
@@ -379,7 +379,7 @@ class Leaves(NamedTuple):
     """Leaves that light meets: arrays (k,)."""
 
     row_indices: Indices  # rows of the light
-    metres: Floats  # metres from the start of the span to the leaf
+    meters: Floats  # meters from the start of the span to the leaf
     triangles: Ints32  # through which the light entered the crown
     cosines: Floats  # mean cosine between light and leaves
 
@@ -406,7 +406,7 @@ class LightInMedia:
         return 1.0 if self.differentials is None else self.differentials.index
 
     def optical(self, step: Floats) -> Floats:
-        """Return the optical paths of steps (n,), metres."""
+        """Return the optical paths of steps (n,), meters."""
         return step if self.differentials is None else step * self.differentials.index
 
     def meet_leaves(
@@ -420,7 +420,7 @@ class LightInMedia:
     ) -> Leaves:
         """Return the leaves that light meets between distances from its origins.
 
-        Distances `starts_m` and `ends_m` are metres (n,), `ray` are numbers of sub-rays (n,), and
+        Distances `starts_m` and `ends_m` are meters (n,), `ray` are numbers of sub-rays (n,), and
         `draw` draws random bits that choose among crowns that overlap. Reduces `remaining_depth`.
         """
         if self.remaining_depth is None:
@@ -435,19 +435,19 @@ class LightInMedia:
             passage = self._pass_grids(starts, directions, length, density)
             density[passage.row_indices] = passage.density
         cumulative = np.cumsum(density, axis=1)
-        row_indices, metres = self._advance_to_leaves(cumulative[:, -1], length, passage)
+        row_indices, meters = self._advance_to_leaves(cumulative[:, -1], length, passage)
         layer = _crown_layers(draw(CROWN, ray[row_indices]), cumulative[row_indices])
         cosines = self.media.leaf_cosines(
             self.stack.kinds[row_indices, layer], upright[row_indices]
         )
-        return Leaves(row_indices, metres, self.stack.triangles[row_indices, layer], cosines)
+        return Leaves(row_indices, meters, self.stack.triangles[row_indices, layer], cosines)
 
     def _advance_to_leaves(
         self, density: Floats, length: Floats, passage: LightInGrids | None
     ) -> tuple[Indices, Floats]:
-        """Reduce the remaining depth over lengths (n,), metres, of a density (n,), 1/m.
+        """Reduce the remaining depth over lengths (n,), meters, of a density (n,), 1/m.
 
-        Returns the rows of light that meets a leaf, and the metres to the leaf.
+        Returns the rows of light that meets a leaf, and the meters to the leaf.
         """
         assert self.remaining_depth is not None
         depth = density * length
@@ -455,23 +455,23 @@ class LightInMedia:
             in_grids = passage.row_indices
             depth[in_grids] = self.remaining_depth[in_grids] - passage.remaining_depth
         row_indices = np.flatnonzero(depth > self.remaining_depth)
-        metres = self.remaining_depth[row_indices] / density[row_indices]
+        meters = self.remaining_depth[row_indices] / density[row_indices]
         if passage is not None:
-            metres_in_grids = np.full(len(depth), np.nan)
-            metres_in_grids[passage.row_indices] = passage.metres
-            metres = np.where(
-                np.isnan(metres_in_grids[row_indices]), metres, metres_in_grids[row_indices]
+            meters_in_grids = np.full(len(depth), np.nan)
+            meters_in_grids[passage.row_indices] = passage.meters
+            meters = np.where(
+                np.isnan(meters_in_grids[row_indices]), meters, meters_in_grids[row_indices]
             )
         self.remaining_depth = self.remaining_depth - depth
-        return row_indices, metres
+        return row_indices, meters
 
     def _pass_grids(
         self, starts: Floats, directions: Floats, length: Floats, density: Floats
     ) -> LightInGrids:
         """Follow light through grids of voxels, and return the passage with new densities.
 
-        Light starts at `starts` (n, 3) and goes on for `length` (n,), metres. `density`
-        (n, MAX_MEDIA) is the optical depth per metre; of a grid for a leaf area density of 1 m²/m³.
+        Light starts at `starts` (n, 3) and goes on for `length` (n,), meters. `density`
+        (n, MAX_MEDIA) is the optical depth per meter; of a grid for a leaf area density of 1 m²/m³.
         """
         grids = self.media.grids
         stack = self.stack
@@ -485,7 +485,7 @@ class LightInMedia:
         is_grid = np.take_along_axis(gridded, grid_layers, axis=1)
         triangles = np.take_along_axis(stack.triangles[row_indices], grid_layers, axis=1)
         media_density = np.where(gridded, 0, density[row_indices])
-        metres, remaining_depth, grid_density = grids.through(
+        meters, remaining_depth, grid_density = grids.through(
             np.where(is_grid, self.media.instances(triangles), -1),
             starts[row_indices],
             directions=directions[row_indices],
@@ -498,10 +498,10 @@ class LightInMedia:
             is_grid, grid_density, np.take_along_axis(media_density, grid_layers, 1)
         )
         np.put_along_axis(media_density, grid_layers, layer_density, 1)
-        return LightInGrids(row_indices, metres, remaining_depth, media_density)
+        return LightInGrids(row_indices, meters, remaining_depth, media_density)
 
     def advance(self, step: Floats) -> None:
-        """Move the light straight on by steps (n,), metres."""
+        """Move the light straight on by steps (n,), meters."""
         if self.differentials is not None:
             self.differentials.advance(step, self.media.attenuation(self.stack))
 

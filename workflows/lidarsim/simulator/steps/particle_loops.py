@@ -57,7 +57,7 @@ def sample_particles(beam, stop, subrays, tables, keys, reach, hits):
     """Sample the particles of a kind that beams `beam` to `stop` meet, while `hits` has room.
 
     `tables` are `ParticleTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
-    that the light of each sub-ray reaches, metres. Writes `SampledHits`; returns the first beam
+    that the light of each sub-ray reaches, meters. Writes `SampledHits`; returns the first beam
     that is not sampled yet, and the number of hits.
     """
     starts = keys.starts

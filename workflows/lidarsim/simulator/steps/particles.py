@@ -60,7 +60,7 @@ class DetectableParticles(NamedTuple):
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … particles in a beam
     # (5, QUANTILES), a column for each equal share of the particles by range: ascending distances,
-    # metres; smallest diameters that may be detected, mm; 1 - exp(-slope * (largest - smallest));
+    # meters; smallest diameters that may be detected, mm; 1 - exp(-slope * (largest - smallest));
     # energies of a particle of 1 mm; and energies of a particle that fills the beam.
     by_range: Floats
     step_mm: float  # 1 / slope: diameter that exp(-1) of the particles exceed
@@ -210,7 +210,7 @@ class WeatherStep(PulseStep):
         return np.asarray(count % 2 == 1)
 
     def _fog_ends(self, hits: PulseReturns, reach: Floats) -> Floats:
-        """Return the ranges at which the fog before each sub-ray ends, (rays,), metres.
+        """Return the ranges at which the fog before each sub-ray ends, (rays,), meters.
 
         Fog ends at `reach`, or where the sub-ray enters water or glass that is thicker than half of
         the pulse's length: panes of glass do not end fog.
@@ -234,7 +234,7 @@ class WeatherStep(PulseStep):
 def light_reach(
     materials: MaterialTable, surfaces: Surfaces, hits: PulseReturns, count: int
 ) -> Floats:
-    """Return ranges that the light of `count` sub-rays reaches, (count,), metres.
+    """Return ranges that the light of `count` sub-rays reaches, (count,), meters.
 
     The range is the distance of the last hit of a sub-ray on a surface. It is inf without a hit, or
     if the last surface lets light pass. `hits.ray` are sub-rays, from 0.
@@ -294,7 +294,7 @@ def room_for_hits(size: int) -> SampledHits:
 def _particles(
     detectable: DetectableParticles, random: RandomKeys, subrays: int, reach: Floats
 ) -> Iterator[SampledHits]:
-    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,), metres."""
+    """Yield the hits of particles of a kind on sub-rays that reach `reach` (rays,), meters."""
     from . import particle_loops as air_loops  # not before: numba takes half a second to import
 
     beams = len(reach) // subrays
@@ -313,7 +313,7 @@ def _particles(
 def _fog_hits(fog: FogCells, random: RandomKeys, subrays: int, reach: Floats) -> SampledHits:
     """Return a hit of fog for each beam that has fog, on its first sub-ray.
 
-    `reach` (rays,) is where fog ends on each sub-ray, metres.
+    `reach` (rays,) is where fog ends on each sub-ray, meters.
     """
     from . import particle_loops as air_loops
 

@@ -10,14 +10,14 @@ from raybeam.compiled import compiled, inlined, stage
 
 from ...base.arrays import Bools, Floats, Ints
 
-SLOPE = 0.5  # largest gap of the planes of one surface, by the distance between neighbouring hits
+SLOPE = 0.5  # largest gap of the planes of one surface, by the distance between neighboring hits
 
 
 class SampledHits(NamedTuple):
     """Arrays for loops to write sampled hits of sub-rays to: (k,) each."""
 
     ray: Ints  # sub-ray
-    distance: Floats  # metres
+    distance: Floats  # meters
     energy: Floats
 
     def first(self, count: int) -> SampledHits:
@@ -25,14 +25,14 @@ class SampledHits(NamedTuple):
         return SampledHits(self.ray[:count], self.distance[:count], self.energy[:count])
 
 
-class Neighbours(NamedTuple):
-    """Neighbouring sub-rays of a beam, and planes of hits.
+class Neighbors(NamedTuple):
+    """Neighboring sub-rays of a beam, and planes of hits.
 
     Without pairs no surface continues.
     """
 
     subrays: int  # number in a beam
-    pairs: Ints  # (k, 2): neighbouring sub-rays of a beam
+    pairs: Ints  # (k, 2): neighboring sub-rays of a beam
     normals: Floats  # (3, n): of the surfaces of hits
     directions: Floats  # (3, n): of the rays of hits
 
@@ -49,8 +49,8 @@ class PulseHits(NamedTuple):
     """Hits of beams in the order of beams and distances, (n,) each, and scratch memory."""
 
     subray: Ints  # number among the sub-rays of all beams
-    distance: Floats  # metres
-    row: Ints  # (n, 2): row among the hits of `Neighbours`, and scratch memory
+    distance: Floats  # meters
+    row: Ints  # (n, 2): row among the hits of `Neighbors`, and scratch memory
     subray_hits: Ints  # scratch memory (n * sub-rays of a beam,)
     changes: Ints  # scratch memory (n + 1,)
 
@@ -97,38 +97,38 @@ def thin_out(ray, scan_starts, keep_every, hit_counts, row_indices, number, retu
 
 
 @inlined
-def _half_way(hit, neighbour, inverse_distance, neighbours):
-    """Return the range of the plane of a hit half-way to a neighbouring hit, metres.
+def _half_way(hit, neighbor, inverse_distance, neighbors):
+    """Return the range of the plane of a hit half-way to a neighboring hit, meters.
 
-    `hit` and `neighbour` are rows in `Neighbours`; `inverse_distance` is of the hit, 1/m.
+    `hit` and `neighbor` are rows in `Neighbors`; `inverse_distance` is of the hit, 1/m.
     """
-    normals = neighbours.normals
-    directions = neighbours.directions
+    normals = neighbors.normals
+    directions = neighbors.directions
     x = normals[0, hit]
     y = normals[1, hit]
     z = normals[2, hit]
-    neighbour_cosine = (
-        x * directions[0, neighbour] + y * directions[1, neighbour] + z * directions[2, neighbour]
+    neighbor_cosine = (
+        x * directions[0, neighbor] + y * directions[1, neighbor] + z * directions[2, neighbor]
     )
     hit_cosine = x * directions[0, hit] + y * directions[1, hit] + z * directions[2, hit]
-    ratio = 1 + neighbour_cosine / hit_cosine
+    ratio = 1 + neighbor_cosine / hit_cosine
     if ratio < 1e-9:  # and not if it is unknown
         ratio = 1e-9
     return 2 / (inverse_distance * ratio)
 
 
 @stage
-def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C901, PLR0914 - a compiled loop
+def continue_surfaces(begin, stop, marks, hits, gap_m, neighbors):  # noqa: C901, PLR0914 - a compiled loop
     """Clear `marks.starts_surface` at hits of a beam where the last hit's surface continues.
 
     The hits of the beam are rows `begin` to `stop` of `hits`, `PulseHits`, and of `marks`,
-    `SurfaceMarks`; only `solid` hits are considered. Two neighbouring sub-rays hit one surface if
+    `SurfaceMarks`; only `solid` hits are considered. Two neighboring sub-rays hit one surface if
     the planes through the two hits meet half-way between the hits, within `gap_m` or half of the
     distance between the hits. The inverse range of a plane is linear in the ray's direction, so two
     hits on one plane always meet, whatever the angle; half of the distance allows for rough ground.
 
     A sub-ray may have several hits, each behind the panes of glass that it hit before: the hits of
-    neighbouring sub-rays behind the same number of panes are compared.
+    neighboring sub-rays behind the same number of panes are compared.
 
     A beam of four sub-rays, with the pairs (0, 1), (1, 2) and (2, 3), has five hits. Sub-rays 0, 1
     and 2 graze the ground, sub-ray 3 meets a post, and sub-ray 0 meets a raindrop on its way:
@@ -136,7 +136,7 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
     ==============================================  ======  ======  ======  ======  ======
     hit k                                           0 drop  1       2 post  3       4
     ==============================================  ======  ======  ======  ======  ======
-    `distance`, metres                              8.0     10.0    10.6    11.0    12.2
+    `distance`, meters                              8.0     10.0    10.6    11.0    12.2
     `subray`                                        0       0       3       1       2
     `solid`                                         no      yes     yes     yes     yes
     `starts_return`, by a gap of 0.3 m              yes     yes     yes     yes     yes
@@ -150,7 +150,7 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
     The element of `changes` behind the last hit is -1 in the end. Pair (2, 3), ground and post, is
     not on one surface. There are two returns, of the drop, and of the ground with the post.
     """
-    subrays = neighbours.subrays
+    subrays = neighbors.subrays
     solid = marks.solid
     starts_return = marks.starts_return
     starts_surface = marks.starts_surface
@@ -179,19 +179,17 @@ def continue_surfaces(begin, stop, marks, hits, gap_m, neighbours):  # noqa: C90
             first_hit = k
         row[k, 1] = first_hit
     for pane in range(panes):
-        for pair in range(len(neighbours.pairs)):
-            hit = subray_hits[pane * subrays + neighbours.pairs[pair, 0]]
-            neighbour = subray_hits[pane * subrays + neighbours.pairs[pair, 1]]
-            if hit < 0 or neighbour < 0 or row[hit, 1] == row[neighbour, 1]:
+        for pair in range(len(neighbors.pairs)):
+            hit = subray_hits[pane * subrays + neighbors.pairs[pair, 0]]
+            neighbor = subray_hits[pane * subrays + neighbors.pairs[pair, 1]]
+            if hit < 0 or neighbor < 0 or row[hit, 1] == row[neighbor, 1]:
                 continue
-            hit_m = _half_way(row[hit, 0], row[neighbour, 0], 1 / distance[hit], neighbours)
-            neighbour_m = _half_way(
-                row[neighbour, 0], row[hit, 0], 1 / distance[neighbour], neighbours
-            )
-            between_m = abs(distance[hit] - distance[neighbour])
-            if abs(hit_m - neighbour_m) <= max(gap_m, SLOPE * between_m):
-                changes[min(hit, neighbour) + 1 - begin] += 1
-                changes[max(hit, neighbour) + 1 - begin] -= 1
+            hit_m = _half_way(row[hit, 0], row[neighbor, 0], 1 / distance[hit], neighbors)
+            neighbor_m = _half_way(row[neighbor, 0], row[hit, 0], 1 / distance[neighbor], neighbors)
+            between_m = abs(distance[hit] - distance[neighbor])
+            if abs(hit_m - neighbor_m) <= max(gap_m, SLOPE * between_m):
+                changes[min(hit, neighbor) + 1 - begin] += 1
+                changes[max(hit, neighbor) + 1 - begin] -= 1
     continuing = 0
     for k in range(begin, stop):
         continuing += changes[k - begin]

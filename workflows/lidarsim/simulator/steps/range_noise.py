@@ -51,9 +51,9 @@ def noisy_ranges(
     ray: Integers,
     number: Integers,
 ) -> Floats:
-    """Return the reported ranges of returns (n,), metres, at least 0.
+    """Return the reported ranges of returns (n,), meters, at least 0.
 
-    `distance` (n,) is in metres; `energy` (n,) is the energy, or the height of the return in a
+    `distance` (n,) is in meters; `energy` (n,) is the energy, or the height of the return in a
     waveform, and may be None if neither noise nor walk depends on it. `scan`, `ray` and `number`
     (n,) count scans, rays in the scan, and returns of the ray.
     """
@@ -69,7 +69,7 @@ def noisy_ranges(
 
 
 def range_walk(noise: Noise, energy: Floats) -> Floats:
-    """Return by how much returns (n,) appear nearer than a return at the threshold, metres.
+    """Return by how much returns (n,) appear nearer than a return at the threshold, meters.
 
     A Gaussian pulse that is `energy / threshold` times as high as a fixed threshold crosses the
     threshold √(2 ln(energy / threshold)) standard deviations before its maximum.

@@ -11,7 +11,7 @@ from ...sensor.optics import FWHM, LIGHT_M_NS
 from ..returns import PulseReturns, required
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
-_HALF_WIDTH_M_NS = LIGHT_M_NS / 4  # half of a pulse's width, in metres of range per ns of width
+_HALF_WIDTH_M_NS = LIGHT_M_NS / 4  # half of a pulse's width, in meters of range per ns of width
 
 
 class SaturationStep(PulseStep):

@@ -17,9 +17,9 @@ class Pulses(NamedTuple):
     ray: Ints
     clipped: Bools  # whether the return fills the receiver
     height: Floats  # before clipping
-    front: Floats  # leading edge of the return, metres
-    back: Floats  # trailing edge of the return, metres
-    distance: Floats  # metres
+    front: Floats  # leading edge of the return, meters
+    back: Floats  # trailing edge of the return, meters
+    distance: Floats  # meters
     energy: Floats
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from ...base.arrays import Bools, owned
 from ...base.random_numbers import quantiles, starts
-from ...scene.colours import GREY, packed
-from ...sensor.disc import neighbours
+from ...scene.colors import GRAY, packed
+from ...sensor.disc import neighbors
 from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ...sensor.optics import Mode
 from ..returns import (
@@ -27,7 +27,7 @@ from .detection import DETECTION, LOSS
 from .step import PulseBatch, PulseStep, Role, Setup
 
 if TYPE_CHECKING:
-    from .pulse_loops import Neighbours
+    from .pulse_loops import Neighbors
     from .random_loops import RandomKeys
     from .separation_loops import Receiver, ReturnArrays, SubrayHits
 
@@ -57,9 +57,9 @@ def separated(
 
     A beam's hits within `gap_m` of the next hit are a single return.
 
-    So are hits of neighbouring sub-rays on one surface, however far apart the hits are: a beam that
+    So are hits of neighboring sub-rays on one surface, however far apart the hits are: a beam that
     grazes a road illuminates all of the road between the hits. The energy of a return is the sum
-    over the hits, the distance and velocity are means weighted by energy, the triangle and colour
+    over the hits, the distance and velocity are means weighted by energy, the triangle and color
     come from the strongest hit. Hits without energy are dropped.
 
     Parameters
@@ -67,7 +67,7 @@ def separated(
     hits
         Hits of sub-rays on surfaces, in the order of sub-rays.
     gap_m
-        Half of the pulse's length, metres.
+        Half of the pulse's length, meters.
     subrays
         Sub-rays of a beam.
     planes
@@ -97,7 +97,7 @@ def separated(
     count = separation_loops.separate(
         _subray_hits(hits, hits.triangle != NO_SURFACE, with_velocity=with_velocity),
         _subray_hits(air_hits, np.zeros(0, np.bool_), with_velocity=with_velocity),
-        neighbours_of(subrays, planes),
+        neighbors_of(subrays, planes),
         _receiver(subrays, gap_m, reporting, with_velocity=with_velocity),
         _detection_keys(reporting),
         output,
@@ -149,9 +149,9 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
     """Return the columns of returns by their strongest hits, on surfaces or in the air."""
     row = output.row
     if len(hits.ray):
-        columns = hits.triangle, hits.colour, hits.cause
-        triangle, colour, cause = selected(columns, np.maximum(row, 0))
-        returns = PulseReturns(output.beam, output.distance, triangle, output.energy, colour, cause)
+        columns = hits.triangle, hits.color, hits.cause
+        triangle, color, cause = selected(columns, np.maximum(row, 0))
+        returns = PulseReturns(output.beam, output.distance, triangle, output.energy, color, cause)
     else:
         returns = returns_without_surface(
             hits, output.beam, output.distance, output.energy, SURFACE
@@ -162,8 +162,8 @@ def _columns(hits: PulseReturns, air_hits: PulseReturns, output: ReturnArrays) -
     cause = np.full(len(row), SURFACE, np.uint8) if returns.cause is None else returns.cause
     cause[from_air] = required(air_hits.cause)[-1 - row[from_air]]
     returns.triangle[from_air] = NO_SURFACE
-    if returns.colour is not None:
-        returns.colour[from_air] = packed(GREY[0])[0]
+    if returns.color is not None:
+        returns.color[from_air] = packed(GRAY[0])[0]
     return returns._replace(cause=cause)
 
 
@@ -184,19 +184,19 @@ def _subray_hits(hits: PulseReturns, solid: Bools, *, with_velocity: bool) -> Su
     )
 
 
-def neighbours_of(subrays: int, planes: Planes | None) -> Neighbours:
-    """Return neighbouring sub-rays and planes for loops.
+def neighbors_of(subrays: int, planes: Planes | None) -> Neighbors:
+    """Return neighboring sub-rays and planes for loops.
 
     Without planes no surface continues.
     """
-    from .pulse_loops import Neighbours
+    from .pulse_loops import Neighbors
 
     if planes is None or subrays == 1:
         no_planes = np.zeros((3, 0))
-        return Neighbours(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
+        return Neighbors(subrays, np.zeros((0, 2), np.int64), no_planes, no_planes)
     normals, directions = planes
-    pairs = owned(neighbours(subrays), np.int64)
-    return Neighbours(subrays, pairs, owned(normals.T), owned(directions.T))
+    pairs = owned(neighbors(subrays), np.int64)
+    return Neighbors(subrays, pairs, owned(normals.T), owned(directions.T))
 
 
 class SeparationStep(PulseStep):

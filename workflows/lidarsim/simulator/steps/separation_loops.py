@@ -23,7 +23,7 @@ class SubrayHits(NamedTuple):
     """Hits in the order of sub-rays: (n,) each."""
 
     ray: Ints  # sub-ray
-    distance: Floats  # metres
+    distance: Floats  # meters
     energy: Floats  # energy as if all of the beam were in the hit's sub-ray
     velocity: Floats  # radial, m/s; empty if returns have none
     solid: Bools  # False for hits of no surface; empty for the table of hits in the air
@@ -60,7 +60,7 @@ class ReturnArrays(NamedTuple):
 
     beam: Ints  # number of the ray of the scans, from 0 at sub-ray 0
     row: Ints  # row of the strongest hit; of hits in the air -1, -2, …
-    distance: Floats  # metres
+    distance: Floats  # meters
     energy: Floats  # energy of the whole beam
     velocity: Floats  # radial, m/s
 
@@ -204,7 +204,7 @@ def _collect_hits(hits, air, beam_rows, scratch):
     """Write the hits of a beam that have energy to `scratch`, in the order of sub-rays.
 
     Hits in the air come first in a sub-ray. Returns the number of hits, and the distance between
-    the nearest and the farthest hit, metres.
+    the nearest and the farthest hit, meters.
     """
     row = scratch.hits.row
     distance = scratch.hits.distance
@@ -251,7 +251,7 @@ def _sort_by_distance(pulse_hits, count):
 
 
 @inlined
-def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbours, scratch):
+def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbors, scratch):
     """Mark the hits in `scratch` at which returns start, and write the columns of the hits.
 
     `count` is the number of hits. `exceeds_gap` is False if no hit of the beam is farther from
@@ -290,8 +290,8 @@ def _mark_returns(hits, air, count, exceeds_gap, receiver, neighbours, scratch):
         if solid[k]:  # surfaces can only continue if they are in several returns
             several |= surface_number >= 0 and surface_number != number
             surface_number = number
-    if several and len(neighbours.pairs):
-        continue_surfaces(0, count, scratch.marks, scratch.hits, receiver.gap_m, neighbours)
+    if several and len(neighbors.pairs):
+        continue_surfaces(0, count, scratch.marks, scratch.hits, receiver.gap_m, neighbors)
 
 
 @inlined
@@ -447,10 +447,10 @@ def mark_reported(ray, energy, mode, shown):
 
 
 @compiled()
-def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
+def separate(hits, air, neighbors, receiver, keys, output):  # noqa: PLR0914, PLR0915 - a compiled loop
     """Write the returns of beams to `output`, `ReturnArrays`, for `separation.separated`.
 
-    `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbours` are `Neighbours`,
+    `hits` on surfaces and hits in the `air` are `SubrayHits`; `neighbors` are `Neighbors`,
     `receiver` is a `Receiver`, and `keys` are `RandomKeys`, with starts if returns are lost. Beams
     are numbered from 0 at sub-ray 0; beam 0 is beam `keys.first` of the scans in `keys`.
     Returns the number of returns.
@@ -498,7 +498,7 @@ def separate(hits, air, neighbours, receiver, keys, output):  # noqa: PLR0914, P
                 count=collected,
                 exceeds_gap=exceeds_gap,
                 receiver=receiver,
-                neighbours=neighbours,
+                neighbors=neighbors,
                 scratch=scratch,
             )
             count = _write_returns(collected, beam, receiver, scratch, count, output)

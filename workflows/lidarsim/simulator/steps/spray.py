@@ -82,7 +82,7 @@ class SprayStep(PulseStep):
             air, clump_kind, FAINTEST * noise.threshold, *range_limits_m
         )
         self._materials = surfaces.at_wavelength(sensor.optics.wavelength_nm)
-        # (actors, 2, 3), actor frame, metres: lowest corner of the box around a mesh, and halves of
+        # (actors, 2, 3), actor frame, meters: lowest corner of the box around a mesh, and halves of
         # the box's sides.
         meshes = [actor.mesh.vertices for actor in setup.scene.actors]
         self._mesh_boxes = np.array(
@@ -160,13 +160,13 @@ class SprayStep(PulseStep):
     def _crossings(self, batch: PulseBatch, reach_m: Floats) -> Crossings:
         """Return where the central rays of beams cross boxes.
 
-        `reach_m` (beams,) is the range at which each beam ends, metres. The crossings of a beam are
+        `reach_m` (beams,) is the range at which each beam ends, meters. The crossings of a beam are
         consecutive, in the order of vehicles, then of the times at which vehicles leave boxes.
         """
         from . import spray_loops
 
         assert self._clump_distribution is not None
-        # Cells of consecutive rays are narrow if neighbours along a ring are consecutive.
+        # Cells of consecutive rays are narrow if neighbors along a ring are consecutive.
         ring_order = along_rings(np.arange(batch.stop - batch.start), self.setup.sensor.channels)
         times = batch.subray_poses.times(ring_order * batch.subrays_per_beam)
         spray_boxes = self._boxes(batch.subray_poses.actor_trajectories, times.min(), times.max())
@@ -221,7 +221,7 @@ class SprayStep(PulseStep):
     ) -> tuple[Floats, Floats]:
         """Return the boxes that actors leave at `created_ns` (b,), and the actors' speeds, m/s.
 
-        Boxes (b, 12) are middles, and halves of their sides as vectors, in the scene frame, metres.
+        Boxes (b, 12) are middles, and halves of their sides as vectors, in the scene frame, meters.
         A box starts at the rear of the actor, and is as long along the actor's x axis, forward, as
         the actor drives in `BOX_NS`. The actor drives straight on from `pose_ns` to `created_ns`.
         """

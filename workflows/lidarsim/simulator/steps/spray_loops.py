@@ -31,7 +31,7 @@ class CellPairs(NamedTuple):
 class SprayBoxes(NamedTuple):
     """Boxes of spray."""
 
-    boxes: Floats  # (b, 12): middles, and halves of their sides as vectors, scene frame, metres
+    boxes: Floats  # (b, 12): middles, and halves of their sides as vectors, scene frame, meters
     # (b, 2): first and last time of each box; the last is `lasts_ns` after the box is left behind.
     presence_ns: Floats
     # (b,): when the box is left behind, as a multiple of `Survey.spray_g_m3`.
@@ -44,7 +44,7 @@ class Crossings(NamedTuple):
     """Crossings of beams and boxes, with the crossings of a beam in sequence."""
 
     beam: Ints  # (k,): number of the beam in the batch
-    # (3, k): ranges at which the beam enters and leaves the box, metres, and the density of the box
+    # (3, k): ranges at which the beam enters and leaves the box, meters, and the density of the box
     # at that time, as a multiple of `Survey.spray_g_m3`.
     spans: Floats
 
@@ -60,7 +60,7 @@ class ClumpTables(NamedTuple):
 
 @stage
 def _ball_radii(boxes):
-    """Return the radii of balls around boxes (b, 12): (b,), metres."""
+    """Return the radii of balls around boxes (b, 12): (b,), meters."""
     radii = np.zeros(len(boxes))
     for b in range(len(boxes)):
         for side in range(3, 12):
@@ -71,7 +71,7 @@ def _ball_radii(boxes):
 
 @inlined
 def _span_in_box(boxes, b, to_middle, direction, reach_m):  # noqa: PLR0914 - a compiled loop
-    """Return where a ray enters and leaves a box, metres, in this order if the ray meets the box.
+    """Return where a ray enters and leaves a box, meters, in this order if the ray meets the box.
 
     `to_middle` is the vector from the ray's start to the middle of the box.
     """
@@ -114,7 +114,7 @@ def _write_crossing(k, b, time, span, spray_boxes, crossings, count):
 
 @compiled()
 def find_crossings(rays, times, reach, pairs, spray_boxes, crossings):  # noqa: PLR0914 - a compiled loop
-    """Write where rays (6, n), to `reach` (n,), metres, cross boxes, and return the number.
+    """Write where rays (6, n), to `reach` (n,), meters, cross boxes, and return the number.
 
     Rows of rays are origins and directions, `times` (n,) are in ns; `pairs` are `CellPairs`, and
     `spray_boxes` `SprayBoxes`. As many crossings are written as `crossings` has room for; all are
@@ -163,7 +163,7 @@ def _column(ranges, guide, part_m, distance):
 
     numba's search takes long to compile.
 
-    `ranges` are the ranges of the columns, metres, ascending. The search starts at the column of
+    `ranges` are the ranges of the columns, meters, ascending. The search starts at the column of
     `guide` for the distance (`_guide`); a part of the guide is `part_m` long.
     """
     column = guide[np.int64(min(distance / part_m, _GUIDE_PARTS))]
@@ -190,7 +190,7 @@ def sample_clumps(k, crossings, subrays, tables, keys, reach, hits):  # noqa: PL
     """Sample the clumps of spray that beams meet, from crossing `k` on, while `hits` has room.
 
     `tables` are `ClumpTables`, `keys` `RandomKeys`, and `reach` (beams * subrays,) is the range
-    that the light of each sub-ray reaches, metres. The depth between two clumps, as the mean number
+    that the light of each sub-ray reaches, meters. The depth between two clumps, as the mean number
     of clumps in it, is exponential. Writes `SampledHits`; returns the first crossing that is not
     sampled yet, and the number of hits.
     """
@@ -254,7 +254,7 @@ def attenuate(crossings, subrays, extinction, reach, hits):
     """Multiply the energies of `SampledHits` of surfaces by the transmission of spray, both ways.
 
     `extinction` is the extinction of spray of density 1, 1/m; `reach` (beams * subrays,) is the
-    range that the light of each sub-ray reaches, metres.
+    range that the light of each sub-ray reaches, meters.
     """
     beam = crossings.beam
     spans = crossings.spans

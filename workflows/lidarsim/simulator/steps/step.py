@@ -72,7 +72,7 @@ class Setup:
 
     @property
     def half_pulse_m(self) -> float:
-        """Half of the pulse's length in space, metres: the smallest gap between two returns."""
+        """Half of the pulse's length in space, meters: the smallest gap between two returns."""
         return self.reporting.min_gap_m(self.sensor.optics)
 
     @property
@@ -284,7 +284,7 @@ class PulseBatch:
 
     @cached_property
     def central_rays(self) -> tuple[Floats, Floats]:
-        """Origins (n, 3), metres, and directions (n, 3) of the first sub-ray of each beam.
+        """Origins (n, 3), meters, and directions (n, 3) of the first sub-ray of each beam.
 
         The first sub-ray is in the middle of the beam. In the scene frame.
         """

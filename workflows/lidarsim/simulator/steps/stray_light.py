@@ -136,7 +136,7 @@ class StrayLightStep(PulseStep):
         return RetroTriangles(cluster.corners, *cluster.bounds, back)
 
     def _has_return(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
-        """Return whether beams `ray` (n,) have a return near distances (n,), metres: (n,).
+        """Return whether beams `ray` (n,) have a return near distances (n,), meters: (n,).
 
         Near is within half of the pulse's length: the receiver cannot tell such returns apart.
         """
@@ -166,8 +166,8 @@ class _Bounds(NamedTuple):
     """Bounds of triangles."""
 
     middles: Floats  # (k, 3)
-    centre: Floats  # (3,): of a ball around the triangles
-    radius: float  # radius of the ball, metres
+    center: Floats  # (3,): of a ball around the triangles
+    radius: float  # radius of the ball, meters
 
 
 @dataclass(frozen=True)
@@ -182,9 +182,9 @@ class _RetroCluster:
     def bounds(self) -> _Bounds:
         """Middles of the triangles, and a ball around the triangles."""
         a, b, c = self.corners.transpose(1, 0, 2)
-        centre = self.corners.reshape(-1, 3).mean(axis=0)
-        radius = float(length(self.corners.reshape(-1, 3) - centre).max())
-        return _Bounds(((a + b) + c) / 3, centre, radius)
+        center = self.corners.reshape(-1, 3).mean(axis=0)
+        radius = float(length(self.corners.reshape(-1, 3) - center).max())
+        return _Bounds(((a + b) + c) / 3, center, radius)
 
 
 def _retro_clusters(

@@ -29,7 +29,7 @@ class RayCells(NamedTuple):
 
     origins: Floats  # (3, n)
     directions: Floats  # (3, n)
-    # (c, 5): axis, half angle, radians, and largest distance of an origin from the first, metres.
+    # (c, 5): axis, half angle, radians, and largest distance of an origin from the first, meters.
     cones: Floats
 
 
@@ -38,8 +38,8 @@ class RetroTriangles(NamedTuple):
 
     corners: Floats  # (t, 3, 3)
     middles: Floats  # (t, 3)
-    centre: Floats  # (3,): of a ball around the triangles
-    radius: float  # radius of the ball, metres
+    center: Floats  # (3,): of a ball around the triangles
+    radius: float  # radius of the ball, meters
     # (t,): energy that a beam head-on at 10 m returns, relative to a white surface.
     back: Floats
 
@@ -57,7 +57,7 @@ class StrayLight(NamedTuple):
     """Strongest stray light of rays, written by loops."""
 
     energy: Floats  # (n,)
-    # (n, 3), metres: from the ray's origin to where the light comes from, in the axes of the rays
+    # (n, 3), meters: from the ray's origin to where the light comes from, in the axes of the rays
     # and triangles that a loop was given.
     points: Floats
     new: Bools  # (n,): set where a loop has written light
@@ -84,7 +84,7 @@ class LitSpots(NamedTuple):
     """Spots on surfaces, lit by pulses of foreign sensors, in the scene frame."""
 
     time_ns: Floats  # (s,): when the pulse lights the spot
-    positions: Floats  # (s, 3), metres
+    positions: Floats  # (s, 3), meters
 
 
 class ReceptionLimits(NamedTuple):
@@ -100,8 +100,8 @@ class ReceivedSpots(NamedTuple):
 
     row: Ints  # row of the ray, in `ReceivingRays`
     spot: Ints  # row of `LitSpots`
-    distance: Floats  # at which the spot seems to be, metres
-    range_m: Floats  # at which the spot is, metres
+    distance: Floats  # at which the spot seems to be, meters
+    range_m: Floats  # at which the spot is, meters
 
     def first(self, count: int) -> ReceivedSpots:
         """Return views of the first `count` rows, which a loop has written."""
@@ -196,15 +196,15 @@ def _nearest_point(corners, t, ray):  # noqa: PLR0914 - a compiled loop
 def _reach_of_cell(rays, c, triangles, limits):
     """Return whether cell `c` of rays may receive light of triangles, and a cosine.
 
-    The cosine belongs to the largest angle between a ray of the cell and the centre of the
+    The cosine belongs to the largest angle between a ray of the cell and the center of the
     triangles at which the ray may receive light: beyond, the light of the nearest triangle is too
     faint. All triangles are taken to return as much light as the first.
     """
     cones = rays.cones
     first = c * CELL_RAYS
-    x = triangles.centre[0] - rays.origins[0, first]
-    y = triangles.centre[1] - rays.origins[1, first]
-    z = triangles.centre[2] - rays.origins[2, first]
+    x = triangles.center[0] - rays.origins[0, first]
+    y = triangles.center[1] - rays.origins[1, first]
+    z = triangles.center[2] - rays.origins[2, first]
     size = triangles.radius + cones[c, 4]
     distance = math.sqrt((x * x + y * y) + z * z)
     half_angle = math.pi
@@ -281,7 +281,7 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
     that is nearest to a ray by angle. `chosen` is scratch memory: of the triangles, those nearest
     to a ray are compared, as many as `chosen` has elements.
     """
-    centre = triangles.centre
+    center = triangles.center
     origins = rays.origins
     directions = rays.directions
     count = origins.shape[1]
@@ -296,9 +296,9 @@ def find_stray_light(rays, triangles, limits, chosen, strongest):  # noqa: PLR09
             dx = directions[0, k]
             dy = directions[1, k]
             dz = directions[2, k]
-            x = centre[0] - ox
-            y = centre[1] - oy
-            z = centre[2] - oz
+            x = center[0] - ox
+            y = center[1] - oy
+            z = center[2] - oz
             if (x * dx + y * dy) + z * dz < cosine * math.sqrt((x * x + y * y) + z * z):
                 continue
             ray = (ox, oy, oz, dx, dy, dz)

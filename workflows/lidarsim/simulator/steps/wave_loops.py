@@ -19,7 +19,7 @@ from .pulse_loops import PulseHits, SurfaceMarks, continue_surfaces
 # In standard deviations of the system waveform:
 # hits within this distance are one Gaussian in closed form, whose position and height err by 1e-3
 NARROW = 0.25
-# two neighbouring hits whose planes meet within this distance are on one surface
+# two neighboring hits whose planes meet within this distance are on one surface
 # (`continue_surfaces`)
 MEET = 1.0
 # Gaussians that are farther apart are fitted separately
@@ -91,7 +91,7 @@ class WaveReturnArrays(NamedTuple):
 
     beam: Ints  # number of the beam in the batch
     row: Ints  # row of the strongest hit, in the table of hits before sorting
-    distance: Floats  # metres
+    distance: Floats  # meters
     energy: Floats
     velocity: Floats  # radial, m/s
     width: Floats  # multiple of the width of the system waveform
@@ -570,7 +570,7 @@ def _has_several_surfaces(starts_surface, first, end):
 
 
 @compiled()
-def divide_into_waveforms(hits, sigma_m, neighbours, hit_ranges):
+def divide_into_waveforms(hits, sigma_m, neighbors, hit_ranges):
     """Mark where waveforms start, write the waveforms to search, and return their number.
 
     A waveform starts at the first hit of a beam, and at each hit whose Gaussian does not overlap
@@ -578,8 +578,8 @@ def divide_into_waveforms(hits, sigma_m, neighbours, hit_ranges):
     `NARROW` standard deviations, and not on one surface.
 
     `hits` are `WaveHits`, whose marks `starts`, `starts_surface` and `searched` are written.
-    `sigma_m` is the standard deviation of the system waveform in range, metres, and `neighbours`
-    are `pulse_loops.Neighbours`. `hit_ranges` (k, 2) receives the first hit, and the hit after the
+    `sigma_m` is the standard deviation of the system waveform in range, meters, and `neighbors`
+    are `pulse_loops.Neighbors`. `hit_ranges` (k, 2) receives the first hit, and the hit after the
     last, of each waveform to search.
     """
     beam = hits.beam
@@ -608,8 +608,8 @@ def divide_into_waveforms(hits, sigma_m, neighbours, hit_ranges):
                 for hit in range(first, k):
                     searched[hit] = hits.marks.solid[hit]
             first = k
-        if count > first_waveform and len(neighbours.pairs):
-            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
+        if count > first_waveform and len(neighbors.pairs):
+            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbors)
         stop_waveform = count
         count = first_waveform
         for waveform in range(first_waveform, stop_waveform):
@@ -698,10 +698,10 @@ def search_waveforms(light, hit_ranges, sampling, starts, peaks, scratch):
 
 
 @compiled()
-def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
+def make_returns(hits, sigma_m, samples_per_m, neighbors, peaks, output):  # noqa: C901, PLR0914, PLR0915 - a compiled loop
     """Write the returns of the waveforms of beams to `output`, for `waveform.returns_in`.
 
-    `hits` are `WaveHits`, `peaks` `WavePeaks`, `neighbours` `pulse_loops.Neighbours`, and `output`
+    `hits` are `WaveHits`, `peaks` `WavePeaks`, `neighbors` `pulse_loops.Neighbors`, and `output`
     is a `WaveReturnArrays`; `sigma_m` is the standard deviation of the system waveform in range. A
     return starts at each mark `starts`, unless the hit continues a surface: such marks are cleared.
     Hits of a return are one Gaussian with their mean and variance. Returns the number of returns.
@@ -722,8 +722,8 @@ def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # no
         has_several_returns = False
         for k in range(begin + 1, end):
             has_several_returns |= starts[k]
-        if has_several_returns and len(neighbours.pairs):
-            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbours)
+        if has_several_returns and len(neighbors.pairs):
+            continue_surfaces(begin, end, surface_marks, hits.pulses, MEET * sigma_m, neighbors)
         for k in range(begin + 1, end + 1):
             if k < end and not starts[k]:
                 continue
@@ -746,7 +746,7 @@ def make_returns(hits, sigma_m, samples_per_m, neighbours, peaks, output):  # no
             output.beam[count] = beam[begin]
             output.row[count] = hits.pulses.row[best, 0]
             output.distance[count] = mean_m
-            output.energy[count] = sum_energy / neighbours.subrays
+            output.energy[count] = sum_energy / neighbors.subrays
             output.velocity[count] = sum_velocity / sum_energy
             output.width[count] = math.sqrt(1 + spread / sum_energy)
             # A peak whose hits are all in the return replaces the Gaussian of the hits.

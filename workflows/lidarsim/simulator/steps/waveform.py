@@ -17,7 +17,7 @@ import numpy as np
 from ...base.arrays import Floats, Ints, owned
 from ...sensor.optics import CUT, FWHM, LIGHT_M_NS
 from ..returns import NO_SURFACE, RETURN_COLUMNS, Planes, PulseReturns, required
-from .separation import neighbours_of
+from .separation import neighbors_of
 from .step import PulseBatch, PulseStep, Role, Setup
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class Digitizer:
 
     @property
     def sigma_m(self) -> float:
-        """Standard deviation of the system waveform in range, metres."""
+        """Standard deviation of the system waveform in range, meters."""
         return self.sigma_ns * LIGHT_M_NS / 2
 
     @property
@@ -76,7 +76,7 @@ class Digitizer:
 
     @property
     def samples_per_m(self) -> float:
-        """Samples in a metre of range."""
+        """Samples in a meter of range."""
         return 2 / LIGHT_M_NS / self.sample_ns
 
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
@@ -96,7 +96,7 @@ def returns_in(
 
     Hits that lie close together, or on one surface (`pulse_loops.continue_surfaces`), are one
     Gaussian with their mean and variance. Other waveforms are sampled and searched. The triangle
-    and colour of a return come from its strongest hit.
+    and color of a return come from its strongest hit.
 
     Parameters
     ----------
@@ -117,10 +117,10 @@ def returns_in(
 
     wave_hits = _wave_hits(hits, subrays)
     count = len(wave_hits.beam)
-    neighbours = neighbours_of(subrays, planes)
+    neighbors = neighbors_of(subrays, planes)
     hit_ranges = np.empty((count, 2), np.int64)
     range_count = wave_loops.divide_into_waveforms(
-        wave_hits, digitizer.sigma_m, neighbours, hit_ranges
+        wave_hits, digitizer.sigma_m, neighbors, hit_ranges
     )
     hit_ranges = hit_ranges[:range_count]
     peaks = _search(wave_hits, digitizer, subrays, hit_ranges)
@@ -133,7 +133,7 @@ def returns_in(
         width=np.empty(count),
     )
     count = wave_loops.make_returns(
-        wave_hits, digitizer.sigma_m, digitizer.samples_per_m, neighbours, peaks, output
+        wave_hits, digitizer.sigma_m, digitizer.samples_per_m, neighbors, peaks, output
     )
     output = output.first(count)
     width = output.width * (FWHM * digitizer.sigma_ns)

@@ -74,7 +74,7 @@ class RecordingStep(PulseStep):
         for start in range(0, len(windows.beam), size):
             block = windows.take(slice(start, start + size))
             samples = _signal_samples(batch, digitizer, block, count)
-            steps, exponents = digitised(self._received(samples, block, batch))
+            steps, exponents = digitized(self._received(samples, block, batch))
             first, stop = np.searchsorted(window_of_return, [start, start + size])
             window_indices = window_of_return[first:stop] - start
             records["samples"][first:stop] = steps[window_indices]
@@ -97,7 +97,7 @@ class RecordingStep(PulseStep):
 def _window_starts(distance: Floats, return_number: Ints, digitizer: Digitizer, count: int) -> Ints:
     """Return the first sample of the window of each return (n,), in samples after firing.
 
-    `distance` (n,) is in metres, `return_number` (n,) counts the returns of each pulse from 0;
+    `distance` (n,) is in meters, `return_number` (n,) counts the returns of each pulse from 0;
     windows have `count` samples. Returns that share a window have the same first sample.
     """
     time = distance * digitizer.samples_per_m
@@ -149,7 +149,7 @@ def _signal_samples(
     return samples.reshape(len(hit_counts), count).astype(np.float64)
 
 
-def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
+def digitized(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
     """Round samples (n, k) to integers around `ZERO`, in steps of a power of two for each row.
 
     Returns the integers, uint16 (n, k), and the exponents of the steps (n,).

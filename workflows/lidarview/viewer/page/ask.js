@@ -75,7 +75,7 @@ function column(cloud, name) {
   return values;
 }
 
-// A function that writes the colour of a row to an array, 4 bytes each.
+// A function that writes the color of a row to an array, 4 bytes each.
 function painter(cloud, name, limits) {
   const legend = cloud.legends[name], { arrays } = cloud, of = (part) => column(cloud, part);
   if (name === "rgb" && !cloud.packed.rgb) {
@@ -88,8 +88,8 @@ function painter(cloud, name, limits) {
   }
   const values = of(name), start = "xyz".includes(name) ? cloud.origin["xyz".indexOf(name)] : 0;
   if (!legend.limits) {
-    const palette = new Map(Array.from(arrays[`${name} labels`], (value, k) => [value, 3 * k])), colours = arrays[`${name} palette`];
-    return (row, to, at) => { const k = palette.get(values[row]); for (let part = 0; part < 3; part++) to[at + part] = colours[k + part]; };
+    const palette = new Map(Array.from(arrays[`${name} labels`], (value, k) => [value, 3 * k])), colors = arrays[`${name} palette`];
+    return (row, to, at) => { const k = palette.get(values[row]); for (let part = 0; part < 3; part++) to[at + part] = colors[k + part]; };
   }
   const scale = arrays[`${name} scale`], logarithmic = legend.logarithmic && !(limits && limits[0] <= 0), as = logarithmic ? Math.log : (value) => value;
   const [low, high] = (limits ?? legend.limits).map(as), least = (limits ?? legend.limits)[0];
@@ -123,19 +123,19 @@ function chosenRows(cloud, filter, scans) {
   return rows.subarray(0, found);
 }
 
-async function pointsOf({ colour, filter = "", scans, most, limits }) {
+async function pointsOf({ color, filter = "", scans, most, limits }) {
   const cloud = await held("cloud?"), all = chosenRows(cloud, filter, scans);
   const step = Math.max(1, Math.ceil(all.length / most)), rows = step === 1 ? all.slice() : all.filter((_, k) => k % step === 0);
-  const positions = new Float32Array(3 * rows.length), colours = new Uint8Array(4 * rows.length).fill(255);
-  const axes = ["x", "y", "z"].map((axis) => column(cloud, axis)), ends = limits?.split(",").map(Number), paint = painter(cloud, colour, ends);
+  const positions = new Float32Array(3 * rows.length), colors = new Uint8Array(4 * rows.length).fill(255);
+  const axes = ["x", "y", "z"].map((axis) => column(cloud, axis)), ends = limits?.split(",").map(Number), paint = painter(cloud, color, ends);
   rows.forEach((row, k) => {
     for (let axis = 0; axis < 3; axis++) positions[3 * k + axis] = axes[axis][row];
-    paint(row, colours, 4 * k);
+    paint(row, colors, 4 * k);
   });
-  return { count: all.length, legend: legendWith(cloud.legends[colour], ends), arrays: { positions, colours, rows } };
+  return { count: all.length, legend: legendWith(cloud.legends[color], ends), arrays: { positions, colors, rows } };
 }
 
-// The legend of a colour scale whose limits were set by hand.
+// The legend of a color scale whose limits were set by hand.
 function legendWith(legend, limits) {
   if (!limits || !legend.limits) return legend;
   const [low, high] = limits, middle = legend.logarithmic && low > 0 ? Math.sqrt(low * high) : (low + high) / 2;

@@ -153,20 +153,20 @@ export function legend(told, only, act, names = {}, hidden = new Set(), change =
   const box = element("div", { className: "legend" });
   if (!told) return box;
   if (!told.labels) {
-    const stops = told.colours.map((colour) => `rgb(${colour})`).join(",");
+    const stops = told.colors.map((color) => `rgb(${color})`).join(",");
     box.append(
       element("div", { textContent: told.title }),
-      ...(told.colours.length ? [element("div", { className: "bar", style: { background: `linear-gradient(to right,${stops})` } })] : []),
+      ...(told.colors.length ? [element("div", { className: "bar", style: { background: `linear-gradient(to right,${stops})` } })] : []),
       element("div", { className: "marks" }, ...told.marks.map((text) => element("span", { textContent: text }))),
     );
     return box;
   }
   const list = element("ul");
-  for (const [name, colour, value] of told.labels) {
+  for (const [name, color, value] of told.labels) {
     const shown = names[value] ?? (name || `${value}`);
     const press = element(
       "button", { type: "button", title: value === only ? "Show all" : `Show only ${shown}`, onclick: () => act(value) },
-      element("i", { style: { background: `rgb(${colour})` } }), element("span", { textContent: shown }),
+      element("i", { style: { background: `rgb(${color})` } }), element("span", { textContent: shown }),
     );
     press.setAttribute("aria-pressed", value === only);
     press.append(element("span", { className: "number", dataset: { value } }));

@@ -17,7 +17,7 @@ const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"
 const HIDDEN = "hidden";
 const OPEN = 3e38; // an end of a range that limits nothing; float32 holds it
 const READING = "Loading points …"; // until the first are there
-const FAINT = 0.2; // opacity of grey surfaces before points, so that these come first
+const FAINT = 0.2; // opacity of gray surfaces before points, so that these come first
 const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
 
 const $ = (id) => document.getElementById(id);
@@ -28,7 +28,7 @@ const theme = themeButton((chosenOne) => picture.setTheme(chosenOne));
 
 // What users have chosen; a link holds it.
 const chosen = {
-  colour: "z", scene: "grey", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: false,
+  color: "z", scene: "gray", filter: [], off: new Set(), show: "all", time: 0, speed: 1, loop: true, images: false,
   budget: 2e6, size: 1, shading: true, opacity: FAINT, boxes: true, clip: [[null, null], [null, null], [null, null]], rays: false, follow: false, tool: "point", limits: null, clipBox: false,
 };
 let state = null; // of the server: {…, arrays}
@@ -95,7 +95,7 @@ function rangesAt(time) {
 const filterText = () => chosen.filter.map(String).join(";");
 
 function questionAt(time) {
-  const asked = { colour: chosen.colour === HIDDEN ? "z" : chosen.colour };
+  const asked = { color: chosen.color === HIDDEN ? "z" : chosen.color };
   if (chosen.filter.length) asked.filter = filterText();
   if (chosen.limits) asked.limits = chosen.limits.join(",");
   const every = picture.sensors.every((sensor) => sensor.shown);
@@ -109,7 +109,7 @@ const keyOf = (asked) => JSON.stringify([asked, state.version, chosen.budget]);
 function refresh() {
   if (!state) return true;
   const asked = questionAt(chosen.time), key = keyOf(asked);
-  if (chosen.colour === HIDDEN) {
+  if (chosen.color === HIDDEN) {
     sayRead();
     for (const layer of ["base", "detail"]) picture.setPoints(layer, null);
     shownKey = null;
@@ -239,12 +239,12 @@ function showLegend(told) {
   if (text === legendText) return;
   legendText = text;
   const column = told?.column;
-  panel.legend.replaceChildren(labels([HIDDEN, "result"].includes(chosen.colour) ? null : told, column));
-  if (told?.limits && chosen.colour !== HIDDEN) panel.legend.append(limitInputs(told.limits));
+  panel.legend.replaceChildren(labels([HIDDEN, "result"].includes(chosen.color) ? null : told, column));
+  if (told?.limits && chosen.color !== HIDDEN) panel.legend.append(limitInputs(told.limits));
   if (told?.labels?.length && column !== "result") tellCounts(panel.legend, column).catch(failed);
 }
 
-// The ends of the colour scale, to be set by hand.
+// The ends of the color scale, to be set by hand.
 function limitInputs(limits) {
   const inputs = limits.map((value, end) => {
     const input = element("input", { type: "number", step: "any", value: +value.toPrecision(6) });
@@ -252,15 +252,15 @@ function limitInputs(limits) {
     input.onchange = () => {
       const ends = inputs.map((other) => other.valueAsNumber);
       if (!ends.every(Number.isFinite) || ends[0] >= ends[1]) return sayBriefly("The lower limit must be less than the upper limit.");
-      return setColourLimits(ends);
+      return setColorLimits(ends);
     };
     return input;
   });
-  const reset = chosen.limits ? [button("Auto", () => setColourLimits(null))] : [];
+  const reset = chosen.limits ? [button("Auto", () => setColorLimits(null))] : [];
   return element("div", { className: "limits" }, ...inputs, ...reset);
 }
 
-function setColourLimits(limits) {
+function setColorLimits(limits) {
   chosen.limits = limits;
   legendText = "";
   refresh();
@@ -294,12 +294,12 @@ function toggle(column, value) {
 function tellFacts() {
   if (!state || !panel.facts) return;
   const layers = Object.values(picture.layers).map((points) => points.told);
-  const some = layers[0]?.count ?? (chosen.colour === HIDDEN ? state.points : 0);
+  const some = layers[0]?.count ?? (chosen.color === HIDDEN ? state.points : 0);
   const count = state.sampled ? state.points : some; // of a run, some parts are read
   const drawn = Math.min(picture.drawn, count), n = (value) => value.toLocaleString("en");
   const parts = [`<b>${n(count)} ${count === 1 ? "point" : "points"}</b>`];
   if (count < state.points) parts.push(`of ${n(state.points)}`);
-  if (drawn < count && chosen.colour !== HIDDEN) parts.push(`· ${n(drawn)} drawn`);
+  if (drawn < count && chosen.color !== HIDDEN) parts.push(`· ${n(drawn)} drawn`);
   panel.facts.innerHTML = parts.join(" ");
   if (requests.detail || requests.base || state.growing || (underWay.size && !playing)) panel.facts.append(" …");
 }
@@ -404,7 +404,7 @@ function buildPanel() {
   );
   panel.legend = element("div");
   const points = section("Points", true,
-    (panel.colour = menu("colour", [...state.colours, HIDDEN], chosen.colour, (value) => { chosen.colour = value; chosen.limits = null; legendText = ""; refresh(); if (value === HIDDEN) showLegend(null); })),
+    (panel.color = menu("color", [...state.colors, HIDDEN], chosen.color, (value) => { chosen.color = value; chosen.limits = null; legendText = ""; refresh(); if (value === HIDDEN) showLegend(null); })),
     panel.legend,
     slider("size", -1, 1, 0.05, Math.log10(chosen.size), (value) => `${(10 ** value).toFixed(1)}×`, (value) => {
       chosen.size = picture.pointScale = 10 ** value;
@@ -416,12 +416,12 @@ function buildPanel() {
   const parts = [head, panel.progress, ...(state.live ? [stop] : []), panel.facts];
   if (state.results.length) parts.push(section("Results", true, (panel.results = element("div"))));
   parts.push(points);
-  if (state.scene_colours) {
+  if (state.scene_colors) {
     panel.sceneLegend = element("div");
     parts.push(section("Scene", true,
-      menu("colour", [...state.scene_colours, HIDDEN], chosen.scene, (value) => {
+      menu("color", [...state.scene_colors, HIDDEN], chosen.scene, (value) => {
         chosen.scene = value;
-        panel.opacity.set(value === "grey" ? FAINT : 1); // a colour is to be seen
+        panel.opacity.set(value === "gray" ? FAINT : 1); // a color is to be seen
         loadSurface().catch(failed);
       }),
       panel.sceneLegend,
@@ -511,11 +511,11 @@ function setClip(limits) {
 }
 
 async function loadSurface() {
-  if (!state.scene_colours) return;
+  if (!state.scene_colors) return;
   const hidden = chosen.scene === HIDDEN;
   picture.actorsHidden = hidden;
-  picture.colourActors(chosen.scene);
-  const told = hidden ? null : await ask("surface", { colour: chosen.scene });
+  picture.colorActors(chosen.scene);
+  const told = hidden ? null : await ask("surface", { color: chosen.scene });
   if (hidden !== (chosen.scene === HIDDEN)) return;
   picture.setSurface(told);
   picture.showObjects(picture.onlyObjects, picture.hiddenObjects);
@@ -834,7 +834,7 @@ function play(seconds) {
     }
     time = 0;
   }
-  if (chosen.show !== "all" && chosen.colour !== HIDDEN) {
+  if (chosen.show !== "all" && chosen.color !== HIDDEN) {
     const next = lastNotAbove(steps, time + 1e-9);
     for (let k = 0; k <= AHEAD; k++) {
       const asked = questionAt(k ? steps[(next + k) % steps.length] : time);
@@ -896,7 +896,7 @@ function linkText() {
   const { position } = picture.camera, { target } = picture.controls;
   const three = (place) => place.toArray().map((value) => +value.toPrecision(7)).join(",");
   const words = {
-    camera: `${three(position)};${three(target)}`, colour: chosen.colour, scene: chosen.scene, show: chosen.show, opacity: chosen.opacity, time: chosen.time.toFixed(6),
+    camera: `${three(position)};${three(target)}`, color: chosen.color, scene: chosen.scene, show: chosen.show, opacity: chosen.opacity, time: chosen.time.toFixed(6),
     clip: chosen.clip.map((pair) => pair.map((value) => value ?? "").join(",")).join(";"), size: chosen.size.toFixed(3),
     images: chosen.images, follow: chosen.follow, rays: chosen.rays,
   };
@@ -939,11 +939,11 @@ function keepLink() {
 function readLink() {
   const words = new URLSearchParams(location.hash.slice(1));
   const columns = state.columns.map((column) => column.name), get = (name) => words.get(name) ?? "";
-  if ([...state.colours, HIDDEN].includes(get("colour"))) chosen.colour = get("colour");
-  if ([...(state.scene_colours ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
+  if ([...state.colors, HIDDEN].includes(get("color"))) chosen.color = get("color");
+  if ([...(state.scene_colors ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
   if (SHOWS.some(([value]) => `${value}` === get("show"))) { chosen.show = get("show"); clock.own = true; }
   if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
-  chosen.opacity = words.has("opacity") ? Math.min(1, Math.max(0, +get("opacity") || 0)) : chosen.scene === "grey" ? FAINT : 1;
+  chosen.opacity = words.has("opacity") ? Math.min(1, Math.max(0, +get("opacity") || 0)) : chosen.scene === "gray" ? FAINT : 1;
   chosen.time = Math.min(Math.max(+get("time") || 0, 0), state.duration);
   for (const name of ["images", "follow", "rays"]) if (words.has(name)) chosen[name] = get(name) === "true";
   picture.follow = chosen.follow;
@@ -1002,8 +1002,8 @@ function takeState(told) {
   }
   picture.setSensors(own);
   picture.setActors(state.actors.map((actor, k) => ({
-    label: [actor.name, state.classes[actor.class] ?? ""].filter(Boolean).join(" · "), object: state.statics + k, colour: state.actor_colours[k],
-    corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`], own: arrays[`mesh${arrays.actor_mesh[k]}_colours`],
+    label: [actor.name, state.classes[actor.class] ?? ""].filter(Boolean).join(" · "), object: state.statics + k, color: state.actor_colors[k],
+    corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`], own: arrays[`mesh${arrays.actor_mesh[k]}_colors`],
     times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
     there: arrays[`actor${k}_there`], frames: arrays[`actor${k}_frames`],
     poses: arrays[`mesh${arrays.actor_mesh[k]}_poses`], faces: arrays[`mesh${arrays.actor_mesh[k]}_faces`],
@@ -1213,10 +1213,10 @@ async function begin() {
   drives = !told.live && told.sensors.some((sensor) => sensor.moves);
   chosen.rays = Boolean(told.live); // they show how a run goes on, and hide the points of a result
   if (told.offline) chosen.budget = BUDGETS.at(-1); // all points are here
-  if (told.results.length) chosen.colour = "result";
+  if (told.results.length) chosen.color = "result";
   takeState(told);
   if (told.by_sweep) chosen.show = "sweep";
-  if (!told.points && told.scene) chosen.scene = ["colour", "object"].find((name) => told.scene.includes(name));
+  if (!told.points && told.scene) chosen.scene = ["color", "object"].find((name) => told.scene.includes(name));
   const words = readLink();
   picture.opacity = chosen.opacity;
   buildPanel();

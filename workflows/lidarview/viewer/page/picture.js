@@ -2,7 +2,7 @@
 import * as THREE from "./three.min.js";
 import { element, saveFile } from "./controls.js";
 
-THREE.ColorManagement.enabled = false; // colours are those of the legends
+THREE.ColorManagement.enabled = false; // colors are those of the legends
 
 const THEMES = {
   light: { back: 0xffffff, grid: 0xdfe3e8, surface: 0xd3d7dc, rays: 0xe88c96 },
@@ -20,10 +20,10 @@ const POINT_VERTEX = `
   uniform float size, pixels, least, most;
   uniform vec3 low, high;
   uniform bool flat_;
-  attribute vec4 colour;
+  attribute vec4 color;
   varying vec3 shade;
   void main() {
-    shade = colour.rgb;
+    shade = color.rgb;
     vec4 at = modelViewMatrix * vec4(position, 1.0);
     gl_Position = projectionMatrix * at;
     gl_PointSize = clamp(size * pixels / (flat_ ? 1.0 : max(-at.z, 1e-6)), least, most);
@@ -38,8 +38,8 @@ const POINT_FRAGMENT = `
     gl_FragColor = vec4(shade, ${AS_POINTS});
   }`;
 
-// Eye-dome lighting: Boucheny, "Visualisation scientifique de grands volumes de données" (2009).
-// A pixel is darker the more its neighbours lie before it. Surfaces are a picture of their own,
+// Eye-dome lighting: Boucheny, "Visualization scientifique de grands volumes de données" (2009).
+// A pixel is darker the more its neighbors lie before it. Surfaces are a picture of their own,
 // which is laid over: lightly where it is before something, so that walls do not hide the points.
 const SHADE_VERTEX = `
   varying vec2 at;
@@ -257,7 +257,7 @@ export class Picture {
     if (this.grid) this.grid.material.color.set(grid);
     if (this.rays) this.rays.material.color.set(rays);
     if (!this.surfaceMaterial.vertexColors) this.surfaceMaterial.color.set(surface);
-    for (const actor of this.actors) if (!actor.coloured) actor.mesh.material.color.set(surface);
+    for (const actor of this.actors) if (!actor.colored) actor.mesh.material.color.set(surface);
     this.dirty = true;
   }
 
@@ -272,7 +272,7 @@ export class Picture {
     if (!told || !told.arrays.rows.length) return;
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(told.arrays.positions, 3));
-    geometry.setAttribute("colour", new THREE.BufferAttribute(told.arrays.colours, 4, true));
+    geometry.setAttribute("color", new THREE.BufferAttribute(told.arrays.colors, 4, true));
     const points = new THREE.Points(geometry, this.pointMaterial);
     points.frustumCulled = false;
     points.told = told;
@@ -306,10 +306,10 @@ export class Picture {
     if (!told || !told.arrays.corners.length) return;
     const geometry = new THREE.BufferGeometry();
     geometry.setAttribute("position", new THREE.BufferAttribute(told.arrays.corners, 3));
-    const coloured = "colours" in told.arrays;
-    if (coloured) geometry.setAttribute("color", new THREE.BufferAttribute(told.arrays.colours, 3, true));
-    this.surfaceMaterial.vertexColors = coloured;
-    this.surfaceMaterial.color.set(coloured ? 0xffffff : THEMES[this.theme].surface);
+    const colored = "colors" in told.arrays;
+    if (colored) geometry.setAttribute("color", new THREE.BufferAttribute(told.arrays.colors, 3, true));
+    this.surfaceMaterial.vertexColors = colored;
+    this.surfaceMaterial.color.set(colored ? 0xffffff : THEMES[this.theme].surface);
     this.surfaceMaterial.needsUpdate = true;
     this.surface = new THREE.Mesh(geometry, this.surfaceMaterial);
     this.surface.frustumCulled = false;
@@ -354,7 +354,7 @@ export class Picture {
       geometry.computeBoundingBox();
       if (actor.poses) geometry.boundingBox.setFromArray(actor.poses);
       actor.top = geometry.boundingBox.max.z;
-      actor.box = this.thickLines(edgesOf(geometry.boundingBox), new THREE.Color(...actor.colour.map((byte) => byte / 255)), 2);
+      actor.box = this.thickLines(edgesOf(geometry.boundingBox), new THREE.Color(...actor.color.map((byte) => byte / 255)), 2);
       actor.box.visible = this.boxes;
       actor.mesh.add(actor.box);
       this.scene.add(actor.mesh);
@@ -367,14 +367,14 @@ export class Picture {
     this.dirty = true;
   }
 
-  // by: "object" for a colour each, "colour" for those of their files
-  colourActors(by) {
+  // by: "object" for a color each, "color" for those of their files
+  colorActors(by) {
     for (const actor of this.actors) {
-      const { material } = actor.mesh, own = by === "colour" && actor.own;
-      actor.coloured = by === "object" || own;
+      const { material } = actor.mesh, own = by === "color" && actor.own;
+      actor.colored = by === "object" || own;
       material.vertexColors = Boolean(own);
       if (own) material.color.set(0xffffff);
-      else if (by === "object") material.color.setRGB(...actor.colour.map((byte) => byte / 255));
+      else if (by === "object") material.color.setRGB(...actor.color.map((byte) => byte / 255));
       else material.color.set(THEMES[this.theme].surface);
       material.needsUpdate = true;
     }
@@ -384,7 +384,7 @@ export class Picture {
   setSensors(sensors) {
     for (const made of this.sensorParts ?? []) this.scene.remove(made);
     this.sensorParts = [];
-    this.balls = []; // [mesh, radius in metres]
+    this.balls = []; // [mesh, radius in meters]
     this.sensors = sensors;
     const ball = new THREE.SphereGeometry(1, 20, 12), red = new THREE.MeshBasicMaterial({ color: RED });
     for (const sensor of sensors) {
@@ -492,7 +492,7 @@ export class Picture {
     return way.length() > 1e-6 ? way.normalize() : this.heading ?? ahead;
   }
 
-  get labelled() {
+  get labeled() {
     const names = this.marks.filter((mark) => mark.text).map((mark) => [mark.text, mark.place]);
     const moving = this.sensors.filter((sensor) => sensor.moves && sensor.shown && sensor.at);
     if (moving.length) names.push([moving.map((sensor) => sensor.name).filter(Boolean).join(", ") || "sensor", moving[0].at]);
@@ -597,7 +597,7 @@ export class Picture {
     this.changed();
   }
 
-  // Metres from the upper to the lower edge, where the camera looks.
+  // Meters from the upper to the lower edge, where the camera looks.
   get viewHeight() {
     if (this.isParallel) return (this.parallel.top - this.parallel.bottom) / this.parallel.zoom;
     return 2 * Math.tan((FOV * Math.PI) / 360) * this.perspective.position.distanceTo(this.controls.target);
@@ -659,7 +659,7 @@ export class Picture {
   drawLabels() {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const taken = [], shown = [];
-    for (const [text, place, kind = ""] of this.labelled) {
+    for (const [text, place, kind = ""] of this.labeled) {
       const at = new THREE.Vector3(...place).project(this.camera);
       if (Math.abs(at.x) > 1 || Math.abs(at.y) > 1 || Math.abs(at.z) > 1) continue;
       // Stations have their number on their mark, other things their name beside it.
@@ -691,8 +691,8 @@ export class Picture {
     pen.textAlign = "center";
     pen.textBaseline = "middle";
     const axes = ["x", "y", "z"].map((name, axis) => [name, new THREE.Vector3().setComponent(axis, 1).applyQuaternion(turn), ["#d2404a", "#3f9a4d", "#3f74d0"][axis]]);
-    for (const [name, way, colour] of axes.sort((a, b) => a[1].z - b[1].z)) {
-      pen.strokeStyle = pen.fillStyle = colour;
+    for (const [name, way, color] of axes.sort((a, b) => a[1].z - b[1].z)) {
+      pen.strokeStyle = pen.fillStyle = color;
       pen.beginPath();
       pen.moveTo(middle, middle);
       pen.lineTo(middle + 38 * way.x, middle - 38 * way.y);
@@ -702,12 +702,12 @@ export class Picture {
   }
 
   drawScale() {
-    const metres = this.viewHeight / this.canvas.clientHeight;
-    const most = 150 * metres, power = 10 ** Math.floor(Math.log10(most));
+    const meters = this.viewHeight / this.canvas.clientHeight;
+    const most = 150 * meters, power = 10 ** Math.floor(Math.log10(most));
     const length = [5, 2, 1].map((n) => n * power).find((n) => n <= most);
     const [unit, size] = length >= 1000 ? ["km", 1000] : length >= 1 ? ["m", 1] : length >= 0.01 ? ["cm", 0.01] : ["mm", 0.001];
     this.scale.firstChild.textContent = `${+(length / size).toPrecision(2)} ${unit}`;
-    this.scale.lastChild.style.width = `${Math.round(length / metres)}px`;
+    this.scale.lastChild.style.width = `${Math.round(length / meters)}px`;
     this.scale.title = this.isParallel ? "scale" : "scale at the focus of the camera";
   }
 
@@ -820,7 +820,7 @@ export class Picture {
     press.onpointerdown = (event) => { press.setPointerCapture(event.pointerId); event.preventDefault(); press.focus(); };
     press.onpointermove = (event) => {
       if (!press.hasPointerCapture(event.pointerId)) return;
-      const [x, y] = this.pixelsPerMetre(axis), squared = x * x + y * y;
+      const [x, y] = this.pixelsPerMeter(axis), squared = x * x + y * y;
       if (squared > 1e-6) move((event.movementX * x + event.movementY * y) / squared);
     };
     press.onkeydown = (event) => {
@@ -846,7 +846,7 @@ export class Picture {
   }
 
   // How far the middle of the clip box moves in the picture, pixels, if it moves along an axis.
-  pixelsPerMetre(axis) {
+  pixelsPerMeter(axis) {
     const step = 1e-3 * this.extent, middle = new THREE.Vector3(...this.clipEnds.map(([low, high]) => (low + high) / 2));
     const [a, b] = [middle.clone(), middle.clone().setComponent(axis, middle.getComponent(axis) + step)].map((place) => this.pixelsOf(place));
     return [(b[0] - a[0]) / step, (b[1] - a[1]) / step];

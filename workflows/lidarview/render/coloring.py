@@ -1,4 +1,4 @@
-"""Colours of points by one of their columns, and legends."""
+"""Colors of points by one of their columns, and legends."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Ints
-from lidarsim.columns.table import COLOURS, NO_SURFACE, NORMAL, OBJECT, Column
-from lidarsim.scene.colours import packed, unpacked
+from lidarsim.columns.table import COLORS, NO_SURFACE, NORMAL, OBJECT, Column
+from lidarsim.scene.colors import packed, unpacked
 
-from .theme import mapped, object_colours
+from .theme import mapped, object_colors
 
 TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
 DIVERGING = mapped("coolwarm", np.linspace(0, 1, 256))  # (256, 3); its middle is pale
-MAX_UNNAMED_LABELS = 12  # labels without names that have a colour each
-MAX_COLOURS = 1 << 16  # limit for labels
+MAX_UNNAMED_LABELS = 12  # labels without names that have a color each
+MAX_COLORS = 1 << 16  # limit for labels
 
 # Columns that are composed of others (`values_of`).
-RGB = Column("rgb", "uint32", "", "colours of the surfaces")
+RGB = Column("rgb", "uint32", "", "colors of the surfaces")
 NORMALS = Column(
     "normals", "uint32", "", "directions of the surfaces: x red, y green, z blue, -1 dark, 1 bright"
 )
-_COMPOSED = {RGB.name: (RGB, COLOURS), NORMALS.name: (NORMALS, NORMAL)}  # {name: (column, parts)}
+_COMPOSED = {RGB.name: (RGB, COLORS), NORMALS.name: (NORMALS, NORMAL)}  # {name: (column, parts)}
 MATERIAL = "material"  # name of the column
 NO_MATERIAL = "no material"
-_SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
-_GREY = 0.5
+_SPREAD = (0.5, 99.5)  # percentiles at the ends of a color scale
+_GRAY = 0.5
 # The scale of energies is logarithmic if they differ by the first factor and the median is this low
 # in their range, or if they differ by the second factor. The scale of other columns is linear: of
 # heights from 0.1 to 20 m, half of a logarithmic scale is for the lowest 1.4 m.
@@ -39,17 +39,17 @@ _TIME_UNITS = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 
 @dataclass(frozen=True, eq=False)
-class Colouring:
-    """Colours of points, and a legend: a scale between two limits, or labels."""
+class Coloring:
+    """Colors of points, and a legend: a scale between two limits, or labels."""
 
-    # Returns colours (n, 3) in 0 to 1 of values (n,).
+    # Returns colors (n, 3) in 0 to 1 of values (n,).
     paint: Callable[[AnyArray], Floats]
     name: str  # name of the column
     unit: str  # unit of the limits
     meaning: str
     limits: tuple[float, float] | None = None  # ends of the scale; None for labels
     logarithmic: bool = False
-    # Name and colour of existing labels, in order of their points if there are many.
+    # Name and color of existing labels, in order of their points if there are many.
     labels: tuple[tuple[str, Floats], ...] = ()
     values: tuple[int, ...] = ()  # values of the column, one for each label
     scale: Floats = field(default_factory=lambda: TURBO)  # (256, 3)
@@ -67,21 +67,21 @@ def with_composed(columns: Mapping[str, Column]) -> dict[str, Column]:
 
 
 def values_of(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
-    """Return the values of a column, or packed colours for `RGB` and `NORMALS`.
+    """Return the values of a column, or packed colors for `RGB` and `NORMALS`.
 
     `read` returns a named column.
     """
     if column is RGB:
-        return packed(np.stack([read(name) for name in COLOURS], axis=1))
+        return packed(np.stack([read(name) for name in COLORS], axis=1))
     if column is NORMALS:
-        return packed(colours_of_normals(np.stack([read(name) for name in NORMAL], axis=1)))
+        return packed(colors_of_normals(np.stack([read(name) for name in NORMAL], axis=1)))
     return read(column.name)
 
 
-def colours_of_normals(normals: AnyArray) -> Bytes:
-    """Return the colours (n, 3) of unit vectors (n, 3).
+def colors_of_normals(normals: AnyArray) -> Bytes:
+    """Return the colors (n, 3) of unit vectors (n, 3).
 
-    NaN, for points on no surface, is grey.
+    NaN, for points on no surface, is gray.
     """
     known = np.isfinite(normals).all(axis=1, keepdims=True)
     return np.asarray(np.where(known, 127.5 * (1 + normals), 127.5).round().astype(np.uint8))
@@ -99,25 +99,25 @@ def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
     return NO_SURFACE if value < 0 and column.name == OBJECT.name else f"{column.name} {value}"
 
 
-def colours_of(
+def colors_of(
     values: AnyArray,
     column: Column,
     names: Sequence[str] = (),
     limits: tuple[float, float] | None = None,
-) -> Colouring:
-    """Choose colours for the values (n,) of a column.
+) -> Coloring:
+    """Choose colors for the values (n,) of a column.
 
     `limits` are the ends of a scale of numbers in its unit, in place of the lowest and the highest
     value.
 
-    `names` are the words for the values 0, 1, 2, … of a label. Labels have a colour each; labels
+    `names` are the words for the values 0, 1, 2, … of a label. Labels have a color each; labels
     without names and with too many values for a legend are on a scale like numbers. Columns with
     `Column.scale` "logarithmic", such as intensities, have that scale if their values differ by
-    large factors. Velocities are blue below 0 and red above. NaN is grey, and so are points on no
+    large factors. Velocities are blue below 0 and red above. NaN is gray, and so are points on no
     surface.
     """
     if column in (RGB, NORMALS):
-        return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
+        return Coloring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
     spread: tuple[float, float] = _SPREAD
     if column.kind == "label" and values.dtype.kind in "iu":
         values = values.astype(np.int64)
@@ -125,28 +125,28 @@ def colours_of(
         if names or len(labels) <= MAX_UNNAMED_LABELS:
             if len(labels) > MAX_UNNAMED_LABELS:
                 labels = labels[np.argsort(-counts, kind="stable")]
-            return _label_colouring(labels, column, names)
+            return _label_coloring(labels, column, names)
         spread = (0, 100)
-    return _number_colouring(values, column, spread, limits)
+    return _number_coloring(values, column, spread, limits)
 
 
-def _label_colouring(labels: Ints, column: Column, names: Sequence[str]) -> Colouring:
-    """Return a colour for each label (k,), in the order of the legend."""
+def _label_coloring(labels: Ints, column: Column, names: Sequence[str]) -> Coloring:
+    """Return a color for each label (k,), in the order of the legend."""
     count = max(len(names), int(labels.max(initial=0)) + 1)
-    colours = object_colours(min(count, MAX_COLOURS))
-    grey = len(colours)
-    palette = np.vstack([colours, [_GREY] * 3])
+    colors = object_colors(min(count, MAX_COLORS))
+    gray = len(colors)
+    palette = np.vstack([colors, [_GRAY] * 3])
     has_none = column.name in (OBJECT.name, MATERIAL)  # a value below 0
 
     def paint(values: AnyArray) -> Floats:
         numbers = values.astype(np.int64)
         is_surface = (numbers >= 0) | (not has_none)
-        return np.asarray(palette[np.where(is_surface, numbers % grey, grey)])
+        return np.asarray(palette[np.where(is_surface, numbers % gray, gray)])
 
     values = tuple(labels.tolist())
     words = [word_of(value, column, names) for value in values]
     entries = tuple(zip(words, paint(labels), strict=True))
-    return Colouring(paint, column.name, "", column.meaning, labels=entries, values=values)
+    return Coloring(paint, column.name, "", column.meaning, labels=entries, values=values)
 
 
 class _Range(NamedTuple):
@@ -165,12 +165,12 @@ class _Range(NamedTuple):
         return bool(self.lower > 0 and (is_skewed or is_wide))
 
 
-def _number_colouring(
+def _number_coloring(
     values: AnyArray,
     column: Column,
     percentiles: tuple[float, float],
     chosen_limits: tuple[float, float] | None,
-) -> Colouring:
+) -> Coloring:
     """Return a scale for values (n,) between two percentiles, or chosen limits."""
     finite = np.isfinite(values)
     lower = 0.0
@@ -198,7 +198,7 @@ def _number_colouring(
         logarithmic = logarithmic and limits.lower > 0
     paint = _scale_painter(limits, divisor, logarithmic, scale)
     range_limits = float(limits.lower), float(limits.upper)
-    return Colouring(
+    return Coloring(
         paint,
         column.name,
         unit,
@@ -213,7 +213,7 @@ def _number_colouring(
 def _scale_painter(
     limits: _Range, divisor: float, logarithmic: bool, scale: Floats
 ) -> Callable[[AnyArray], Floats]:
-    """Return the function from values (n,) to colours (n, 3) of a scale (256, 3).
+    """Return the function from values (n,) to colors (n, 3) of a scale (256, 3).
 
     `limits` belong to values over the divisor.
     """
@@ -226,8 +226,8 @@ def _scale_painter(
         if logarithmic:
             numbers = np.log(np.clip(numbers, lower, upper))
         scaled = (numbers - start) * (255 / (stop - start if upper > lower else 1.0))
-        colours = scale[np.clip(np.where(finite, scaled, 0), 0, 255).astype(np.uint8)]
-        colours[~finite] = _GREY
-        return colours
+        colors = scale[np.clip(np.where(finite, scaled, 0), 0, 255).astype(np.uint8)]
+        colors[~finite] = _GRAY
+        return colors
 
     return paint

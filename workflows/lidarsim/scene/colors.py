@@ -1,4 +1,4 @@
-"""Colours of triangles: images, plain colours, and colours of corners."""
+"""Colors of triangles: images, plain colors, and colors of corners."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from ..base.errors import LidarError
 from ..base.vectors import matmul
 from ..base.words import plural
 
-# Faces without a colour are grey, of half of the light, as the default reflectance is.
-GREY = np.full((1, 1, 3), 188, np.uint8)
+# Faces without a color are gray, of half of the light, as the default reflectance is.
+GRAY = np.full((1, 1, 3), 188, np.uint8)
 WHITE = np.full((1, 1, 3), 255, np.uint8)
 WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear light, ITU-R BT.709
 BLOCK_FACES = 1 << 16
@@ -41,20 +41,20 @@ def as_bytes(shares: ArrayLike) -> Bytes:
 
 
 @dataclass(frozen=True, eq=False)
-class Colours:
-    """Colours of the faces of a mesh, in sRGB, as in files.
+class Colors:
+    """Colors of the faces of a mesh, in sRGB, as in files.
 
     Attributes
     ----------
     images
-        uint8 (h, w, 3) each. An image of a single element is a plain colour.
+        uint8 (h, w, 3) each. An image of a single element is a plain color.
     image
         int32 (f,): index of each face's image.
     uv
         float32 (f, 3, 2): texture coordinates of the corners (`Cutout`); None if there are only
-        plain colours.
+        plain colors.
     corners
-        uint8 (f, 3, 3): colours of the corners, factors of the colours of the images in linear
+        uint8 (f, 3, 3): colors of the corners, factors of the colors of the images in linear
         light; None for white.
     """
 
@@ -67,28 +67,28 @@ class Colours:
         return len(self.image)
 
     @classmethod
-    def plain(cls, colour: Bytes, faces: int) -> Colours:
-        """Return the same colour (1, 1, 3) for all faces."""
-        return cls((colour,), np.zeros(faces, np.int32))
+    def plain(cls, color: Bytes, faces: int) -> Colors:
+        """Return the same color (1, 1, 3) for all faces."""
+        return cls((color,), np.zeros(faces, np.int32))
 
     @classmethod
-    def of_corners(cls, corners: Bytes) -> Colours:
-        """Return colours (f, 3, 3) of the corners of each face."""
+    def of_corners(cls, corners: Bytes) -> Colors:
+        """Return colors (f, 3, 3) of the corners of each face."""
         return cls((WHITE,), np.zeros(len(corners), np.int32), corners=corners)
 
     @classmethod
-    def of_faces(cls, colours: Bytes) -> Colours:
-        """Return a plain colour for each face, from colours (f, 3)."""
-        return cls.of_corners(colours[:, None].repeat(3, axis=1))
+    def of_faces(cls, colors: Bytes) -> Colors:
+        """Return a plain color for each face, from colors (f, 3)."""
+        return cls.of_corners(colors[:, None].repeat(3, axis=1))
 
-    def take(self, face_selection: Integers | slice) -> Colours:
-        """Return the colours of selected faces."""
+    def take(self, face_selection: Integers | slice) -> Colors:
+        """Return the colors of selected faces."""
         uv = None if self.uv is None else self.uv[face_selection]
         corners = None if self.corners is None else self.corners[face_selection]
-        return Colours(self.images, self.image[face_selection], uv, corners)
+        return Colors(self.images, self.image[face_selection], uv, corners)
 
-    def divided(self, face_indices: Integers, weights: Floats) -> Colours:
-        """Return the colours of pieces of faces, by the indices of the faces (k,).
+    def divided(self, face_indices: Integers, weights: Floats) -> Colors:
+        """Return the colors of pieces of faces, by the indices of the faces (k,).
 
         `weights` (k, 3, 3) are the barycentric coordinates of the corners of each piece in its
         face.
@@ -98,8 +98,8 @@ class Colours:
         corners = None if faces.corners is None else matmul(weights, faces.corners).astype(np.uint8)
         return replace(faces, uv=uv, corners=corners)
 
-    def mirrored(self) -> Colours:
-        """Return the colours with the corners of each face in reverse order."""
+    def mirrored(self) -> Colors:
+        """Return the colors with the corners of each face in reverse order."""
         uv = None if self.uv is None else self.uv[:, ::-1]
         corners = None if self.corners is None else self.corners[:, ::-1]
         return replace(self, uv=uv, corners=corners)
@@ -122,13 +122,13 @@ class Colours:
             )
 
     def means(self) -> Bytes:
-        """Return the mean colour of each face, in linear light, (f, 3).
+        """Return the mean color of each face, in linear light, (f, 3).
 
         The mean is taken over 4 points of the face, or of 100 if there are few faces.
         """
-        mean_colours = np.empty((len(self), 3), np.uint8)
+        mean_colors = np.empty((len(self), 3), np.uint8)
         steps = 10 if len(self) <= MAX_DENSE_FACES else 2
-        # Centres of the pieces into which lines parallel to the edges cut a face.
+        # Centers of the pieces into which lines parallel to the edges cut a face.
         i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
         upright = np.stack([i, j], axis=1)[i + j < steps] + 1 / 3
         inverted = np.stack([i, j], axis=1)[i + j < steps - 1] + 2 / 3
@@ -139,13 +139,13 @@ class Colours:
             rows = np.arange(len(block))
             light = np.zeros((len(block), 3))
             for u, v in points.tolist():
-                colours = lookup.colours_at(rows, np.tile([u, v, 0.0], (len(block), 1)))
-                light += LINEAR[unpacked(colours)]
-            mean_colours[start : start + BLOCK_FACES] = as_srgb(light / len(points))
-        return mean_colours
+                colors = lookup.colors_at(rows, np.tile([u, v, 0.0], (len(block), 1)))
+                light += LINEAR[unpacked(colors)]
+            mean_colors[start : start + BLOCK_FACES] = as_srgb(light / len(points))
+        return mean_colors
 
 
-MAX_DENSE_FACES = 20_000  # limit for meshes whose colours are averaged from 100 points a face
+MAX_DENSE_FACES = 20_000  # limit for meshes whose colors are averaged from 100 points a face
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
@@ -155,26 +155,26 @@ def are_indices(indices: Ints32, count: int) -> bool:
 
 
 class Lookup:
-    """Lookup of colours by the index of a face and a point on the face, in a table of all texels.
+    """Lookup of colors by the index of a face and a point on the face, in a table of all texels.
 
     Parameters
     ----------
-    colours
-        Colours of f faces.
+    colors
+        Colors of f faces.
     corners
         (k, 3, 3) each: corners of the faces, block by block.
     """
 
-    def __init__(self, colours: Colours, corners: Iterable[Floats]) -> None:
-        images = colours.images
-        tints = colours.corners
-        self._image = colours.image
+    def __init__(self, colors: Colors, corners: Iterable[Floats]) -> None:
+        images = colors.images
+        tints = colors.corners
+        self._image = colors.image
         self._texels = np.concatenate([packed(image.reshape(-1, 3)) for image in images])
         sizes = np.array([image.shape[:2] for image in images], np.int64)
         self._height, self._width = sizes.T
         counts = sizes.prod(axis=1)
         self._first = np.cumsum([0, *counts[:-1]])
-        # Texture coordinates of faces with images, and colours of corners, are stored as planes:
+        # Texture coordinates of faces with images, and colors of corners, are stored as planes:
         # linear functions of the position.
         textured = (counts > 1)[self._image]
         tinted = np.zeros(0, np.bool_) if tints is None else (tints != 255).any(axis=(1, 2))
@@ -183,8 +183,8 @@ class Lookup:
         start = 0
         for block in corners:
             rows = slice(start, start + len(block))
-            if colours.uv is not None:
-                uv = colours.uv[rows][textured[rows]]
+            if colors.uv is not None:
+                uv = colors.uv[rows][textured[rows]]
                 textures.append(_planes(block[textured[rows]], uv.astype(np.float64)))
             if tints is not None:
                 light = LINEAR[tints[rows][tinted[rows]]]
@@ -193,8 +193,8 @@ class Lookup:
         self._texture = _Planes.joined(textured, textures)
         self._light = _Planes.joined(tinted, lights)
 
-    def colours_at(self, face_indices: Integers, points: Floats) -> UInts32:
-        """Return the packed colours (n,) of points (n, 3) on faces (n,), the texel of an image."""
+    def colors_at(self, face_indices: Integers, points: Floats) -> UInts32:
+        """Return the packed colors (n,) of points (n, 3) on faces (n,), the texel of an image."""
         image = self._image.take(face_indices)
         texel = self._first.take(image)
         positions = np.ascontiguousarray(points.T)
@@ -204,12 +204,12 @@ class Lookup:
             width = self._width.take(image)
             row = _element(v, self._height.take(image))
             texel[selected] += row * width + _element(u, width)
-        colours = self._texels.take(texel)
+        colors = self._texels.take(texel)
         if self._light is not None:
             selected, light = self._light.values_at(face_indices, positions)
-            tinted = LINEAR[unpacked(colours[selected])] * np.clip(light.T, 0, 1)
-            colours[selected] = packed(as_srgb(tinted))
-        return colours
+            tinted = LINEAR[unpacked(colors[selected])] * np.clip(light.T, 0, 1)
+            colors[selected] = packed(as_srgb(tinted))
+        return colors
 
 
 class _Planes(NamedTuple):
@@ -275,47 +275,47 @@ def _element(coordinate: Floats, size: Ints) -> Ints:
     return np.minimum(position.astype(np.int64), size - 1)
 
 
-def packed(colours: Bytes) -> UInts32:
-    """Return colours (n, 3) packed into a number each (n,), red in the lowest byte."""
-    channels = np.zeros((len(colours), 4), np.uint8)
-    channels[:, :3] = colours
+def packed(colors: Bytes) -> UInts32:
+    """Return colors (n, 3) packed into a number each (n,), red in the lowest byte."""
+    channels = np.zeros((len(colors), 4), np.uint8)
+    channels[:, :3] = colors
     return channels.view("<u4")[:, 0]
 
 
-def unpacked(colours: UInts32) -> Bytes:
-    """Return the colours (n, 3) of packed colours (n,)."""
-    return np.ascontiguousarray(colours, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
+def unpacked(colors: UInts32) -> Bytes:
+    """Return the colors (n, 3) of packed colors (n,)."""
+    return np.ascontiguousarray(colors, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
 
 
 def as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
-    """Return colours (n,) as in the field `rgb` of PCL and ROS: bits 0x00RRGGBB as a float."""
+    """Return colors (n,) as in the field `rgb` of PCL and ROS: bits 0x00RRGGBB as a float."""
     return packed(np.column_stack([blue, green, red])).view("<f4")
 
 
-def luminance(colours: UInts32) -> Floats:
-    """Return the luminance (n,) of packed colours in linear light, 0 to 1."""
-    red, green, blue = map(np.take, _SHARES, unpacked(colours).T)
+def luminance(colors: UInts32) -> Floats:
+    """Return the luminance (n,) of packed colors in linear light, 0 to 1."""
+    red, green, blue = map(np.take, _SHARES, unpacked(colors).T)
     return np.asarray(red + green + blue)
 
 
 _SHARES = WEIGHTS[:, None] * LINEAR
 
 
-def join_colours(mesh_colours: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
-    """Join the colours of meshes in order, or return None if no mesh has colours.
+def join_colors(mesh_colors: Sequence[Colors | None], sizes: Iterable[int]) -> Colors | None:
+    """Join the colors of meshes in order, or return None if no mesh has colors.
 
-    `sizes` are the numbers of faces of the meshes; a mesh without colours becomes grey.
+    `sizes` are the numbers of faces of the meshes; a mesh without colors becomes gray.
     """
-    if not any(part is not None for part in mesh_colours):
+    if not any(part is not None for part in mesh_colors):
         return None
-    coloured = [
-        Colours.plain(GREY, size) if part is None else part
-        for part, size in zip(mesh_colours, sizes, strict=True)
+    colored = [
+        Colors.plain(GRAY, size) if part is None else part
+        for part, size in zip(mesh_colors, sizes, strict=True)
     ]
     image_numbers: dict[int, int] = {}  # {id of an image: its number}
     images: list[Bytes] = []
     image_indices = []  # (f,) of each mesh
-    for part in coloured:
+    for part in colored:
         for pixels in part.images:
             if id(pixels) not in image_numbers:
                 image_numbers[id(pixels)] = len(images)
@@ -324,30 +324,30 @@ def join_colours(mesh_colours: Sequence[Colours | None], sizes: Iterable[int]) -
         image_indices.append(np.array(part_numbers, np.int32)[part.image])
     uv = None
     corners = None
-    if any(part.uv is not None for part in coloured):
+    if any(part.uv is not None for part in colored):
         uv = np.concatenate(
-            [np.zeros((len(p), 3, 2), np.float32) if p.uv is None else p.uv for p in coloured]
+            [np.zeros((len(p), 3, 2), np.float32) if p.uv is None else p.uv for p in colored]
         )
-    if any(part.corners is not None for part in coloured):
+    if any(part.corners is not None for part in colored):
         corners = np.concatenate(
             [
                 np.full((len(p), 3, 3), 255, np.uint8) if p.corners is None else p.corners
-                for p in coloured
+                for p in colored
             ]
         )
-    return Colours(tuple(images), np.concatenate(image_indices), uv, corners)
+    return Colors(tuple(images), np.concatenate(image_indices), uv, corners)
 
 
-def colours_summary(mesh_colours: Iterable[Colours | None]) -> str:
-    """Return a summary of colours: «2 textures, 1 plain colour, colours of vertices»."""
-    coloured = [part for part in mesh_colours if part is not None]
+def colors_summary(mesh_colors: Iterable[Colors | None]) -> str:
+    """Return a summary of colors: «2 textures, 1 plain color, colors of vertices»."""
+    colored = [part for part in mesh_colors if part is not None]
     kinds = {
         id(part.images[number]): "texture" if part.images[number].size > 3 else "plain color"
-        for part in coloured
+        for part in colored
         for number in np.unique(part.image)
         if part.images[number] is not WHITE
     }
     counts = Counter(kinds.values())
     words = [plural(counts[kind], kind) for kind in ("texture", "plain color") if counts[kind]]
-    words += ["vertex colors"] * any(part.corners is not None for part in coloured)
+    words += ["vertex colors"] * any(part.corners is not None for part in colored)
     return ", ".join(words) or "no colors"

@@ -1,4 +1,4 @@
-"""Colours of meshes: what a ray hits is what other programs read from the same file."""
+"""Colors of meshes: what a ray hits is what other programs read from the same file."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ from lidarpool import (
     Track,
 )
 from lidarpool.scenario.scenario import Scenario
-from lidarsim.columns.table import COLOURS
+from lidarsim.columns.table import COLORS
 from lidarsim.media.materials import DARKEST, reflectances
 from lidarsim.scene import masks
-from lidarsim.scene.colours import (
-    GREY,
+from lidarsim.scene.colors import (
+    GRAY,
     LINEAR,
     WEIGHTS,
-    Colours,
+    Colors,
     as_srgb,
-    colours_summary,
+    colors_summary,
     luminance,
     packed,
     unpacked,
@@ -72,19 +72,19 @@ def hills():
     return vertices, faces, RNG.uniform(0, 1, (81, 2))
 
 
-def png(colours=PICTURE):
+def png(colors=PICTURE):
     out = io.BytesIO()
-    Image.fromarray(colours).save(out, "png")
+    Image.fromarray(colors).save(out, "png")
     return out.getvalue()
 
 
 def sweep(scene, *columns, sensor=SENSOR, pose=HERE, **options):
-    """A sweep, and the colours (n, 3) of its points."""
-    names: list[str | Column] = [*COLOURS, "triangle", *columns]
+    """A sweep, and the colors (n, 3) of its points."""
+    names: list[str | Column] = [*COLORS, "triangle", *columns]
     scanner = Scanner(scene, sensor, columns=names, precision_m=1e-6, backend="numpy", **options)
     cloud = scanner.sweep(pose)
     assert len(cloud) > 500
-    return cloud, np.stack([cloud[name] for name in COLOURS], axis=1)
+    return cloud, np.stack([cloud[name] for name in COLORS], axis=1)
 
 
 def weights(cloud, vertices, faces):
@@ -101,8 +101,8 @@ def test_images_are_looked_up_as_trimesh_does(tmp_path, suffix):
     visual = TextureVisuals(uv, material=looks, image=None if looks else picture)
     path = tmp_path / f"hills{suffix}"
     trimesh.Trimesh(vertices, faces, visual=visual, process=False).export(path)
-    scene = Scene.load(path, up_axis="z", colours=True)
-    assert colours_summary([scene.colours]) == "1 texture"
+    scene = Scene.load(path, up_axis="z", colors=True)
+    assert colors_summary([scene.colors]) == "1 texture"
     cloud, found = sweep(scene)
     at = (weights(cloud, vertices, faces)[:, :, None] * uv[faces[cloud["triangle"]]]).sum(axis=1)
     # trimesh's elements are half a pixel off, which shows at the edges of blocks alone.
@@ -110,26 +110,26 @@ def test_images_are_looked_up_as_trimesh_does(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("name", ["a.ply", "text.ply", "a.obj", "a.off"])
-def test_colours_of_vertices_are_interpolated_in_linear_light(tmp_path, name):
+def test_colors_of_vertices_are_interpolated_in_linear_light(tmp_path, name):
     vertices, faces, _ = hills()
-    colours = RNG.integers(0, 256, (81, 3), dtype=np.uint8)
+    colors = RNG.integers(0, 256, (81, 3), dtype=np.uint8)
     path = tmp_path / name
-    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colors, process=False)
     if name == "a.off":
         rows = [
-            f"{' '.join(map(str, [*v, *c]))} 255" for v, c in zip(vertices, colours, strict=True)
+            f"{' '.join(map(str, [*v, *c]))} 255" for v, c in zip(vertices, colors, strict=True)
         ]
         rows += [f"3 {a} {b} {c}" for a, b, c in faces]
         write(path, "\n".join([f"COFF\n81 {len(faces)} 0", *rows]))
     else:
         mesh.export(path, **({"encoding": "ascii"} if name == "text.ply" else {}))
-    scene = Scene.load(path, up_axis="z", colours=True)
-    assert colours_summary([scene.colours]) == "vertex colors"
+    scene = Scene.load(path, up_axis="z", colors=True)
+    assert colors_summary([scene.colors]) == "vertex colors"
     cloud, found = sweep(scene)
-    light = LINEAR[colours[faces[cloud["triangle"]]]]
+    light = LINEAR[colors[faces[cloud["triangle"]]]]
     want = as_srgb((weights(cloud, vertices, faces)[:, :, None] * light).sum(axis=1))
     np.testing.assert_allclose(found.astype(int), want.astype(int), atol=1)
-    assert Scene.load(path, up_axis="z").colours is None  # unless asked for
+    assert Scene.load(path, up_axis="z").colors is None  # unless asked for
 
 
 PLY = """ply
@@ -156,7 +156,7 @@ end_header
         ("float", "1 0.502 0"),
     ],
 )
-def test_colours_of_vertices_are_bytes_or_shares(tmp_path, kind, rgb):
+def test_colors_of_vertices_are_bytes_or_shares(tmp_path, kind, rgb):
     rows = [f"{place} {rgb}\n" for place in ("0 0 0", "1 0 0", "0 1 0")]
     if kind == "obj":
         path = tmp_path / "m.obj"
@@ -166,7 +166,7 @@ def test_colours_of_vertices_are_bytes_or_shares(tmp_path, kind, rgb):
         path = tmp_path / "m.ply"
         text = PLY.format(names) + "".join(rows) + "3 0 1 2\n"
     write(path, text)
-    assert Scene.load(path, colours=True).colours.means().tolist() == [[255, 128, 0]]
+    assert Scene.load(path, colors=True).colors.means().tolist() == [[255, 128, 0]]
 
 
 EFFECTS = """
@@ -185,7 +185,7 @@ EFFECTS = """
   <material id="n"><instance_effect url="#plain"/></material></library_materials>"""
 
 
-def test_collada_has_images_and_colours(tmp_path):
+def test_collada_has_images_and_colors(tmp_path):
     def numbers(kind, values, width):
         text = " ".join(map(str, values.ravel().tolist()))
         return (
@@ -217,7 +217,7 @@ def test_collada_has_images_and_colours(tmp_path):
         "</bind_material></instance_geometry></node></visual_scene></library_visual_scenes>"
         "</COLLADA>",
     )
-    scene = Scene.load(tmp_path / "m.dae", colours=True)
+    scene = Scene.load(tmp_path / "m.dae", colors=True)
     cloud, found = sweep(scene)
     at = (weights(cloud, vertices, faces)[:, :, None] * uv[faces[cloud["triangle"]]]).sum(axis=1)
     own = cloud["triangle"] < 64
@@ -234,14 +234,14 @@ def opaque(texture=None, **changes):
 
 
 def on_card(tmp_path, header, body):
-    """Colours of hits of a card, and u and v of each."""
+    """Colors of hits of a card, and u and v of each."""
     write(tmp_path / "m.glb", glb(header, body))
-    scene = Scene.load(tmp_path / "m.glb", up_axis="z", colours=True)
+    scene = Scene.load(tmp_path / "m.glb", up_axis="z", colors=True)
     cloud, found = sweep(scene, sensor=Sensor.grid(720, 61, 60.0), pose=Pose((0.0, 0.0, 0.0)))
     return found, (cloud.positions[:, 1] + 2) / 4, (2 - cloud.positions[:, 2]) / 4
 
 
-def test_factors_and_colours_of_vertices_multiply_light(tmp_path):
+def test_factors_and_colors_of_vertices_multiply_light(tmp_path):
     header, body = opaque()
     header["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 0.25, 1, 1]
     header["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 3
@@ -276,19 +276,19 @@ def test_factors_and_colours_of_vertices_multiply_light(tmp_path):
         ({"pbrMetallicRoughness": 3}, "it is invalid"),
     ],
 )
-def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
+def test_what_cannot_be_read_is_a_note_and_gray(tmp_path, caplog, change, why):
     header, body = opaque(**change)
     with caplog.at_level(logging.WARNING):
         found, _, _ = on_card(tmp_path, header, body)
     assert why in caplog.text and "have no color: Leaf" in caplog.text
-    assert (found == GREY[0, 0]).all()
+    assert (found == GRAY[0, 0]).all()
 
 
 def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
     write(tmp_path / "m.mtl", "newmtl a\nmap_Kd gone.png\nnewmtl b\nKd nan 2 -1\nnewmtl c\nKd x\n")
     ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
     write(tmp_path / "m.obj", f"{ground}usemtl a\nf 1 2 3\nusemtl b\nf 1 3 4\nusemtl c\nf 3 4 1\n")
-    scene = Scene.load(tmp_path / "m.obj", colours=True)
+    scene = Scene.load(tmp_path / "m.obj", colors=True)
     assert "its image 'gone.png' is not there" in caplog.text
     _, found = sweep(scene)
     assert {*map(tuple, found.tolist())} == {(188, 188, 188), (0, 255, 0)}
@@ -298,7 +298,7 @@ def test_faces_without_a_material_may_precede_those_with_one(tmp_path):
     write(tmp_path / "m.mtl", "\ufeffnewmtl b\nKd 0 1 0\n")  # as some editors begin files
     ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
     write(tmp_path / "m.obj", f"{ground}usemtl \nf 1 2 3\nusemtl b\nf 1 3 4\n")
-    _, found = sweep(Scene.load(tmp_path / "m.obj", colours=True))
+    _, found = sweep(Scene.load(tmp_path / "m.obj", colors=True))
     assert {*map(tuple, found.tolist())} == {(188, 188, 188), (0, 255, 0)}
 
 
@@ -306,7 +306,7 @@ def test_large_images_are_made_smaller(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(masks, "MAX_SIDE_PIXELS", 36)
     header, body = opaque(png())
     write(tmp_path / "m.glb", glb(header, body))
-    (picture,) = Scene.load(tmp_path / "m.glb", colours=True).colours.images
+    (picture,) = Scene.load(tmp_path / "m.glb", colors=True).colors.images
     assert picture.shape == (24, 36, 3)
     assert (
         "has images of 288 x 192 pixels, which are reduced to at most 36 pixels per side"
@@ -314,17 +314,17 @@ def test_large_images_are_made_smaller(tmp_path, monkeypatch, caplog):
 
 
 def textured():
-    """A mesh of the hills with an image and colours of vertices."""
+    """A mesh of the hills with an image and colors of vertices."""
     vertices, faces, uv = hills()
     image = (RNG.random(len(faces)) < 0.3).astype(np.int32)
     corners = RNG.integers(100, 256, (len(faces), 3, 3), dtype=np.uint8)
     corners[::2] = 255
     plain = np.array([[[250, 40, 10]]], np.uint8)
-    colours = Colours((PICTURE, plain), image, uv[faces].astype(np.float32), corners)
-    return SceneMesh("Hills", vertices, faces, colours=colours)
+    colors = Colors((PICTURE, plain), image, uv[faces].astype(np.float32), corners)
+    return SceneMesh("Hills", vertices, faces, colors=colors)
 
 
-def test_instances_and_actors_have_the_colours_of_their_mesh():
+def test_instances_and_actors_have_the_colors_of_their_mesh():
     mesh = textured()
     turn = trimesh.transformations.rotation_matrix(0.7, [0, 0, 1], [1, 2, 0])
     turn[:3, :3] @= np.diag([1.1, -0.9, 1.2])  # mirrored
@@ -347,10 +347,10 @@ def test_instances_and_actors_have_the_colours_of_their_mesh():
 
 def test_an_image_is_sent_once_whatever_shares_it():
     mesh = textured()
-    many = [SceneMesh(str(n), mesh.vertices, mesh.faces, colours=mesh.colours) for n in range(20)]
+    many = [SceneMesh(str(n), mesh.vertices, mesh.faces, colors=mesh.colors) for n in range(20)]
     alone, all_of = (len(pickle.dumps(Scene.from_meshes(some))) for some in (many[:1], many))
     assert all_of < 20 * alone - 15 * PICTURE.nbytes
-    assert len(Scene.from_meshes(many).colours.images) == 2
+    assert len(Scene.from_meshes(many).colors.images) == 2
 
 
 def test_textures_are_the_reflectance(caplog):
@@ -362,12 +362,12 @@ def test_textures_are_the_reflectance(caplog):
     share = np.clip(0.8 * LINEAR[found] @ WEIGHTS, DARKEST, 1)
     share[cloud["object"] == 1] = 0.4
     np.testing.assert_allclose(cloud["reflectance"], share * plain["reflectance"], rtol=1e-5)
-    # What has no colour has the luminance of the default.
-    grey, found = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity",
+    # What has no color has the luminance of the default.
+    gray, found = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity",
                         materials=[Material("*", "texture")])  # fmt: skip
     usual, _ = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity")
     assert (found == 188).all() and "the scene has no colors" in caplog.text
-    np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
+    np.testing.assert_allclose(gray["intensity"], usual["intensity"], rtol=0.01)
 
 
 def test_each_sub_ray_has_the_light_of_its_own_hit():
@@ -377,14 +377,14 @@ def test_each_sub_ray_has_the_light_of_its_own_hit():
     corners = np.array([[-8, -8, 0], [8, -8, 0], [8, 8, 0], [-8, 8, 0]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uv = (corners[faces][..., :2] / 16).astype(np.float32)
-    colours = Colours((image,), np.zeros(2, np.int32), uv)
-    scene = Scene.from_meshes([SceneMesh("Ground", corners, faces, colours=colours)])
+    colors = Colors((image,), np.zeros(2, np.int32), uv)
+    scene = Scene.from_meshes([SceneMesh("Ground", corners, faces, colors=colors)])
     materials = [Material("*", "texture")]
     options = {"materials": materials, "pose": Pose((0.05, 0.1, 3.0))}
     one, _ = sweep(scene, "reflectance", **options)
     wide = Returns("strongest", 61, divergence_mrad=200.0)
-    many, colour = sweep(scene, "reflectance", returns=wide, **options)
-    assert np.isin(colour, [0, 255]).all()
+    many, color = sweep(scene, "reflectance", returns=wide, **options)
+    assert np.isin(color, [0, 255]).all()
     spread = [np.std(cloud["reflectance"][cloud["reflectance"] > 0.0]) for cloud in (one, many)]
     assert spread[1] < 0.4 * spread[0]
     # Noise of angles, and of ranges, moves hits and points.
@@ -392,26 +392,26 @@ def test_each_sub_ray_has_the_light_of_its_own_hit():
     assert np.std(noisy["reflectance"]) == pytest.approx(spread[0], rel=0.1)
 
 
-def test_colours_that_do_not_fit_are_refused():
+def test_colors_that_do_not_fit_are_refused():
     vertices, faces, _ = hills()
-    for colours in (
-        Colours.plain(GREY, 3),
-        Colours((GREY,), np.ones(128, np.int32)),
-        Colours((PICTURE,), np.zeros(128, np.int32)),
-        Colours((PICTURE,), np.zeros(128, np.int32), np.full((128, 3, 2), np.nan, np.float32)),
-        Colours((GREY.astype(float),), np.zeros(128, np.int32)),
+    for colors in (
+        Colors.plain(GRAY, 3),
+        Colors((GRAY,), np.ones(128, np.int32)),
+        Colors((PICTURE,), np.zeros(128, np.int32)),
+        Colors((PICTURE,), np.zeros(128, np.int32), np.full((128, 3, 2), np.nan, np.float32)),
+        Colors((GRAY.astype(float),), np.zeros(128, np.int32)),
     ):
         with pytest.raises(LidarError, match="do not match its 128 faces"):
-            SceneMesh("Hills", vertices, faces, colours=colours)
+            SceneMesh("Hills", vertices, faces, colors=colors)
 
 
 @pytest.mark.extended
 @given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=1, max_size=20))
 def test_light_and_bytes_are_one_another(rows):
-    colours = np.array(rows, np.uint8)
-    np.testing.assert_array_equal(as_srgb(LINEAR[colours]), colours)
-    np.testing.assert_array_equal(unpacked(packed(colours)), colours)
-    np.testing.assert_allclose(luminance(packed(colours)), LINEAR[colours] @ WEIGHTS)
+    colors = np.array(rows, np.uint8)
+    np.testing.assert_array_equal(as_srgb(LINEAR[colors]), colors)
+    np.testing.assert_array_equal(unpacked(packed(colors)), colors)
+    np.testing.assert_allclose(luminance(packed(colors)), LINEAR[colors] @ WEIGHTS)
 
 
 def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
@@ -461,7 +461,7 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
         ),
         ({"spectrum": "limestone rock"}, "Did you mean 'limestone'"),
         ({"spectrum": "muddy"}, "Available spectra: water, muddy.$"),
-        ({"spectrum": "tar"}, "Available spectra: aluminium, weathered; asphalt"),
+        ({"spectrum": "tar"}, "Available spectra: aluminum, weathered; asphalt"),
         (
             {"spectrum": "asphalt, dry", "reflectance": 0.2},
             ("spectrum and reflectance cannot be combined"),
@@ -493,9 +493,9 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
         assert row in page
 
 
-def test_colours_of_vertices_with_too_few_numbers_are_a_note(tmp_path, caplog):
+def test_colors_of_vertices_with_too_few_numbers_are_a_note(tmp_path, caplog):
     header, body = opaque()
     attributes = header["meshes"][0]["primitives"][0]["attributes"]
     attributes["COLOR_0"] = attributes["TEXCOORD_0"]
     found, _, _ = on_card(tmp_path, header, body)
-    assert "its COLOR_0 is not red" in caplog.text and (found == GREY[0, 0]).all()
+    assert "its COLOR_0 is not red" in caplog.text and (found == GRAY[0, 0]).all()

@@ -10,7 +10,7 @@ from .open3d_module import load_open3d
 
 
 def nearest(points: Floats, reference: Floats) -> tuple[Floats, Ints]:
-    """Return distances (n,) to the nearest points of a reference, metres, and indices (n,)."""
+    """Return distances (n,) to the nearest points of a reference, meters, and indices (n,)."""
     core = load_open3d().core
     origin = reference.mean(axis=0)  # far from zero, squares would lose their digits
     tree = core.nns.NearestNeighborSearch(core.Tensor(reference - origin))
