@@ -1,8 +1,8 @@
-"""Makes the files of block.yaml: a city block in OpenUSD, hills as GeoTIFF, and a hundred cars.
+"""Create the files of block.yaml: a city block (OpenUSD), hills (GeoTIFF) and a hundred cars.
 
     python block.py [FOLDER]
 
-It needs the extras [usd] and [geo].
+It requires the extras [usd] and [geo].
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Make pedestrian.glb, an adult of 1.75 m who walks at 1.4 m/s: `python make_pedestrian.py`.
+"""Create pedestrian.glb, an adult of 1.75 m who walks at 1.4 m/s: `python make_pedestrian.py`.
 
 Tubes of ellipses along the limbs, bent by a skin of 15 joints. The animation "Walk" is one cycle of
 two steps. Feet roll from heel to ball without sliding, knees follow from where hips and feet are,

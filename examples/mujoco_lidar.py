@@ -1,4 +1,4 @@
-"""A robot of MuJoCo drives through falling balls, and scans while all of it moves."""
+"""A MuJoCo robot drives through falling balls, and its lidar scans while everything moves."""
 
 import numpy as np
 

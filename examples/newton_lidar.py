@@ -1,4 +1,4 @@
-"""A lidar in Newton: boxes fall while its beams leave, and it scans them as they fall."""
+"""A lidar in Newton scans falling boxes. The boxes move between the firings of a sweep."""
 
 import numpy as np
 

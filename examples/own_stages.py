@@ -1,8 +1,8 @@
-"""A pipeline of four stages and 100 trials beside it, on one pool, with functions of your own.
+"""Run a four-stage pipeline and 100 independent trials on one pool, with your own functions.
 
 The partitions are those of MATLAB's example: a worker for each GPU, four workers for the pipeline,
 and the rest for other work. While stage 1 generates scans, each scan becomes a short task on the
-GPU partition. Replace the bodies of the functions; the pipes between them stay.
+GPU partition. Replace the bodies of the functions and keep the pipes between them.
 
     python examples/own_stages.py
 """

@@ -1,4 +1,4 @@
-"""Makes road.glb: a road whose lane markings are in the image of its base color."""
+"""Create road.glb, a road whose lane markings are part of the base color texture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An environment of Gymnasium: a robot drives to a goal among columns, by its lidar alone."""
+"""A Gymnasium environment: a robot drives to a goal between columns, using only its lidar."""
 
 import math
 

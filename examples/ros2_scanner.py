@@ -1,4 +1,4 @@
-"""A node of ROS 2 that publishes what a simulated lidar sees, ten times a second.
+"""A ROS 2 node that publishes the points of a simulated lidar ten times per second.
 
 It takes the sensor's pose from the topic `pose` and publishes on `points`, in the sensor's axes,
 with the fields of Velodyne's driver:

@@ -1,4 +1,4 @@
-"""The survey of the demo from Python: a local cluster, a cloud on disk, a planned path."""
+"""Run the survey of the demo from Python: a local cluster, a cloud on disk, a planned path."""
 
 from lidarpool import Planning, Scene, Survey, save_cloud, simulate
 

@@ -1,4 +1,4 @@
-"""Tells ground, buildings and cars apart: a campaign of cities, and a network in NumPy.
+"""Classify ground, buildings and cars with a campaign of cities and a neural network in NumPy.
 
     python tell_apart.py [FOLDER | stream]
 

@@ -1,4 +1,4 @@
-"""Thumbnails: decode on CPU workers, shrink on GPU workers, append to a file in order."""
+"""Decode images on CPU workers, shrink them on GPU workers, and append them to a file in order."""
 
 import sys
 import time

@@ -1,4 +1,4 @@
-"""A vector environment of Gymnasium: robots of MuJoCo drive among columns, by their lidars."""
+"""A Gymnasium vector environment: MuJoCo robots drive between columns, using their lidars."""
 
 import numpy as np
 

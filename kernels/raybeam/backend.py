@@ -118,11 +118,15 @@ class Backend(ABC):
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
     ) -> DeviceNearest:
         """Put rays `start` to `stop` of a scan on the device, as `RayCaster.device_nearest`."""
-        raise BackendUnavailable(f"Backend {self.name!r} has no device: use cast_crossing.")
+        raise BackendUnavailable(
+            f"Backend {self.name!r} does not support devices. Use cast_crossing."
+        )
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
         """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`."""
-        raise BackendUnavailable(f"Backend {self.name!r} has no device: use cast_crossing.")
+        raise BackendUnavailable(
+            f"Backend {self.name!r} does not support devices. Use cast_crossing."
+        )
 
     def cast(self, rays: Rays) -> Hits:
         """Return the closest hit of every ray, misses included."""
@@ -176,5 +180,5 @@ class Backend(ABC):
         BackendUnavailable if this backend has no device.
         """
         raise BackendUnavailable(
-            f"Hits of backend {self.name!r} are on no device: use scan, or backend='cuda'."
+            f"The hits of backend {self.name!r} are not on a device. Use scan, or backend='cuda'."
         )

@@ -119,7 +119,7 @@ class RayCaster:
         device: int | None,
     ) -> None:
         if threads is not None and index(threads) < 1:
-            raise ValueError(f"threads is {threads}; it must be at least 1, or None.")
+            raise ValueError(f"threads must be at least 1 or None, but is {threads}.")
         engine = choose(backend)
         self._scene, self._transforms = check_instances(instances)
         self._engine = engine(self._scene, threads, device)
@@ -209,12 +209,13 @@ class RayCaster:
         outside = numbers[(numbers < 0) | (numbers >= self.instance_count)]
         if len(outside):
             raise IndexError(
-                f"There is no instance {outside[0]}: this caster has {self.instance_count}, from 0."
+                f"Instance {outside[0]} does not exist. This caster has {self.instance_count} "
+                "instances, numbered from 0."
             )
         if not self._scene.nested:
             raise ValueError(
-                "A single mesh without a transform stays in its place: make the caster with "
-                "RayCaster.from_instances([Instance(mesh, numpy.eye(4))]) to move it."
+                "A single mesh without a transform cannot be moved. Create the caster with "
+                "RayCaster.from_instances([Instance(mesh, numpy.eye(4))]) instead."
             )
         matrices = check_transforms(numbers, np.asarray(transform)[None] if single else transform)
         with self._lock:

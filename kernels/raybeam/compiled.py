@@ -46,9 +46,10 @@ def _has_cache() -> bool:
 _log = logging.getLogger(__name__)
 # Of all loops together: a first `lidarpool check` took 24 s of processor time, a later check 4 s,
 # and 30 and 5 s while the machine was busy.
-COMPILING = "compiling, once: some 20 s"
+COMPILING = "compiling the ray-casting loops, which takes about 20 s the first time"
 COMPILING_EACH_TIME = (
-    "compiling, some 20 s in each process: set NUMBA_CACHE_DIR to a folder that can be written"
+    "compiling the ray-casting loops, which takes about 20 s in each process. Set NUMBA_CACHE_DIR "
+    "to a writable folder to keep them"
 )
 _TOLD_AFTER_S = 1.0  # a single loop that has changed is compiled sooner
 _compiling_s = [0.0]  # what this process has waited for loops that were not compiled

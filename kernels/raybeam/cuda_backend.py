@@ -75,25 +75,26 @@ class CudaBackend(Backend):
     def missing(cls) -> str:
         """Return why CuPy or CUDA cannot be used and the remedy, or "" if they can be used."""
         if importlib.util.find_spec("cupy") is None:
-            return f"CuPy is not installed: {install_command('cupy-cuda12x')} or cupy-cuda13x"
+            return f"CuPy is not installed; run {install_command('cupy-cuda12x')}, or cupy-cuda13x"
         try:
             import cupy
         except ImportError as error:
-            return f"CuPy does not load ({error})"
+            return f"CuPy cannot be imported ({error})"
         try:
             count = cupy.cuda.runtime.getDeviceCount()
         except cupy.cuda.runtime.CUDARuntimeError as error:
-            return f"CuPy finds no CUDA device ({error})"
+            return f"CuPy does not find a CUDA device ({error})"
         if not count:
-            return "there is no CUDA device"
+            return "no CUDA device is available"
         try:
             cupy.cuda.nvrtc.getVersion()
         except RuntimeError as error:
             reason = str(error).partition("\n")[0]
             command = install_command("cupy-cuda13x[ctk]")
-            return f"CuPy finds no compiler ({reason}): {command}, or 12x"
+            return f"CuPy does not find a compiler ({reason}); run {command}, or 12x"
         if not _headers():
-            return f"CuPy finds no CUDA headers: {install_command('cupy-cuda13x[ctk]')}, or 12x"
+            command = install_command("cupy-cuda13x[ctk]")
+            return f"CuPy does not find the CUDA headers; run {command}, or 12x"
         return ""
 
     @classmethod
@@ -577,5 +578,8 @@ def _device(cupy: Any, number: int | None) -> Any:
     """
     count = cupy.cuda.runtime.getDeviceCount()
     if number is not None and not 0 <= number < count:
-        raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")
+        raise ValueError(
+            f"CUDA device {number} does not exist. This process has {count} devices, numbered "
+            "from 0."
+        )
     return cupy.cuda.Device(number)

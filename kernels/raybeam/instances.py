@@ -223,7 +223,7 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
     """
     listed = list(instances)
     if not listed:
-        raise ValueError("There is no instance: a caster needs at least one.")
+        raise ValueError("A caster requires at least one instance.")
     transforms = np.stack([_matrix(k, instance.transform) for k, instance in enumerate(listed)])
     _check_regular(np.arange(len(listed)), transforms)
     numbers: dict[Mesh, int] = {}
@@ -233,7 +233,9 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
     meshes = tuple(mesh._local for mesh in numbers)
     total = sum(mesh.face_count for mesh in meshes)
     if total > MAX_TRIANGLES:
-        raise ValueError(f"{total:,} triangles are too many: the limit is {MAX_TRIANGLES:,}.")
+        raise ValueError(
+            f"The instances have {total:,} triangles, but the limit is {MAX_TRIANGLES:,}."
+        )
     if len(listed) == 1 and listed[0].transform is None:
         return plain(meshes[0]), transforms
     frames = MeshFrames.of_instances(meshes, mesh)
@@ -248,8 +250,8 @@ def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
     values = np.asarray(transforms)
     if values.ndim != 3 or len(values) != len(numbers):
         raise ValueError(
-            f"There must be {len(numbers)} transforms (3, 4) or (4, 4) for as many instances; "
-            f"the shape is {values.shape}."
+            f"{len(numbers)} instances require transforms of shape ({len(numbers)}, 3, 4) or "
+            f"({len(numbers)}, 4, 4), but the shape is {values.shape}."
         )
     matrices = _matrices(numbers, values)
     _check_regular(numbers, matrices)
@@ -274,15 +276,15 @@ def _matrices(numbers: Integers, values: AnyArray) -> Floats:
     if values.dtype.kind not in "fiu" or values.shape[1:] not in ((3, 4), (4, 4)):
         raise ValueError(
             f"The transform of instance {numbers[0]} must be real numbers of shape (3, 4) or "
-            f"(4, 4), not {values.dtype} {values.shape[1:]}."
+            f"(4, 4), but has the type {values.dtype} and the shape {values.shape[1:]}."
         )
     matrices = values.astype(np.float64)
     if values.shape[1] == 4:
         wrong = np.flatnonzero((matrices[:, 3] != [0, 0, 0, 1]).any(axis=1))
         if len(wrong):
             raise ValueError(
-                f"The last row of the transform of instance {numbers[wrong[0]]} is "
-                f"{matrices[wrong[0], 3].tolist()}: expected 0, 0, 0, 1."
+                f"The last row of the transform of instance {numbers[wrong[0]]} must "
+                f"be [0, 0, 0, 1], but is {matrices[wrong[0], 3].tolist()}."
             )
     return matrices[:, :3]
 
@@ -296,7 +298,8 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
     if not finite.all():
         row = int(finite.argmin())
         raise ValueError(
-            f"The transform of instance {numbers[row]} is not finite: {transforms[row].tolist()}."
+            f"The transform of instance {numbers[row]} must be finite, but is "
+            f"{transforms[row].tolist()}."
         )
     rotation_scale = transforms[:, :, :3]
     with np.errstate(all="ignore"):
@@ -306,9 +309,8 @@ def _check_regular(numbers: Integers, transforms: Floats) -> None:
     if not regular.all():
         row = int(regular.argmin())
         raise ValueError(
-            f"The transform of instance {numbers[row]} is singular: "
-            f"{rotation_scale[row].tolist()} makes the mesh flat, or is too large or small to be "
-            "inverted."
+            f"The transform of instance {numbers[row]} is singular or cannot be inverted "
+            f"accurately: {rotation_scale[row].tolist()}."
         )
 
 

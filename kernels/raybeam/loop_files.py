@@ -110,7 +110,7 @@ class LoopFiles(IndexDataCacheFile):
     def _tell_damaged(self, name: str) -> None:
         """Say that a file is not used."""
         _tell_once(
-            "Compiled loops in %s are damaged and are compiled again. The first is %s.",
+            "Compiled loops in %s are damaged and will be compiled again. The first one is %s.",
             self._cache_path,
             name,
         )
@@ -119,7 +119,7 @@ class LoopFiles(IndexDataCacheFile):
 def tell_not_kept(folder: str, error: OSError) -> None:
     """Say that compiled code cannot be written, so that each process compiles."""
     _tell_once(
-        "Compiled loops cannot be kept in %s, so each process compiles them for itself: %s.",
+        "Compiled loops cannot be stored in %s, so each process compiles them: %s.",
         folder,
         error.strerror or str(error),
     )

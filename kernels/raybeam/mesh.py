@@ -126,7 +126,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     """
     points = real_rows("vertices", vertices)
     rows = _check_faces(faces, len(points))
-    refuse_rows("Vertex", points, finite_rows, "finite coordinates")
+    refuse_rows("Vertex", points, finite_rows, "finite")
     points = points.astype(np.float64)
     is_used = np.zeros(len(points), np.bool_)
     is_used[rows.reshape(-1)] = True
@@ -138,7 +138,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     )
     index = np.flatnonzero(has_area).astype(np.int32)
     if not len(index):
-        raise ValueError("No triangle of the mesh has an area: there is nothing to hit.")
+        raise ValueError("The mesh contains only triangles without an area.")
     face_count = len(rows)
     if len(index) < face_count:
         corners = corners[has_area]
@@ -178,15 +178,16 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
     rows = np.asarray(faces)
     if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows) or rows.dtype.kind not in "iu":
         raise ValueError(
-            "faces must be integers (rows of vertices) of shape (f, 3), at least one triangle, "
-            f"not {rows.dtype} {rows.shape}."
+            "faces must be integers (vertex indices) of shape (f, 3) with f > 0, but have the type "
+            f"{rows.dtype} and the shape {rows.shape}."
         )
     if len(rows) >= 2**28:  # positions in the tree have 31 bits; a leaf takes 3 of them
-        raise ValueError(f"{len(rows)} triangles are too many: the limit is {2**28 - 1}.")
+        raise ValueError(f"The mesh has {len(rows):,} triangles, but the limit is {2**28 - 1:,}.")
     invalid = np.flatnonzero(((rows < 0) | (rows >= vertex_count)).any(axis=1))
     if len(invalid):
         raise ValueError(
-            f"Face {invalid[0]} is {rows[invalid[0]].tolist()}, but there are {vertex_count} "
-            f"vertices: indices must be 0 to {vertex_count - 1}."
+            f"Face {invalid[0]} contains the vertex indices {rows[invalid[0]].tolist()}, but the "
+            "mesh "
+            f"has {vertex_count} vertices, numbered from 0."
         )
     return rows.astype(np.int64, copy=False)

@@ -119,7 +119,9 @@ def hits_on(
         If numba is not installed.
     """
     if importlib.util.find_spec("numba") is None:
-        raise BackendUnavailable(f"Bodies that move need numba: {install_command('numba')}.")
+        raise BackendUnavailable(
+            f"Moving bodies require numba. Install it with `{install_command('numba')}`."
+        )
     from . import moving_loops as loops  # numba takes half a second to import
 
     end = _end(scan)

@@ -60,19 +60,20 @@ def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpac
     uv = np.asarray(opacity.uv)
     if mask.dtype != np.bool_ or mask.ndim != 2 or not mask.size:
         raise ValueError(
-            f"mask must be bool of shape (h, w), at least one element, not {mask.dtype} "
-            f"{mask.shape}."
+            "mask must be a non-empty bool array of shape (h, w), but has the type "
+            f"{mask.dtype} and the shape {mask.shape}."
         )
     if uv.dtype.kind not in "fiu" or uv.shape != (face_count, 3, 2):
         raise ValueError(
-            f"uv must be real numbers of shape ({face_count}, 3, 2), three corners for each face, "
-            f"not {uv.dtype} {uv.shape}."
+            f"uv must be real numbers of shape ({face_count}, 3, 2), for three corners per face, "
+            "but "
+            f"has the type {uv.dtype} and the shape {uv.shape}."
         )
     invalid = np.flatnonzero(~(np.abs(uv) < _MAX_COORDINATE).all(axis=(1, 2)))
     if len(invalid):
         raise ValueError(
-            f"uv of face {invalid[0]} is {uv[invalid[0]].tolist()}: expected finite numbers within "
-            "2**31."
+            f"uv of face {invalid[0]} must be finite and below 2**31 in magnitude, but is "
+            f"{uv[invalid[0]].tolist()}."
         )
     single = uv[index].astype(np.float32).reshape(-1, 6)
     # Devices may flush subnormal numbers.

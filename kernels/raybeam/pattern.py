@@ -72,7 +72,7 @@ class Pattern:
         step: int | None = None,
     ) -> None:
         if step is not None and index(step) < 1:
-            raise ValueError(f"step is {step}; it must be at least 1, or None to guess it.")
+            raise ValueError(f"step must be at least 1, or None to estimate it, but is {step}.")
         self._step = None if step is None else index(step)
         self._directions = unit_directions(directions).T
         self._directions.flags.writeable = False

@@ -68,8 +68,8 @@ def pattern_rays(
     stop = int(ray.max()) + 1 if len(ray) else 0
     if first < 0 or (len(ray) and (int(ray.min()) < 0 or not len(pattern))):
         raise ValueError(
-            f"There are no rays {ray.min() if len(ray) else 0} to {stop} after row {start} of "
-            f"a pattern with {len(pattern)} rows: numbers and rows start at 0."
+            f"Rays {ray.min() if len(ray) else 0} to {stop} from row {start} are outside a pattern "
+            f"with {len(pattern)} rows. Numbers and rows start at 0."
         )
     poses = check_poses(positions, rotations, rays_per_pose, stop, motion)
     return checked_rays(pattern, first, ray, poses)

@@ -156,25 +156,24 @@ def check_poses(
     if isinstance(positions, Poses):
         return positions
     position_rows = real_rows("positions", positions)
-    refuse_rows("Position", position_rows, finite_rows, "finite coordinates")
+    refuse_rows("Position", position_rows, finite_rows, "finite")
     matrices = None if rotations is None else _check_rotations(rotations)
     count = max(len(position_rows), 1 if matrices is None else len(matrices))
     for table in (position_rows, matrices):
         if table is not None and len(table) not in (1, count):
             raise ValueError(
-                f"There are {len(position_rows)} positions and "
-                f"{0 if matrices is None else len(matrices)} rotations: give one for all poses, "
-                "or one for each."
+                "positions and rotations must have the same length, or one of them must have the "
+                f"length 1, but their lengths are {len(position_rows)} and "
+                f"{0 if matrices is None else len(matrices)}."
             )
     if rays_per_pose is None and count > 1:
-        raise ValueError(
-            f"There are {count:,} poses: rays_per_pose must say how many rays each of them has."
-        )
+        raise ValueError(f"rays_per_pose is required, because there are {count:,} poses.")
     rays_of_pose = max(ray_count, 1) if rays_per_pose is None else index(rays_per_pose)
     if rays_of_pose < 1 or count * rays_of_pose < ray_count:
         raise ValueError(
-            f"{count:,} poses of {rays_of_pose:,} rays are not enough for {ray_count:,} rays: "
-            "give more poses, more rays_per_pose, or a smaller window."
+            f"{count:,} poses with {rays_of_pose:,} rays each do not cover {ray_count:,} rays. "
+            "Pass "
+            "more poses, a larger rays_per_pose, or a smaller window."
         )
     return Poses(
         _repeated(by_component(position_rows), count),
@@ -199,8 +198,9 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
         array = by_component(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
-                f"PoseMotion.{name} must be {shape} finite numbers for {pose_count:,} poses of "
-                f"{ray_count:,} rays; given: {array.shape}."
+                f"PoseMotion.{name} must contain finite numbers of shape {shape} for "
+                f"{pose_count:,} "
+                f"poses with {ray_count:,} rays each, but has the shape {array.shape}."
             )
         arrays.append(array)
     return PoseMotion(*arrays)
@@ -226,12 +226,14 @@ def _check_rotations(rotations: ArrayLike) -> Floats:
     first = invalid[0]
     if mirrored[first]:
         raise ValueError(
-            f"Rotation {first} is {matrices[first].tolist()}, which mirrors: expected the "
-            f"determinant 1 ({len(invalid)} of {len(matrices)} are no rotations)."
+            f"The determinant of rotation {first} must be 1, but {matrices[first].tolist()} "
+            "contains a "
+            f"reflection. {len(invalid)} of {len(matrices)} matrices are invalid."
         )
     raise ValueError(
-        f"Rotation {first} is {matrices[first].tolist()}: expected orthonormal rows, which "
-        f"turn the sensor's axes to the mesh's ({len(invalid)} of {len(matrices)} are like that)."
+        f"Rotation {first} must be an orthonormal matrix from the sensor frame to the mesh frame, "
+        "but "
+        f"is {matrices[first].tolist()}. {len(invalid)} of {len(matrices)} matrices are invalid."
     )
 
 

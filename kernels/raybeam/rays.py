@@ -76,10 +76,11 @@ def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
     rows = real_rows("origins", origins)
     if len(rows) not in (1, ray_count):
         raise ValueError(
-            f"There are {len(rows)} origins and {ray_count} directions: "
-            "give one origin for all rays, or one for each."
+            f"origins must have the length 1 or the length of directions, which is {ray_count}, "
+            "but "
+            f"has the length {len(rows)}."
         )
-    refuse_rows("Origin", rows, finite_rows, "finite coordinates")
+    refuse_rows("Origin", rows, finite_rows, "finite")
     return rows
 
 
@@ -92,8 +93,8 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
     t_max = float(t_max)
     if not (0 <= t_min < np.inf and t_min <= t_max):
         raise ValueError(
-            f"t_min is {t_min} and t_max {t_max}: distances must be finite, at least 0, "
-            "and t_max not less than t_min (inf for no limit)."
+            "t_min must be finite and at least 0, and t_max must not be less than t_min, but t_min "
+            f"is {t_min} and t_max is {t_max}. Use inf as t_max for no limit."
         )
     return t_min, t_max
 
@@ -148,7 +149,9 @@ def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> An
     if rows.dtype.kind not in "fiu" or not rows.ndim or rows.shape[1:] != shape:
         expected = ", ".join(map(str, shape))
         raise ValueError(
-            f"{name} must be real numbers of shape (n, {expected}), not {rows.dtype} {rows.shape}."
+            f"{name} must be real numbers of shape (n, {expected}), but has the type {rows.dtype} "
+            "and "
+            f"the shape {rows.shape}."
         )
     return rows
 
@@ -173,8 +176,8 @@ def refuse_rows(
     rows = np.concatenate(invalid)
     if len(rows):
         raise ValueError(
-            f"{subject} {rows[0]} is {_float64(table[rows[0]]).tolist()}: expected {expected} "
-            f"({len(rows)} of {len(table)} rows are like that)."
+            f"{subject} {rows[0]} must be {expected}, but is {_float64(table[rows[0]]).tolist()}. "
+            f"{len(rows)} of {len(table)} rows are invalid."
         )
 
 
@@ -200,7 +203,7 @@ def _refuse_directions(table: AnyArray) -> None:
         "Direction",
         table,
         lambda block: finite_rows(block) & block.any(axis=1),
-        "a finite vector that is not zero",
+        "a finite vector other than zero",
     )
 
 

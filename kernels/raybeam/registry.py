@@ -49,10 +49,10 @@ def choose(name: str) -> type[Backend]:
         return next(backend for backend in BACKENDS if not backend.missing())
     by_name = {backend.name: backend for backend in BACKENDS}
     if name not in by_name:
-        raise ValueError(f"There is no backend {name!r}: use auto, {', '.join(by_name)}.")
+        raise ValueError(f"Unknown backend {name!r}. The backends are auto, {', '.join(by_name)}.")
     reason = by_name[name].missing()
     if reason:
         raise BackendUnavailable(
-            f"Backend {name!r} cannot be used here: {reason}. Backend 'auto' takes what works."
+            f"Backend {name!r} cannot be used: {reason}. Use 'auto' to select an available backend."
         )
     return by_name[name]

@@ -98,17 +98,17 @@ def check_scan(
     start, stop = (0, len(pattern)) if window is None else map(index, window)
     if not 0 <= start <= stop or (stop > start and not len(pattern)):
         raise ValueError(
-            f"Rows {start} to {stop} of a pattern with {len(pattern)} are no window: "
-            "expected 0 <= start <= stop."
+            f"window must satisfy 0 <= start <= stop, but is ({start}, {stop}) for a pattern with "
+            f"{len(pattern)} rows."
         )
     count = stop - start
     if count > _MAX_RAYS:
         raise ValueError(
-            f"{count:,} rays are more than the {_MAX_RAYS:,} that one call can number: "
-            "scan smaller windows."
+            f"The window has {count:,} rays, but the limit is {_MAX_RAYS:,} per call. Scan smaller "
+            "windows."
         )
     if index(keep_every) < 1:
-        raise ValueError(f"keep_every is {keep_every}: it must be at least 1, to keep all hits.")
+        raise ValueError(f"keep_every must be at least 1, but is {keep_every}.")
     poses = check_poses(positions, rotations, rays_per_pose, count, motion)
     t_min, t_max = check_interval(t_min, t_max)
     return Scan(

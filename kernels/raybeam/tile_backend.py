@@ -43,7 +43,7 @@ class TileBackend(Backend):
     def missing(cls) -> str:
         """Return why numba cannot be used and the remedy, or "" if it can be used."""
         if importlib.util.find_spec("numba") is None:
-            return f"numba is not installed: {install_command('numba')}"
+            return f"numba is not installed; run {install_command('numba')}"
         return ""
 
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:

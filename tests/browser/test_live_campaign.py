@@ -63,7 +63,7 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
             run.join(300)
         assert [row.number for row in ended[0].failed] == [FAILS]
         text = tab.wait_for(lambda text: f"{COUNT - 1} of {COUNT} jobs done" in text and text)
-        assert "no such place" in text and "Under way" not in text
+        assert "no such place" in text and "Running" not in text
         tab.wait_for(lambda text: "done" in text.split("\n")[1])
         tab.wait_for(lambda _: tab.value("document.querySelectorAll('#charts svg').length") == 2)
         tab.wait_for(lambda _: tab.value(DRAWN))

@@ -127,7 +127,7 @@ def test_a_large_cloud_is_drawn_by_a_sample_until_all_points_are_read(kinds, new
     view = growing_view(place_of(kinds, "las"))
     with page_server(view.answer, port=0) as page:
         tab = new_tab(page.url)
-        tab.wait_for(lambda text: drawn(tab) > 0 and "Reading the points … 0 %" in text)
+        tab.wait_for(lambda text: drawn(tab) > 0 and "Loading points … 0 %" in text)
         tab.choose("color", "intensity")
         is_drawn.set()
         total = f"{view.total:,} points"
@@ -140,7 +140,7 @@ def test_jobs_of_a_data_set_are_listed_and_each_is_opened(kinds, new_tab):
     with page_server(JobList(kinds / "set").answer, port=0, index="jobs.html") as page:
         tab = new_tab(page.url)
         tab.wait_for(lambda text: "5 of 6 jobs done" in text and "Points of job 00" in text)
-        assert "failed" in tab.text and "go on to newer jobs" not in tab.text
+        assert "failed" in tab.text and "switch to newer jobs automatically" not in tab.text
         links = tab.value("[...document.querySelectorAll('#jobs a')].map(link => link.href)")
         assert len(links) == 5
         job = new_tab(links[1])

@@ -70,7 +70,7 @@ def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
     assert [request for request in tab.requests if not request.startswith(own)] == []
     tab.choose("color", "wetness")
     tab.wait_for(lambda text: "wetness, %" in text and "z, m" not in text)
-    tab.choose("color", "not shown")
+    tab.choose("color", "hidden")
     tab.wait_for(lambda _: drawn(tab) == 0)
     assert tab.errors == []
 
@@ -214,7 +214,7 @@ def test_a_page_that_loads_says_so_and_its_heading_is_whole(view, new_tab):
         tab = new_tab("about:blank")
         tab.resize(1280)
         tab.open(page.url)
-        tab.wait_for(lambda text: "Reading the points …" in text)
+        tab.wait_for(lambda text: "Loading points …" in text)
         asked.set()
         tab.wait_for(lambda text: "30,000 points" in text and "Reading" not in text)
     heading = "document.querySelector('#panel h1')"
@@ -231,7 +231,7 @@ def test_points_in_their_own_colors(new_tab, tmp_path):
     path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
     with page_server(View(CloudFile(path)).answer, port=0) as page:
         tab = opened(new_tab, page)
-        tab.tick("shade by depth", on=False)
+        tab.tick("depth shading", on=False)
         tab.key("t")
         tab.choose("color", "rgb")
         tab.wait_for(lambda text: "z, m" not in text)
@@ -499,7 +499,7 @@ def test_a_click_beside_all_points_is_answered(served, new_tab):
     tab = opened(new_tab, served)
     tab.key("t")
     tab.press(800, 600)
-    tab.wait_for(lambda text: "No point here." in text)
+    tab.wait_for(lambda text: "There is no point here." in text)
     assert tab.errors == []
 
 
@@ -682,7 +682,9 @@ def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise
         tab.wait_for(lambda _, tab=tab: colorful(tab.picture(tmp_path / "a.png")) > 3000)
         corner = tab.picture(tmp_path / "a.png")[5:40, 300:335].mean()
         assert (corner > 200) == (name == "light")
-        tab.value("document.querySelector('button[title=\"Light or dark\"]').click()")
+        tab.value(
+            "document.querySelector('button[title=\"Switch between light and dark mode\"]').click()"
+        )
         assert tab.value(theme) == other
         tab.value("localStorage.clear()")
 
@@ -692,7 +694,7 @@ def test_the_page_says_that_its_server_has_ended(view, new_tab):
         tab = opened(new_tab, page)
         tab.wait_for(lambda _: drawn(tab) == COUNT)
     tab.key("ArrowRight")
-    tab.wait_for(lambda text: "server of this page has ended" in text)
+    tab.wait_for(lambda text: "server of this page has stopped" in text)
 
 
 def test_actors_deform_with_the_time(view, new_tab, tmp_path):

@@ -8,6 +8,7 @@ from click.testing import CliRunner
 
 from lidarpool.cli import first_step
 from lidarpool.cli.commands import cli
+from raybeam import compiled
 
 STEP = re.compile(r"\d\d:\d\d:\d\d  reading the scene\n")
 
@@ -37,10 +38,13 @@ def test_compiling_is_told_where_logs_are_dropped(capsys, monkeypatch):
     first_step.begin("reading the scene")
     first_step.begin("reading the scene")  # as a second command of the process
     capsys.readouterr()
-    logger.info("compiling, once: some 20 s")
-    assert re.fullmatch(r"\d\d:\d\d:\d\d  compiling, once: some 20 s\n", capsys.readouterr().err)
+    logger.info(compiled.COMPILING)
+    assert re.fullmatch(
+        r"\d\d:\d\d:\d\d  compiling the ray-casting loops, which takes about 20 s the first time\n",
+        capsys.readouterr().err,
+    )
     first_step.begin("reading the scene", quiet=True)
-    logger.info("compiling, once: some 20 s")
+    logger.info(compiled.COMPILING)
     assert capsys.readouterr().err == ""
 
 

@@ -196,7 +196,7 @@ def test_a_loop_that_cannot_be_kept_runs_with_a_note(package, function, caplog):
     file.unlink()
     file.mkdir()
     assert compilations(function) == 1
-    assert f"cannot be kept in {file.parent}, so each process compiles them for" in caplog.text
+    assert f"cannot be stored in {file.parent}, so each process compiles them" in caplog.text
     assert not [*file.parent.glob("*.tmp.*")]
 
 

@@ -104,7 +104,7 @@ def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
 def test_other_backends_have_no_device(shapes):
     caster = RayCaster(*shapes["cube"](), backend="numpy")
     assert not caster.on_device
-    with pytest.raises(BackendUnavailable, match="use scan"):
+    with pytest.raises(BackendUnavailable, match="Use scan"):
         caster.visit(scan_of(), print)
 
 

@@ -275,30 +275,36 @@ def test_nothing_to_scan(caster, shapes):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"window": (2, 1)}, "Rows 2 to 1 of a pattern with 3 are no window: expected 0 <= start"),
-        ({"window": (-1, 2)}, "Rows -1 to 2"),
-        ({"window": (5, 2**32 + 6)}, "4,294,967,297 rays are more than the 4,294,967,296 that"),
-        ({"pattern": Pattern(np.empty((0, 3))), "window": (0, 2)}, "Rows 0 to 2 of a pattern with"),
-        ({"rotations": 2 * np.eye(3)}, r"Rotation 0 is .*orthonormal.*1 of 1"),
-        ({"rotations": [np.eye(3), np.eye(3)[::-1] * 1.1]}, r"Rotation 1 is .*orthonormal.*1 of 2"),
-        ({"rotations": np.diag([1, -1, 1])}, r"Rotation 0 is .*mirrors.*determinant 1 \(1 of 1"),
-        ({"rotations": [np.eye(3), -np.eye(3)]}, r"Rotation 1 is .*mirrors.*\(1 of 2"),
-        ({"rotations": np.eye(2)}, r"rotations must be .* \(n, 3, 3\), not float64 \(2, 2\)"),
+        ({"window": (2, 1)}, "0 <= start <= stop, but is .2, 1. for a pattern with 3 rows"),
+        ({"window": (-1, 2)}, "is .-1, 2."),
+        ({"window": (5, 2**32 + 6)}, "4,294,967,297 rays, but the limit is 4,294,967,296"),
+        (
+            {"pattern": Pattern(np.empty((0, 3))), "window": (0, 2)},
+            "is .0, 2. for a pattern with 0",
+        ),
+        ({"rotations": 2 * np.eye(3)}, r"Rotation 0 must be an orthonormal.*1 of 1"),
+        (
+            {"rotations": [np.eye(3), np.eye(3)[::-1] * 1.1]},
+            r"Rotation 1 must be an orthonormal.*1 of 2",
+        ),
+        ({"rotations": np.diag([1, -1, 1])}, r"rotation 0 must be 1, .* reflection.*1 of 1"),
+        ({"rotations": [np.eye(3), -np.eye(3)]}, r"rotation 1 must be 1, .* reflection.*1 of 2"),
+        ({"rotations": np.eye(2)}, r"rotations must be .* \(n, 3, 3\), .* float64 .* \(2, 2\)"),
         ({"rotations": np.full((3, 3), np.nan)}, "orthonormal"),
-        ({"rotations": np.zeros((0, 3, 3))}, "1 positions and 0 rotations"),
-        ({"positions": [[0, 0, 0], [0, np.inf, 1]]}, "Position 1 is .*inf"),
-        ({"positions": np.zeros((0, 3))}, "0 positions and 0 rotations"),
-        ({"positions": np.zeros((2, 3))}, "There are 2 poses: rays_per_pose must say"),
+        ({"rotations": np.zeros((0, 3, 3))}, "lengths are 1 and 0"),
+        ({"positions": [[0, 0, 0], [0, np.inf, 1]]}, "Position 1 must .*inf"),
+        ({"positions": np.zeros((0, 3))}, "lengths are 0 and 0"),
+        ({"positions": np.zeros((2, 3))}, "rays_per_pose is required, because there are 2"),
         (
             {"positions": np.zeros((2, 3)), "rotations": rotations(3), "rays_per_pose": 1},
-            "2 positions and 3 rotations",
+            "lengths are 2 and 3",
         ),
         (
             {"positions": np.zeros((2, 3)), "rays_per_pose": 1},
-            "2 poses of 1 rays are not enough for 3 rays",
+            "2 poses with 1 rays each do not cover 3",
         ),
-        ({"t_min": 2, "t_max": 1}, "t_min is 2.0 and t_max 1.0"),
-        ({"keep_every": 0}, "keep_every is 0: it must be at least 1"),
+        ({"t_min": 2, "t_max": 1}, "t_min is 2.0 and t_max is 1.0"),
+        ({"keep_every": 0}, "keep_every must be at least 1, but is 0"),
     ],
 )
 def test_scan_refused(change, words):
@@ -308,11 +314,11 @@ def test_scan_refused(change, words):
 
 
 def test_pattern_refused():
-    with pytest.raises(ValueError, match="Direction 2 is"):
+    with pytest.raises(ValueError, match="Direction 2 must"):
         Pattern([[0, 0, 1], [0, 1, 0], [0, 0, 0]])
-    with pytest.raises(ValueError, match=r"Origin 1 is .*nan"):
+    with pytest.raises(ValueError, match=r"Origin 1 must .*nan"):
         Pattern(np.eye(3), [[0, 0, 0], [0, np.nan, 0], [0, 0, 0]])
-    with pytest.raises(ValueError, match="2 origins and 3 directions"):
+    with pytest.raises(ValueError, match="directions, which is 3, but has the length 2"):
         Pattern(np.eye(3), np.zeros((2, 3)))
     for table in ("directions", "origins"):
         with pytest.raises(ValueError, match="read-only"):
@@ -323,10 +329,10 @@ def test_pattern_refused():
     ("change", "error", "words"),
     [
         ({"numbers": [0.5]}, TypeError, "float64"),
-        ({"numbers": [3, -1]}, ValueError, "There are no rays -1 to 4 after row 0"),
-        ({"start": -1}, ValueError, "There are no rays 0 to 2 after row -1"),
-        ({"positions": np.zeros((2, 3))}, ValueError, "There are 2 poses: rays_per_pose"),
-        ({"numbers": [4], "rays_per_pose": 4}, ValueError, "not enough for 5 rays"),
+        ({"numbers": [3, -1]}, ValueError, "Rays -1 to 4 from row 0"),
+        ({"start": -1}, ValueError, "Rays 0 to 2 from row -1"),
+        ({"positions": np.zeros((2, 3))}, ValueError, "rays_per_pose is required"),
+        ({"numbers": [4], "rays_per_pose": 4}, ValueError, "do not cover 5 rays"),
     ],
 )
 def test_rays_refused(change, error, words):

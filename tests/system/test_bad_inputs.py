@@ -204,7 +204,7 @@ def test_bad_arguments(case, refused, impatient):
 def test_cuda_without_a_gpu(refused):
     if not available_backends()["cuda"]:
         pytest.skip("there is a GPU")
-    refused(["run", "good.yaml", "--backend", "cuda"], "Backend 'cuda' cannot be used here")
+    refused(["run", "good.yaml", "--backend", "cuda"], "Backend 'cuda' cannot be used")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no locks on folders")

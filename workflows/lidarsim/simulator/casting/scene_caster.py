@@ -76,7 +76,7 @@ def check_backend_here(backend: str, advice: str = AUTO_TAKES) -> None:
         hint = did_you_mean(backend, backends) or f" Available backends: {', '.join(backends)}."
         raise LidarError(f"Unknown backend {backend!r}.{hint}")
     if backends[backend]:
-        raise LidarError(f"Backend {backend!r} cannot be used here: {backends[backend]}. {advice}")
+        raise LidarError(f"Backend {backend!r} cannot be used: {backends[backend]}. {advice}")
 
 
 class SceneCaster:

@@ -24,7 +24,7 @@ async function answerTo(what, address, signal) {
     } catch (error) {
       if (!(error instanceof TypeError)) throw error;
     }
-    if (!pause) throw words ? new Error(words) : new TypeError("The server of this page has ended.");
+    if (!pause) throw words ? new Error(words) : new TypeError("The server of this page has stopped.");
     await new Promise((done) => setTimeout(done, pause));
   }
 }

@@ -63,7 +63,7 @@ export function themeButton(show = () => {}) {
   use();
   systemDark.addEventListener("change", use);
   addEventListener("storage", use); // another page has changed it, as the one around this one
-  return iconButton("theme", "Light or dark", () => {
+  return iconButton("theme", "Switch between light and dark mode", () => {
     const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
     try { localStorage.setItem("lidarpool-theme", theme); } catch { /* a page in a frame may not */ }
     set(theme);
@@ -165,12 +165,12 @@ export function legend(told, only, act, names = {}, hidden = new Set(), change =
   for (const [name, color, value] of told.labels) {
     const shown = names[value] ?? (name || `${value}`);
     const press = element(
-      "button", { type: "button", title: value === only ? "Show all again" : `Show only ${shown}`, onclick: () => act(value) },
+      "button", { type: "button", title: value === only ? "Show all" : `Show only ${shown}`, onclick: () => act(value) },
       element("i", { style: { background: `rgb(${color})` } }), element("span", { textContent: shown }),
     );
     press.setAttribute("aria-pressed", value === only);
     press.append(element("span", { className: "number", dataset: { value } }));
-    const box = element("input", { type: "checkbox", checked: !hidden.has(value), title: hidden.has(value) ? "Switch on" : "Switch off", onchange: () => change(value) });
+    const box = element("input", { type: "checkbox", checked: !hidden.has(value), title: hidden.has(value) ? "Show" : "Hide", onchange: () => change(value) });
     box.setAttribute("aria-label", `show ${shown}`);
     list.append(element("li", {}, ...(change ? [box] : []), press));
   }

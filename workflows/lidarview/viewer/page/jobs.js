@@ -22,7 +22,7 @@ const inSeconds = (value) => value === null ? "–" : `${value >= 100 ? whole(va
 // -- the run -----------------------------------------------------------------------------
 
 function showRun(told) {
-  if (told.still && shown === null) $("cloud").querySelector("p").textContent = "Reading the points of a job …";
+  if (told.still && shown === null) $("cloud").querySelector("p").textContent = "Loading the points of a job …";
   document.title = `${told.over ? "" : `${Math.floor((100 * (told.done + told.failed)) / told.count)}% `}${told.title} - lidarpool`;
   $("title").textContent = told.title;
   $("state").textContent = told.state;
@@ -31,7 +31,7 @@ function showRun(told) {
     ([className, jobs]) => element("i", { className, style: { width: `${(100 * jobs) / told.count}%` } }),
   ));
   const entries = [
-    ["failed", whole(told.failed), "failed", told.failed > 0], ["under way", told.over ? "" : whole(told.busy), "busy"],
+    ["failed", whole(told.failed), "failed", told.failed > 0], ["running", told.over ? "" : whole(told.busy), "busy"],
     ["rate", told.rate], ["left", told.left], ["time", told.time], ["points", short(told.points)], ["rays", short(told.rays)],
   ];
   $("figures").replaceChildren(...entries.filter(([, value]) => value !== "").map(([name, value, className, bad]) => {
@@ -46,7 +46,7 @@ function showRun(told) {
 // The name of a job leads to its page, if its points can be shown.
 function nameOf(job) {
   if (!job.opens) return cell(job.name);
-  return element("td", {}, element("a", { href: `job/${job.number}/`, target: "_blank", title: "Open its points", textContent: job.name }));
+  return element("td", {}, element("a", { href: `job/${job.number}/`, target: "_blank", title: "Open the point cloud of this job", textContent: job.name }));
 }
 const cell = (text, className = "") => element("td", { textContent: text, className });
 
@@ -78,7 +78,7 @@ function showJobs(told) {
   const ended = told.ended.map((job) => line(job, cell("done", "text"), whole(job.points), inSeconds(job.seconds)));
   const last = (jobs, listed) => (jobs > listed ? `the ${told.still ? "first" : "last"} ${whole(listed)} of ${whole(jobs)}` : whole(jobs));
   const bodies = [
-    ...group("Under way", told.busy > underWay.length ? `the first ${underWay.length} of ${whole(told.busy)}` : whole(told.busy), width, underWay),
+    ...group("Running", told.busy > underWay.length ? `first ${underWay.length} of ${whole(told.busy)}` : whole(told.busy), width, underWay),
     ...group("Failed", last(told.failed, told.failures.length), width, failed),
     ...group("Done", last(told.done, told.ended.length), width, ended),
   ];
@@ -107,8 +107,8 @@ function showCloud(newest) {
     const box = element("input", { type: "checkbox", checked: follows, onchange: () => { follows = box.checked; } });
     $("shown").replaceChildren(
       element("span", {}, "Points of ", element("b", { textContent: `job ${name}` })),
-      element("a", { href: `job/${number}/`, target: "_blank", textContent: "open with all controls" }),
-      ...(isStill ? [] : [element("label", {}, box, "go on to newer jobs")]),
+      element("a", { href: `job/${number}/`, target: "_blank", textContent: "open in the viewer" }),
+      ...(isStill ? [] : [element("label", {}, box, "switch to newer jobs automatically")]),
     );
   }, SETTLED_MS);
   $("frames").append(frame);

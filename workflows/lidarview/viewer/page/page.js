@@ -13,10 +13,10 @@ const AHEAD = 3; // sweeps that are asked for before they are played
 const GROWING = 300_000; // points of all sweeps up to now, while they are played
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
 const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
-const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
-const HIDDEN = "not shown";
+const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all so far"]];
+const HIDDEN = "hidden";
 const OPEN = 3e38; // an end of a range that limits nothing; float32 holds it
-const READING = "Reading the points …"; // until the first are there
+const READING = "Loading points …"; // until the first are there
 const FAINT = 0.2; // opacity of gray surfaces before points, so that these come first
 const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
 
@@ -248,10 +248,10 @@ function showLegend(told) {
 function limitInputs(limits) {
   const inputs = limits.map((value, end) => {
     const input = element("input", { type: "number", step: "any", value: +value.toPrecision(6) });
-    input.setAttribute("aria-label", end ? "highest of the colors" : "lowest of the colors");
+    input.setAttribute("aria-label", end ? "upper limit of the color scale" : "lower limit of the color scale");
     input.onchange = () => {
       const ends = inputs.map((other) => other.valueAsNumber);
-      if (!ends.every(Number.isFinite) || ends[0] >= ends[1]) return sayBriefly("The first limit has to be lower than the second.");
+      if (!ends.every(Number.isFinite) || ends[0] >= ends[1]) return sayBriefly("The lower limit must be less than the upper limit.");
       return setColorLimits(ends);
     };
     return input;
@@ -398,9 +398,9 @@ function buildPanel() {
   const name = state.title.replace(/ - lidarpool$/, "");
   const head = element(
     "header", {}, element("h1", { textContent: name }),
-    iconButton("link", "Copy the link to this view", copyLink),
-    iconButton("picture", "Save the picture", () => picture.save(`${name}.png`)),
-    iconButton("help", "Keys and mouse (?)", showKeys), theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
+    iconButton("link", "Copy a link to this view", copyLink),
+    iconButton("picture", "Save as image", () => picture.save(`${name}.png`)),
+    iconButton("help", "Keyboard and mouse help (?)", showKeys), theme, iconButton("panel", "Hide the panel (H)", () => showPanel(false)),
   );
   panel.legend = element("div");
   const points = section("Points", true,
@@ -410,8 +410,8 @@ function buildPanel() {
       chosen.size = picture.pointScale = 10 ** value;
       picture.sizePoints();
     }),
-    menu("at most", BUDGETS.map((count) => [count, `${(count / 1e6).toLocaleString("en")} million`]), chosen.budget, (value) => { chosen.budget = +value; shownKey = null; refresh(); }),
-    tick("shade by depth", chosen.shading, (on) => { chosen.shading = on; picture.strength = on ? 1 : 0; picture.dirty = true; }),
+    menu("maximum", BUDGETS.map((count) => [count, `${(count / 1e6).toLocaleString("en")} million`]), chosen.budget, (value) => { chosen.budget = +value; shownKey = null; refresh(); }),
+    tick("depth shading", chosen.shading, (on) => { chosen.shading = on; picture.strength = on ? 1 : 0; picture.dirty = true; }),
   );
   const parts = [head, panel.progress, ...(state.live ? [stop] : []), panel.facts];
   if (state.results.length) parts.push(section("Results", true, (panel.results = element("div"))));
@@ -461,7 +461,7 @@ function buildPanel() {
   if (state.exports.length) {
     const format = menu("format", state.exports, state.exports[0], () => {});
     parts.push(section("Export", false, format, button("Download", () => download(format.menu.value).catch(failed)),
-      element("div", { className: "note", textContent: "The points that are shown: filtered, clipped, at this time." })));
+      element("div", { className: "note", textContent: "Exports the visible points, with the current filter, clip box and time." })));
   }
   $("panel").replaceChildren(...parts.flatMap((part) => (part === panel.facts && state.note ? [part, element("div", { className: "note", style: { padding: "0 12px 8px" }, textContent: state.note })] : [part])));
   buildClip();
@@ -546,15 +546,15 @@ const showPath = () => picture.setPath(state.path, loadSurface.floor ?? state.bo
 
 // {tool: [title, most points, what to click]}
 const TOOLS = {
-  point: ["What a point is (1)", 1, "Click a point; Shift and click another to measure."],
+  point: ["Inspect a point (1)", 1, "Click a point to inspect it. Shift-click another point to measure the distance."],
   distance: ["Measure a distance (2)", 2, "Click two points."],
-  angle: ["Measure an angle (3)", 3, "Click three points: the second is the corner."],
-  area: ["Measure an area (4)", 100, "Click the corners of an area."],
+  angle: ["Measure an angle (3)", 3, "Click three points. The second is the vertex of the angle."],
+  area: ["Measure an area (4)", 100, "Click the corners of the area."],
 };
 
 function buildTools() {
   const tools = Object.entries(TOOLS).map(([name, [title]]) => [name, iconButton(name, title, () => setTool(name))]);
-  const clip = iconButton("clip", "Clip box (B): drag its sides", () => showClipBox(!chosen.clipBox));
+  const clip = iconButton("clip", "Clip box (B): drag its faces", () => showClipBox(!chosen.clipBox));
   $("tools").replaceChildren(...tools.map(([, press]) => press), clip);
   panel.tools = { ...Object.fromEntries(tools), clip };
   tellTools();
@@ -609,7 +609,7 @@ async function pick(x, y, measure) {
   const found = picture.pick(x, y);
   if (!found) {
     if (chosen.tool === "point") clearPicked();
-    return sayBriefly("No point here.");
+    return sayBriefly("There is no point here.");
   }
   if (measure && chosen.tool === "point" && picked.length) {
     chosen.tool = "distance";
@@ -695,24 +695,24 @@ function buildTime() {
   const shows = SHOWS.filter(([value]) => !(+value >= (stationary() ? 0 : state.duration)))
     .map(([value, text]) => [value, value === "sweep" && steps.length === state.stations.length - 1 ? "one station" : text]);
   clock.show = menu("", shows, chosen.show, (value) => { clock.own = true; setShow(value); });
-  explain(clock.show, "Points that are shown");
+  explain(clock.show, "Visible points");
   clock.slider = element("input", { type: "range", min: 0, max: sliderEnd(), step: stationary() ? 1 : "any", value: stationary() ? stepNow() : chosen.time });
   explain(clock.slider, stationary() ? "Station" : "Time, seconds");
   clock.slider.oninput = () => { leaveAll(); setTime(stationary() ? steps[+clock.slider.value] : +clock.slider.value); };
   clock.ticks = element("canvas");
   clock.now = element("span", { className: "now" });
   clock.speed = menu("", SPEEDS.map((speed) => [speed, `${speed}×`]), chosen.speed, (value) => { chosen.speed = +value; });
-  explain(clock.speed, stationary() ? "Speed; 1× is a station a second" : "Speed; 1× is as fast as the survey");
-  clock.loop = iconButton("loop", "Play again from the start", () => { chosen.loop = !chosen.loop; showToggles(); });
+  explain(clock.speed, stationary() ? "Playback speed (1× is one station per second)" : "Playback speed (1× is real time)");
+  clock.loop = iconButton("loop", "Loop", () => { chosen.loop = !chosen.loop; showToggles(); });
   clock.follow = button("Follow", () => setFollow(!chosen.follow));
-  clock.follow.title = "Move the camera with the carrier";
+  clock.follow.title = "Follow the platform with the camera";
   clock.follow.hidden = !picture.sensors.some((sensor) => sensor.moves);
   clock.images = button("Range image", () => { chosen.images = !chosen.images; showToggles(); showImages(); });
   clock.images.hidden = Boolean(state.offline); // a file does not hold them
   $("time").replaceChildren(
     element("div", { className: "line" }, clock.slider, clock.ticks),
     element("div", { className: "transport" },
-      iconButton("back", "Sweep back (←)", () => stepBy(-1)), clock.play, iconButton("next", "Sweep on (→)", () => stepBy(1)), clock.speed, clock.loop),
+      iconButton("back", "Previous sweep (←)", () => stepBy(-1)), clock.play, iconButton("next", "Next sweep (→)", () => stepBy(1)), clock.speed, clock.loop),
     clock.now,
     element("div", { className: "options" }, clock.show, clock.follow, clock.images),
   );
@@ -920,7 +920,7 @@ async function copyLink() {
   writeLink(linkText());
   try {
     await navigator.clipboard.writeText(location.href);
-    sayBriefly("The link to this view was copied.");
+    sayBriefly("A link to this view was copied.");
   } catch {
     sayBriefly("The link is in the address bar.");
   }
@@ -1069,7 +1069,7 @@ async function news(told) {
 // Of a large file, a sample is shown first, and more points while they are read.
 async function grow() {
   const told = await follow("growth", () => ({}), NEWS_MS, ({ complete: all, error, share, version }) => {
-    say(`Reading the points … ${Math.round(100 * share)} %`);
+    say(`Loading points … ${Math.round(100 * share)} %`);
     if (all || error) return true;
     if (version !== state.version) {
       state.version = version;
@@ -1130,15 +1130,15 @@ function releaseKey(event) {
 }
 
 const KEYS = [
-  ["Space", "play or pause"], ["← →", "one sweep back or on; ten with Shift"], ["Home End", "first or last sweep"],
-  ["A T S F", "all, from the top, side, front"], ["P", "parallel or perspective"], ["C", "copy the link"],
-  ["1 2 3 4", "read a point, measure a distance, an angle, an area"], ["Esc", "clear what is measured"], ["B", "clip box"],
-  ["H", "hide or show the panel"], ["R", "the next result, or all"], ["Enter", "press the focused button"],
-  ["↑ ↓", "change the focused slider or menu"], ["?", "show or hide these keys"],
+  ["Space", "play or pause"], ["← →", "previous or next sweep; ten sweeps with Shift"], ["Home End", "first or last sweep"],
+  ["A T S F", "fit all, top, side or front view"], ["P", "toggle parallel projection"], ["C", "copy a link to this view"],
+  ["1 2 3 4", "inspect a point; measure a distance, an angle or an area"], ["Esc", "clear measurements"], ["B", "toggle the clip box"],
+  ["H", "toggle the panel"], ["R", "next result, or all results"], ["Enter", "activate the focused button"],
+  ["↑ ↓", "change the focused slider or menu"], ["?", "toggle this help"],
 ];
 const GESTURES = [
-  ["drag", "turn; with two fingers, the right button or Shift, move"], ["wheel, pinch", "closer or farther"],
-  ["click, tap", "what a point is, or the next point to measure"], ["Shift-click", "measure to another point"],
+  ["drag", "rotate; pan with two fingers, the right button or Shift"], ["wheel, pinch", "zoom"],
+  ["click, tap", "inspect a point, or add a point to the measurement"], ["Shift-click", "measure the distance to another point"],
 ];
 
 function showKeys() {
@@ -1152,7 +1152,7 @@ function showKeys() {
   const line = (head, words) => [element("dt", {}, ...head), element("dd", { textContent: words })];
   box.replaceChildren(
     element("h2", { textContent: "Keys" }), element("dl", {}, ...shown.flatMap(([names, words]) => line(kbd(names), words))),
-    element("h2", { textContent: "Mouse and fingers" }), element("dl", {}, ...GESTURES.flatMap(([name, words]) => line([name], words))),
+    element("h2", { textContent: "Mouse and touch" }), element("dl", {}, ...GESTURES.flatMap(([name, words]) => line([name], words))),
     button("Close", () => box.close()),
   );
   box.showModal();

@@ -114,7 +114,7 @@ function bend({ mesh, poses, faces }, frame) {
 function stationsOf({ name, labels, places, at }) {
   const distinct = new Map(labels.map((label, k) => [label, places.subarray(3 * k, 3 * k + 3)]));
   if (distinct.size < 2) return [[name || "sensor", at]];
-  return [...distinct].map(([label, place]) => [label, place, at.every((value, axis) => value === place[axis]) ? "station now" : "station"]);
+  return [...distinct].map(([label, place]) => [label, place, at.every((value, axis) => value === place[axis]) ? "current station" : "station"]);
 }
 
 export class Picture {
@@ -708,7 +708,7 @@ export class Picture {
     const [unit, size] = length >= 1000 ? ["km", 1000] : length >= 1 ? ["m", 1] : length >= 0.01 ? ["cm", 0.01] : ["mm", 0.001];
     this.scale.firstChild.textContent = `${+(length / size).toPrecision(2)} ${unit}`;
     this.scale.lastChild.style.width = `${Math.round(length / meters)}px`;
-    this.scale.title = this.isParallel ? "scale" : "scale where the camera looks";
+    this.scale.title = this.isParallel ? "scale" : "scale at the focus of the camera";
   }
 
   // -- the mouse -------------------------------------------------------------------------

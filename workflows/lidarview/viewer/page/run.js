@@ -13,7 +13,7 @@ export const count = ([label, done, whole]) => element(
 
 export const slots = ([label, share, whole]) => element(
   "div", { className: "count" }, element("span", { textContent: label }),
-  element("span", { textContent: `${Math.round(100 * share)} % of ${whole}`, title: "over the last seconds" }), meter(share),
+  element("span", { textContent: `${Math.round(100 * share)} % of ${whole}`, title: "in the last few seconds" }), meter(share),
 );
 
 // Leaves alone what shows this already.
