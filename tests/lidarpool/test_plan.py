@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from lidarpool import LidarError, Planning
 from lidarpool.plan import Trial, best, run_trial, shortest_path_length
+from lidarpool.plan.cost import PathCost
 from lidarpool.plan.geometry import clearance, segment_distances
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
@@ -241,6 +242,18 @@ CASES = {
 def test_lengths_by_formula(name):
     *given, expected = CASES[name]
     assert shortest_path_length(*given) == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_path_through_a_disc_costs_more_than_any_detour():
+    """The boundaries of all discs together are longer than any path around them."""
+    centers = np.array([[0.0, 2.0 * k] for k in range(20)])
+    radii = np.full(20, 0.3)
+    cost = PathCost(centers, radii, waypoints=1, particles=2)
+    cost.waypoints[:, :, 0] = [[0.0, 0.0]]  # through the first disc
+    cost.waypoints[:, :, 1] = [[0.0, -0.4]]  # around it
+    through, around = cost.evaluate().tolist()
+    assert around == pytest.approx(2 * math.hypot(0.5, 0.4), rel=1e-6)
+    assert through > 2 * math.pi * radii.sum()
 
 
 @pytest.mark.parametrize("enclosed", [(0, 0), (9, 9)])

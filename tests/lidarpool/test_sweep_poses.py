@@ -10,6 +10,7 @@ import pytest
 from lidarpool import SceneMesh
 from lidarpool.comparing.fit.smooth_surfaces import find_surfaces
 from lidarpool.places.alignment import Alignment
+from lidarpool.places.free_space import RangeImage
 from lidarpool.places.labels import divided, labels_of
 from lidarpool.places.motion import Motion
 from lidarpool.places.odometry import RecordedPoses
@@ -181,3 +182,19 @@ def test_surfels_are_divided_by_the_objects_and_classes_of_their_labels():
     assert parts[0].materials is None  # a class above 65,535 is none
     assert parts[1].materials.names == (f"{CLASS_MATERIAL}7",)
     assert parts[2].materials.names == (f"{CLASS_MATERIAL}9",)
+
+
+def test_range_images_have_a_row_around_each_ring():
+    """Each cell has the nearest and farthest range of its row and of the rows beside it."""
+    elevation = np.radians([10.0, 4.0, 0.0, -10.0, -20.0])
+    ranges = np.array([10.0, 20.0, 30.0, 40.0, 50.0])
+    points = ranges[:, None] * np.stack(
+        [np.cos(elevation), 0 * elevation, np.sin(elevation)], axis=1
+    )
+    image = RangeImage.of_points(points, elevation)
+    column = np.isfinite(image.nearest_m).all(axis=0)
+    assert column.sum() == 3
+    np.testing.assert_allclose(image.nearest_m[:, column].T, [[10, 10, 20, 30, 40]] * 3)
+    np.testing.assert_allclose(image.farthest_m[:, column].T, [[20, 30, 40, 50, 50]] * 3)
+    passed, confirmed = image.judge(points * 0.5)
+    assert passed.tolist() == [True, False, True, True, True] and not confirmed[2:].any()

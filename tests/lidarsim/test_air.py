@@ -267,6 +267,17 @@ def test_spray_takes_light_from_what_is_behind_it():
     assert same(before, sprayed(car(spray=False), [wall("W", 6)])), "nor does any return"
 
 
+def test_a_wall_before_one_beam_leaves_spray_to_the_others():
+    upper = beams(2000)
+    meshes = [wall("W", 3, z=(-2.2, -1.2))]  # the tilted beams meet it 1.73 m below the sensor
+    lone = sprayed(car(), sensor=upper)
+    mixed_beams = Beams(np.repeat([0.0, -30.0], 2000))
+    both = sprayed(car(), meshes, sensor=replace(upper, beams=mixed_beams))
+    hits = both["object"] == 0
+    assert hits.sum() > 1000 and both["range"][hits].max() < 4
+    assert np.count_nonzero(both["cause"] == SPRAY) > 0.5 * len(lone["cause"]) > 20
+
+
 def test_spray_lies_where_the_car_was():
     """On a circle of 10 m around the sensor, behind the car and within its width."""
     turns = np.radians(np.arange(0, 181, 3.0))

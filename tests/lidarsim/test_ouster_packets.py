@@ -36,7 +36,7 @@ from lidarpool.recordings.opening import open_recording
 from lidarsim.base.model_names import model_names
 from lidarsim.columns.table import SCAN
 from lidarsim.packets.encoders import START_NS, PacketSource, encoder_of
-from lidarsim.packets.ouster import LIDAR_PORT, PROFILES
+from lidarsim.packets.ouster import LIDAR_PORT, PROFILES, OusterDecoder
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -729,3 +729,11 @@ def test_ouster_sdk_reads_all_models(model, columns, tmp_path):
     for profile in PROFILES:
         case = still(model.partition("/")[2], profile, columns)
         check_by_sdk(*encoded(*case[1:]), tmp_path)
+
+
+@pytest.mark.parametrize("beams", [16, 32, 64, 128])
+def test_legacy_packets_are_recognized_by_their_size(beams):
+    """16 columns with a header of 16 bytes, 12 bytes a beam and a status, as the manual has it."""
+    size = 16 * (16 + 12 * beams + 4)
+    assert OusterDecoder.recognizes(bytes(size))
+    assert not OusterDecoder.recognizes(bytes(size + 1))
