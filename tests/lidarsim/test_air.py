@@ -271,7 +271,7 @@ def test_a_wall_before_one_beam_leaves_spray_to_the_others():
     upper = beams(2000)
     meshes = [wall("W", 3, z=(-2.2, -1.2))]  # the tilted beams meet it 1.73 m below the sensor
     lone = sprayed(car(), sensor=upper)
-    mixed_beams = Beams(np.repeat([0.0, -30.0], 2000))
+    mixed_beams = Beams(np.repeat(np.radians([0.0, -30.0]), 2000))
     both = sprayed(car(), meshes, sensor=replace(upper, beams=mixed_beams))
     hits = both["object"] == 0
     assert hits.sum() > 1000 and both["range"][hits].max() < 4
