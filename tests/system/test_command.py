@@ -332,7 +332,7 @@ def test_a_timeline_says_when_each_step_ended_and_no_process_is_left(tmp_path):
     wall_s = time.monotonic() - began_s
     time.sleep(1)
     assert processes_with(mark) == []
-    table = re.search(r"^step +takes +ends at\n(.*)", ended.stderr, re.DOTALL | re.MULTILINE)
+    table = re.search(r"^step +duration +end\n(.*)", ended.stderr, re.DOTALL | re.MULTILINE)
     lines = table[1].splitlines()
     rows = [re.fullmatch(r"(\D+?) +([\d.]+) s +([\d.]+) s", line).groups() for line in lines]
     steps = [name for name, _, _ in rows]

@@ -263,9 +263,10 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         chosen = options_of_call("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
             hint = (
-                did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."
+                did_you_mean(split, self.splits)
+                or f" Available splits: {', '.join(self.splits) or 'none'}."
             )
-            raise LidarError(f"The campaign has no split {split!r}.{hint}")
+            raise LidarError(f"Unknown split {split!r}.{hint}")
         numbers = [n for n in range(self.count) if split in (None, self.split(n))]
         run_options = RunOptions(**chosen).with_pool(self.pool, chosen)
         return SweepStream(self, numbers, ahead, run_options)

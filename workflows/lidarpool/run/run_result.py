@@ -83,7 +83,7 @@ class RunResult:
         """
         keep_every = self.survey.keep_every
         return (
-            f", one of every {keep_every:,} hits of a scan (keep_every)" if keep_every > 1 else ""
+            f", one in {keep_every:,} hits of each scan (keep_every)" if keep_every > 1 else ""
         )
 
     @property

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, message_of
 from lidarsim.base.extras import install_command
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
@@ -96,7 +96,7 @@ class SweepStream:
             except Exception as error:  # Dask has many kinds where a cluster is gone
                 if client.status == "running" and not isinstance(error, (PoolError, OSError)):
                     raise
-                raise LidarError(f"The stream has lost its cluster: {error}") from error
+                raise LidarError(f"The stream lost its cluster: {message_of(error)}") from error
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
@@ -108,7 +108,7 @@ class SweepStream:
         LidarError if torch is not installed; in a worker of a DataLoader.
         """
         if find_spec("torch") is None:
-            raise LidarError(f"This needs PyTorch: {install_command('torch')}.")
+            raise LidarError(f"`torch` requires PyTorch. Run {install_command('torch')}.")
         from ..datasets.torch_sweeps import TorchStream
 
         return TorchStream(self, transform)
@@ -325,10 +325,10 @@ class _Casting:
         self._warned = True
         job = streamed.job
         logger.warning(
-            "Job %s of the stream has no points: %s. Further jobs without points are not named.",
+            "Job %s of the stream has no points: %s. Further jobs without points are not reported.",
             job.name,
             empty_cloud_reason(job.scene, job.survey),
         )
 
     def _warn_of_failure(self, name: str, error: object) -> None:
-        logger.warning("Job %s is left out of the stream: %s", name, error)
+        logger.warning("Job %s of the stream was skipped: %s", name, error)

@@ -114,7 +114,7 @@ class CampaignSpec:
         self._jobs = jobs
         self._splits = Splits(self.splits, head.seed)
 
-    changeable = "pool, and count, which may grow"
+    changeable = "Only `pool` and `count` may change, and `count` must not decrease."
 
     @classmethod
     @checked
@@ -236,8 +236,8 @@ class CampaignSpec:
         job = self._jobs.job(number, cache, columns, fields)
         if job.survey.navigation is not None:
             raise LidarError(
-                "navigation is for single surveys, since a data set has no place for its files: "
-                "leave it out of the campaign's base."
+                "`navigation` is not supported in campaigns, because data sets have no files for "
+                "it. Remove `navigation` from the base of the campaign."
             )
         survey = with_laser_scans(job.survey, [self.keep.format])
         return job if survey is job.survey else replace(job, survey=survey)
@@ -257,7 +257,7 @@ class CampaignSpec:
         """Return the number of a job as an integer, or raise LidarError."""
         if not 0 <= number < self.count:
             raise LidarError(
-                f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
+                f"Job {number} does not exist. The jobs of the campaign are 0 to {self.count - 1}."
             )
         return int(number)  # converts a number of NumPy
 
