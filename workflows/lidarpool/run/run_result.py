@@ -82,9 +82,7 @@ class RunResult:
         The clause is empty if all points are kept.
         """
         keep_every = self.survey.keep_every
-        return (
-            f", one in {keep_every:,} hits of each scan (keep_every)" if keep_every > 1 else ""
-        )
+        return f", one in {keep_every:,} hits of each scan (keep_every)" if keep_every > 1 else ""
 
     @property
     def records(self) -> tuple[TaskRecord, ...]:

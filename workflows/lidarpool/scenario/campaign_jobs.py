@@ -134,8 +134,8 @@ class FunctionJobs(JobSource):
             plain = value.item() if isinstance(value, np.generic) else value
             if not isinstance(name, str) or not isinstance(plain, Value | None):
                 raise LidarError(
-                    f"job {number} has the value {name!r}: {shown(plain)}; values are numbers, "
-                    "text, True or False, by names."
+                    "The values of a job must be numbers, text, True or False, and their names "
+                    f"must be text, but job {number} has {{{name!r}: {shown(plain)}}}."
                 )
             if plain is not None:
                 values[name] = plain
@@ -167,7 +167,7 @@ class FunctionJobs(JobSource):
                 raise LidarError(message) from error
             if not isinstance(job, Job):
                 raise LidarError(
-                    f"the function returned {shown(job)}; it must return a Job(scene, survey)."
+                    f"the function must return a Job(scene, survey), but returned {shown(job)}."
                 )
         return job
 
@@ -187,9 +187,7 @@ class ScenarioJobs(JobSource):
         for path in paths:
             with mistakes.noted():
                 if is_campaign(path):
-                    raise LidarError(
-                        f"{path} is a campaign with its own jobs. Run it separately."
-                    )
+                    raise LidarError(f"{path} is a campaign with its own jobs. Run it separately.")
                 scenario = Scenario.load(path)
                 fingerprints.append(_fingerprint(scenario))
                 files.update(scenario.files)

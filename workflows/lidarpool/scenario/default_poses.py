@@ -230,7 +230,7 @@ def _inside_note(
 def seen_from(scene: Scene, carried: Mounted) -> str:
     """Return a sentence, without its period, with two poses that see a scene from outside."""
     poses = [as_entry(pose) for pose in poses_around(scene, carried)[0:4:2]]
-    return f"To view the scene from outside, set `poses: {on_one_line(poses)}`"
+    return f"To view the scene from outside, use poses: {on_one_line(poses)}"
 
 
 def on_one_line(value: Any) -> str:

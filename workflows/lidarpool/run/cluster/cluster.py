@@ -99,9 +99,7 @@ class Cluster:
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         if client.asynchronous:
-            raise LidarError(
-                "The client is asynchronous. Create it without `asynchronous=True`."
-            )
+            raise LidarError("The client is asynchronous. Create it without `asynchronous=True`.")
         self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
             self._request_slots(first, store, required_slots)

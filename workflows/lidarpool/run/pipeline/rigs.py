@@ -145,9 +145,7 @@ def _unpickled(data: Packed) -> Any:
         try:
             return data.load()
         except OSError as error:
-            raise MemoryUnseen(
-                f"This worker cannot access the driver's memory: {error}"
-            ) from error
+            raise MemoryUnseen(f"This worker cannot access the driver's memory: {error}") from error
     return data.load()
 
 
