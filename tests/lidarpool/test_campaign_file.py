@@ -410,7 +410,7 @@ def test_a_function_makes_jobs():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda number, rng: 5, "job 1: the function returned 5; it must return a Job("),
+        (lambda number, rng: 5, "job 1: the function must return a Job(scene, survey), but returned 5"),
         (lambda number, rng: 1 / 0, "job 1: the function raised ZeroDivisionError: division"),
         (
             lambda number, rng: job(keep_every=0),
@@ -418,11 +418,11 @@ def test_a_function_makes_jobs():
         ),
         (
             lambda number, rng: job(*[3] * number),
-            "job 1 has the value 'drawn', which the first has not",
+            "Job 1 has a value 'drawn', which the first job does not have",
         ),
         (
             lambda number, rng: Job(job().scene, job().survey, values={"a": [1]}),
-            "job 1 has the value 'a': [1]; values are numbers, text",
+            "but job 1 has {'a': [1]}",
         ),
     ],
     ids=["no job", "raises", "refused", "other names", "a list"],
@@ -468,9 +468,9 @@ WRONG = {
         {KM: {"uniform": [1, 2], "choice": [1]}},
         "Set exactly one of uniform, log_uniform",
     ),
-    "a value": ({KM: 3}, "must be a way of choosing"),
+    "a value": ({KM: 3}, "must be a mapping that defines the choice"),
     "misspelt": ({KM: {"unifrom": [1, 2]}}, "Did you mean 'uniform'?"),
-    "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "as many weights as"),
+    "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "must have one weight for each value"),
     "twice": (
         {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
         "actors.0.box.0 and actors.Van.box.0 lead to the same field",
@@ -481,7 +481,7 @@ WRONG = {
     "of a mapping": ({"rate_hz": {"choice": [5]}}, "mean 'sensors.roof.rate_hz'?"),
     "within": (
         {"scene": {"choice": ["hall.glb"]}, "scene.files.0.file": {"choice": ["hall.glb"]}},
-        "scene is chosen as a whole",
+        "cannot be combined, because scene replaces",
     ),
     "no table": ({"actors": {"sample": {"from": "no.csv", "count": 1}}}, "no.csv does not exist"),
     "few rows": ({"actors": {"sample": {"from": "traffic.csv", "count": 3}}}, "has 2 rows"),
@@ -491,7 +491,7 @@ WRONG = {
     ),
     "other rows": (
         {"scene.copies": {"sample": {"from": "traffic.csv", "count": 1}}},
-        "traffic.csv is not a usable table: its columns are not known: trajectory",
+        "traffic.csv cannot be used as a table: it contains the unknown columns trajectory",
     ),
 }
 
@@ -524,11 +524,11 @@ def test_it_is_told_what_is_wrong(campaign, name):
     [
         ({"base": None}, "base is required"),
         ({"base": "bse.yaml"}, "bse.yaml does not exist"),
-        ({"base": "campaign.yaml"}, "'campaign.yaml' is a campaign; give a scenario"),
+        ({"base": "campaign.yaml"}, "base must be a scenario, but 'campaign.yaml' is a campaign"),
         ({"cont": 5}, "Did you mean 'count'?"),
         ({"keep": "kiti"}, "Did you mean 'kitti'?"),
-        ({"splits": {"train": 0.8, "val": 0.1}}, "splits add up to 0.9; they must add up to 1"),
-        ({"splits": {"a/b": 1}}, "the split 'a/b' gets a file of its name"),
+        ({"splits": {"train": 0.8, "val": 0.1}}, "must add up to 1, but add up to 0.9"),
+        ({"splits": {"a/b": 1}}, "a-z, A-Z, 0-9, - and _, but is 'a/b'"),
     ],
 )
 def test_fields_that_cannot_be_meant(campaign, fields, says):
@@ -539,7 +539,7 @@ def test_fields_that_cannot_be_meant(campaign, fields, says):
 
 
 def test_a_count_is_needed_where_something_is_drawn(campaign):
-    with pytest.raises(LidarError, match=r"count is missing: steps is drawn"):
+    with pytest.raises(LidarError, match=r"count is required, because values of steps are drawn"):
         campaign({"steps": {"integer": [1, 2]}}, count=None)
     assert campaign(count=None).count == 1
 
@@ -550,7 +550,7 @@ def test_values_that_do_not_fit_together_are_told_with_the_job(campaign):
     with pytest.raises(LidarError) as raised:
         found.job(wrong)
     assert f"campaign.yaml: job {wrong}: returns.subrays must be " in str(raised.value)
-    assert "\nIts values are returns.subrays: " in str(raised.value)
+    assert "\nThe values of the job are returns.subrays: " in str(raised.value)
 
 
 def test_files_of_every_row_are_looked_for(campaign, folder):
@@ -582,7 +582,7 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
 def test_a_grid_that_is_too_large(campaign):
     many = {"each": list(range(1, 1001))}
     vary = {"steps": many, "cloud.keep_every": many, "noise.seed": many}
-    with pytest.raises(LidarError, match=r"all values of each are 1,000,000,000 jobs"):
+    with pytest.raises(LidarError, match=r"grid of all values would have 1,000,000,000 jobs"):
         campaign(vary, count=None)
     assert campaign(vary, count=5).count == 5
 

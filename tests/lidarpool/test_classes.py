@@ -89,7 +89,7 @@ def test_a_path_of_a_campaign_leads_to_the_name_of_a_class():
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("poses.1.position", "1 entry, counted from 0, and no entry 1"),
+        ("poses.1.position", "has 1 entry, so entry 1 does not exist"),
         (f"poses.{'9' * 5000}", "999…999"),
     ],
 )

@@ -59,7 +59,7 @@ def test_partitions_that_grow_with_their_work(tmp_path):
 
 
 WRONG = {
-    "a list": ("[1]", "contains a list. A cluster file has"),
+    "a list": ("[1]", "contains a list. A cluster file contains"),
     "a misspelt field": (
         GOOD.replace("arguments", "argument"),
         "Unknown field 'argument'. Did you mean 'arguments'?",
@@ -67,7 +67,7 @@ WRONG = {
     "no partitions": ("cluster: distributed.SSHCluster", "partitions is required"),
     "a partition of others": (
         GOOD.replace("GPU", "GPUS"),
-        "not a partition of a survey.*mean 'GPU'",
+        "Unknown partition .*mean 'GPU'",
     ),
     "workers": (
         GOOD.replace("workers: 5", "workers: many"),
@@ -79,11 +79,11 @@ WRONG = {
     ),
     "two numbers of workers": (
         GOOD.replace("workers: 5", "workers: 5, adapt: [0, 8]"),
-        "partitions.OTHER.adapt .* leave out workers",
+        "partitions.OTHER.adapt and workers cannot be combined",
     ),
     "a time without a range": (
         GOOD.replace("workers: 5", "idle_s: 60"),
-        "partitions.OTHER.idle_s needs adapt",
+        "partitions.OTHER.idle_s requires adapt",
     ),
     "no host": (
         GOOD.replace("[a, b], slots: 2", "[]"),
@@ -93,10 +93,10 @@ WRONG = {
         GOOD.replace("distributed.", "dask_jobqueues."),
         r"is not installed.*\.\[clusters\]",
     ),
-    "no such class": (GOOD.replace("SSHCluster", "SHCluster"), "cannot be started by partition"),
+    "no such class": (GOOD.replace("SSHCluster", "SHCluster"), "cannot start workers for each partition"),
     "another class": (
         GOOD.replace("distributed.SSHCluster", "subprocess.Popen"),
-        "cannot be started by partition",
+        "cannot start workers for each partition",
     ),
 }
 
@@ -111,7 +111,7 @@ def test_what_is_wrong_with_a_file(tmp_path, case):
 def test_a_cluster_that_does_not_start(tmp_path):
     file = load(tmp_path, GOOD.replace("hosts: [head]}", "host: head}", 1))
     with (
-        pytest.raises(LidarError, match=r"c.yaml: distributed.SSHCluster was not started \(.*"),
+        pytest.raises(LidarError, match=r"c.yaml: distributed.SSHCluster could not be started \(.*"),
         file.started(print),
     ):
         pass
@@ -163,7 +163,7 @@ def test_counts_that_cannot_be(given):
         (((), ()), "tiles", ""),
         ((("GPU-1",), ()), "cuda", ""),
         ((("GPU-1",), ()), "tiles", "the GPUs of partition GPU are not used"),
-        (((), ("GPU-1",)), "tiles", "no GPU in partition GPU: CPU workers cast the rays"),
+        (((), ("GPU-1",)), "tiles", "partition GPU has no worker with a GPU, so CPU workers cast"),
     ],
 )
 def test_of_gpus_is_spoken_only_where_there_is_one_that_stays_idle(gpus, backend, says):

@@ -262,7 +262,7 @@ def test_actors_of_a_survey_come_back_from_its_trace(drive, tmp_path):
     read = scenario(tmp_path, "cloud.mcap", offset_s=-START_NS / 1e9)
     built = build(read)
     assert [actor.name for actor in built.scene.actors] == ["car (1)"]
-    note = "1 moving object without dimensions left out (vehicle)"
+    note = "was skipped because of missing dimensions (vehicle)"
     assert any(note in line for line in built.findings.notes)
 
 
@@ -341,7 +341,7 @@ def test_the_host_vehicle_carries_the_sensors(tmp_path, vehicle, host):
     with pytest.raises(
         LidarError,
         match=(
-            r"may not name its host .*identity\. Available "
+            r"does not state its host vehicle, set an identity\. Available "
             r"names: 0, 7, 9\."
         ),
     ):

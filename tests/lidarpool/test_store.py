@@ -126,7 +126,7 @@ def test_it_is_gone_on_with(unfinished):
     assert store.only_job.parts.missing(0, 6) == [(2, 3), (5, 6)]
     assert "were cast with it" in store.advice
     store.db.close()
-    with pytest.raises(LidarError, match=r"'tiles' is asked for, .* cast with 'numpy'"):
+    with pytest.raises(LidarError, match=r"cast with the backend 'numpy', .* cannot continue with 'tiles'"):
         opened(unfinished, backend="tiles", resume=True)
 
 
@@ -149,7 +149,7 @@ def test_another_run_cannot_go_on(other, unfinished):
             opened(unfinished, resume=resume, job=OTHERS[other])
         differs = f"cannot be continued, it is of another {other}: {FIELDS_OF_OTHERS[other]}"
         assert differs in str(raised.value)
-        assert "Only these may change: pool, and formats of output" in str(raised.value)
+        assert "Only `pool` and output formats without additional columns may change" in str(raised.value)
     remove_run(unfinished)
     opened(unfinished, job=OTHERS[other]).db.close()
 
@@ -157,7 +157,7 @@ def test_another_run_cannot_go_on(other, unfinished):
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
     later = {"lidarpool": "0.2 (sources 12345678)"}
     monkeypatch.setattr(lidarpool.run.store.run_store, "software", lambda: later)
-    with pytest.raises(LidarError, match=r"lidarpool \S+ \(sources \w+\), here it is 0\.2"):
+    with pytest.raises(LidarError, match=r"lidarpool \S+ \(sources \w+\), but this is lidarpool 0\.2"):
         opened(unfinished, resume=True)
 
 
@@ -290,9 +290,9 @@ def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
 
 
 def test_places_that_cannot_be(tmp_path):
-    with pytest.raises(LidarError, match="Make the one that it lies in first"):
+    with pytest.raises(LidarError, match="Create its parent folder first"):
         opened(tmp_path / "none" / "run")
-    with pytest.raises(LidarError, match="give a folder for the run as well"):
+    with pytest.raises(LidarError, match="`parts` requires `folder`"):
         opened(None, tmp_path / "parts")
 
 
@@ -503,7 +503,7 @@ def test_a_database_that_points_elsewhere(where, kept, request, tmp_path):
     put(tmp_path / "victim")
     place = tmp_path / "victim" if where == "victim" else other.storage.url
     change(folder, f"UPDATE meta SET value = '{place}' WHERE name = 'parts'")
-    with pytest.raises(LidarError, match=r"run\.db is damaged .* is not the place of this"):
+    with pytest.raises(LidarError, match=r"run\.db is damaged .* is not the location of this"):
         opened(folder)
     remove_run(folder)
     assert not folder.exists()
@@ -527,7 +527,7 @@ def test_parts_of_another_mark_stay(unfinished, tmp_path):
 def test_a_damaged_database_is_dropped_with_the_parts_of_its_folder(unfinished):
     (unfinished / "run.db").write_bytes(bytes(8192))
     put(unfinished / "parts", ["a.npz"])
-    with pytest.raises(LidarError, match="drop the run with --fresh"):
+    with pytest.raises(LidarError, match="Remove the run with `--fresh`"):
         opened(unfinished)
     assert len(names(unfinished)) == 5
     remove_run(unfinished)
@@ -648,7 +648,7 @@ def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
     late.save(force=True)
     again = opened(url, resume=True)
     assert again.only_job.resumed == (6 if how == "resumed" else 4)
-    with pytest.raises(LidarError, match="this one has ended"), late.kept_on_error():
+    with pytest.raises(LidarError, match="so this run was stopped"), late.kept_on_error():
         late.remove()
     assert left(url) == before
 

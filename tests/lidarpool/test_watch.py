@@ -58,7 +58,7 @@ def test_a_partition_may_be_empty_for_a_while(look):
 def test_workers_that_are_paused_take_no_tasks(look):
     paused = [("GPU", "paused"), *ALL[1:]]
     look(59, *paused)
-    with pytest.raises(LidarError, match=r"'GPU' have taken no tasks for 60 s.*--memory-limit"):
+    with pytest.raises(LidarError, match=r"'GPU' have accepted no tasks for 60 s.*--memory-limit"):
         look(61, *paused)
 
 

@@ -91,15 +91,15 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "out cannot be made": (["run", "good.yaml", "--out", "/proc/o"], "Cannot write to the folder"),
     "malformed address": (["run", "good.yaml", "--scheduler", "tcp://::1:x"], "tcp://host:8786"),
     "unknown scheme": (["run", "good.yaml", "--scheduler", "foo://127.0.0.1:1"], "scheme 'foo'"),
-    "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "has no host"),
-    "no port": (["doctor", "--scheduler", "localhost"], "no port of 1 to 65535"),
+    "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "must consist of a host"),
+    "no port": (["doctor", "--scheduler", "localhost"], "a port from 1 to 65535"),
     "no certificates": (
         ["run", "good.yaml", "--scheduler", "tls://127.0.0.1:1"],
-        "is encrypted, and --tls-ca and --tls-cert are missing",
+        "uses TLS, but `--tls-ca` and `--tls-cert` are missing",
     ),
     "certificates without encryption": (
         ["doctor", "--scheduler", "tcp://127.0.0.1:1", "--tls-ca", "a.stl"],
-        "'tcp://127.0.0.1:1' does not begin with tls://",
+        "'tcp://127.0.0.1:1' does not start with tls://",
     ),
     "no scheduler file": (
         ["run", "good.yaml", "--wait", "0s", "--scheduler", "sched.json"],
@@ -231,7 +231,7 @@ CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
         [{"GPU": 1}, {"LIDAR": 3}, {"OTHER": 1}],
         "Partition 'LIDAR' has 3 of the 4 slots",
     ),
-    "no OTHER": ([{"GPU": 1}, {"LIDAR": 4}], "or remove planning from the scenario"),
+    "no OTHER": ([{"GPU": 1}, {"LIDAR": 4}], "unless `planning` is removed from the scenario"),
     "two resources": ([{"GPU": 1, "LIDAR": 4}, {"OTHER": 1}], "declares GPU and LIDAR"),
 }
 
@@ -352,11 +352,11 @@ OTHER_SOURCES = "import lidarpool.base.software as s; s.sources = lambda: '12345
     [
         pytest.param(
             WITHOUT_LIDARPOOL,
-            "does not have lidarpool: install lidarpool",
+            "does not have lidarpool. Install lidarpool",
             marks=pytest.mark.slow,
         ),
-        (OTHER_SOURCES, "(sources 12345678), here it is"),
-        pytest.param(ANOTHER_PYTHON, "has Python 3.99.1, here it is", marks=pytest.mark.slow),
+        (OTHER_SOURCES, "(sources 12345678), but the run requires"),
+        pytest.param(ANOTHER_PYTHON, "has Python 3.99.1, but the run requires", marks=pytest.mark.slow),
     ],
     ids=["none", "other sources", "another Python"],
 )
@@ -370,4 +370,4 @@ def test_workers_whose_lidarpool_is_not_ours(outside, place, refused, preload, m
 @pytest.mark.extended
 def test_a_run_without_open3d_ends_before_it_starts(place, refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d.pybind", None)
-    refused(["run", "good.yaml"], "Clouds are written through Open3D, which does not load")
+    refused(["run", "good.yaml"], "Writing clouds requires Open3D, which cannot be loaded")

@@ -362,8 +362,8 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     assert other.code == 2 and other.err.count("\n") == 1
     assert "it is of another campaign: vary.scene.files.0.file is b.obj, b.obj" in other.err
     assert ", was a.obj, b.obj" in other.err
-    assert "Only these may change: pool, and count, which may grow. Drop it" in other.err
-    assert "--fresh" in other.err and "give another folder" in other.err
+    assert "Only `pool` and `count` may change, and `count` must not decrease. Remove it" in other.err
+    assert "--fresh" in other.err and "choose a different folder" in other.err
 
 
 def third_if(there: Path, made: list[int]) -> Callable[[int, np.random.Generator], Job]:
@@ -746,8 +746,8 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--job", 99], "there is no job 99"),
-        (["--resume", "--overwrite"], "overwrite remove what resume"),
+        (["--job", 99], "Job 99 does not exist"),
+        (["--resume", "--overwrite"], "`overwrite` cannot be combined with `resume`"),
         (["--only", "cloud"], "cannot be used with campaigns"),
         (["--resume", "--fresh"], "--fresh"),
         (["--retry-failed", "--fresh"], "--fresh"),

@@ -182,7 +182,7 @@ def test_a_path_that_there_is_not(run):
 def test_a_run_that_hits_nothing_says_so(run):
     outcome = run(text="scene: seed\nsteps: 1\nposes: [[0, 0, 1000]]\n")
     assert outcome.code == 0
-    assert "warning: the cloud has no points: no ray hit anything" in outcome.err
+    assert "warning: the cloud has no points: no ray hits a surface" in outcome.err
 
 
 def test_json_is_one_document_and_all_of_stdout(run, tmp_path):

@@ -285,7 +285,7 @@ def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside
     assert run.process.wait(300) == 2
     (message,) = said_besides_progress(run)
     assert message.startswith(
-        f"lidarpool: The cluster at {cluster.address} cannot be reached any more"
+        f"lidarpool: The cluster at {cluster.address} is no longer reachable"
     )
     assert re.search(KEPT, message)
     assert untouched(kept=True)

@@ -158,7 +158,7 @@ def test_jobs_of_a_run_that_is_stopped_go_away(empty_queue, tmp_path, number):
 def test_a_job_that_the_queue_refuses_takes_the_others_with_it(empty_queue, tmp_path):
     run = Command(tmp_path, slurm_file(tmp_path, queue="nowhere"))
     assert run.process.wait(300) == 2
-    assert "cluster.yaml: dask_jobqueue.SLURMCluster was not started" in run.said
+    assert "cluster.yaml: dask_jobqueue.SLURMCluster could not be started" in run.said
     assert "invalid partition specified: nowhere" in run.said
     assert "Traceback" not in run.said
     assert empty_queue.jobs() == {}
@@ -275,7 +275,7 @@ def test_what_a_host_says_that_cannot_start_its_process(ssh, tmp_path, where):
         file["arguments"]["remote_python"] = "/nowhere/python"
     run = Command(tmp_path, file)
     assert run.process.wait(300) == 2
-    assert re.search(r"was not started \(.*/nowhere/python.*No such file", run.said), run.said
+    assert re.search(r"could not be started \(.*/nowhere/python.*No such file", run.said), run.said
     wait_until(lambda: not processes_in(tmp_path))
 
 

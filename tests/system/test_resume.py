@@ -31,7 +31,7 @@ planning: {start: [25, 25], target: [-30, -20], trials: 4, iterations: 20}
 pool: {backend: numpy, gpu: 1, other: 1}
 """
 SCANS = 2 * 180
-KEPT = r"holds an unfinished run, [\d,]+ of \d+ scans: continue it with"
+KEPT = r"contains an unfinished run with [\d,]+ of \d+ scans\. Continue it with"
 
 
 @pytest.fixture(scope="module")
@@ -98,15 +98,15 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     refused = lidarpool(*arguments)
     assert (refused.code, refused.out) == (2, "")
     assert re.fullmatch(
-        rf"lidarpool: \S+/out/run {KEPT} --resume \(.*\), or drop it with --fresh \(.*\)\.\n",
+        rf"lidarpool: \S+/out/run {KEPT} `--resume` \(.*\), or remove it with `--fresh` \(.*\)\.\n",
         refused.err,
     )
     path, *rest = arguments[1:]
     path.with_name("t.yaml").write_text(SCENARIO.replace("trials: 4", "enabled: false"))
     other = lidarpool("run", path.with_name("t.yaml"), *rest, "--resume")
-    assert other.code == 2 and "is of another planning: " in other.err
+    assert other.code == 2 and "the planning has changed: " in other.err
     wrong = lidarpool(*arguments, "--resume", "--backend", "tiles")
-    assert wrong.code == 2 and "were cast with 'numpy': continue with that" in wrong.err
+    assert wrong.code == 2 and "were cast with the backend 'numpy', so" in wrong.err
     both = lidarpool(*arguments, "--resume", "--fresh")
     assert both.code == 2 and "cannot be combined" in both.err
     assert committed(out / "run") == before
@@ -135,7 +135,7 @@ def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
     done = lidarpool(*arguments, "--only", "cloud", "-q", "--resume")
     assert (done.code, done.err) == (0, "")
-    assert f"note: there was nothing to resume in {tmp_path / 'out'}" in done.out
+    assert f"note: {tmp_path / 'out'} contained no unfinished run to resume" in done.out
 
 
 SURVEY = Survey(

@@ -175,7 +175,7 @@ def test_no_workers_are_started_in_a_task(cluster_client):
         lp.simulate(lp.Scene.seed(), Survey(poses=[(0, 0, 1)]))
 
     task = cluster_client.submit(run, resources={"OTHER": 1}, pure=False)
-    with pytest.raises(LidarError, match="which in a task of Dask cannot be done: give client"):
+    with pytest.raises(LidarError, match="which is not possible in a Dask task\. Pass `client"):
         task.result(timeout=300)
     task.release()  # the error has frames that hold it
 
@@ -236,8 +236,8 @@ def test_the_first_job_without_points_is_named(cluster_client, caplog):
     sweeps = list(Campaign(lambda number, rng: Job(SCENE, far), 3).stream(client=cluster_client))
     assert [len(sweep.points) for sweep in sweeps] == [0] * 3
     (told,) = [record.getMessage() for record in caplog.records if "no points" in record.message]
-    assert told.startswith("Job 0000 of the stream has no points: no ray hit anything")
-    assert told.endswith("Further jobs without points are not named.")
+    assert told.startswith("Job 0000 of the stream has no points: no ray hits a surface")
+    assert told.endswith("Further jobs without points are not reported.")
 
 
 def test_errors_are_told_in_a_line(cluster_client):

@@ -198,7 +198,7 @@ class Result(RunResult):
         names = ", ".join(("x", "y", "z", *(column.name for column in self.points.table)))
         yield "cloud", f"{plural(len(self.points), 'point')}{self.thinned}: {names}"
         if self.plan is not None:
-            free = "collision-free" if self.plan.collision_free else "with collisions"
+            free = "free of collisions" if self.plan.collision_free else "not free of collisions"
             yield (
                 "path",
                 f"{self.plan.length:.2f} m, {free} ({self.plan.trials} trials, "

@@ -197,7 +197,7 @@ class Cluster:
             yield
             return
         with suppress(PoolError):
-            self._screen.tell(f"page with the partitions: {self._pool.page()}")
+            self._screen.tell(f"partitions page: {self._pool.page()}")
         try:
             yield
         finally:
