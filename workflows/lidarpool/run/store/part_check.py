@@ -75,4 +75,4 @@ def _note(job: JobUnderWay, receipts: Sequence[Receipt], state: str) -> str:
     names = listed([part.name for part in receipts])
     scans = listed([scans_in_words(part.first, part.stop) for part in receipts])
     verb = "was" if len(receipts) == 1 else "were"
-    return f"{scans} {verb} repeated because {names} {verb} {state} in {job.storage.url}"
+    return f"repeated {scans}, because {names} {verb} {state} in {job.storage.url}"
