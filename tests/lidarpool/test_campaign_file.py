@@ -216,7 +216,9 @@ def test_cells_that_are_no_values_are_text(campaign, folder, cell):
 def test_columns_of_a_table_are_fields_or_ignored(campaign, folder):
     (folder / "crates.csv").write_text('name,Wood,box,at,wood\nA,oak,"[1, 2, 3]","[[1, 2]]",5\n')
     sample = {"from": "crates.csv", "count": 1}
-    with pytest.raises(LidarError, match=r"not known: Wood, wood\. Rename .* Known are name, "):
+    with pytest.raises(
+        LidarError, match=r"unknown columns Wood and wood\. Rename .* available columns are name, "
+    ):
         campaign({"scene.copies": {"sample": sample}}).check_files()
     found = campaign({"scene.copies": {"sample": {**sample, "ignore": "wood"}}})
     assert found.scenario(0).scene.copies[1].box == (1, 2, 3)
@@ -410,7 +412,10 @@ def test_a_function_makes_jobs():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda number, rng: 5, "job 1: the function must return a Job(scene, survey), but returned 5"),
+        (
+            lambda number, rng: 5,
+            "job 1: the function must return a Job(scene, survey), but returned 5",
+        ),
         (lambda number, rng: 1 / 0, "job 1: the function raised ZeroDivisionError: division"),
         (
             lambda number, rng: job(keep_every=0),
@@ -447,7 +452,7 @@ WRONG = {
         {"noise.range_m": {"normal": {"mean": 1, "std": 1}}},
         "can be -5.0, but must be from 0 to",
     ),
-    "limits": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "Give limits."),
+    "limits": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "Set `limits`."),
     "far": ({KM: {"normal": {"mean": 1, "std": 1, "limits": [9, 10]}}}, "at least 1% of the"),
     "not whole": ({"steps": {"uniform": [1, 9]}}, "steps can be 1.0, but must be a whole"),
     "type": ({"noise.range_m": {"choice": [0, "a"]}}, "noise.range_m can be 'a', but must be"),
@@ -455,7 +460,10 @@ WRONG = {
         {"sensors.roof.model": {"choice": ["velodyne/vlp15"]}},
         "Did you mean 'velodyne/vlp16",
     ),
-    "together": ({"sensors.roof.layers": {"integer": [8, 9]}}, "leave out layers"),
+    "together": (
+        {"sensors.roof.layers": {"integer": [8, 9]}},
+        "`model` and `layers` cannot be combined",
+    ),
     "file": (
         {"scene.files.0.file": {"choice": ["hall.glb", "hut.glb"]}},
         "hut.glb does not exist",
@@ -473,7 +481,7 @@ WRONG = {
     "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "must have one weight for each value"),
     "twice": (
         {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
-        "actors.0.box.0 and actors.Van.box.0 lead to the same field",
+        "actors.0.box.0 and actors.Van.box.0 refer to the same field",
     ),
     "other section": ({"performance": {"choice": ["ideal"]}}, "mean 'sensors.roof.performance'?"),
     "of a list": ({"up_axis": {"choice": ["z"]}}, "Did you mean 'scene.files.0.up_axis'?"),
@@ -484,10 +492,10 @@ WRONG = {
         "cannot be combined, because scene replaces",
     ),
     "no table": ({"actors": {"sample": {"from": "no.csv", "count": 1}}}, "no.csv does not exist"),
-    "few rows": ({"actors": {"sample": {"from": "traffic.csv", "count": 3}}}, "has 2 rows"),
+    "few rows": ({"actors": {"sample": {"from": "traffic.csv", "count": 3}}}, "has only 2 rows"),
     "rows of no list": (
         {"steps": {"sample": {"from": "traffic.csv", "count": 1}}},
-        "and this is no",
+        "but this field is not a list",
     ),
     "other rows": (
         {"scene.copies": {"sample": {"from": "traffic.csv", "count": 1}}},
@@ -571,10 +579,10 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
         campaign(
             {"sensors.roof.model": {"choice": ["velodyne/vlp16"]}}, base=["base.yaml", "fog.yaml"]
         )
-    assert "campaign.yaml: vary, of fog.yaml: sensors of the base has no 'roof'" in str(
+    assert "campaign.yaml: vary for fog.yaml: sensors of the base has no entry 'roof'" in str(
         raised.value
     )
-    with pytest.raises(LidarError, match=r"vary, of fog\.yaml: steps can be 0, but must"):
+    with pytest.raises(LidarError, match=r"vary for fog\.yaml: steps can be 0, but must"):
         campaign({"steps": {"choice": [0]}}, base=["base.yaml", "fog.yaml"])
 
 

@@ -248,5 +248,5 @@ def test_what_cannot_be_is_told_in_a_line(made, folder, name, monkeypatch):
 def test_nothing_to_stand_on(made):
     with pytest.raises(LidarError, match=r"no surface to place objects on\. Add `scene\.files`"):
         made(TREE | {"scatter": {"count": 1}}, scene={"files": []})
-    with pytest.raises(LidarError, match="give z"):
+    with pytest.raises(LidarError, match="Set the z coordinate of 1 copy"):
         made(TREE | {"at": [[0, 0]]}, scene={"files": []})

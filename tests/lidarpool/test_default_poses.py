@@ -61,7 +61,9 @@ def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     scene = scene_of(*OBJECTS[name], at=(far, far, 0))
     placed = place_sensor(scene, GRID)
     assert (
-        placed.surrounds_object and "was recognized as an object" in placed.note and len(placed.poses) == 5
+        placed.surrounds_object
+        and "was recognized as an object" in placed.note
+        and len(placed.poses) == 5
     )
     poses = [np.subtract(pose.position, scene.origin) for pose in placed.poses]
     middle = scene.bounds.mean(axis=0)

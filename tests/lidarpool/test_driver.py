@@ -769,7 +769,9 @@ def test_a_scan_that_kills_its_workers_is_found_among_tiny_jobs(empty, stage):
     begin_tiny(empty, 30)
     empty.until(lambda: len(empty.driver.dispatcher.batches) == 30, idle="cast")
     empty.until(striking(empty, stage, 3, job=17))
-    assert empty.fails(17).startswith(f"3 workers in a row died in stage {stage} while they processed only scan 3")
+    assert empty.fails(17).startswith(
+        f"3 workers in a row died in stage {stage} while they processed only scan 3"
+    )
     empty.end()
     assert [number for number, error in empty.ended.items() if error] == [17]
 

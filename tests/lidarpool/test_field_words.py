@@ -43,7 +43,9 @@ def test_of_many_fields_some_are_named_and_the_others_counted():
     earlier = {f"field{number}": "1" for number in range(9)}
     now = dict.fromkeys(earlier, "2")
     said = differences(earlier, now)
-    assert said.startswith("field0 changed from 1 to 2; field1 changed") and said.endswith("; and 5 more")
+    assert said.startswith("field0 changed from 1 to 2; field1 changed") and said.endswith(
+        "; and 5 more"
+    )
     assert differences(now, now) == ""
 
 

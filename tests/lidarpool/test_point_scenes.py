@@ -465,7 +465,10 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
     notes = []
     scene = scene_of_points(path, tell=notes.append)
     np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
-    assert "was converted to meters, because its header states units of 0.001, 0.001, 0.001 m" in notes[0]
+    assert (
+        "was converted to meters, because its header states units of 0.001, 0.001, 0.001 m"
+        in notes[0]
+    )
     metres = scene_of_points(path, unit="cm", tell=notes.append)
     np.testing.assert_allclose(metres.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
     np.testing.assert_allclose(open_recording(path).read_points(0).points.max(axis=0), [4, 3, 2])
@@ -475,7 +478,10 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("a.ply", "`colour` cannot be 'intensity', because .* has no intensities"), ("a.xyz", "has no intensities")],
+    [
+        ("a.ply", "`colour` cannot be 'intensity', because .* has no intensities"),
+        ("a.xyz", "has no intensities"),
+    ],
 )
 def test_missing_intensities_are_an_error(tmp_path, name, words):
     with pytest.raises(LidarError, match=words):
@@ -507,9 +513,9 @@ def test_cut_files_are_refused(tmp_path, name):
     ("name", "text", "words"),
     [
         ("a.xyz", "", "a.xyz: it is empty"),
-        ("a.xyz", "1 2 3\n" * 11, "has 11 points, and at least 12 are needed.$"),
+        ("a.xyz", "1 2 3\n" * 11, "must have at least 12 points, but has 11.$"),
         ("a.xyz", "1 2 3\n" * 50, "Most points of .* have the same positions"),
-        ("a.xyz", "nan 2 3\n" * 50, "0 points"),
+        ("a.xyz", "nan 2 3\n" * 50, "but has 0"),
         ("a.xyz", "x y z\n" * 50, "cannot be read: line 2 has 'x' as x, and a number"),
         ("a.asc", "ncols 3\n" * 50, "cannot be read: it is a raster of heights"),
         ("a.pts", "50\n1 2 3\n", "is cut short: line 1 announces 50 points, and 1 follow"),
@@ -543,7 +549,7 @@ def test_the_command_says_what_is_not_kept(tmp_path):
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
     monkeypatch.setattr("lidarpool.scenario.point_scene.memory", lambda: 1_000_000)
-    with pytest.raises(LidarError, match=r"1,200 surfels, .* larger voxel_m than 0.01"):
+    with pytest.raises(LidarError, match=r"1,200 surfels, .* Increase `voxel_m`, which is 0.01"):
         scene_of_points(path, voxel_m=0.01)
     assert len(scene_of_points(path, voxel_m=0.3).faces) < 2 * 500
 
@@ -565,7 +571,7 @@ def test_the_command(tmp_path):
     assert Scene.load(out).triangles == 2 * len(GRID)
     with pytest.raises(LidarError, match="exists"):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
-    with pytest.raises(LidarError, match=r"size is -1.0"):
+    with pytest.raises(LidarError, match=r"size must be a positive number, but is -1.0"):
         arguments += ["--size", "-1", "--overwrite"]
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 

@@ -278,7 +278,10 @@ def test_actors_that_stand(scenario):
 
 IDENTITY = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 BAD = [
-    ("sensor: {layers: 4}\nsensors: {a: {}}", "`sensors` cannot be combined with `sensor` or `mount`"),
+    (
+        "sensor: {layers: 4}\nsensors: {a: {}}",
+        "`sensors` cannot be combined with `sensor` or `mount`",
+    ),
     ("output: {write: [laz, mcap, {format: mcap, layout: ouster}]}", "`write` contains mcap twice"),
     # (text, what the message says after the file's name)
     ("sensor: {layers: 0}", r"sensor\.layers must be from 1 to 65535, but is 0"),
@@ -345,7 +348,10 @@ BAD = [
     ("sensor: {vertical_fov_deg: .nan}", r"must be a finite number, but is nan"),
     ("sensor: {model: velodyne/vlp61}", "Unknown sensor model .* Did you mean 'velodyne/vlp16'"),
     ("sensor: vlp61", "Unknown sensor model .* Did you mean 'vlp16'"),
-    ("mount: roof", r"mount must be x, y and z in meters, \[0, 0, 1\], or .*, but is 'roof'"),
+    (
+        "mount: roof",
+        r"mount must be x, y and z in meters, such as \[0, 0, 1\], or .*, but is 'roof'",
+    ),
     (
         "actors: [{name: A, box: [1, 1, 1], at: [1, 2]}]",
         r"actors\[0\]\.at\.position\[2\] is required",
@@ -360,13 +366,16 @@ BAD = [
     ("poses: [{position: [0, 0, 0], yaw: 5}]", r"'poses\[0\]\.yaw'.*'yaw_deg'"),
     ("poses: &a [*a]", r"s\.yaml, line 1: 'a' contains itself"),
     ("scene: {files: [{file: a.stl, unit: parsec}]}", r"unit must be 'um', .*, but is 'parsec'"),
-    ("scene: {files: [{file: a.stl, scale: 0}]}", "scale must not be 0"),
-    ("scene: {files: [{file: a.stl, scale: 2, matrix: " + IDENTITY + "}]}", "`matrix` and `scale` cannot be combined"),
+    ("scene: {files: [{file: a.stl, scale: 0}]}", "`scale` must not be 0"),
+    (
+        "scene: {files: [{file: a.stl, scale: 2, matrix: " + IDENTITY + "}]}",
+        "`matrix` and `scale` cannot be combined",
+    ),
     ("scene: {files: [{file: a.stl, matrix: " + IDENTITY.replace("1", "0") + "}]}", "0 0 0 1"),
     ("scene: {preset: sead}", r"preset cannot be 'sead'\. Did you mean 'seed'\? It must be 'seed'"),
     (
         "scene: seed\nplanning: {start: [5, 5], target: [9, 9]}",
-        r"planning\.start lies .* middle of Bowl",
+        r"`planning\.start` must be outside all obstacles, .* center of Bowl",
     ),
     (
         "scene: seed\nplanning: {start: [25, 25], target: [-30, -20], obstacles: [Bel]}",
@@ -375,7 +384,7 @@ BAD = [
     ("scene: seed\nplanning: {trials: 5}", r"`planning` requires a start and a target"),
     ("scene: seed\nplanning: {start: [5, 5]}", r"Set `planning\.start` and `planning\.target`\."),
     ("scene: {preset: none}", r"preset must be 'seed', but is 'none'"),
-    ("planning: {obstacles: [{centre: [0, 0]}]}", "both centre and radius_m"),
+    ("planning: {obstacles: [{centre: [0, 0]}]}", "both `centre` and `radius_m`"),
     ("scene: a.stl\nplanning: {enabled: true}", r"Set `planning\.start` and `planning\.target`"),
     ("pool: {backend: opengl}", "must be 'auto', 'cuda', 'tiles' or 'numpy'"),
     ("", "is empty. A scenario is a mapping with sections"),
@@ -543,8 +552,8 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
         "For a path without corners, set `interpolation: smooth`"
     )
     for points, actors, notes in (
-        (legs, [], [f"the trajectory of the carrier has no angles: {faces}{turns}"]),
-        (legs[:2], [], [f"the trajectory of the carrier has no angles: {faces}"]),
+        (legs, [], [f"the trajectory of the platform has no angles, {faces}{turns}"]),
+        (legs[:2], [], [f"the trajectory of the platform has no angles, {faces}"]),
         (turned, [], []),
         (turned, vans, ["the trajectories of Van, Bus have no angles, so their poses are level and face "
                         "the direction of travel"]),
@@ -585,9 +594,9 @@ def test_fog_that_returns_no_light_is_in_the_advice(scenario, weather, noise, no
 @pytest.mark.parametrize(
     ("text", "noted"),
     [
-        ("returns: {mode: dual}", "is dual, .* Set returns: {subrays: 7, divergence_mrad: 3}$"),
-        ("sensor: vlp16\nreturns: {mode: two_strongest}", "two_strongest, .* {subrays: 7}$"),
-        ("sensor: own.yaml", "is dual, .* single ray .*{subrays: 7, divergence_mrad: 3}$"),
+        ("returns: {mode: dual}", "is dual, .* Set `returns: {subrays: 7, divergence_mrad: 3}`$"),
+        ("sensor: vlp16\nreturns: {mode: two_strongest}", "two_strongest, .* {subrays: 7}`$"),
+        ("sensor: own.yaml", "is dual, .* single ray .*{subrays: 7, divergence_mrad: 3}`$"),
         ("sensors: {a: own.yaml, b: {model: vlp16}}", "returns mode of a is dual"),
         ("sensor: own.yaml\nreturns: {subrays: 7, divergence_mrad: 3}", None),
         ("sensor: vlp16\nreturns: {mode: dual, subrays: 7}", None),
@@ -815,7 +824,7 @@ WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in r
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("cloud: {columns: [red]}", "needs colors"),
+        ("cloud: {columns: [red]}", "uses colors"),
         (
             f"navigation: {{imu: {{}}}}\ntrajectory: {{interpolation: linear, points: {WAY}}}",
             "interpolation: smooth",

@@ -293,7 +293,11 @@ def test_a_scene_keeps_the_system_of_its_cloud(tmp_path, suffix):
         built(origin=[500_000, 5_200_000])
     other = built(epsg=32632)
     assert other.survey.epsg == 32632
-    assert [note for note in other.findings.notes if "is in EPSG:25832, and EPSG:32632" in note]
+    assert [
+        note
+        for note in other.findings.notes
+        if "is in EPSG:25832, but the output states EPSG:32632" in note
+    ]
     moved = {"file": file.name, "translation": [-500_000, -5_200_000, 0]}
     assert built(moved, origin=[500_000, 5_200_000]).survey.epsg is None
     assert Scene.load(file, unit="ft").epsg is None

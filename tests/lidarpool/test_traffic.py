@@ -243,7 +243,9 @@ def test_human_readable_times_of_sumo(tmp_path, shown):
     plain = build(scenario(tmp_path)).scene
     read = build(scenario(tmp_path, text, {"offset_s": -3598})).scene
     assert len(plain.actors) == 3 and fingerprint(read) == fingerprint(plain)
-    with pytest.raises(LidarError, match="hours, minutes and seconds, so `time_unit` cannot be set"):
+    with pytest.raises(
+        LidarError, match="hours, minutes and seconds, so `time_unit` cannot be set"
+    ):
         build(scenario(tmp_path, text, {"time_unit": "s"}))
 
 
@@ -350,11 +352,14 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         (FCD.replace('x="40"', ""), "'x' is missing"),
         (
             FCD.replace('x="40"', 'x="40" heading="3"'),
-            "vehicle has the attribute 'heading', which SUMO does not define\. To ignore it, "
+            r"vehicle has the attribute 'heading', which SUMO does not define\. To ignore it, "
             r"set `ignore: \[heading\]`",
         ),
-        (FCD.replace('x="40"', 'x="east"'), "vehicle 'a.1' has the x 'east'; give a number"),
-        (FCD.replace('time="3.00"', 'time="3:00"'), "a timestep has the time '3:00'; give a num"),
+        (FCD.replace('x="40"', 'x="east"'), "x of vehicle 'a.1' must be a number, but is 'east'"),
+        (
+            FCD.replace('time="3.00"', 'time="3:00"'),
+            "time of a timestep must be a number, but is '3:00'",
+        ),
         (FCD.replace('angle="45"', ""), "'angle' is missing"),
         (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares the XML entity"),
     ],
@@ -435,7 +440,7 @@ def test_who_rides_in_a_vehicle_is_no_actor(tmp_path):
 
 def test_what_is_wrong_with_traffic_is_told(tmp_path):
     nobody = scenario(tmp_path, traffic={"offset_s": 300})
-    assert any("no vehicle or person is in the" in n for n in advice(build(nobody)))
+    assert any("has no vehicle or person in the" in n for n in advice(build(nobody)))
     with pytest.raises(LidarError, match=r"traffic\.surfaces"):
         scenario(tmp_path, traffic={"surfaces": []})
     with pytest.raises(LidarError, match=r"type 'car', but no entry .* Add one, such as"):
@@ -444,7 +449,7 @@ def test_what_is_wrong_with_traffic_is_told(tmp_path):
         scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
     with pytest.raises(LidarError, match=r"traffic\.file: .*no\.xml does not exist"):
         build(scenario(tmp_path, traffic={"file": "no.xml"}))
-    with pytest.raises(LidarError, match="surfaces names 'Street'"):
+    with pytest.raises(LidarError, match="`surfaces` contains 'Street'"):
         build(scenario(tmp_path, traffic={"surfaces": "Street"}))
 
 
@@ -485,7 +490,10 @@ def test_what_is_wrong_with_a_carrier_of_the_traffic_is_told(tmp_path):
     for trajectory, message in (
         ({"vehicle": "a.2"}, r"vehicle` is 'a\.2', but fcd\.xml does not contain .*'a\.1'"),
         ({"vehicle": 7}, r"vehicle` is '7', but .* Available names: a\.1, bus, p\."),
-        ({"vehicle": "bus"}, "vehicle` is 'bus', but fcd.xml does not contain this vehicle in at least two"),
+        (
+            {"vehicle": "bus"},
+            "vehicle` is 'bus', but fcd.xml does not contain this vehicle in at least two",
+        ),
         ({"vehicle": "a.1"}, "from 0 to 1, 3 to 4 s. Set `trajectory.start_s`"),
         ({"vehicle": "a.1", "start_s": 2}, "from 0 to 1, 3 to 4 s. Set `trajectory.start_s`"),
         ({"vehicle": "p", "offset_s": 1}, r"cannot be combined with `trajectory\.offset_s`"),

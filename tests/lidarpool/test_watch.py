@@ -47,10 +47,10 @@ ALL = [("GPU", "running"), ("OTHER", "running"), ("LIDAR", "running")]
 def test_a_partition_may_be_empty_for_a_while(look):
     look(2, *ALL)
     look(60, *ALL[:2])
-    assert look.told == ["waiting for workers of partition LIDAR, for another 2 s"]
+    assert look.told == ["waiting for workers of partition LIDAR for up to 2 s more"]
     look(63, *ALL)
     look(120, *ALL[1:])
-    assert look.told[1:] == ["waiting for workers of partition GPU, for another 3 s"]
+    assert look.told[1:] == ["waiting for workers of partition GPU for up to 3 s more"]
     with pytest.raises(LidarError, match=r"'GPU' has had no workers for 60 s.*\"GPU=1\""):
         look(124, *ALL[1:])
 

@@ -103,10 +103,12 @@ def test_fields_that_do_not_fit_the_world_are_refused(tmp_path):
         Scenario.from_data({"world": {"origin": [1]}})
     with pytest.raises(LidarError, match=r"Unknown field '.*epsg'"):
         Scenario.from_data({"cloud": {"epsg": 25832}})
-    with pytest.raises(LidarError, match=r"world\.epsg .*EPSG:3857.*a world map projection"):
+    with pytest.raises(LidarError, match=r"`world\.epsg` .*EPSG:3857.*a world map projection"):
         job_of(world={"epsg": 3857, "origin": ORIGIN})
     track = {"points": [{"time_s": 0, "position": [0, 0, 1]}, {"time_s": 1, "position": [1, 0, 1]}]}
-    with pytest.raises(LidarError, match=r"Set `world\.epsg` instead of `navigation\.gnss\.origin`"):
+    with pytest.raises(
+        LidarError, match=r"Set `world\.epsg` instead of `navigation\.gnss\.origin`"
+    ):
         Scenario.from_data(
             {
                 "trajectory": track,
@@ -124,7 +126,9 @@ def test_a_raster_that_is_in_the_system_is_not_moved_by_its_origin(tmp_path):
         data = {"scene": {"files": [*files]}, "world": world}
         return build(Scenario.from_data(data, folder=tmp_path))
 
-    with pytest.raises(LidarError, match=rf"translation: \[-{X0}, -{Y0}, 0\], or leave out"):
+    with pytest.raises(
+        LidarError, match=rf"translation: \[-{X0}, -{Y0}, 0\]` for the file, or remove"
+    ):
         built("hills.tif")
     world["epsg"] = 25832
     scene = built({"file": "hills.tif", "translation": [-X0, -Y0, 0]}).job().scene

@@ -572,7 +572,9 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     assert {kinds[name].semantic_class == 7 for name in actors if "Rover/" in name} == {True}
     assert kinds["Arm/base_link"].semantic_class != 7
     notes = advice(built)
-    assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
+    assert (
+        "link lidar of Rover is not part of the scene, because a sensor is mounted on it" in notes
+    )
     assert built.findings.sources["rover.urdf"].startswith(
         "14 links, 6,720 triangles; 9 movable joints"
     )
@@ -596,8 +598,14 @@ def test_a_robot_that_stands_moves_its_joints_by_the_clock_of_the_survey(folder)
         ({"mount": {"link": "lidor"}}, "0 robots have a link 'lidor'.*Did you mean 'lidar'"),
         ({"mount": {"link": "hand"}}, "'hand', which is moved by joints.csv"),
         ({"actors": [ROVER | {"name": name} for name in "AB"]}, "but 2 robots have a link"),
-        ({"actors": [{"name": "B", "box": [1, 1, 1], "joints": "a.csv"}]}, "`joints` requires a robot"),
-        ({"actors": [{"name": "R", "file": {"file": "rover.urdf", "scale": 2}}]}, "only be combined with `opacity`"),
+        (
+            {"actors": [{"name": "B", "box": [1, 1, 1], "joints": "a.csv"}]},
+            "`joints` requires a robot",
+        ),
+        (
+            {"actors": [{"name": "R", "file": {"file": "rover.urdf", "scale": 2}}]},
+            "only be combined with `opacity`",
+        ),
     ],
 )
 def test_scenarios_that_do_not_fit_their_robot(folder, change, words):
@@ -637,7 +645,9 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     at_zero, turned = (scene.bounds + scene.origin for scene in (alone.scene, placed))
     np.testing.assert_allclose(turned[:, 0], 5 - at_zero[::-1, 1], atol=1e-6)
     np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
-    with pytest.raises(LidarError, match="is a robot, which is always in meters with z up\. Remove `unit`"):
+    with pytest.raises(
+        LidarError, match=r"is a robot, which is always in meters with z up\. Remove `unit`"
+    ):
         build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
     with pytest.raises(
         LidarError, match=r"is not read: it describes a robot\. Read it with load_robot"

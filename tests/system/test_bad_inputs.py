@@ -276,7 +276,7 @@ def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monke
         outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "1s")
     assert outcome.code == 2
     assert re.search(
-        r"note: waiting for workers, for another \d s: Partition 'LIDAR' has 0 of the 4 slots",
+        r"note: waiting for workers for up to \d s more: Partition 'LIDAR' has 0 of the 4 slots",
         outcome.err,
     )
     assert outcome.err.splitlines()[-1].startswith("lidarpool: Partition 'LIDAR' has 0 of the 4")
@@ -316,7 +316,7 @@ def test_jobs_that_do_not_begin_are_cancelled(place, refused, monkeypatch):
     (place / "queue.yaml").write_text(QUEUE.replace("slots: 4", "slots: 3"))
     refused(
         ["run", "good.yaml", "--cluster", "queue.yaml"],
-        "queue.yaml: partition LIDAR has 3 of the 4 slots needed",
+        "queue.yaml: Partition LIDAR has 3 slots, but the run needs 4",
     )
     assert len(submitted) == 4
 
@@ -356,7 +356,9 @@ OTHER_SOURCES = "import lidarpool.base.software as s; s.sources = lambda: '12345
             marks=pytest.mark.slow,
         ),
         (OTHER_SOURCES, "(sources 12345678), but the run requires"),
-        pytest.param(ANOTHER_PYTHON, "has Python 3.99.1, but the run requires", marks=pytest.mark.slow),
+        pytest.param(
+            ANOTHER_PYTHON, "has Python 3.99.1, but the run requires", marks=pytest.mark.slow
+        ),
     ],
     ids=["none", "other sources", "another Python"],
 )

@@ -362,7 +362,9 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     assert other.code == 2 and other.err.count("\n") == 1
     assert "it is of another campaign: vary.scene.files.0.file is b.obj, b.obj" in other.err
     assert ", was a.obj, b.obj" in other.err
-    assert "Only `pool` and `count` may change, and `count` must not decrease. Remove it" in other.err
+    assert (
+        "Only `pool` and `count` may change, and `count` must not decrease. Remove it" in other.err
+    )
     assert "--fresh" in other.err and "choose a different folder" in other.err
 
 
@@ -581,7 +583,7 @@ def full_disk(slots, tmp_path_factory):
     ):  # the others would fail, too
         patched.setattr(DataSet, "write_job", fail)
         campaign.run(ds, client=client)
-    assert "of 3 jobs are kept in" in ended.value.__notes__[0] and bytes_of(ds)
+    assert "of 3 jobs are stored in" in ended.value.__notes__[0] and bytes_of(ds)
     shutil.copytree(ds, ds.with_name("copy"))
     return campaign, ds.parent
 
@@ -829,7 +831,7 @@ def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
         _, err = run.communicate(timeout=300)
     assert run.returncode == 130, err
     assert err.startswith("\nlidarpool: Interrupted. All processes were stopped")  # behind the ^C
-    assert re.search(r" of 100 jobs are kept in .*ds/run: continue with --resume .*\.\n$", err)
+    assert re.search(r" of 100 jobs are stored in .*ds/run\. Continue with `--resume` .*\.\n$", err)
 
 
 @pytest.mark.slow

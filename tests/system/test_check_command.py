@@ -183,7 +183,10 @@ def test_each_file_has_a_line_that_says_what_it_gave(check, tmp_path):
         {"objects": "m", "reflectance": 0.5}, {"objects": "*", "reflectance": "texture"}
     ]  # fmt: skip
     told = check(text=json.dumps(scenario)).out
-    assert "note: 4 of 8 objects with `reflectance: texture` have no colors and are treated as gray: " in told
+    assert (
+        "note: 4 of 8 objects with `reflectance: texture` have no colors and are treated as gray: "
+        in told
+    )
     assert "gray: P, P.2, P.3, …\n" in told
 
 
@@ -311,7 +314,10 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     assert outcome.code == 0
     assert "from 5 poses" in outcome.out and "points      about 0 " not in outcome.out
     assert "hits, rounded to 0.001 m;" in outcome.out
-    assert "note: the scene was recognized as an object of 1 x 1 x 1 m, so the default is" in outcome.out
+    assert (
+        "note: the scene was recognized as an object of 1 x 1 x 1 m, so the default is"
+        in outcome.out
+    )
     assert "no GPU" not in outcome.out
     backend = next(name for name, missing in available_backends().items() if not missing)
     kind = "GPU" if backend == "cuda" else "CPU"

@@ -87,7 +87,9 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
 
     with (
         Client(cluster.address, set_as_default=False) as client,
-        pytest.raises(LidarError, match=r"sources 12345678\), but the run requires .*\. Install the same"),
+        pytest.raises(
+            LidarError, match=r"sources 12345678\), but the run requires .*\. Install the same"
+        ),
     ):
         long = replace(SURVEY, steps=72 * 1000)  # so that it lasts until the other worker is there
         simulate(Scene.seed(), long, planning, client=client, backend="numpy", on_frame=on_frame)

@@ -119,7 +119,9 @@ def slurm_file(folder: Path, **gpu: Any) -> dict[str, Any]:
 def test_a_run_waits_for_its_jobs_and_takes_them_with_it(empty_queue, tmp_path):
     held = [*JOBS["GPU"]["job_extra_directives"], "--hold"]
     run = Command(tmp_path, slurm_file(tmp_path, job_extra_directives=held))
-    run.wait_for(r"waiting for workers, for another 35\d\d s: Partition 'GPU' has 0 of the 1 slot")
+    run.wait_for(
+        r"waiting for workers for up to 35\d\d s more: Partition 'GPU' has 0 of the 1 slot"
+    )
     states = {state for _, state in empty_queue.jobs().values()}
     assert states == {"PENDING", "RUNNING"}
     assert empty_queue.jobs()["gpu"][1] == "PENDING"
@@ -211,7 +213,9 @@ def test_a_run_waits_for_jobs_that_replace_lost_ones(empty_queue, tmp_path):
     run = Command(tmp_path, file, MINUTE)
     run.wait_for(r"survey +[1-9]")
     empty_queue.ask("scancel", empty_queue.jobs()["gpu"][0])
-    run.wait_for(r"waiting for workers of partition GPU, for another \d+ s: 1 job in the queue")
+    run.wait_for(
+        r"waiting for workers of partition GPU for up to \d+ s more: 1 job is in the queue"
+    )
     checksum, _ = run.result()
     assert checksum == expected
     assert empty_queue.jobs() == {}

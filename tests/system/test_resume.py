@@ -163,7 +163,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
     with pytest.raises(ZeroDivisionError) as caught:
         run(on_frame=on_frame, backend="tiles")
     assert re.fullmatch(
-        rf"\d+ of 144 scans are kept in {folder}: continue with --resume \(.*\)\.",
+        rf"\d+ of 144 scans are stored in {folder}. Continue with `--resume` \(.*\)\.",
         *caught.value.__notes__,
     )
     with pytest.raises(LidarError, match=rf"{KEPT} --resume .*resume=True.*remove_run"):

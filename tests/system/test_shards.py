@@ -658,7 +658,9 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
         merge(shards, survey / "moved")
     merge(shards, survey / "moved", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 25", "steps: 26")
-    with pytest.raises(LidarError, match=r"than these shards, steps changed from 25 to 26: give --scen"):
+    with pytest.raises(
+        LidarError, match=r"than these shards, steps changed from 25 to 26: give --scen"
+    ):
         merge(shards, survey / "none", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 26", "steps: 25")
     (survey / "elsewhere/s.yaml").rename(survey / "s.yaml")
@@ -726,7 +728,11 @@ SHARDS = [
     ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
     ("auto", slurm(14, 10, 28, 2, 10), Shard(3, 10)),
     ("auto", slurm(9, 1, 3, 1, 3), "no shard 9/3: they are 1/3 to"),
-    ("auto", slurm(2, 1, 9, 2, 6), "cannot be determined from SLURM_ARRAY_TASK_ID=2, "),  # 1-3,5-9:2
+    (
+        "auto",
+        slurm(2, 1, 9, 2, 6),
+        "cannot be determined from SLURM_ARRAY_TASK_ID=2, ",
+    ),  # 1-3,5-9:2
     ("auto", {}, "cannot be determined from SLURM_ARRAY_TASK_ID="),
     ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "cannot be determined from JOB_COMPLETION_INDEX=x"),
     ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "Shard 11/10 does not exist"),

@@ -175,7 +175,7 @@ def test_no_workers_are_started_in_a_task(cluster_client):
         lp.simulate(lp.Scene.seed(), Survey(poses=[(0, 0, 1)]))
 
     task = cluster_client.submit(run, resources={"OTHER": 1}, pure=False)
-    with pytest.raises(LidarError, match="which is not possible in a Dask task\. Pass `client"):
+    with pytest.raises(LidarError, match=r"which is not possible in a Dask task\. Pass `client"):
         task.result(timeout=300)
     task.release()  # the error has frames that hold it
 

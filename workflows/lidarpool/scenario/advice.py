@@ -272,7 +272,7 @@ def _timing_notes(built: Built) -> Iterator[str]:
             moment = datetime.fromtimestamp(start_s, UTC).isoformat()
             yield (
                 f"the times of the trajectory start at {start_s:.0f} s, but the times of points "
-                "count from the start of the survey. If the trajectory has Unix times, set "
+                "count from the start of the survey. If the trajectory has seconds since 1970, set "
                 f"`cloud: {{start: {moment}}}` to keep the date"
             )
     end = np.array([built.survey.duration_ns])

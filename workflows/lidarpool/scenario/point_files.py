@@ -166,7 +166,7 @@ def _check_points(path: Path, points: ScannedPoints, left_out: LeftOut) -> None:
         raise LidarError(f"{path} must have at least {MIN_POINTS} points, but has {len(points)}.")
     if (reach := np.abs(points.positions).max()) > MAX_COORDINATE_M:
         raise LidarError(
-            f"{path} extends {reach:.3g} m from the origin, which is farther than any point on "
+            f"{path} extends {reach:.3g} m from the origin, which is farther than anything on "
             "Earth. If the file is not damaged, set its unit with `--unit` (`unit` in Python)."
         )
 
