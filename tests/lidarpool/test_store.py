@@ -134,7 +134,7 @@ def test_it_is_gone_on_with(unfinished):
 
 FIELDS_OF_OTHERS = {
     "survey": "cloud.keep_every changed from 1 to 2",
-    "scene": "scene.triangles is ",
+    "scene": "scene.triangles changed from ",
     "planning": "planning.",
 }
 OTHERS = {

@@ -360,8 +360,8 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     (files / "c.yaml").write_text((files / "c.yaml").read_text().replace("[a.obj", "[b.obj"))
     other = lidarpool(*run, "--resume")
     assert other.code == 2 and other.err.count("\n") == 1
-    assert "it is of another campaign: vary.scene.files.0.file is b.obj, b.obj" in other.err
-    assert ", was a.obj, b.obj" in other.err
+    assert "the campaign has changed: vary.scene.files.0.file changed from a.obj, b.obj" in other.err
+    assert " to b.obj, b.obj" in other.err
     assert (
         "Only `pool` and `count` may change, and `count` must not decrease. Remove it" in other.err
     )
@@ -543,7 +543,7 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
     (files / "c.yaml").write_text(CAMPAIGN.replace("seed: 3", "seed: 4"))
     for more in (["--resume"], ["--job", 1]):
         other = lidarpool(*run, *more)
-        assert other.code == 2 and "is of another campaign: seed is " in other.err
+        assert other.code == 2 and "the campaign has changed: seed changed from 3 to 4" in other.err
     (files / "c.yaml").write_text(CAMPAIGN)
     record = files / "ds" / "campaign.json"
     made = unsealed(record.read_bytes())

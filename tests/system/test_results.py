@@ -79,7 +79,7 @@ def test_a_report_does_not_replace_that_of_another_survey_unasked(result, anothe
     with pytest.raises(LidarError, match=r"holds the result of another survey: .*overwrite"):
         another.report(tmp_path)
     sparse = replace(another, survey=replace(another.survey, keep_every=7))
-    words = r"of another survey, cloud\.keep_every is 7, was \d: .*overwrite"
+    words = r"of another survey, cloud\.keep_every changed from \d to 7: .*overwrite"
     with pytest.raises(LidarError, match=words):
         sparse.report(tmp_path)
     another.report(tmp_path, only_cloud=True, overwrite=True)

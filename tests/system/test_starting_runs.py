@@ -164,6 +164,7 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
     assert len(submitted) == 2  # they may wait in the queue: no others in their place
     assert "has no workers" in str(caught.value)
     assert caught.value.__notes__ == [
-        "2 jobs are in the queue or starting. If they are only waiting in the queue, increase `--wait`."
+        "2 jobs are in the queue or starting. If they are only waiting in the queue, increase "
+        "`--wait`."
     ]
     assert told == [f"The log {tmp_path}/gpu-1.err ends: no module named lidarpool"]
