@@ -555,8 +555,8 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
         (legs, [], [f"the trajectory of the platform has no angles, {faces}{turns}"]),
         (legs[:2], [], [f"the trajectory of the platform has no angles, {faces}"]),
         (turned, [], []),
-        (turned, vans, ["the trajectories of Van, Bus have no angles, so their poses are level and face "
-                        "the direction of travel"]),
+        (turned, vans, ["the trajectories of Van, Bus have no angles, so their poses are level "
+                        "and face the direction of travel"]),
     ):  # fmt: skip
         data = {"trajectory": {"points": points}, "actors": actors, "steps": 36}
         read = scenario(json.dumps({"scene": {"preset": "seed"}} | data))

@@ -35,7 +35,7 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
     "too fine": (
         "s.yaml",
         b"scene: {preset: seed, ground: {margin_m: 1000000}}\ncloud: {precision_m: 0.000001}\n",
-        "too fine",
+        "is too small for a scene",
     ),
 }
 
@@ -60,7 +60,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "unknown backend": (["run", "good.yaml", "--backend", "gpu"], "'gpu' is not one of 'auto'"),
     "options of a mesh": (
         ["run", "good.yaml", "--pose", "0,0,1"],
-        "in good.yaml, change poses.",
+        "`--pose` requires a mesh file. Set `poses` in good.yaml",
     ),
     "several meshes": (["run", "a.stl", "a.stl", "--pose", "0,0,1"], "require a single mesh file"),
     "misspelt model": (["run", "a.stl", "--sensor", "vlp61"], "Did you mean 'vlp16'?"),
@@ -226,7 +226,7 @@ def test_a_listener_that_is_no_scheduler(refused, impatient):
 
 
 CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
-    "no workers": ([], "has no workers: start some"),
+    "no workers": ([], "has no workers. Start workers"),
     "little LIDAR": (
         [{"GPU": 1}, {"LIDAR": 3}, {"OTHER": 1}],
         "Partition 'LIDAR' has 3 of the 4 slots",

@@ -275,7 +275,7 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
     assert said["can_run"] is False
     assert len(said["reasons"]) == 3 and said["estimate"] is None
     assert "is a file" in said["reasons"][0]
-    assert "Casting one scan takes about 1 MB, more than the 0 MB" in said["reasons"][1]
+    assert "Casting one scan takes about 1 MB, but a casting worker" in said["reasons"][1]
     assert "There are 0.95 MiB of memory" in said["reasons"][2]
 
 

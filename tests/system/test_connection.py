@@ -79,7 +79,7 @@ def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypat
     monkeypatch.setattr(watch, "TELL_EVERY_S", 0.0)
     told: list[str] = []
     with (
-        pytest.raises(LidarError, match=rf"answers at '{address}' within 1.5 s \("),
+        pytest.raises(LidarError, match=rf"responded at '{address}' within 1.5 s \("),
         connected(address, waiting=Waiting(1.5, told.append)),
     ):
         pytest.fail("it is connected")
