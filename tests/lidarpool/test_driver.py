@@ -674,12 +674,12 @@ def test_a_job_that_fails_leaves_and_the_other_goes_on(two, how):
         two.until(lambda: two.at(BatchState.CASTING) and two.committed[0])
         two.stages.inbox.append(Failed(0, "generate", "scan 59: out of order"))
         two.step()
-        assert two.fails() == "stage generate failed: scan 59: out of order"
+        assert two.fails() == "Stage generate failed: scan 59: out of order"
     elif how == "cast":
         two.until(lambda: two.at(BatchState.CASTING, 0), idle="cast")
-        two.workers.end(two.at(BatchState.CASTING, 0)[0].key, JobError("stage intersect failed: 3"))
+        two.workers.end(two.at(BatchState.CASTING, 0)[0].key, JobError("Stage intersect failed: 3"))
         two.step()
-        assert two.fails() == "stage intersect failed: 3"
+        assert two.fails() == "Stage intersect failed: 3"
     else:
         two.until(striking(two, how, 23))
         assert two.fails().startswith("scan 23 kills")

@@ -276,7 +276,7 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
     assert len(said["reasons"]) == 3 and said["estimate"] is None
     assert "is a file" in said["reasons"][0]
     assert "Casting one scan takes about 1 MB, but a casting worker" in said["reasons"][1]
-    assert "There are 0.95 MiB of memory" in said["reasons"][2]
+    assert "0.95 MiB of memory are available" in said["reasons"][2]
 
 
 def test_a_scenario_with_errors_gives_json_too(check):

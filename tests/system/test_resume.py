@@ -125,7 +125,7 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     assert (out / "cloud.ply").read_bytes() == undisturbed
     report = report_of(out)
     assert sum(stop - first for first, stop in before[1:]) <= report["resumed_scans"] < SCANS
-    (note,) = (note for note in report["notes"] if note.startswith("cast again: "))
+    (note,) = (note for note in report["notes"] if note.startswith("repeated scan"))
     assert f"{part.name} was missing" in note
 
 
@@ -166,7 +166,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
         rf"\d+ of 144 scans are stored in {folder}. Continue with `--resume` \(.*\)\.",
         *caught.value.__notes__,
     )
-    with pytest.raises(LidarError, match=rf"{KEPT} --resume .*resume=True.*remove_run"):
+    with pytest.raises(LidarError, match=rf"{KEPT} `--resume` .*resume=True.*remove_run"):
         run()
     result = run(resume=True, on_frame=lambda frame: second.append(frame.scan))
     assert first == list(range(51))

@@ -727,7 +727,7 @@ SHARDS = [
     ("3/10", {}, Shard(3, 10)),
     ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
     ("auto", slurm(14, 10, 28, 2, 10), Shard(3, 10)),
-    ("auto", slurm(9, 1, 3, 1, 3), "no shard 9/3: they are 1/3 to"),
+    ("auto", slurm(9, 1, 3, 1, 3), "Shard 9/3 does not exist. The shards are 1/3 to"),
     (
         "auto",
         slurm(2, 1, 9, 2, 6),
@@ -736,7 +736,7 @@ SHARDS = [
     ("auto", {}, "cannot be determined from SLURM_ARRAY_TASK_ID="),
     ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "cannot be determined from JOB_COMPLETION_INDEX=x"),
     ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "Shard 11/10 does not exist"),
-    ("0/10", {}, "no shard 0/10"),
+    ("0/10", {}, "Shard 0/10 does not exist"),
     ("11/10", {}, "Shard 11/10 does not exist"),
     ("3", {}, "Invalid shard '3'"),
 ]
