@@ -60,11 +60,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class SweepStream:
-    """The sweeps of jobs of a campaign, which are cast while they are read.
+    """The sweeps of the jobs of a campaign, which are cast while they are read.
 
-    Each loop casts all sweeps again, with the same result. When a loop is over or left, its tasks
-    are cancelled and the workers that it has started are stopped. A pickled copy connects to the
-    scheduler of the client, and in a task of that cluster takes the client of the task's worker.
+    Each loop casts all sweeps again, with the same result. When a loop ends, its tasks are canceled
+    and the workers that it has started are stopped. A pickled copy connects to the scheduler of the
+    client. In a task of that cluster, it uses the client of the task's worker.
     """
 
     campaign: CampaignSpec
@@ -101,11 +101,19 @@ class SweepStream:
     def torch(self, transform: Callable[[Sweep], Any] | None = None) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
 
-        Its DataLoader needs ``num_workers=0``, since the cluster works ahead. Ranks of
-        torch.distributed, if that is initialized when the loader begins, get the same number of
-        jobs each. `transform` makes an item of a sweep, as of `SavedSweeps.torch`.
+        The DataLoader must have ``num_workers=0``, since the cluster works ahead. If
+        torch.distributed is initialized when the loader starts, each rank receives the same number
+        of jobs.
 
-        LidarError if torch is not installed; in a worker of a DataLoader.
+        Parameters
+        ----------
+        transform
+            Function that converts a sweep to an item, as for `SavedSweeps.torch`.
+
+        Raises
+        ------
+        LidarError
+            If torch is not installed, or in a worker of a DataLoader.
         """
         if find_spec("torch") is None:
             raise LidarError(f"`torch` requires PyTorch. Run {install_command('torch')}.")

@@ -77,34 +77,32 @@ MESH_PRECISION_M = 0.001
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Job:
-    """A survey of a scene, possibly with path planning.
+    """A survey of a scene, optionally with path planning.
 
-    Jobs of a `Campaign` are numbered.
-
-    A function that makes jobs for a `Campaign` gives scene, survey and values: the campaign
-    numbers, names and splits the jobs.
+    A function that makes the jobs of a `Campaign` sets only the scene, the survey and the values.
+    The campaign sets the number, name and split of each job.
 
     Parameters
     ----------
     scene, survey, planning
-        As for `simulate`: in the scene's local coordinates.
+        As for `simulate`, in the local coordinates of the scene.
     values
-        Values that differ between the jobs of a campaign: {name: number, text, or True and
-        False}; None for an empty cell. All jobs of a campaign have the same names, the columns
-        of its table.
+        Values that differ between the jobs of a campaign, as a mapping from names to numbers, text,
+        True or False, or None for an empty cell. All jobs of a campaign have the same names, which
+        are columns of its job table.
     number, name, split
         Number of the job in its campaign, its name in files, and the name of its split.
     outputs
-        Formats that the cloud is written in besides PLY.
+        Formats of the cloud in addition to PLY.
     made_of
-        Names and SHA-256 of the files that the job was made of.
+        Names and SHA-256 hashes of the files that the job was made from.
 
     Raises
     ------
     LidarError
-        If a field has another type, the survey's precision is too fine for the scene, a
-        material is for no object, an object lacks a material while others have one, or the
-        survey's coordinate system is not in meters that are true where the scene is.
+        If a field has the wrong type, the precision of the survey is too small for the scene, a
+        material matches no object, an object has no material although others have one, or the
+        coordinate system of the survey is not in true meters at the location of the scene.
     """
 
     scene: Scene
@@ -150,7 +148,10 @@ class Job:
 
     @cached_property
     def sweeps(self) -> Sweeps:
-        """Sweeps with poses and boxes of actors, in seconds for thousands of poses."""
+        """Sweeps with their poses and the boxes of actors.
+
+        The computation takes seconds for thousands of poses.
+        """
         return Sweeps.from_survey(self.survey, self.scene)
 
 

@@ -520,20 +520,21 @@ def parts_of(location: Storage, parts_location: str) -> Storage:
 
 @checked
 def remove_run(folder: str | Path | Storage) -> None:
-    """Remove a stored run and its parts, wherever the parts are, and no further file.
+    """Remove a stored run and its parts, and no other files.
 
-    If the database is damaged, only parts in the run's folder are found.
+    The parts are removed even if they are stored in a different location. If the database is
+    damaged, only parts in the folder of the run are found.
 
     Parameters
     ----------
     folder
-        The run's folder, or its URL.
+        Folder or URL of the run.
 
     Raises
     ------
     LidarError
-        If another run uses the database, the files cannot be removed, or there is a link in place
-        of the run's files.
+        If another run uses the database, the files cannot be removed, or a file of the run is a
+        symbolic link.
     """
     location = Storage.at(folder)
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
