@@ -388,7 +388,7 @@ def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     assert [row.number for row in run.failed] == [2] and run.done == 3
     assert run.sensors == {"lidar": "old model, 10 Hz"}
     before = bytes_of(tmp_path / "ds")
-    with pytest.raises(LidarError, match=r"holds an unfinished run, 4 of 4 jobs"):
+    with pytest.raises(LidarError, match=r"contains an unfinished run with 4 of 4 jobs"):
         campaign.run(tmp_path / "ds", client=client)
     assert campaign.run(tmp_path / "ds", client=client, resume=True).failed == run.failed
     there.touch()
@@ -543,7 +543,7 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
     (files / "c.yaml").write_text(CAMPAIGN.replace("seed: 3", "seed: 4"))
     for more in (["--resume"], ["--job", 1]):
         other = lidarpool(*run, *more)
-        assert other.code == 2 and "the campaign has changed: seed changed from 3 to 4" in other.err
+        assert other.code == 2 and "campaign: seed changed from 3 to 4" in other.err
     (files / "c.yaml").write_text(CAMPAIGN)
     record = files / "ds" / "campaign.json"
     made = unsealed(record.read_bytes())

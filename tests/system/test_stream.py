@@ -244,7 +244,7 @@ def test_errors_are_told_in_a_line(cluster_client):
     for options, words in (
         ({"ahead": 0}, "ahead must be at least 1, but is 0"),
         ({"split": "tran"}, r"Unknown split 'tran'\. Did you mean 'train'"),
-        ({"split": "x"}, r"no split 'x'\. It has train, test"),
+        ({"split": "x"}, r"Unknown split 'x'\. Available splits: train, test"),
     ):
         with pytest.raises(LidarError, match=words) as told:
             campaign(splits={"train": 0.5, "test": 0.5}).stream(client=cluster_client, **options)

@@ -104,5 +104,5 @@ class Sweep:
 
     @property
     def objects(self) -> Ints32 | None:
-        """Indices into `object_names`, int32 of shape (n,), or None if the data set lacks the column."""
+        """Indices into `object_names`, int32 of shape (n,), or None if the data set lacks them."""
         return self.columns.get("object")
