@@ -177,7 +177,7 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     place, turn = person.poses(0, np.array([1.5e9]))
     np.testing.assert_allclose(place + turn @ [0.2, 0, 0], [[0, 0.5, 0.5]], atol=1e-9)
     np.testing.assert_allclose(again.poses(0, np.array([3e9]))[1][0, :2, 0], [0.5**0.5] * 2)
-    assert built.findings.sources["fcd.xml"].startswith("3 actors during the survey, of 3 vehicles")
+    assert built.findings.sources["fcd.xml"].startswith("3 actors during the survey, out of 3 vehicles")
 
     job = build(read).job()
     found = made(job.survey, job.scene, "tiles")
@@ -383,7 +383,7 @@ def test_unusable_data_is_refused(tmp_path, text, told):
             3 * 2**19,
             "the limit is 1.50 MiB. Simulate a shorter time, or fewer vehicles.",
         ),
-        ("<x/>" * 1_000_000, 2**20, "the limit is 1.00 MiB. Unpack it with gunzip first."),
+        ("<x/>" * 1_000_000, 2**20, "the limit is 1.00 MiB. Decompress it with gunzip first."),
     ],
 )
 def test_packed_data_that_unpacks_to_far_more_is_refused(

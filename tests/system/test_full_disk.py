@@ -93,7 +93,7 @@ def test_the_disk_of_the_run_is_full(disk, run, expected):
 def test_a_disk_without_room_for_anything(disk, run):
     folder = disk(4)
     (folder / "filler").write_bytes(bytes(4096))
-    with pytest.raises(LidarError, match=r"run\.db cannot be written .*\. Free disk space") as caught:
+    with pytest.raises(LidarError, match=r"run\.db cannot be written .*\. Free disk") as caught:
         run(folder=folder / "run")
     assert not hasattr(caught.value, "__notes__")
     assert [path.name for path in folder.iterdir()] == ["filler"]

@@ -672,7 +672,7 @@ def _another_shard_in_the_folder(survey: Path, lidarpool: Callable[..., Any], sl
     for shard in (["--shard", "3/3"], ["--shard", "2/4"], []):
         for more in ([], ["--resume"]):
             refused = lidarpool(*run, *shard, *more)
-            assert refused.code == 2 and "it is shard 2/3, not" in refused.err, refused
+            assert refused.code == 2 and "it is shard 2/3 rather than" in refused.err, refused
     assert lidarpool(*run, "--shard", "2/3", "--resume").code == 0
     assert content(survey / "part-2").keys() == before.keys()
 
