@@ -241,7 +241,10 @@ def test_quaternions_in_another_order(tmp_path, path):
 def test_a_carrier_that_faces_aside_all_along(tmp_path, yaw_deg, side):
     aside = drive((0, -20, 5, 2, yaw_deg), (4, 20, 5, 2, yaw_deg))
     [warning] = warnings_of(tmp_path, TOWN, **aside)
-    assert f"the platform constantly faces 90 degrees to the {side} of its direction of travel" in warning
+    assert (
+        f"the platform constantly faces 90 degrees to the {side} of its direction of travel"
+        in warning
+    )
     there_and_back = drive((0, -20, 5, 2, 0), (4, 20, 5, 2, 0), (8, -20, 5, 2, 0))
     assert warnings_of(tmp_path, TOWN, **there_and_back) == []
 

@@ -101,7 +101,7 @@ def test_without_a_scene_nothing_is_made_up(scenario, tmp_path, scene):
         "`scene: seed` for the six objects of `lidarpool demo`."
     )
     actors = "actors: [{name: Crate, box: [2, 2, 2], at: [6, 0, 0]}]"
-    with pytest.raises(LidarError, match=r"has actors, but nothing that stands still\. Add"):
+    with pytest.raises(LidarError, match=r"has actors, but no stationary object\. Add"):
         build(scenario(text + actors))
 
 

@@ -124,7 +124,7 @@ def test_it_is_gone_on_with(unfinished):
     store = opened(unfinished, resume=True)
     assert (store.only_job.resumed, store.backend, store.notes) == (4, "numpy", [])
     assert store.only_job.parts.missing(0, 6) == [(2, 3), (5, 6)]
-    assert "were cast with it" in store.advice
+    assert "were cast with this backend" in store.advice
     store.db.close()
     with pytest.raises(
         LidarError, match=r"cast with the backend 'numpy', .* cannot continue with 'tiles'"

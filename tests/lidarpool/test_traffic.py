@@ -177,7 +177,8 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     place, turn = person.poses(0, np.array([1.5e9]))
     np.testing.assert_allclose(place + turn @ [0.2, 0, 0], [[0, 0.5, 0.5]], atol=1e-9)
     np.testing.assert_allclose(again.poses(0, np.array([3e9]))[1][0, :2, 0], [0.5**0.5] * 2)
-    assert built.findings.sources["fcd.xml"].startswith("3 actors during the survey, out of 3 vehicles")
+    summary = built.findings.sources["fcd.xml"]
+    assert summary.startswith("3 actors during the survey, out of 3 vehicles")
 
     job = build(read).job()
     found = made(job.survey, job.scene, "tiles")

@@ -35,7 +35,7 @@ from .scenario import Scenario
 from .sections import PoolSection
 from .static_scene import SceneCache
 
-_FORM = "a campaign has base:, count:, vary:, keep:, splits:"
+_FORM = "a campaign file contains base:, count:, vary:, keep: and splits:"
 MAX_SHOWN_FILES = 5  # files of a command that are named
 
 

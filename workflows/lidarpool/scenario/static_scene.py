@@ -248,7 +248,7 @@ def _check_not_empty(scenario: Scenario) -> None:
         return
     if scenario.actors or scenario.traffic is not None:
         raise LidarError(
-            f"{scenario.source}: The scene has actors, but nothing that stands still. Add "
+            f"{scenario.source}: The scene has actors, but no stationary object. Add "
             "`scene: {ground: {}}`, or mesh files as `scene.files`."
         )
     raise LidarError(
@@ -450,9 +450,9 @@ def _ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
     footprints = [static.corners, *_footprints(scenario)]
     if not any(map(len, footprints)):
         raise LidarError(
-            f"{scenario.source}: `scene.ground` lies under the objects, poses, trajectories and "
-            "actors of the scenario, which has none of them. Add `poses`, or mesh files as "
-            "`scene.files`."
+            f"{scenario.source}: The extent of `scene.ground` cannot be determined, because the "
+            "scenario has no objects, poses, trajectories or actors. Add `poses`, or mesh files "
+            "as `scene.files`."
         )
     return _ground_mesh(scenario.scene, footprints)
 

@@ -344,7 +344,7 @@ class RunStore:
         if not self.committed_in_words:
             return AUTO_TAKES
         return (
-            f"The scans in {self.location} were cast with it. Continue on a machine where it is "
+            f"The scans in {self.location} were cast with this backend. Continue where it is "
             f"available, or remove them with {_DROP}."
         )
 
