@@ -143,7 +143,7 @@ def test_the_ground_lies_under_poses_trajectories_and_actors(scenario, text, rec
 
 
 def test_a_ground_under_nothing_is_refused(scenario):
-    with pytest.raises(LidarError, match=r"s\.yaml: `scene\.ground` lies under .* Add `poses`"):
+    with pytest.raises(LidarError, match=r"s\.yaml: The extent of `scene\.ground` .* Add `poses`"):
         build(scenario("scene: {ground: {}}"))
 
 
