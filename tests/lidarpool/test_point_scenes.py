@@ -469,8 +469,8 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
         "was converted to meters, because its header states units of 0.001, 0.001, 0.001 m"
         in notes[0]
     )
-    metres = scene_of_points(path, unit="cm", tell=notes.append)
-    np.testing.assert_allclose(metres.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
+    meters = scene_of_points(path, unit="cm", tell=notes.append)
+    np.testing.assert_allclose(meters.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
     np.testing.assert_allclose(open_recording(path).read_points(0).points.max(axis=0), [4, 3, 2])
     points = open_recording(path, unit="m").read_points(0).points
     np.testing.assert_allclose(points.max(axis=0), [4000, 3000, 2000])
@@ -479,7 +479,7 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("a.ply", "`colour` cannot be 'intensity', because .* has no intensities"),
+        ("a.ply", "`color` cannot be 'intensity', because .* has no intensities"),
         ("a.xyz", "has no intensities"),
     ],
 )

@@ -384,7 +384,7 @@ BAD = [
     ("scene: seed\nplanning: {trials: 5}", r"`planning` requires a start and a target"),
     ("scene: seed\nplanning: {start: [5, 5]}", r"Set `planning\.start` and `planning\.target`\."),
     ("scene: {preset: none}", r"preset must be 'seed', but is 'none'"),
-    ("planning: {obstacles: [{centre: [0, 0]}]}", "both `centre` and `radius_m`"),
+    ("planning: {obstacles: [{center: [0, 0]}]}", "both `center` and `radius_m`"),
     ("scene: a.stl\nplanning: {enabled: true}", r"Set `planning\.start` and `planning\.target`"),
     ("pool: {backend: opengl}", "must be 'auto', 'cuda', 'tiles' or 'numpy'"),
     ("", "is empty. A scenario is a mapping with sections"),

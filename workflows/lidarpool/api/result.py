@@ -105,7 +105,7 @@ class Result(RunResult):
             all pictures are drawn.
         size
             Width and height in pixels.
-        colour
+        color
             Column that determines the color of the points, or "rgb" for red, green and blue.
 
         Returns

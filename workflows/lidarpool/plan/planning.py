@@ -46,7 +46,7 @@ class Planning(Search):
     ----------
     start, target
         x and y of the start and of the target, in meters.
-    centres
+    centers
         Centers of the discs to avoid, in meters. Shape (m, 2), where m may be 0.
     radii
         Radii of the discs in meters, greater than 0. Shape (m,), or one number for all discs.

@@ -146,8 +146,8 @@ def _color_note(built: Built) -> str:
         return ""
     shown = ", ".join(names[i] for i in gray[:3]) + ", …" * (len(gray) > 3)
     return (
-        f"{len(grey):,} of {plural(int(textured.sum()), 'object')} with `reflectance: texture` "
-        f"{'has' if len(grey) == 1 else 'have'} no colors and {'is' if len(grey) == 1 else 'are'} "
+        f"{len(gray):,} of {plural(int(textured.sum()), 'object')} with `reflectance: texture` "
+        f"{'has' if len(gray) == 1 else 'have'} no colors and {'is' if len(gray) == 1 else 'are'} "
         f"treated as gray: {shown}"
     )
 

@@ -212,8 +212,8 @@ def _to_meters(
             notes = check_metric_format(content.system, finite)
             meters = (1.0, 1.0, 1.0)
         elif content.units_m is not None and unit is None:
-            metres = content.units_m
-            lengths = ", ".join(f"{length:g}" for length in metres)
+            meters = content.units_m
+            lengths = ", ".join(f"{length:g}" for length in meters)
             notes = [f"was converted to meters, because its header states units of {lengths} m"]
         else:
             meters, notes = stated_meters(content.system, finite, unit)

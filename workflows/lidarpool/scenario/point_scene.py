@@ -202,23 +202,23 @@ def _colored(
 
     LidarError if the chosen quantity is missing.
     """
-    present = {"rgb": points.colours is not None, "intensity": points.intensities is not None}
-    if colour is not None and not present[colour]:
-        quantity = "colors" if colour == "rgb" else "intensities"
-        raise LidarError(f"`colour` cannot be {colour!r}, because {path} has no {quantity}.")
+    present = {"rgb": points.colors is not None, "intensity": points.intensities is not None}
+    if color is not None and not present[color]:
+        quantity = "colors" if color == "rgb" else "intensities"
+        raise LidarError(f"`color` cannot be {color!r}, because {path} has no {quantity}.")
     if points.classes is not None:
         _note_unknown(path, "class", points.classes == NO_CLASS, "have no material", tell)
     if not any(present.values()):
         return points
     color = color or next(name for name, is_present in present.items() if is_present)
     if all(present.values()):
-        other, choice = ("intensities", "intensity") if colour == "rgb" else ("colors", "rgb")
+        other, choice = ("intensities", "intensity") if color == "rgb" else ("colors", "rgb")
         tell(
             f"the {other} of {path} are not stored, because a surfel has a single color. To use "
-            f"them, set `colour` to {choice}"
+            f"them, set `color` to {choice}"
         )
-    if points.colours is not None and colour == "rgb":
-        _note_unknown(path, "color", np.isnan(points.colours[:, 0]), _GRAY, tell)
+    if points.colors is not None and color == "rgb":
+        _note_unknown(path, "color", np.isnan(points.colors[:, 0]), _GRAY, tell)
         return replace(points, intensities=None)
     if points.intensities is not None:
         _note_unknown(path, "intensity", np.isnan(points.intensities), _GRAY, tell)
@@ -257,7 +257,7 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
     if count < _NEIGHBORS:
         raise LidarError(
             f"The points of {path} are in {plural(count, 'voxel')} of {voxel_m:.3g} m, but at "
-            f"least {_NEIGHBOURS} are required. Reduce `voxel_m`, or use a different cloud."
+            f"least {_NEIGHBORS} are required. Reduce `voxel_m`, or use a different cloud."
         )
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(voxels.means(positions)))
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBORS))

@@ -718,7 +718,7 @@ class Obstacle(Section):
     object: Annotated[Text | None, about("name of objects in the scene; may contain * and ?")] = (
         None
     )
-    centre: Annotated[Pair | None, about("x and y of the center of a disc, in meters")] = None
+    center: Annotated[Pair | None, about("x and y of the center of a disc, in meters")] = None
     radius_m: Annotated[float | None, about("radius of the disc, in meters", gt=0, le=1e6)] = None
 
     @model_validator(mode="after")
@@ -728,7 +728,7 @@ class Obstacle(Section):
         if (self.object is None) != disc or (
             self.object is not None and self.model_fields_set > {"object"}
         ):
-            raise ValueError("Set either `object`, or both `centre` and `radius_m`.")
+            raise ValueError("Set either `object`, or both `center` and `radius_m`.")
         return self
 
 
