@@ -87,7 +87,7 @@ def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch,
 
     def given_up() -> bool:
         if stage == GPU:
-            return "its worker is gone or silent" in reasons
+            return "its worker has left or does not respond" in reasons
         return not {None, stopped[0]} & {_worker_of(arena, stage)}
 
     def on_frame(frame) -> None:

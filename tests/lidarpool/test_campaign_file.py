@@ -216,7 +216,9 @@ def test_cells_that_are_no_values_are_text(campaign, folder, cell):
 def test_columns_of_a_table_are_fields_or_ignored(campaign, folder):
     (folder / "crates.csv").write_text('name,Wood,box,at,wood\nA,oak,"[1, 2, 3]","[[1, 2]]",5\n')
     sample = {"from": "crates.csv", "count": 1}
-    with pytest.raises(LidarError, match=r"not known: Wood, wood\. Rename .* Known are name, "):
+    with pytest.raises(
+        LidarError, match=r"unknown columns Wood and wood\. Rename .* available columns are name, "
+    ):
         campaign({"scene.copies": {"sample": sample}}).check_files()
     found = campaign({"scene.copies": {"sample": {**sample, "ignore": "wood"}}})
     assert found.scenario(0).scene.copies[1].box == (1, 2, 3)
@@ -410,7 +412,10 @@ def test_a_function_makes_jobs():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda number, rng: 5, "job 1: the function returned 5; it must return a Job("),
+        (
+            lambda number, rng: 5,
+            "job 1: the function must return a Job(scene, survey), but returned 5",
+        ),
         (lambda number, rng: 1 / 0, "job 1: the function raised ZeroDivisionError: division"),
         (
             lambda number, rng: job(keep_every=0),
@@ -418,11 +423,11 @@ def test_a_function_makes_jobs():
         ),
         (
             lambda number, rng: job(*[3] * number),
-            "job 1 has the value 'drawn', which the first has not",
+            "Job 1 has a value 'drawn', which the first job does not have",
         ),
         (
             lambda number, rng: Job(job().scene, job().survey, values={"a": [1]}),
-            "job 1 has the value 'a': [1]; values are numbers, text",
+            "but job 1 has {'a': [1]}",
         ),
     ],
     ids=["no job", "raises", "refused", "other names", "a list"],
@@ -447,7 +452,7 @@ WRONG = {
         {"noise.range_m": {"normal": {"mean": 1, "std": 1}}},
         "can be -5.0, but must be from 0 to",
     ),
-    "limits": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "Give limits."),
+    "limits": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "Set `limits`."),
     "far": ({KM: {"normal": {"mean": 1, "std": 1, "limits": [9, 10]}}}, "at least 1% of the"),
     "not whole": ({"steps": {"uniform": [1, 9]}}, "steps can be 1.0, but must be a whole"),
     "type": ({"noise.range_m": {"choice": [0, "a"]}}, "noise.range_m can be 'a', but must be"),
@@ -455,7 +460,10 @@ WRONG = {
         {"sensors.roof.model": {"choice": ["velodyne/vlp15"]}},
         "Did you mean 'velodyne/vlp16",
     ),
-    "together": ({"sensors.roof.layers": {"integer": [8, 9]}}, "leave out layers"),
+    "together": (
+        {"sensors.roof.layers": {"integer": [8, 9]}},
+        "`model` and `layers` cannot be combined",
+    ),
     "file": (
         {"scene.files.0.file": {"choice": ["hall.glb", "hut.glb"]}},
         "hut.glb does not exist",
@@ -468,12 +476,12 @@ WRONG = {
         {KM: {"uniform": [1, 2], "choice": [1]}},
         "Set exactly one of uniform, log_uniform",
     ),
-    "a value": ({KM: 3}, "must be a way of choosing"),
+    "a value": ({KM: 3}, "must be a mapping that defines the choice"),
     "misspelt": ({KM: {"unifrom": [1, 2]}}, "Did you mean 'uniform'?"),
-    "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "as many weights as"),
+    "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "must have one weight for each value"),
     "twice": (
         {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
-        "actors.0.box.0 and actors.Van.box.0 lead to the same field",
+        "actors.0.box.0 and actors.Van.box.0 refer to the same field",
     ),
     "other section": ({"performance": {"choice": ["ideal"]}}, "mean 'sensors.roof.performance'?"),
     "of a list": ({"up_axis": {"choice": ["z"]}}, "Did you mean 'scene.files.0.up_axis'?"),
@@ -481,17 +489,17 @@ WRONG = {
     "of a mapping": ({"rate_hz": {"choice": [5]}}, "mean 'sensors.roof.rate_hz'?"),
     "within": (
         {"scene": {"choice": ["hall.glb"]}, "scene.files.0.file": {"choice": ["hall.glb"]}},
-        "scene is chosen as a whole",
+        "cannot be combined, because scene replaces",
     ),
     "no table": ({"actors": {"sample": {"from": "no.csv", "count": 1}}}, "no.csv does not exist"),
-    "few rows": ({"actors": {"sample": {"from": "traffic.csv", "count": 3}}}, "has 2 rows"),
+    "few rows": ({"actors": {"sample": {"from": "traffic.csv", "count": 3}}}, "has only 2 rows"),
     "rows of no list": (
         {"steps": {"sample": {"from": "traffic.csv", "count": 1}}},
-        "and this is no",
+        "but this field is not a list",
     ),
     "other rows": (
         {"scene.copies": {"sample": {"from": "traffic.csv", "count": 1}}},
-        "traffic.csv is not a usable table: its columns are not known: trajectory",
+        "traffic.csv cannot be used as a table: it contains the unknown columns trajectory",
     ),
 }
 
@@ -524,11 +532,11 @@ def test_it_is_told_what_is_wrong(campaign, name):
     [
         ({"base": None}, "base is required"),
         ({"base": "bse.yaml"}, "bse.yaml does not exist"),
-        ({"base": "campaign.yaml"}, "'campaign.yaml' is a campaign; give a scenario"),
+        ({"base": "campaign.yaml"}, "base must be a scenario, but 'campaign.yaml' is a campaign"),
         ({"cont": 5}, "Did you mean 'count'?"),
         ({"keep": "kiti"}, "Did you mean 'kitti'?"),
-        ({"splits": {"train": 0.8, "val": 0.1}}, "splits add up to 0.9; they must add up to 1"),
-        ({"splits": {"a/b": 1}}, "the split 'a/b' gets a file of its name"),
+        ({"splits": {"train": 0.8, "val": 0.1}}, "must add up to 1, but add up to 0.9"),
+        ({"splits": {"a/b": 1}}, "a-z, A-Z, 0-9, - and _, but is 'a/b'"),
     ],
 )
 def test_fields_that_cannot_be_meant(campaign, fields, says):
@@ -539,7 +547,7 @@ def test_fields_that_cannot_be_meant(campaign, fields, says):
 
 
 def test_a_count_is_needed_where_something_is_drawn(campaign):
-    with pytest.raises(LidarError, match=r"count is missing: steps is drawn"):
+    with pytest.raises(LidarError, match=r"count is required, because values of steps are drawn"):
         campaign({"steps": {"integer": [1, 2]}}, count=None)
     assert campaign(count=None).count == 1
 
@@ -550,7 +558,7 @@ def test_values_that_do_not_fit_together_are_told_with_the_job(campaign):
     with pytest.raises(LidarError) as raised:
         found.job(wrong)
     assert f"campaign.yaml: job {wrong}: returns.subrays must be " in str(raised.value)
-    assert "\nIts values are returns.subrays: " in str(raised.value)
+    assert "\nThe values of the job are returns.subrays: " in str(raised.value)
 
 
 def test_files_of_every_row_are_looked_for(campaign, folder):
@@ -571,10 +579,10 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
         campaign(
             {"sensors.roof.model": {"choice": ["velodyne/vlp16"]}}, base=["base.yaml", "fog.yaml"]
         )
-    assert "campaign.yaml: vary, of fog.yaml: sensors of the base has no 'roof'" in str(
+    assert "campaign.yaml: vary for fog.yaml: sensors of the base has no entry 'roof'" in str(
         raised.value
     )
-    with pytest.raises(LidarError, match=r"vary, of fog\.yaml: steps can be 0, but must"):
+    with pytest.raises(LidarError, match=r"vary for fog\.yaml: steps can be 0, but must"):
         campaign({"steps": {"choice": [0]}}, base=["base.yaml", "fog.yaml"])
 
 
@@ -582,7 +590,7 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
 def test_a_grid_that_is_too_large(campaign):
     many = {"each": list(range(1, 1001))}
     vary = {"steps": many, "cloud.keep_every": many, "noise.seed": many}
-    with pytest.raises(LidarError, match=r"all values of each are 1,000,000,000 jobs"):
+    with pytest.raises(LidarError, match=r"grid of all values would have 1,000,000,000 jobs"):
         campaign(vary, count=None)
     assert campaign(vary, count=5).count == 5
 

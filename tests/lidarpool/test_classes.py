@@ -82,14 +82,14 @@ def test_names_add_the_column_and_are_no_part_of_the_survey():
 def test_a_path_of_a_campaign_leads_to_the_name_of_a_class():
     scenario = Scenario.from_data({"classes": {40: "road"}})
     assert [key for key, _ in find_field(scenario, "classes.40")[0]] == ["classes", 40]
-    with pytest.raises(LidarError, match=r"no .41.\. It has 40"):
+    with pytest.raises(LidarError, match=r"no entry .41.\. Available names: 40"):
         find_field(scenario, "classes.41")
 
 
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("poses.1.position", "1 entry, counted from 0, and no entry 1"),
+        ("poses.1.position", "has 1 entry, so entry 1 does not exist"),
         (f"poses.{'9' * 5000}", "999…999"),
     ],
 )

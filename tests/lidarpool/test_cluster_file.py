@@ -41,7 +41,9 @@ def test_slots_and_workers_of_a_file(tmp_path):
     assert file.slots == {"GPU": 4, "LIDAR": 4, "OTHER": 5}
     assert str(file) == "SSHCluster: 8 workers, GPU 2, LIDAR 1, OTHER 5"
     file.require({"GPU": 1, "LIDAR": 4})
-    with pytest.raises(LidarError, match=r"c.yaml: partition LIDAR has 4 of the 5 slots"):
+    with pytest.raises(
+        LidarError, match=r"c.yaml: Partition LIDAR has 4 slots, but the run needs 5"
+    ):
         file.require({"LIDAR": 5})
 
 
@@ -54,12 +56,12 @@ def test_partitions_that_grow_with_their_work(tmp_path):
     assert str(file) == "SSHCluster: up to 12 workers, GPU 1 to 3, LIDAR 1, OTHER 0 to 8"
     file.require({"GPU": 1, "LIDAR": 4, "OTHER": 1})
     few = load(tmp_path, GOOD.replace("slots: 4", "adapt: [0, 3]"))
-    with pytest.raises(LidarError, match=r"partition LIDAR has 3 of the 4 slots needed"):
+    with pytest.raises(LidarError, match=r"Partition LIDAR has 3 slots, but the run needs 4"):
         few.require({"LIDAR": 4})
 
 
 WRONG = {
-    "a list": ("[1]", "contains a list. A cluster file has"),
+    "a list": ("[1]", "contains a list. A cluster file contains"),
     "a misspelt field": (
         GOOD.replace("arguments", "argument"),
         "Unknown field 'argument'. Did you mean 'arguments'?",
@@ -67,7 +69,7 @@ WRONG = {
     "no partitions": ("cluster: distributed.SSHCluster", "partitions is required"),
     "a partition of others": (
         GOOD.replace("GPU", "GPUS"),
-        "not a partition of a survey.*mean 'GPU'",
+        "Unknown partition .*mean 'GPU'",
     ),
     "workers": (
         GOOD.replace("workers: 5", "workers: many"),
@@ -75,15 +77,15 @@ WRONG = {
     ),
     "a swapped range": (
         GOOD.replace("workers: 5", "adapt: [8, 0]"),
-        r"partitions.OTHER.adapt is \[8, 0\]: give the least and the greatest number",
+        r"partitions.OTHER.adapt must be .*, but is \[8, 0\]",
     ),
     "two numbers of workers": (
         GOOD.replace("workers: 5", "workers: 5, adapt: [0, 8]"),
-        "partitions.OTHER.adapt .* leave out workers",
+        "partitions.OTHER.adapt and workers cannot be combined",
     ),
     "a time without a range": (
         GOOD.replace("workers: 5", "idle_s: 60"),
-        "partitions.OTHER.idle_s needs adapt",
+        "partitions.OTHER.idle_s requires adapt",
     ),
     "no host": (
         GOOD.replace("[a, b], slots: 2", "[]"),
@@ -93,10 +95,13 @@ WRONG = {
         GOOD.replace("distributed.", "dask_jobqueues."),
         r"is not installed.*\.\[clusters\]",
     ),
-    "no such class": (GOOD.replace("SSHCluster", "SHCluster"), "cannot be started by partition"),
+    "no such class": (
+        GOOD.replace("SSHCluster", "SHCluster"),
+        "cannot start workers for each partition",
+    ),
     "another class": (
         GOOD.replace("distributed.SSHCluster", "subprocess.Popen"),
-        "cannot be started by partition",
+        "cannot start workers for each partition",
     ),
 }
 
@@ -111,7 +116,9 @@ def test_what_is_wrong_with_a_file(tmp_path, case):
 def test_a_cluster_that_does_not_start(tmp_path):
     file = load(tmp_path, GOOD.replace("hosts: [head]}", "host: head}", 1))
     with (
-        pytest.raises(LidarError, match=r"c.yaml: distributed.SSHCluster was not started \(.*"),
+        pytest.raises(
+            LidarError, match=r"c.yaml: distributed.SSHCluster could not be started \(.*"
+        ),
         file.started(print),
     ):
         pass
@@ -163,7 +170,7 @@ def test_counts_that_cannot_be(given):
         (((), ()), "tiles", ""),
         ((("GPU-1",), ()), "cuda", ""),
         ((("GPU-1",), ()), "tiles", "the GPUs of partition GPU are not used"),
-        (((), ("GPU-1",)), "tiles", "no GPU in partition GPU: CPU workers cast the rays"),
+        (((), ("GPU-1",)), "tiles", "partition GPU has no worker with a GPU, so CPU workers cast"),
     ],
 )
 def test_of_gpus_is_spoken_only_where_there_is_one_that_stays_idle(gpus, backend, says):

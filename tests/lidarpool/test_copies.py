@@ -201,8 +201,8 @@ WRONG = {
     "short": (TREE | {"at": [[0]]}, "at least 2 items"),
     "outside": (
         TREE | {"at": [[0, 0], [99, 1], [99, 2]]},
-        "copies[0]: below x 99, y 1 nothing of the scene's files or ground faces up to stand on "
-        "(2 copies): give z.",
+        "copies[0]: There is no upward-facing surface at x 99, y 1 to place a copy on. "
+        "Set the z coordinate of 2 copies.",
     ),
     "name": (TREE | {"scatter": {"count": 1, "surfaces": "Hil"}}, "'Hil', but no object has"),
     "ordered": (
@@ -211,7 +211,7 @@ WRONG = {
     ),
     "full": (
         TREE | {"scatter": {"count": 9, "spacing_m": 25}},
-        "of 9 found room on * within x -20 to 20, y -10 to 10: take fewer",
+        "of 9 copies fit on * within x -20 to 20, y -10 to 10. Reduce",
     ),
     "no file": (TREE | {"table": "none.csv"}, "none.csv does not exist."),
     "no column": (TREE | {"table": "a.csv"}, "it has no column 'y'. Its columns are x, z"),
@@ -246,7 +246,7 @@ def test_what_cannot_be_is_told_in_a_line(made, folder, name, monkeypatch):
 
 
 def test_nothing_to_stand_on(made):
-    with pytest.raises(LidarError, match=r"nothing to stand on: add scene\.files"):
+    with pytest.raises(LidarError, match=r"no surface to place objects on\. Add `scene\.files`"):
         made(TREE | {"scatter": {"count": 1}}, scene={"files": []})
-    with pytest.raises(LidarError, match="give z"):
+    with pytest.raises(LidarError, match="Set the z coordinate of 1 copy"):
         made(TREE | {"at": [[0, 0]]}, scene={"files": []})

@@ -61,7 +61,9 @@ def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     scene = scene_of(*OBJECTS[name], at=(far, far, 0))
     placed = place_sensor(scene, GRID)
     assert (
-        placed.surrounds_object and "looks like an object" in placed.note and len(placed.poses) == 5
+        placed.surrounds_object
+        and "was recognized as an object" in placed.note
+        and len(placed.poses) == 5
     )
     poses = [np.subtract(pose.position, scene.origin) for pose in placed.poses]
     middle = scene.bounds.mean(axis=0)
@@ -107,7 +109,7 @@ def test_the_default_grid_is_narrowed_to_an_object(tmp_path, mesh, points, rays)
     rig = Rig(built.scene, survey, "auto")
     hits = [sum(map(len, rig.cast(36 * n, 36 * (n + 1)))) for n in range(5)]
     assert sum(hits) == pytest.approx(points, rel=0.2)
-    assert "as no sensor is given, a grid of" in advice(built)[-1]
+    assert "The default sensor is a grid of" in advice(built)[-1]
     # The whole object is seen: no pose sees more of it without the narrow field of view.
     grid = built.placing.grid
     wide = {"vertical_fov_deg": 90, "horizontal_fov_deg": 90}
@@ -175,7 +177,7 @@ def test_in_a_place_the_sensor_stands_in_the_middle(name):
     assert len(placed.poses) == 3 and not placed.surrounds_object
     middle = (scene.bounds + scene.origin).mean(axis=0)
     assert all(pose.position[:2] == pytest.approx(middle[:2]) for pose in placed.poses)
-    assert ("only the backs" in placed.note) == (name == "box hall")
+    assert ("only the back faces" in placed.note) == (name == "box hall")
 
 
 @pytest.mark.extended
@@ -217,8 +219,8 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     data = {"scene": {"files": ["b.stl"]}, "poses": [[0, 0, 0]]}
     given = Scenario.from_data(data, folder=tmp_path)
     [warning] = implausibilities(build(given))
-    assert "only the backs of its surfaces" in warning
-    assert "from outside it is seen by poses: [{position: [" in warning
+    assert "only the back faces of its surfaces" in warning
+    assert "To view the scene from outside, use poses: [{position: [" in warning
     data["poses"] = [[0, 0, 9]]
     assert implausibilities(build(Scenario.from_data(data, folder=tmp_path))) == []
 
@@ -247,7 +249,7 @@ def test_the_unit_of_a_long_object_is_asked_for(tmp_path, file, length, noted):
     (tmp_path / file).write_bytes(capsule.export(file_type=file[-3:]))
     built = build(Scenario.load(tmp_path / file))
     notes = " ".join(advice(built))
-    assert "looks like an object" in notes and ("give the file's unit (mm?)" in notes) == noted
+    assert "was recognized as an object" in notes and ("possibly mm, or pass" in notes) == noted
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])

@@ -524,7 +524,7 @@ def test_a_scan_that_kills_its_workers_is_isolated_and_named(run, stage):
     deaths = []
     run.stages.advice = 20
     run.until(striking(run, stage, poison, deaths))
-    message = f"scan {poison} kills the worker that runs stage {stage}: 3 workers died, one after"
+    message = f"3 workers in a row died in stage {stage} while they processed only scan {poison}"
     assert run.fails().startswith(message)
     # Twice with the whole batch, once alone, once with its piece, and three times by itself.
     pieces = 20 // -(-20 // PIECES)
@@ -652,7 +652,7 @@ def test_a_scene_that_kills_whoever_casts_it_is_told_after_a_few_deaths(run, adv
         return run.ended
 
     run.until(strike)
-    assert run.fails().startswith("Casting workers die whatever they cast first: 3 died, one a")
+    assert run.fails().startswith("3 casting workers in a row died in their first batch")
     assert len(deaths) <= 10
 
 
@@ -674,12 +674,12 @@ def test_a_job_that_fails_leaves_and_the_other_goes_on(two, how):
         two.until(lambda: two.at(BatchState.CASTING) and two.committed[0])
         two.stages.inbox.append(Failed(0, "generate", "scan 59: out of order"))
         two.step()
-        assert two.fails() == "stage generate failed: scan 59: out of order"
+        assert two.fails() == "Stage generate failed: scan 59: out of order"
     elif how == "cast":
         two.until(lambda: two.at(BatchState.CASTING, 0), idle="cast")
-        two.workers.end(two.at(BatchState.CASTING, 0)[0].key, JobError("stage intersect failed: 3"))
+        two.workers.end(two.at(BatchState.CASTING, 0)[0].key, JobError("Stage intersect failed: 3"))
         two.step()
-        assert two.fails() == "stage intersect failed: 3"
+        assert two.fails() == "Stage intersect failed: 3"
     else:
         two.until(striking(two, how, 23))
         assert two.fails().startswith("scan 23 kills")
@@ -769,7 +769,9 @@ def test_a_scan_that_kills_its_workers_is_found_among_tiny_jobs(empty, stage):
     begin_tiny(empty, 30)
     empty.until(lambda: len(empty.driver.dispatcher.batches) == 30, idle="cast")
     empty.until(striking(empty, stage, 3, job=17))
-    assert empty.fails(17).startswith(f"scan 3 kills the worker that runs stage {stage}")
+    assert empty.fails(17).startswith(
+        f"3 workers in a row died in stage {stage} while they processed only scan 3"
+    )
     empty.end()
     assert [number for number, error in empty.ended.items() if error] == [17]
 

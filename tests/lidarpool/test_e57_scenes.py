@@ -70,7 +70,7 @@ def test_pulses_without_a_return_are_left_out_with_a_note(path):
     scans = [{"fields": wall(zeros=600), "pose": pose(10.0)}]
     scene, notes = scene_and_notes(path, scans)
     np.testing.assert_allclose(scene.bounds[:, 0], 15, atol=1e-6)
-    assert notes == ["600 points at zero are left out, as pulses without a return"]
+    assert notes == [f"600 points of {path} at the origin were skipped as pulses without a return"]
 
 
 @pytest.mark.parametrize("state", ["cartesianInvalidState", "sphericalInvalidState"])
@@ -88,7 +88,7 @@ def test_invalid_colors_do_not_darken(path):
     red, _ = reds(scene)
     assert (red == 200).all()
     assert notes == [
-        f"{COUNT // 2} of {COUNT} points have no color. Surfels of such points take the mean color "
+        f"{COUNT // 2} of {COUNT} points have no color. Surfels of such points have the mean color "
         "of their neighbors, or are gray."
     ]
     view = open_view(path).points

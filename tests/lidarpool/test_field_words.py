@@ -25,14 +25,14 @@ def words(**sections):
 @pytest.mark.parametrize(
     ("sections", "differs"),
     [
-        ({"noise": {"range_m": 0.02}}, "noise.range_m is 0.02, was 0"),
-        ({"steps": 7}, "steps is 7, was "),
-        ({"weather": {"visibility_km": 2}}, "weather.visibility_km is 2, was not given"),
-        ({"cloud": {"columns": ["range"]}}, "cloud.columns is [range], was []"),
-        ({"poses": [[0, 0, 2]]}, "poses[0].position is [0, 0, 2], was [0, 0, 1]"),
-        ({"sensor": "velodyne/vlp16"}, "sensor.model is Velodyne VLP-16, was grid"),
-        ({"mount": [0, 0, 0.5]}, "sensor.mount.position is [0, 0, 0.5], was [0, 0, 0]"),
-        ({"scene": {"preset": "seed", "ground": {}}}, "scene.objects is 7, was 6"),
+        ({"noise": {"range_m": 0.02}}, "noise.range_m changed from 0 to 0.02"),
+        ({"steps": 7}, " to 7"),
+        ({"weather": {"visibility_km": 2}}, "weather.visibility_km was set to 2"),
+        ({"cloud": {"columns": ["range"]}}, "cloud.columns changed from [] to [range]"),
+        ({"poses": [[0, 0, 2]]}, "poses[0].position changed from [0, 0, 1] to [0, 0, 2]"),
+        ({"sensor": "velodyne/vlp16"}, "sensor.model changed from grid to Velodyne VLP-16"),
+        ({"mount": [0, 0, 0.5]}, "sensor.mount.position changed from [0, 0, 0] to [0, 0, 0.5]"),
+        ({"scene": {"preset": "seed", "ground": {}}}, "scene.objects changed from 6 to 7"),
     ],
 )
 def test_fields_that_differ_are_named_as_in_a_scenario(sections, differs):
@@ -43,21 +43,23 @@ def test_of_many_fields_some_are_named_and_the_others_counted():
     earlier = {f"field{number}": "1" for number in range(9)}
     now = dict.fromkeys(earlier, "2")
     said = differences(earlier, now)
-    assert said.startswith("field0 is 2, was 1; field1 is 2") and said.endswith("; and 5 more")
+    assert said.startswith("field0 changed from 1 to 2; field1 changed") and said.endswith(
+        "; and 5 more"
+    )
     assert differences(now, now) == ""
 
 
 def test_a_long_list_that_differs_has_other_content():
     lists = [dict(fields_in_words({"poses": np.add(POSES, shift)})) for shift in (0, 1)]
-    assert differences(*lists) == "poses has other content"
+    assert differences(*lists) == "the content of poses changed"
     poses = dict(fields_in_words({"poses": POSES[:-1]})), dict(fields_in_words({"poses": POSES}))
-    assert differences(*poses) == "poses is 30 entries, was 29 entries"
+    assert differences(*poses) == "poses changed from 29 entries to 30 entries"
 
 
 def test_a_plan_is_of_the_fields():
     plans = [Planning((0, 0), (10, 0), centers=[(5, 0)], radii=r) for r in (1, 2)]
     fields = [dict(fields_in_words(plan, "planning")) for plan in plans]
-    assert differences(*fields) == "planning.radii is [2.0], was [1.0]"
+    assert differences(*fields) == "planning.radii changed from [1.0] to [2.0]"
 
 
 @pytest.mark.parametrize(

@@ -212,7 +212,7 @@ def test_another_process_finds_the_same():
 )
 def test_what_has_none_is_refused_by_name(thing, name):
     for outer in (thing, [thing], Box({"a": thing})):
-        with pytest.raises(LidarError, match=f"of type {name} has no fingerprint.*keep num"):
+        with pytest.raises(LidarError, match=f"of type {name} cannot be hashed.*Use only num"):
             fingerprint(outer)
 
 
@@ -257,6 +257,9 @@ def test_the_first_difference_is_named():
     here = software("numpy")
     assert difference(here, here) == ""
     there = here | {"numpy": "1.0 with nothing"}
-    assert difference(there, here) == f"numpy 1.0 with nothing, the run numpy {here['numpy']}"
-    assert difference({}, here).startswith("lidarpool not installed, the run lidarpool 0.")
+    assert (
+        difference(there, here)
+        == f"numpy 1.0 with nothing, but the run requires numpy {here['numpy']}"
+    )
+    assert difference({}, here).startswith("no lidarpool, but the run requires lidarpool 0.")
     assert here["numpy"] == np.__version__  # and no instruction sets

@@ -80,9 +80,9 @@ def test_classes_without_a_name_are_noted_if_others_have_names(tmp_path):
     }
     for classes, noted in (({4: "stone"}, ["30"]), ({4: "stone", 30: "cart"}, []), ({}, [])):
         read = Scenario.from_data(scenario | {"classes": classes}, folder=tmp_path)
-        notes = [note for note in advice(build(read)) if "without a name" in note]
+        notes = [note for note in advice(build(read)) if "has no name" in note]
         assert notes == [
-            f"class {n} of materials or actors without a name: add {{{n}: …}} to classes"
+            f"class {n} of materials or actors has no name. Add `{{{n}: …}}` to `classes`"
             for n in noted
         ]
 

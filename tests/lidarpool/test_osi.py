@@ -224,8 +224,8 @@ def test_moving_objects_of_ground_truth_are_actors(tmp_path, name):
     np.testing.assert_allclose(rotations[0, :, 0], [0.5, 0.75**0.5, 0], atol=1e-9)
     assert person.trajectory.presence_ns == (0, 2e9)
     source = built.findings.sources[name]
-    assert source == "3 actors during the survey, of 3 moving objects until its end"
-    assert any("1 stationary object left out" in note for note in built.findings.notes)
+    assert source == "3 actors during the survey, out of 3 moving objects until its end"
+    assert any("1 stationary object in" in note for note in built.findings.notes)
 
 
 def test_timestamps_that_cannot_be_seconds_need_their_unit(tmp_path):
@@ -262,7 +262,7 @@ def test_actors_of_a_survey_come_back_from_its_trace(drive, tmp_path):
     read = scenario(tmp_path, "cloud.mcap", offset_s=-START_NS / 1e9)
     built = build(read)
     assert [actor.name for actor in built.scene.actors] == ["car (1)"]
-    note = "1 moving object without dimensions left out (vehicle)"
+    note = "was skipped because of missing dimensions (vehicle)"
     assert any(note in line for line in built.findings.notes)
 
 
@@ -332,7 +332,7 @@ def test_the_host_vehicle_carries_the_sensors(tmp_path, vehicle, host):
     names = ["car (0)"] if host else []
     assert [actor.name for actor in on_bus.scene.actors] == [*names, "pedestrian (9)"]
     with pytest.raises(
-        LidarError, match=r"vehicle is '8', which .* Available names: 0, 7, 9, host\."
+        LidarError, match=r"vehicle` is '8', but .* Available names: 0, 7, 9, host\."
     ):
         carried(tmp_path, "town_gt.osi", 8)
     for truth in (nobody := list(truths())):
@@ -341,7 +341,7 @@ def test_the_host_vehicle_carries_the_sensors(tmp_path, vehicle, host):
     with pytest.raises(
         LidarError,
         match=(
-            r"may not name its host .*identity\. Available "
+            r"does not state its host vehicle, set an identity\. Available "
             r"names: 0, 7, 9\."
         ),
     ):

@@ -82,33 +82,33 @@ def warnings_of(folder: Path, meshes: list[SceneMesh] | None = None, **scenario:
 @pytest.mark.parametrize(
     ("meshes", "position", "warning"),
     [
-        (TOWN, (0, 0, -5), "the sensor is under the scene at (0.000, 0.000, -5.000): check z"),
-        (TOWN, (0, 0, -0.3), "the sensor is under the scene"),
-        (SLAB, (0, 0, -5), "the sensor is under the scene"),
-        (SLAB, (0, 0, -0.5), "the sensor is inside a closed body"),
+        (TOWN, (0, 0, -5), "the sensor is below the scene at (0.000, 0.000, -5.000). Check z"),
+        (TOWN, (0, 0, -0.3), "the sensor is below the scene"),
+        (SLAB, (0, 0, -5), "the sensor is below the scene"),
+        (SLAB, (0, 0, -0.5), "the sensor is inside the closed body"),
         (
             TOWN,
             (20, 0, 2),
-            "the sensor is inside a closed body at (20.000, 0.000, 2.000), in 'House', and",
+            "the sensor is inside the closed body 'House' at (20.000, 0.000, 2.000) and",
         ),
-        (TOWN, (-20, 0, 2), "the sensor is inside a closed body"),
-        (TOWN, (0, 20, 1), "the sensor is inside a closed body"),
-        (TOWN, (0, -30, 1), "the sensor is inside a closed body"),
+        (TOWN, (-20, 0, 2), "the sensor is inside the closed body"),
+        (TOWN, (0, 20, 1), "the sensor is inside the closed body"),
+        (TOWN, (0, -30, 1), "the sensor is inside the closed body"),
     ],
     ids=["below", "just below", "slab", "in slab", "house", "no bottom", "car", "wall"],
 )
 def test_a_sensor_under_the_scene_or_in_a_body(tmp_path, meshes, position, warning):
     warnings = warnings_of(tmp_path, meshes, poses=[[*position]])
     assert len(warnings) == 1 and warnings[0].startswith(warning)
-    assert "from outside it is seen by poses: [{position: [" in warnings[0]
+    assert "To view the scene from outside, use poses: [{position: [" in warnings[0]
 
 
 def test_a_drive_into_a_body_names_body_and_time_and_offers_no_poses(tmp_path):
     into = drive((0, -40, 0, 2), (4, 20, 0, 2)) | {"steps": 1440}
     [warning] = warnings_of(tmp_path, TOWN, **into)
     assert re.match(
-        r"the sensor is inside a closed body at \d+ of 24 positions that were tried, first at "
-        r"\(-\d\d\.\d{3}, 0\.000, 2\.000\), 1\.\d+ s after the start, in 'Shell', and hits",
+        r"the sensor is inside the closed body 'Shell' at \d+ of 24 tested positions, first at "
+        r"\(-\d\d\.\d{3}, 0\.000, 2\.000\), 1\.\d+ s after the start and hits",
         warning,
     )
     assert "poses" not in warning
@@ -116,7 +116,7 @@ def test_a_drive_into_a_body_names_body_and_time_and_offers_no_poses(tmp_path):
 
 def test_one_bad_position_of_several_is_counted(tmp_path):
     [warning] = warnings_of(tmp_path, TOWN, poses=[[0, 0, 2], [0, 20, 1], [5, 5, 1]])
-    assert " at 1 of 3 positions that were tried, first at (0.000, 20.000, 1.000)" in warning
+    assert " at 1 of 3 tested positions, first at (0.000, 20.000, 1.000)" in warning
 
 
 @pytest.mark.parametrize(
@@ -153,16 +153,16 @@ def test_a_housing_that_a_sensor_does_not_see_is_no_fault(tmp_path):
     """Of the scene or of an actor, for the sensor that does not see it alone."""
     at_car = {"poses": [[0, 20, 1]]}
     [warning] = warnings_of(tmp_path, TOWN, **at_car)
-    assert "if it is the sensor's housing, give its name as unseen of the sensor" in warning
+    assert "If the body is the sensor housing, add its name to `unseen` of the sensor" in warning
     assert warnings_of(tmp_path, TOWN, **at_car, sensor={"unseen": ["Car"]}) == []
     sensors = {"one": {"unseen": "Car"}, "other": {"mount": [0, 0, 0.1]}}
     [warning] = warnings_of(tmp_path, TOWN, **at_car, sensors=sensors)
-    assert " at 1 of 2 positions that were tried, first at (0.000, 20.000, 1.100)" in warning
+    assert " at 1 of 2 tested positions, first at (0.000, 20.000, 1.100)" in warning
     points = [{"time_s": 0, "position": [-20, 5, 0]}, {"time_s": 4, "position": [20, 5, 0]}]
     drive = {"trajectory": {"points": points}, "steps": 36, "mount": [0, 0, 0.8]}
     drive["actors"] = [{"name": "Robot", "box": [4.5, 1.8, 1.5]}]
     [warning] = warnings_of(tmp_path, TOWN, **drive)
-    assert "or give the name as unseen of the sensor" in warning
+    assert "or add the name to `unseen` of the sensor" in warning
     assert warnings_of(tmp_path, TOWN, **drive, sensor={"unseen": ["Rob*"]}) == []
 
 
@@ -170,14 +170,14 @@ def test_a_housing_that_a_sensor_does_not_see_is_no_fault(tmp_path):
 def test_noise_above_a_tenth_of_the_range(tmp_path, sensor):
     poses = {"poses": [[0, 0, 2]]}
     [warning] = warnings_of(tmp_path, TOWN, **sensor, **poses, noise={"range_m": 20})
-    assert warning.startswith("noise.range_m is 20 m, more than a tenth of the range, ")
+    assert warning.startswith("`noise.range_m` is 20 m, which is more than a tenth of the range (")
     assert warnings_of(tmp_path, TOWN, **sensor, **poses, noise={"range_m": 0.02}) == []
     [warning] = warnings_of(tmp_path, TOWN, **poses, noise={"range_per_m": 0.2})
-    assert "noise.range_per_m is 0.2" in warning
+    assert "`noise.range_per_m` is 0.2" in warning
     [warning] = warnings_of(
         tmp_path, scene="seed", noise={"range_m": 20}
     )  # with poses that were chosen
-    assert "noise.range_m is 20 m" in warning
+    assert "`noise.range_m` is 20 m" in warning
 
 
 def drive(*points: tuple[float, ...]) -> dict[str, Any]:
@@ -193,14 +193,16 @@ def drive(*points: tuple[float, ...]) -> dict[str, Any]:
 def test_speeds_and_angular_rates_that_carriers_do_not_have(tmp_path):
     fast = drive((0, -1000, 5, 2), (1, 1000, 5, 2))
     [warning] = warnings_of(tmp_path, TOWN, **fast)
-    assert warning.startswith("the carrier moves at 2,000 m/s at 0.5 s, and carriers on the ground")
+    assert warning.startswith("the platform moves at 2,000 m/s at 0.5 s, but platforms on the")
     assert warnings_of(tmp_path, TOWN, **drive((0, -20, 5, 2), (4, 20, 5, 2))) == []
     flight = drive((0, -300, 0, 400), (3, 300, 0, 400))  # 200 m/s
     assert warnings_of(tmp_path, TOWN, **flight) == []
     low = drive((0, -300, 0, 10), (3, 300, 0, 10))
     assert "moves at 200 m/s" in warnings_of(tmp_path, TOWN, **low)[0]
     jump = drive((0, -20, 5, 2, 0), (0.1, -19, 5, 2, 170), (4, 20, 5, 2, 0))
-    assert "the carrier turns at 1,700 degrees a second" in warnings_of(tmp_path, TOWN, **jump)[0]
+    assert (
+        "the platform rotates at 1,700 degrees per second" in warnings_of(tmp_path, TOWN, **jump)[0]
+    )
 
 
 def quaternions(yaw: np.ndarray) -> np.ndarray:
@@ -229,7 +231,9 @@ def test_quaternions_in_another_order(tmp_path, path):
     np.savetxt(tmp_path / "way.tum", np.column_stack([TIMES, positions, w_first]))
     [warning] = warnings_of(tmp_path, TOWN, **scenario)
     assert "probably in the order w, x, y, z" in warning
-    assert re.match(r"the carrier's z axis is \d+ degrees from up: ", warning)
+    assert re.match(
+        r"the z axis of the platform is tilted by \d+ degrees from vertical\. ", warning
+    )
 
 
 @pytest.mark.extended
@@ -237,7 +241,10 @@ def test_quaternions_in_another_order(tmp_path, path):
 def test_a_carrier_that_faces_aside_all_along(tmp_path, yaw_deg, side):
     aside = drive((0, -20, 5, 2, yaw_deg), (4, 20, 5, 2, yaw_deg))
     [warning] = warnings_of(tmp_path, TOWN, **aside)
-    assert f"the carrier faces 90 degrees to the {side} of its direction of travel" in warning
+    assert (
+        f"the platform constantly faces 90 degrees to the {side} of its direction of travel"
+        in warning
+    )
     there_and_back = drive((0, -20, 5, 2, 0), (4, 20, 5, 2, 0), (8, -20, 5, 2, 0))
     assert warnings_of(tmp_path, TOWN, **there_and_back) == []
 
@@ -246,7 +253,7 @@ def test_a_trajectory_with_another_axis_up(tmp_path):
     positions = CIRCLE[0][::10, [0, 2, 1]] + [0, 0, 20]
     points = [(t, *p) for t, p in zip(TIMES[::10].tolist(), positions.tolist(), strict=True)]
     warnings = warnings_of(tmp_path, TOWN, **drive(*points))
-    assert any("is y the up axis of its file?" in warning for warning in warnings)
+    assert any("whether y is the up axis of its file" in warning for warning in warnings)
     climb = drive((0, 0, 0, 1), (10, 0, 0, 31))
     assert warnings_of(tmp_path, TOWN, **climb) == []  # of a drone
 

@@ -325,7 +325,7 @@ def test_software_has_the_plugins_that_are_used(tmp_path, distribution):
     assert described["plug-in used-mesh"] == plugin_versions([plugin])[plugin]
     assert described["plug-in used-mesh"].startswith("0.1 (sources ")
     told = difference(software(), described)
-    assert told.startswith("plug-in used-mesh not installed, the run plug-in used-mesh 0.1")
+    assert told.startswith("no plug-in used-mesh, but the run requires plug-in used-mesh 0.1")
 
 
 def test_jobs_of_campaigns_know_the_plugins_that_read_their_meshes(tmp_path, distribution):

@@ -214,7 +214,7 @@ def test_classes_colors_and_intensities_stay_in_the_scene(tmp_path, name):
         assert np.abs(means.astype(int) - expected).max() <= 1
         assert scene.material_names == (() if name == "a.e57" else ("class 2",))
         assert name == "a.e57" or again.material_names == ("class 2",)
-    assert f"{path}: intensities are not kept, because surfels have a color" in notes[0] + notes[1]
+    assert f"the intensities of {path} are not stored, because a surfel" in notes[0] + notes[1]
     left_out = {"a.las": "gps_time", "a.e57": ""}.get(name, "curvature")
     assert any(note.endswith(f": {left_out}") for note in notes) == bool(left_out)
 
@@ -456,7 +456,7 @@ def test_pulses_without_a_return_are_left_out_with_a_note(tmp_path):
     path = written(tmp_path / "a.npy", points)
     scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
     assert scene.triangles == 2 * len(GRID)
-    assert notes == [f"{path}: 20 points at zero are left out, as pulses without a return"]
+    assert notes == [f"20 points of {path} at the origin were skipped as pulses without a return"]
 
 
 def test_units_of_a_header_are_converted_with_a_note(tmp_path):
@@ -465,7 +465,10 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
     notes = []
     scene = scene_of_points(path, tell=notes.append)
     np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
-    assert "was converted to meters: its header names units of 0.001, 0.001, 0.001 m" in notes[0]
+    assert (
+        "was converted to meters, because its header states units of 0.001, 0.001, 0.001 m"
+        in notes[0]
+    )
     meters = scene_of_points(path, unit="cm", tell=notes.append)
     np.testing.assert_allclose(meters.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
     np.testing.assert_allclose(open_recording(path).read_points(0).points.max(axis=0), [4, 3, 2])
@@ -475,7 +478,10 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("a.ply", "has no intensities: leave out color intensity"), ("a.xyz", "has no intensities")],
+    [
+        ("a.ply", "`color` cannot be 'intensity', because .* has no intensities"),
+        ("a.xyz", "has no intensities"),
+    ],
 )
 def test_missing_intensities_are_an_error(tmp_path, name, words):
     with pytest.raises(LidarError, match=words):
@@ -485,11 +491,11 @@ def test_missing_intensities_are_an_error(tmp_path, name, words):
 def test_columns_without_names_are_noted(tmp_path):
     notes = []
     scene_of_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, tell=notes.append)
-    assert len(notes) == 1 and notes[0].endswith("no room for them: column_4")
+    assert len(notes) == 1 and notes[0].endswith("and that were skipped: column_4")
     rows = "\n".join(f"wall {x} {y} {z} 7" for x, y, z in plane())
     (tmp_path / "b.csv").write_text("kind,x,y,z,gps\n" + rows.replace(" ", ","))
     scene_of_points(tmp_path / "b.csv", voxel_m=0.1, tell=notes.append)
-    assert len(notes) == 2 and notes[1].endswith("no room for them: gps, kind")
+    assert len(notes) == 2 and notes[1].endswith("and that were skipped: gps, kind")
 
 
 @pytest.mark.parametrize("name", ["a.ply", "text.ply", "a.pcd", "text.pcd", "a.las", "a.laz"])
@@ -507,15 +513,15 @@ def test_cut_files_are_refused(tmp_path, name):
     ("name", "text", "words"),
     [
         ("a.xyz", "", "a.xyz: it is empty"),
-        ("a.xyz", "1 2 3\n" * 11, "has 11 points, and at least 12 are needed.$"),
-        ("a.xyz", "1 2 3\n" * 50, "most of its points in the same places"),
-        ("a.xyz", "nan 2 3\n" * 50, "0 points"),
+        ("a.xyz", "1 2 3\n" * 11, "must have at least 12 points, but has 11.$"),
+        ("a.xyz", "1 2 3\n" * 50, "Most points of .* have the same positions"),
+        ("a.xyz", "nan 2 3\n" * 50, "but has 0"),
         ("a.xyz", "x y z\n" * 50, "cannot be read: line 2 has 'x' as x, and a number"),
         ("a.asc", "ncols 3\n" * 50, "cannot be read: it is a raster of heights"),
         ("a.pts", "50\n1 2 3\n", "is cut short: line 1 announces 50 points, and 1 follow"),
         ("a.bin", "no floats", "cannot be read: a.bin has 9 bytes, and whole rows of 16"),
         ("a.xyz", "1 2 1e30\n" * 50, "farther than anything"),
-        ("a.glb", "glTF", "point clouds are read from"),
+        ("a.glb", "glTF", "point clouds must have one"),
         ("b.ply", None, "cannot be read"),
     ],
 )
@@ -543,7 +549,7 @@ def test_the_command_says_what_is_not_kept(tmp_path):
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
     monkeypatch.setattr("lidarpool.scenario.point_scene.memory", lambda: 1_000_000)
-    with pytest.raises(LidarError, match=r"1,200 surfels, .* larger voxel_m than 0.01"):
+    with pytest.raises(LidarError, match=r"1,200 surfels, .* Increase `voxel_m`, which is 0.01"):
         scene_of_points(path, voxel_m=0.01)
     assert len(scene_of_points(path, voxel_m=0.3).faces) < 2 * 500
 
@@ -565,7 +571,7 @@ def test_the_command(tmp_path):
     assert Scene.load(out).triangles == 2 * len(GRID)
     with pytest.raises(LidarError, match="exists"):
         CliRunner().invoke(command, arguments, catch_exceptions=False)
-    with pytest.raises(LidarError, match=r"size is -1.0"):
+    with pytest.raises(LidarError, match=r"size must be a positive number, but is -1.0"):
         arguments += ["--size", "-1", "--overwrite"]
         CliRunner().invoke(command, arguments, catch_exceptions=False)
 

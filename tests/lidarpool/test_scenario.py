@@ -101,7 +101,7 @@ def test_without_a_scene_nothing_is_made_up(scenario, tmp_path, scene):
         "`scene: seed` for the six objects of `lidarpool demo`."
     )
     actors = "actors: [{name: Crate, box: [2, 2, 2], at: [6, 0, 0]}]"
-    with pytest.raises(LidarError, match=r"has actors, but nothing that stands still\. Add"):
+    with pytest.raises(LidarError, match=r"has actors, but no stationary object\. Add"):
         build(scenario(text + actors))
 
 
@@ -143,7 +143,7 @@ def test_the_ground_lies_under_poses_trajectories_and_actors(scenario, text, rec
 
 
 def test_a_ground_under_nothing_is_refused(scenario):
-    with pytest.raises(LidarError, match=r"s\.yaml: `scene\.ground` lies under .* Add `poses`"):
+    with pytest.raises(LidarError, match=r"s\.yaml: The extent of `scene\.ground` .* Add `poses`"):
         build(scenario("scene: {ground: {}}"))
 
 
@@ -278,8 +278,11 @@ def test_actors_that_stand(scenario):
 
 IDENTITY = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
 BAD = [
-    ("sensor: {layers: 4}\nsensors: {a: {}}", "give either sensor and mount, or sensors"),
-    ("output: {write: [laz, mcap, {format: mcap, layout: ouster}]}", "write has mcap twice"),
+    (
+        "sensor: {layers: 4}\nsensors: {a: {}}",
+        "`sensors` cannot be combined with `sensor` or `mount`",
+    ),
+    ("output: {write: [laz, mcap, {format: mcap, layout: ouster}]}", "`write` contains mcap twice"),
     # (text, what the message says after the file's name)
     ("sensor: {layers: 0}", r"sensor\.layers must be from 1 to 65535, but is 0"),
     ("sensor: {layers: '40'}", r"sensor\.layers must be a whole number, but is '40'"),
@@ -345,38 +348,44 @@ BAD = [
     ("sensor: {vertical_fov_deg: .nan}", r"must be a finite number, but is nan"),
     ("sensor: {model: velodyne/vlp61}", "Unknown sensor model .* Did you mean 'velodyne/vlp16'"),
     ("sensor: vlp61", "Unknown sensor model .* Did you mean 'vlp16'"),
-    ("mount: roof", r"mount must be x, y and z in meters, \[0, 0, 1\], or .*, but is 'roof'"),
+    (
+        "mount: roof",
+        r"mount must be x, y and z in meters, such as \[0, 0, 1\], or .*, but is 'roof'",
+    ),
     (
         "actors: [{name: A, box: [1, 1, 1], at: [1, 2]}]",
         r"actors\[0\]\.at\.position\[2\] is required",
     ),
     (
         "actors: [{name: A, box: [1, 1, 1], at: [1, 2, 0], trajectory: a.csv}]",
-        "give either trajectory or at",
+        "`trajectory` and `at` cannot be combined",
     ),
-    ("sensor: {model: ouster/os1-64, layers: 64}", "a model defines the beams: leave out layers"),
+    ("sensor: {model: ouster/os1-64, layers: 64}", "`model` and `layers` cannot be combined"),
     ("sensor: [1]", r"sensor must be a mapping, but is \[1\]"),
     ("poses: [0, 0, 1]", r"poses\[0\] must be x, y and z in meters.*, but is 0"),
     ("poses: [{position: [0, 0, 0], yaw: 5}]", r"'poses\[0\]\.yaw'.*'yaw_deg'"),
     ("poses: &a [*a]", r"s\.yaml, line 1: 'a' contains itself"),
     ("scene: {files: [{file: a.stl, unit: parsec}]}", r"unit must be 'um', .*, but is 'parsec'"),
-    ("scene: {files: [{file: a.stl, scale: 0}]}", "scale must not be 0"),
-    ("scene: {files: [{file: a.stl, scale: 2, matrix: " + IDENTITY + "}]}", "either matrix or"),
+    ("scene: {files: [{file: a.stl, scale: 0}]}", "`scale` must not be 0"),
+    (
+        "scene: {files: [{file: a.stl, scale: 2, matrix: " + IDENTITY + "}]}",
+        "`matrix` and `scale` cannot be combined",
+    ),
     ("scene: {files: [{file: a.stl, matrix: " + IDENTITY.replace("1", "0") + "}]}", "0 0 0 1"),
     ("scene: {preset: sead}", r"preset cannot be 'sead'\. Did you mean 'seed'\? It must be 'seed'"),
     (
         "scene: seed\nplanning: {start: [5, 5], target: [9, 9]}",
-        r"planning\.start lies .* middle of Bowl",
+        r"`planning\.start` must be outside all obstacles, .* center of Bowl",
     ),
     (
         "scene: seed\nplanning: {start: [25, 25], target: [-30, -20], obstacles: [Bel]}",
         "Did you mean 'Bell'",
     ),
-    ("scene: seed\nplanning: {trials: 5}", r"planning needs a start and a target: give planning"),
-    ("scene: seed\nplanning: {start: [5, 5]}", r"give planning\.start and planning\.target\."),
+    ("scene: seed\nplanning: {trials: 5}", r"`planning` requires a start and a target"),
+    ("scene: seed\nplanning: {start: [5, 5]}", r"Set `planning\.start` and `planning\.target`\."),
     ("scene: {preset: none}", r"preset must be 'seed', but is 'none'"),
-    ("planning: {obstacles: [{center: [0, 0]}]}", "both center and radius_m"),
-    ("scene: a.stl\nplanning: {enabled: true}", r"give planning\.start and planning\.target"),
+    ("planning: {obstacles: [{center: [0, 0]}]}", "both `center` and `radius_m`"),
+    ("scene: a.stl\nplanning: {enabled: true}", r"Set `planning\.start` and `planning\.target`"),
     ("pool: {backend: opengl}", "must be 'auto', 'cuda', 'tiles' or 'numpy'"),
     ("", "is empty. A scenario is a mapping with sections"),
     ("hello", "contains only 'hello'"),
@@ -430,7 +439,7 @@ def test_all_faults_are_told_at_once(scenario, tmp_path):
         ),
         (
             of_sections,
-            ["planning needs a start", "either poses or a trajectory", "beam divergence"],
+            ["`planning` requires a start", "`poses` and `trajectory` cannot", "beam divergence"],
         ),
     ):
         with pytest.raises(LidarError) as raised:
@@ -511,7 +520,7 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
 @pytest.mark.parametrize(
     ("seconds", "start", "noted"),
     [
-        (1777890600.25, "", "give start: 2026-05-04T10:30:00.250000+00:00 in cloud to keep"),
+        (1777890600.25, "", "set `cloud: {start: 2026-05-04T10:30:00.250000+00:00}`"),
         (1777890600.25, 'cloud: {start: "2026-05-04T10:30:00Z"}', ""),
         (1e8, "", ""),  # of a clock since some start
     ],
@@ -537,17 +546,17 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
             ("Cab", turned, {}),
         )
     ]
-    faces = "it is level and faces the direction of travel"
+    faces = "so its poses are level and face the direction of travel"
     turns = (
-        ". At a corner between straight lines, the turn takes 1 m before and after it; "
-        "interpolation: smooth makes a path without corners"
+        ". At a corner between straight lines, they turn from 1 m before to 1 m after the corner. "
+        "For a path without corners, set `interpolation: smooth`"
     )
     for points, actors, notes in (
-        (legs, [], [f"the trajectory of the carrier has no angles: {faces}{turns}"]),
-        (legs[:2], [], [f"the trajectory of the carrier has no angles: {faces}"]),
+        (legs, [], [f"the trajectory of the platform has no angles, {faces}{turns}"]),
+        (legs[:2], [], [f"the trajectory of the platform has no angles, {faces}"]),
         (turned, [], []),
-        (turned, vans, ["the trajectories of Van, Bus have no angles: they are level and face "
-                        "the direction of travel"]),
+        (turned, vans, ["the trajectories of Van, Bus have no angles, so their poses are level "
+                        "and face the direction of travel"]),
     ):  # fmt: skip
         data = {"trajectory": {"points": points}, "actors": actors, "steps": 36}
         read = scenario(json.dumps({"scene": {"preset": "seed"}} | data))
@@ -564,12 +573,12 @@ def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
 @pytest.mark.parametrize(
     ("weather", "noise", "noted"),
     [
-        ("visibility_km: 0.06", "", "no light returns from it, because noise.detection_range_m is"),
+        ("visibility_km: 0.06", "", "returns none, because `noise.detection_range_m` is"),
         ("visibility_km: 0.06", "detection_range_m: 90", None),
         (
             "visibility_km: 0.06, fog_lidar_ratio_sr: null",
             "detection_range_m: 90",
-            "weather.fog_lidar_ratio_sr is null: fog attenuates light, and no light returns",
+            "returns none, because `weather.fog_lidar_ratio_sr` is null",
         ),
         ("visibility_km: 23", "", None),  # the returns of haze are too faint to be detected
         ("", "", None),
@@ -585,9 +594,9 @@ def test_fog_that_returns_no_light_is_in_the_advice(scenario, weather, noise, no
 @pytest.mark.parametrize(
     ("text", "noted"),
     [
-        ("returns: {mode: dual}", "is dual, .* Set returns: {subrays: 7, divergence_mrad: 3}$"),
-        ("sensor: vlp16\nreturns: {mode: two_strongest}", "two_strongest, .* {subrays: 7}$"),
-        ("sensor: own.yaml", "is dual, .* single ray .*{subrays: 7, divergence_mrad: 3}$"),
+        ("returns: {mode: dual}", "is dual, .* Set `returns: {subrays: 7, divergence_mrad: 3}`$"),
+        ("sensor: vlp16\nreturns: {mode: two_strongest}", "two_strongest, .* {subrays: 7}`$"),
+        ("sensor: own.yaml", "is dual, .* single ray .*{subrays: 7, divergence_mrad: 3}`$"),
         ("sensors: {a: own.yaml, b: {model: vlp16}}", "returns mode of a is dual"),
         ("sensor: own.yaml\nreturns: {subrays: 7, divergence_mrad: 3}", None),
         ("sensor: vlp16\nreturns: {mode: dual, subrays: 7}", None),
@@ -815,7 +824,7 @@ WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in r
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("cloud: {columns: [red]}", "needs colors"),
+        ("cloud: {columns: [red]}", "uses colors"),
         (
             f"navigation: {{imu: {{}}}}\ntrajectory: {{interpolation: linear, points: {WAY}}}",
             "interpolation: smooth",
@@ -832,10 +841,10 @@ def test_an_object_far_from_all_others_is_named_where_points_would_be_too_coarse
     meshes = [box(name, (1, 1, 1)) for name in ("one", "two", "three")]
     fallen = SceneInstance(box("fallen", (1, 1, 1)), Pose((0, 0, -7e7)))
     survey = Survey(poses=[(0, 0, 1)], precision_m=0.001)
-    message = "use at least 0.018, or leave out 'fallen', which is far from all else."
+    message = "Set it to at least 0.018, or remove 'fallen', which is far from all other objects."
     with pytest.raises(LidarError, match=re.escape(message)):
         Job(Scene.from_meshes([*meshes, fallen]), survey)
-    with pytest.raises(LidarError, match=r"use at least 0.018\.$"):
+    with pytest.raises(LidarError, match=r"Set it to at least 0.018\.$"):
         Job(Scene.from_meshes([fallen, meshes[0]]), survey)
 
 

@@ -181,7 +181,7 @@ def test_what_cannot_be_brought_is_refused(tmp_path):
     ):
         with pytest.raises(LidarError, match=message):
             scene_of_points(path, epsg=epsg)
-    with pytest.raises(LidarError, match="leave out unit"):
+    with pytest.raises(LidarError, match="`epsg` and `unit` cannot be combined"):
         scene_of_points(path, epsg=32632, unit="m")
     bare = written(tmp_path / "b.las", ground("EPSG:3857"))
     np.savetxt(tmp_path / "b.xyz", ground("EPSG:3857"))
@@ -289,11 +289,15 @@ def test_a_scene_keeps_the_system_of_its_cloud(tmp_path, suffix):
         return build(Scenario.from_data(data, folder=tmp_path), plans=False)
 
     assert built().survey.epsg == 25832
-    with pytest.raises(LidarError, match=rf"world.origin would be added to {file.name} as well"):
+    with pytest.raises(LidarError, match=rf"`world.origin` would also be added to {file.name}"):
         built(origin=[500_000, 5_200_000])
     other = built(epsg=32632)
     assert other.survey.epsg == 32632
-    assert [note for note in other.findings.notes if "is in EPSG:25832, and EPSG:32632" in note]
+    assert [
+        note
+        for note in other.findings.notes
+        if "is in EPSG:25832, but the output states EPSG:32632" in note
+    ]
     moved = {"file": file.name, "translation": [-500_000, -5_200_000, 0]}
     assert built(moved, origin=[500_000, 5_200_000]).survey.epsg is None
     assert Scene.load(file, unit="ft").epsg is None

@@ -124,15 +124,17 @@ def test_it_is_gone_on_with(unfinished):
     store = opened(unfinished, resume=True)
     assert (store.only_job.resumed, store.backend, store.notes) == (4, "numpy", [])
     assert store.only_job.parts.missing(0, 6) == [(2, 3), (5, 6)]
-    assert "were cast with it" in store.advice
+    assert "were cast with this backend" in store.advice
     store.db.close()
-    with pytest.raises(LidarError, match=r"'tiles' is asked for, .* cast with 'numpy'"):
+    with pytest.raises(
+        LidarError, match=r"cast with the backend 'numpy', .* cannot continue with 'tiles'"
+    ):
         opened(unfinished, backend="tiles", resume=True)
 
 
 FIELDS_OF_OTHERS = {
-    "survey": "cloud.keep_every is 2, was 1",
-    "scene": "scene.triangles is ",
+    "survey": "cloud.keep_every changed from 1 to 2",
+    "scene": "scene.triangles changed from ",
     "planning": "planning.",
 }
 OTHERS = {
@@ -147,9 +149,11 @@ def test_another_run_cannot_go_on(other, unfinished):
     for resume in (True, False):
         with pytest.raises(LidarError) as raised:
             opened(unfinished, resume=resume, job=OTHERS[other])
-        differs = f"cannot be continued, it is of another {other}: {FIELDS_OF_OTHERS[other]}"
+        differs = f"cannot be continued because the {other} has changed: {FIELDS_OF_OTHERS[other]}"
         assert differs in str(raised.value)
-        assert "Only these may change: pool, and formats of output" in str(raised.value)
+        assert "Only `pool` and output formats without additional columns may change" in str(
+            raised.value
+        )
     remove_run(unfinished)
     opened(unfinished, job=OTHERS[other]).db.close()
 
@@ -157,7 +161,9 @@ def test_another_run_cannot_go_on(other, unfinished):
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
     later = {"lidarpool": "0.2 (sources 12345678)"}
     monkeypatch.setattr(lidarpool.run.store.run_store, "software", lambda: later)
-    with pytest.raises(LidarError, match=r"lidarpool \S+ \(sources \w+\), here it is 0\.2"):
+    with pytest.raises(
+        LidarError, match=r"lidarpool \S+ \(sources \w+\), but this is lidarpool 0\.2"
+    ):
         opened(unfinished, resume=True)
 
 
@@ -207,7 +213,7 @@ def test_a_damaged_part_is_made_again(damage, unfinished):
     store = opened(unfinished, resume=True)
     assert (store.only_job.resumed, store.only_job.parts.missing(0, 6)) == (2, [(2, 6)])
     (note,) = store.notes
-    assert "scans 3 to 4; " in note and f"{part.name} was damaged" in note
+    assert "scans 3 to 4, because " in note and f"{part.name} was damaged" in note
     assert add(store, 3, 5)
     store.tidy()
     assert {*store.only_job.points().names, mark_of(store)} == store.storage.sizes().keys()
@@ -229,7 +235,7 @@ def test_a_part_that_is_damaged_meanwhile_is_made_again_by_the_next_run(folder):
     with pytest.raises(LidarError) as caught, store.kept_on_error():
         store.only_job.points().load()
     (note,) = caught.value.__notes__
-    assert "continue with --resume" in note
+    assert "Continue with `--resume`" in note
     again = opened(folder, resume=True)
     assert again.only_job.parts.missing(0, 6) == [(0, 6)] and part.name in again.notes[0]
 
@@ -239,7 +245,7 @@ def test_parts_that_are_gone_are_made_again(unfinished):
     store = opened(unfinished, resume=True)
     assert store.only_job.resumed == 0
     (note,) = store.notes
-    assert note.startswith("cast again: scans 0 to 1, scans 3 to 4; ")
+    assert note.startswith("repeated scans 0 to 1, scans 3 to 4, because ")
     assert note.endswith(f".npz were missing in {unfinished / 'parts'}")
     assert add(store, 0, 6)
     store.remove()
@@ -290,9 +296,9 @@ def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
 
 
 def test_places_that_cannot_be(tmp_path):
-    with pytest.raises(LidarError, match="Make the one that it lies in first"):
+    with pytest.raises(LidarError, match="Create its parent folder first"):
         opened(tmp_path / "none" / "run")
-    with pytest.raises(LidarError, match="give a folder for the run as well"):
+    with pytest.raises(LidarError, match="`parts` requires `folder`"):
         opened(None, tmp_path / "parts")
 
 
@@ -303,7 +309,7 @@ def test_an_error_tells_how_to_go_on(anywhere):
     with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
         raise KeyboardInterrupt
     (note,) = caught.value.__notes__
-    assert note.startswith(f"2 of 6 scans are kept in {anywhere}: continue with --resume")
+    assert note.startswith(f"2 of 6 scans are stored in {anywhere}. Continue with `--resume`")
     again = opened(anywhere, resume=True)
     assert (again.only_job.resumed, again.only_job.frames) == (2, 1)
 
@@ -422,7 +428,7 @@ def campaign(folder, *, height=1.0, resume=False):
 
 @pytest.mark.parametrize("left", ["a job that is done", "a job under way"])
 def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, unfinished):
-    with pytest.raises(LidarError, match="cannot be continued, "):
+    with pytest.raises(LidarError, match="cannot be continued because "):
         campaign(folder)
     assert len(names(folder)) > 2
     remove_run(folder)
@@ -435,7 +441,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
     store.db.close()
     before = names(folder)
     for resume in (False, True):
-        with pytest.raises(LidarError, match="cannot be continued, "):
+        with pytest.raises(LidarError, match="cannot be continued because "):
             opened(folder, resume=resume)
     assert names(folder) == before
 
@@ -503,7 +509,7 @@ def test_a_database_that_points_elsewhere(where, kept, request, tmp_path):
     put(tmp_path / "victim")
     place = tmp_path / "victim" if where == "victim" else other.storage.url
     change(folder, f"UPDATE meta SET value = '{place}' WHERE name = 'parts'")
-    with pytest.raises(LidarError, match=r"run\.db is damaged .* is not the place of this"):
+    with pytest.raises(LidarError, match=r"run\.db is damaged .* is not the location of this"):
         opened(folder)
     remove_run(folder)
     assert not folder.exists()
@@ -527,7 +533,7 @@ def test_parts_of_another_mark_stay(unfinished, tmp_path):
 def test_a_damaged_database_is_dropped_with_the_parts_of_its_folder(unfinished):
     (unfinished / "run.db").write_bytes(bytes(8192))
     put(unfinished / "parts", ["a.npz"])
-    with pytest.raises(LidarError, match="drop the run with --fresh"):
+    with pytest.raises(LidarError, match="Remove the run with `--fresh`"):
         opened(unfinished)
     assert len(names(unfinished)) == 5
     remove_run(unfinished)
@@ -543,14 +549,14 @@ def test_a_lost_database_is_made_again_from_the_parts(harm, folder, place):
     path = folder / "run.db"
     path.unlink() if harm == "missing" else path.write_bytes(path.read_bytes()[:6000])
     before = names(folder)
-    with pytest.raises(LidarError, match="cannot be continued, it is of another scene"):
+    with pytest.raises(LidarError, match="cannot be continued because the scene"):
         opened(folder, place, resume=True, job=OTHERS["scene"])
     assert names(folder) == before
     again = opened(folder, place, resume=True)
     assert (again.only_job.resumed, again.backend) == (
         4,
         "numpy",
-    ) and "is made again" in again.notes[0]
+    ) and "was rebuilt from" in again.notes[0]
     add(again, 2, 3), add(again, 5, 6)
     assert set(again.only_job.sample_rays()[:, 1, 0]) == {0, 2, 3, 5}
     assert again.only_job.parts.hit_count == 12 == again.only_job.hit_counts().sum()
@@ -648,7 +654,7 @@ def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
     late.save(force=True)
     again = opened(url, resume=True)
     assert again.only_job.resumed == (6 if how == "resumed" else 4)
-    with pytest.raises(LidarError, match="this one has ended"), late.kept_on_error():
+    with pytest.raises(LidarError, match="so this run was stopped"), late.kept_on_error():
         late.remove()
     assert left(url) == before
 
@@ -660,7 +666,7 @@ def test_storage_that_fails(url, monkeypatch):
         raise OSError("it is full")
 
     monkeypatch.setattr(lidarpool.run.store.remote.Storage, "write", fail)
-    with pytest.raises(LidarError, match=f"cannot be kept in {url}: it is full"):
+    with pytest.raises(LidarError, match=f"cannot be stored in {url}: it is full"):
         store.save(force=True)
     with pytest.raises(LidarError, match=rf"Cannot write to {url}: it is full"):
         opened(url, resume=True)

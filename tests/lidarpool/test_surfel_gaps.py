@@ -80,15 +80,15 @@ def test_the_loss_is_that_of_a_scan_from_the_same_place(hall, voxel_m):
     lost = (seen & np.isinf(found_m)).sum() / seen.sum()
     assert made.loss == pytest.approx(lost, abs=0.07)
     assert made.loss > 0.3 if voxel_m is None else made.loss < 0.1
-    note = f"about {made.loss:.0%} of the returns would be lost in gaps"
+    note = f"would lose about {made.loss:.0%} of the returns in gaps"
     assert (note in made.gap_note) == (made.loss >= 0.02)
 
 
 def test_the_command_notes_the_loss(hall, tmp_path):
     _, _, path = hall
     noted = CliRunner().invoke(command, ["points", str(path), str(tmp_path / "a.glb")]).stderr
-    assert "% of the returns would be lost in gaps between points, such as those between" in noted
-    assert "A larger --voxel-m (in Python voxel_m=), such as " in noted
+    assert "% of the returns in gaps between points, such as those between" in noted
+    assert "increase `--voxel-m` (`voxel_m` in Python), such as to " in noted
     np.save(tmp_path / "b.npy", np.random.default_rng(0).uniform(0, 1, (500, 3)))
     arguments = ["points", str(tmp_path / "b.npy"), str(tmp_path / "b.glb")]
-    assert "the scanner's positions are not known" in CliRunner().invoke(command, arguments).stderr
+    assert "the scanner positions are unknown" in CliRunner().invoke(command, arguments).stderr

@@ -116,7 +116,7 @@ def test_plain_lines_tell_why_nothing_goes_on():
         show(replace(progress(float(second), 20), waits_for="LIDAR"))
     show(progress(4.1, 40))
     run = [line for line in lines_of(stream) if line.startswith("run")]
-    words = "waits for slots of LIDAR, which other runs hold"
+    words = "waiting for LIDAR slots held by other runs"
     assert run == [f"run  {words}, 20 scans are done", "run  continues, 40 scans are done"]
     assert len(lines_of(stream)) - len(run) == 4
 

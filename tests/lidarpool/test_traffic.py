@@ -177,7 +177,8 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     place, turn = person.poses(0, np.array([1.5e9]))
     np.testing.assert_allclose(place + turn @ [0.2, 0, 0], [[0, 0.5, 0.5]], atol=1e-9)
     np.testing.assert_allclose(again.poses(0, np.array([3e9]))[1][0, :2, 0], [0.5**0.5] * 2)
-    assert built.findings.sources["fcd.xml"].startswith("3 actors during the survey, of 3 vehicles")
+    summary = built.findings.sources["fcd.xml"]
+    assert summary.startswith("3 actors during the survey, out of 3 vehicles")
 
     job = build(read).job()
     found = made(job.survey, job.scene, "tiles")
@@ -243,7 +244,9 @@ def test_human_readable_times_of_sumo(tmp_path, shown):
     plain = build(scenario(tmp_path)).scene
     read = build(scenario(tmp_path, text, {"offset_s": -3598})).scene
     assert len(plain.actors) == 3 and fingerprint(read) == fingerprint(plain)
-    with pytest.raises(LidarError, match="hours, minutes and seconds: leave out time_unit"):
+    with pytest.raises(
+        LidarError, match="hours, minutes and seconds, so `time_unit` cannot be set"
+    ):
         build(scenario(tmp_path, text, {"time_unit": "s"}))
 
 
@@ -318,7 +321,7 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     assert build(read(points, duration_s=3)).survey.path.duration_ns == 3e9
     with pytest.raises(LidarError, match=r"leaves its surfaces \(Ramp\)"):
         build(read(points))
-    with pytest.raises(LidarError, match=r"trajectory\.beyond is for actors"):
+    with pytest.raises(LidarError, match=r"`trajectory\.beyond` is only allowed for actors"):
         read(points, beyond="hold")
 
 
@@ -344,23 +347,26 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         ("", "no element found"),
         ("<a/>", "it has no time steps"),
         (FCD.replace("</fcd-export>", ""), "no element found"),
-        (FCD.replace('time="3.00"', 'time="1.5"'), "the time 1.5 does not come after"),
-        (FCD.replace('time="3.00"', 'time="nan"'), "the time nan does not come after"),
+        (FCD.replace('time="3.00"', 'time="1.5"'), "the time 1.5 is not after"),
+        (FCD.replace('time="3.00"', 'time="nan"'), "the time nan is not after"),
         (FCD.replace('x="40"', 'x="inf"'), "vehicle 'a.1' has no finite position at 3 s"),
         (FCD.replace('x="40"', ""), "'x' is missing"),
         (
             FCD.replace('x="40"', 'x="40" heading="3"'),
-            "vehicle has the attribute 'heading', which --fcd-output does not define: leave it "
-            r"out with \{file: …, ignore: \[heading\]\}",
+            r"vehicle has the attribute 'heading', which SUMO does not define\. To ignore it, "
+            r"set `ignore: \[heading\]`",
         ),
-        (FCD.replace('x="40"', 'x="east"'), "vehicle 'a.1' has the x 'east'; give a number"),
-        (FCD.replace('time="3.00"', 'time="3:00"'), "a timestep has the time '3:00'; give a num"),
+        (FCD.replace('x="40"', 'x="east"'), "x of vehicle 'a.1' must be a number, but is 'east'"),
+        (
+            FCD.replace('time="3.00"', 'time="3:00"'),
+            "time of a timestep must be a number, but is '3:00'",
+        ),
         (FCD.replace('angle="45"', ""), "'angle' is missing"),
         (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares the XML entity"),
     ],
 )
 def test_unusable_data_is_refused(tmp_path, text, told):
-    with pytest.raises(LidarError, match=rf"fcd\.xml is not usable as floating .*{told}"):
+    with pytest.raises(LidarError, match=rf"fcd\.xml cannot be read as floating .*{told}"):
         build(scenario(tmp_path, text))
 
 
@@ -378,7 +384,7 @@ def test_unusable_data_is_refused(tmp_path, text, told):
             3 * 2**19,
             "the limit is 1.50 MiB. Simulate a shorter time, or fewer vehicles.",
         ),
-        ("<x/>" * 1_000_000, 2**20, "the limit is 1.00 MiB. Unpack it with gunzip first."),
+        ("<x/>" * 1_000_000, 2**20, "the limit is 1.00 MiB. Decompress it with gunzip first."),
     ],
 )
 def test_packed_data_that_unpacks_to_far_more_is_refused(
@@ -435,16 +441,16 @@ def test_who_rides_in_a_vehicle_is_no_actor(tmp_path):
 
 def test_what_is_wrong_with_traffic_is_told(tmp_path):
     nobody = scenario(tmp_path, traffic={"offset_s": 300})
-    assert any("no vehicle or person is in the" in n for n in advice(build(nobody)))
+    assert any("has no vehicle or person in the" in n for n in advice(build(nobody)))
     with pytest.raises(LidarError, match=r"traffic\.surfaces"):
         scenario(tmp_path, traffic={"surfaces": []})
-    with pytest.raises(LidarError, match=r"type 'car', but no entry .* add one, such as"):
+    with pytest.raises(LidarError, match=r"type 'car', but no entry .* Add one, such as"):
         build(scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}))
     with pytest.raises(LidarError, match="Set exactly one of file and box"):
         scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
     with pytest.raises(LidarError, match=r"traffic\.file: .*no\.xml does not exist"):
         build(scenario(tmp_path, traffic={"file": "no.xml"}))
-    with pytest.raises(LidarError, match="surfaces names 'Street'"):
+    with pytest.raises(LidarError, match="`surfaces` contains 'Street'"):
         build(scenario(tmp_path, traffic={"surfaces": "Street"}))
 
 
@@ -483,20 +489,23 @@ def test_a_vehicle_of_the_traffic_carries_the_sensors(tmp_path):
 
 def test_what_is_wrong_with_a_carrier_of_the_traffic_is_told(tmp_path):
     for trajectory, message in (
-        ({"vehicle": "a.2"}, r"vehicle is 'a\.2', which fcd\.xml does not have .*'a\.1'"),
-        ({"vehicle": 7}, r"vehicle is '7', which .* Available names: a\.1, bus, p\."),
-        ({"vehicle": "bus"}, "vehicle is 'bus', which fcd.xml does not have for two time steps"),
-        ({"vehicle": "a.1"}, "from 0 to 1, 3 to 4 s: give trajectory.start_s"),
-        ({"vehicle": "a.1", "start_s": 2}, "from 0 to 1, 3 to 4 s: give trajectory.start_s"),
-        ({"vehicle": "p", "offset_s": 1}, r"leave out trajectory\.offset_s"),
+        ({"vehicle": "a.2"}, r"vehicle` is 'a\.2', but fcd\.xml does not contain .*'a\.1'"),
+        ({"vehicle": 7}, r"vehicle` is '7', but .* Available names: a\.1, bus, p\."),
+        (
+            {"vehicle": "bus"},
+            "vehicle` is 'bus', but fcd.xml does not contain this vehicle in at least two",
+        ),
+        ({"vehicle": "a.1"}, "from 0 to 1, 3 to 4 s. Set `trajectory.start_s`"),
+        ({"vehicle": "a.1", "start_s": 2}, "from 0 to 1, 3 to 4 s. Set `trajectory.start_s`"),
+        ({"vehicle": "p", "offset_s": 1}, r"cannot be combined with `trajectory\.offset_s`"),
         ({"vehicle": "p", "file": "a.tum"}, "Set exactly one of file, points and vehicle"),
         ({"vehicle": ""}, "vehicle"),
     ):
         with pytest.raises(LidarError, match=message) as caught:
             build(carried(tmp_path, trajectory))
         assert "\n" not in str(caught.value)
-    with pytest.raises(LidarError, match=r"give traffic\.file"):
+    with pytest.raises(LidarError, match=r"Set `traffic\.file`"):
         Scenario.from_data({"trajectory": {"vehicle": "p"}}, folder=tmp_path)
     follower = {"name": "Van", "box": [4, 2, 2], "trajectory": {"vehicle": "p"}}
-    with pytest.raises(LidarError, match="vehicles of traffic are actors"):
+    with pytest.raises(LidarError, match="vehicles of `traffic` are already actors"):
         scenario(tmp_path, actors=[follower])

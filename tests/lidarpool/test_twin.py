@@ -627,7 +627,9 @@ def test_a_drive_far_from_zero_with_an_empty_sweep_and_a_trajectory(drive, place
 def test_another_sensor_is_for_a_scenario_of_one_sensor(tmp_path):
     path = tmp_path / "s.yaml"
     path.write_text(yaml.safe_dump({"scene": "seed", "sensors": {"a": "velodyne/vlp16"}}))
-    with pytest.raises(LidarError, match=r"--sensor is for one sensor: in .* change sensors"):
+    with pytest.raises(
+        LidarError, match=r"`--sensor` requires a scenario with a single sensor\. Change `sensors`"
+    ):
         Scenario.load(path, {"sensor": "velodyne/vlp32c"})
 
 

@@ -47,10 +47,10 @@ ALL = [("GPU", "running"), ("OTHER", "running"), ("LIDAR", "running")]
 def test_a_partition_may_be_empty_for_a_while(look):
     look(2, *ALL)
     look(60, *ALL[:2])
-    assert look.told == ["waiting for workers of partition LIDAR, for another 2 s"]
+    assert look.told == ["waiting for workers of partition LIDAR for up to 2 s more"]
     look(63, *ALL)
     look(120, *ALL[1:])
-    assert look.told[1:] == ["waiting for workers of partition GPU, for another 3 s"]
+    assert look.told[1:] == ["waiting for workers of partition GPU for up to 3 s more"]
     with pytest.raises(LidarError, match=r"'GPU' has had no workers for 60 s.*\"GPU=1\""):
         look(124, *ALL[1:])
 
@@ -58,7 +58,7 @@ def test_a_partition_may_be_empty_for_a_while(look):
 def test_workers_that_are_paused_take_no_tasks(look):
     paused = [("GPU", "paused"), *ALL[1:]]
     look(59, *paused)
-    with pytest.raises(LidarError, match=r"'GPU' have taken no tasks for 60 s.*--memory-limit"):
+    with pytest.raises(LidarError, match=r"'GPU' have accepted no tasks for 60 s.*--memory-limit"):
         look(61, *paused)
 
 

@@ -103,10 +103,12 @@ def test_fields_that_do_not_fit_the_world_are_refused(tmp_path):
         Scenario.from_data({"world": {"origin": [1]}})
     with pytest.raises(LidarError, match=r"Unknown field '.*epsg'"):
         Scenario.from_data({"cloud": {"epsg": 25832}})
-    with pytest.raises(LidarError, match=r"world\.epsg .*EPSG:3857.*a world map projection"):
+    with pytest.raises(LidarError, match=r"`world\.epsg` .*EPSG:3857.*a world map projection"):
         job_of(world={"epsg": 3857, "origin": ORIGIN})
     track = {"points": [{"time_s": 0, "position": [0, 0, 1]}, {"time_s": 1, "position": [1, 0, 1]}]}
-    with pytest.raises(LidarError, match=r"give world\.epsg in place of navigation\.gnss\.origin"):
+    with pytest.raises(
+        LidarError, match=r"Set `world\.epsg` instead of `navigation\.gnss\.origin`"
+    ):
         Scenario.from_data(
             {
                 "trajectory": track,
@@ -124,7 +126,9 @@ def test_a_raster_that_is_in_the_system_is_not_moved_by_its_origin(tmp_path):
         data = {"scene": {"files": [*files]}, "world": world}
         return build(Scenario.from_data(data, folder=tmp_path))
 
-    with pytest.raises(LidarError, match=rf"translation: \[-{X0}, -{Y0}, 0\], or leave out"):
+    with pytest.raises(
+        LidarError, match=rf"translation: \[-{X0}, -{Y0}, 0\]` for the file, or remove"
+    ):
         built("hills.tif")
     world["epsg"] = 25832
     scene = built({"file": "hills.tif", "translation": [-X0, -Y0, 0]}).job().scene
@@ -135,7 +139,7 @@ def test_a_raster_that_is_in_the_system_is_not_moved_by_its_origin(tmp_path):
 def test_notes_and_reasons_have_the_coordinates_of_the_scenario():
     far = job_of(world={"epsg": 25832, "origin": ORIGIN}, poses=[[900, 0, 1]])
     reason = empty_cloud_reason(far.scene, far.survey)
-    assert "the sensor begins at (900.000, 0.000, 1.000)" in reason and "500" not in reason
+    assert "The sensor starts at (900.000, 0.000, 1.000)" in reason and "500" not in reason
     built = build(Scenario.from_data({**PLAN, "world": {"origin": ORIGIN}}))
     assert "500,000" not in " ".join(advice(built))
 
@@ -152,19 +156,20 @@ def test_a_scene_outside_the_area_of_use_is_told_with_both_remedies():
     assert re.fullmatch(
         r"The scene is at x 1,000,000, y 10,800,000, outside the area of use of EPSG:25832 \(.*\), "
         r"which is Europe .*\. If the files of the scene have world coordinates, remove "
-        r"world\.origin, which puts it inside\. Otherwise, set world\.epsg to the system of these "
-        r"coordinates\.",
+        r"`world\.origin`, which moves it inside\. Otherwise, set `world\.epsg` to the system of "
+        r"these coordinates\.",
         twice,
     )
     [no_origin] = placed_at((0, 0), epsg=25832)
-    assert no_origin.endswith("local coordinates, set world.origin to the place of their zero.")
+    remedy = "set `world.origin` to the world coordinates of their origin."
+    assert no_origin.endswith(f"If they have local coordinates, {remedy}")
     with pytest.raises(
-        LidarError, match=r"Switzerland\. If the files .* set world\.epsg to the system"
+        LidarError, match=r"Switzerland\. If the files .* set `world\.epsg` to the system"
     ):
         placed_at((600_000, 200_000), epsg=2056)
     with pytest.raises(LidarError, match=r"outside the area of use of EPSG:31467") as wrong:
         placed_at(ORIGIN, epsg=31467)
-    assert "such as EPSG:32632, by which they are inside this area" in str(wrong.value)
+    assert "such as EPSG:32632, in which they are inside this area" in str(wrong.value)
     assert "EPSG:32626" not in str(wrong.value)
 
 
@@ -189,9 +194,9 @@ def test_scenes_in_their_system_are_not_told(place, world):
 def test_an_origin_that_is_added_twice_is_told_wherever_it_ends(epsg):
     [twice] = placed_at((300_000, 4_000_000), origin=[290_000, 4_010_000], **epsg)
     assert twice == (
-        "world.origin, x 290,000, y 4,010,000, is added to coordinates that are near it already, "
-        "as the files of the scene are at x 300,000, y 4,000,000. If these are world coordinates, "
-        "remove world.origin."
+        "`world.origin` (x 290,000, y 4,010,000) is added to the coordinates of the scene's files, "
+        "although these are already close to it (x 300,000, y 4,000,000). If they are world "
+        "coordinates, remove `world.origin`."
     )
 
 

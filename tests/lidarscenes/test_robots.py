@@ -572,7 +572,9 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     assert {kinds[name].semantic_class == 7 for name in actors if "Rover/" in name} == {True}
     assert kinds["Arm/base_link"].semantic_class != 7
     notes = advice(built)
-    assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
+    assert (
+        "link lidar of Rover is not part of the scene, because a sensor is mounted on it" in notes
+    )
     assert built.findings.sources["rover.urdf"].startswith(
         "14 links, 6,720 triangles; 9 movable joints"
     )
@@ -590,14 +592,20 @@ def test_a_robot_that_stands_moves_its_joints_by_the_clock_of_the_survey(folder)
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"trajectory": None, "poses": [[0, 0, 1]]}, "give the survey a trajectory"),
-        ({"actors": []}, "no robot is the carrier"),
-        ({"actors": [ROVER | {"at": [0, 0, 0]}]}, "no robot is the carrier"),
-        ({"mount": {"link": "lidor"}}, "no robots on the carrier have.*Did you mean 'lidar'"),
-        ({"mount": {"link": "hand"}}, "'hand', which joints.csv moves"),
-        ({"actors": [ROVER | {"name": name} for name in "AB"]}, "which 2 robots on the carrier"),
-        ({"actors": [{"name": "B", "box": [1, 1, 1], "joints": "a.csv"}]}, "those of a robot"),
-        ({"actors": [{"name": "R", "file": {"file": "rover.urdf", "scale": 2}}]}, "just its file"),
+        ({"trajectory": None, "poses": [[0, 0, 1]]}, "replace `poses` with a `trajectory`"),
+        ({"actors": []}, "`mount.link` requires a robot as the platform"),
+        ({"actors": [ROVER | {"at": [0, 0, 0]}]}, "`mount.link` requires a robot as the platform"),
+        ({"mount": {"link": "lidor"}}, "0 robots have a link 'lidor'.*Did you mean 'lidar'"),
+        ({"mount": {"link": "hand"}}, "'hand', which is moved by joints.csv"),
+        ({"actors": [ROVER | {"name": name} for name in "AB"]}, "but 2 robots have a link"),
+        (
+            {"actors": [{"name": "B", "box": [1, 1, 1], "joints": "a.csv"}]},
+            "`joints` requires a robot",
+        ),
+        (
+            {"actors": [{"name": "R", "file": {"file": "rover.urdf", "scale": 2}}]},
+            "only be combined with `opacity`",
+        ),
     ],
 )
 def test_scenarios_that_do_not_fit_their_robot(folder, change, words):
@@ -631,13 +639,15 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     robot = load_robot(folder / "rover.urdf")
     assert alone.placing.surrounds_object and not alone.scene.actors
     assert alone.scene.names == tuple(actor.name for actor in robot.actors())
-    assert "has its joints at zero" in advice(alone)[0]
+    assert "are at zero. To move them" in advice(alone)[0]
     entry = {"file": "rover.urdf", "rotation_deg": [0, 0, 90], "translation": [5, 0, 0]}
     placed = build(Scenario.from_data({"scene": [entry]}, folder=folder)).scene
     at_zero, turned = (scene.bounds + scene.origin for scene in (alone.scene, placed))
     np.testing.assert_allclose(turned[:, 0], 5 - at_zero[::-1, 1], atol=1e-6)
     np.testing.assert_allclose(turned[:, 1:], at_zero[:, [0, 2]], atol=1e-6)
-    with pytest.raises(LidarError, match="is a robot, which is in meters and Z-up: leave out"):
+    with pytest.raises(
+        LidarError, match=r"is a robot, which is always in meters with z up\. Remove `unit`"
+    ):
         build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
     with pytest.raises(
         LidarError, match=r"is not read: it describes a robot\. Read it with load_robot"

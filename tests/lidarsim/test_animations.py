@@ -646,7 +646,9 @@ def test_scenarios_name_animations(tmp_path):
     assert a.mesh.animation is c.mesh.animation and a.mesh.animation.speed_m_s is None
     assert (b.mesh.animation.speed_m_s, b.mesh.animation.repeat, b.offset_s) == (1.4, False, 0.5)
     (told,) = [line for line in advice(built) if "animation" in line]
-    assert told.startswith("B: its animation of 1.05 s ends before the survey does, and its last")
+    assert told.startswith(
+        "the animation of B ends after 1.05 s, before the end of the survey, and its last"
+    )
     still = build(scenario(tmp_path, {k: v for k, v in one.items() if k != "animation"}))
     assert still.scene.actors[0].mesh.animation is None
     assert any("actors move by animation: NAME" in line for line in advice(still))
@@ -655,12 +657,12 @@ def test_scenarios_name_animations(tmp_path):
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"box": [1, 1, 1], "animation": "Walk"}, "animation is of a mesh file: give its file"),
+        ({"box": [1, 1, 1], "animation": "Walk"}, "`animation` requires a mesh file"),
         (
             {"file": "pedestrian.glb", "animation": "Walk", "wheels": "w"},
-            "give either animation or",
+            "`animation` and `wheels` cannot be combined",
         ),
-        ({"file": "robot.urdf", "animation": "Walk"}, "a robot has joints: leave out animation"),
+        ({"file": "robot.urdf", "animation": "Walk"}, "A robot has joints, so `animation`"),
         (
             {"file": "pedestrian.glb", "animation": "Wlak"},
             r"no animation 'Wlak' .Did you mean 'Walk'",

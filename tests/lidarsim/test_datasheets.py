@@ -184,7 +184,7 @@ def test_rain_without_a_detection_range_proposes_one_that_can_be_written(sensor,
 @pytest.mark.parametrize(
     ("sensor", "says"),
     [
-        ({"performance": "datasheet"}, "needs a model"),
+        ({"performance": "datasheet"}, "requires a sensor model"),
         ({"model": "velodyne/hdl32e", "performance": "datasheet"}, "Set noise instead"),
         ({"model": "velodyne/vlp16", "performance": "typical"}, "datasheet"),
     ],

@@ -35,7 +35,7 @@ FILES: dict[str, tuple[str, bytes | None, str]] = {
     "too fine": (
         "s.yaml",
         b"scene: {preset: seed, ground: {margin_m: 1000000}}\ncloud: {precision_m: 0.000001}\n",
-        "too fine",
+        "is too small for a scene",
     ),
 }
 
@@ -60,7 +60,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "unknown backend": (["run", "good.yaml", "--backend", "gpu"], "'gpu' is not one of 'auto'"),
     "options of a mesh": (
         ["run", "good.yaml", "--pose", "0,0,1"],
-        "in good.yaml, change poses.",
+        "`--pose` requires a mesh file. Set `poses` in good.yaml",
     ),
     "several meshes": (["run", "a.stl", "a.stl", "--pose", "0,0,1"], "require a single mesh file"),
     "misspelt model": (["run", "a.stl", "--sensor", "vlp61"], "Did you mean 'vlp16'?"),
@@ -91,15 +91,15 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "out cannot be made": (["run", "good.yaml", "--out", "/proc/o"], "Cannot write to the folder"),
     "malformed address": (["run", "good.yaml", "--scheduler", "tcp://::1:x"], "tcp://host:8786"),
     "unknown scheme": (["run", "good.yaml", "--scheduler", "foo://127.0.0.1:1"], "scheme 'foo'"),
-    "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "has no host"),
-    "no port": (["doctor", "--scheduler", "localhost"], "no port of 1 to 65535"),
+    "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "must consist of a host"),
+    "no port": (["doctor", "--scheduler", "localhost"], "a port from 1 to 65535"),
     "no certificates": (
         ["run", "good.yaml", "--scheduler", "tls://127.0.0.1:1"],
-        "is encrypted, and --tls-ca and --tls-cert are missing",
+        "uses TLS, but `--tls-ca` and `--tls-cert` are missing",
     ),
     "certificates without encryption": (
         ["doctor", "--scheduler", "tcp://127.0.0.1:1", "--tls-ca", "a.stl"],
-        "'tcp://127.0.0.1:1' does not begin with tls://",
+        "'tcp://127.0.0.1:1' does not start with tls://",
     ),
     "no scheduler file": (
         ["run", "good.yaml", "--wait", "0s", "--scheduler", "sched.json"],
@@ -226,12 +226,12 @@ def test_a_listener_that_is_no_scheduler(refused, impatient):
 
 
 CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
-    "no workers": ([], "has no workers: start some"),
+    "no workers": ([], "has no workers. Start workers"),
     "little LIDAR": (
         [{"GPU": 1}, {"LIDAR": 3}, {"OTHER": 1}],
         "Partition 'LIDAR' has 3 of the 4 slots",
     ),
-    "no OTHER": ([{"GPU": 1}, {"LIDAR": 4}], "or remove planning from the scenario"),
+    "no OTHER": ([{"GPU": 1}, {"LIDAR": 4}], "unless `planning` is removed from the scenario"),
     "two resources": ([{"GPU": 1, "LIDAR": 4}, {"OTHER": 1}], "declares GPU and LIDAR"),
 }
 
@@ -276,7 +276,7 @@ def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monke
         outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "1s")
     assert outcome.code == 2
     assert re.search(
-        r"note: waiting for workers, for another \d s: Partition 'LIDAR' has 0 of the 4 slots",
+        r"note: waiting for workers for up to \d s more: Partition 'LIDAR' has 0 of the 4 slots",
         outcome.err,
     )
     assert outcome.err.splitlines()[-1].startswith("lidarpool: Partition 'LIDAR' has 0 of the 4")
@@ -316,7 +316,7 @@ def test_jobs_that_do_not_begin_are_cancelled(place, refused, monkeypatch):
     (place / "queue.yaml").write_text(QUEUE.replace("slots: 4", "slots: 3"))
     refused(
         ["run", "good.yaml", "--cluster", "queue.yaml"],
-        "queue.yaml: partition LIDAR has 3 of the 4 slots needed",
+        "queue.yaml: Partition LIDAR has 3 slots, but the run needs 4",
     )
     assert len(submitted) == 4
 
@@ -352,11 +352,13 @@ OTHER_SOURCES = "import lidarpool.base.software as s; s.sources = lambda: '12345
     [
         pytest.param(
             WITHOUT_LIDARPOOL,
-            "does not have lidarpool: install lidarpool",
+            "does not have lidarpool. Install lidarpool",
             marks=pytest.mark.slow,
         ),
-        (OTHER_SOURCES, "(sources 12345678), here it is"),
-        pytest.param(ANOTHER_PYTHON, "has Python 3.99.1, here it is", marks=pytest.mark.slow),
+        (OTHER_SOURCES, "(sources 12345678), but the run requires"),
+        pytest.param(
+            ANOTHER_PYTHON, "has Python 3.99.1, but the run requires", marks=pytest.mark.slow
+        ),
     ],
     ids=["none", "other sources", "another Python"],
 )
@@ -370,4 +372,4 @@ def test_workers_whose_lidarpool_is_not_ours(outside, place, refused, preload, m
 @pytest.mark.extended
 def test_a_run_without_open3d_ends_before_it_starts(place, refused, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d.pybind", None)
-    refused(["run", "good.yaml"], "Clouds are written through Open3D, which does not load")
+    refused(["run", "good.yaml"], "Writing clouds requires Open3D, which cannot be loaded")

@@ -92,7 +92,7 @@ def test_jobs_that_cannot_run_are_reasons(campaign, lidarpool):
 @pytest.mark.parametrize(
     ("name", "job", "says"),
     [
-        ("campaign.yaml", 9, "there is no job 9: the campaign has jobs 0 to 8"),
+        ("campaign.yaml", 9, "Job 9 does not exist. The jobs of the campaign are 0 to 8"),
         ("base.yaml", 1, "base.yaml is no campaign, and has no job 1"),
         ("campaign.yaml", -1, "-1 is not in the range"),
     ],

@@ -360,10 +360,12 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     (files / "c.yaml").write_text((files / "c.yaml").read_text().replace("[a.obj", "[b.obj"))
     other = lidarpool(*run, "--resume")
     assert other.code == 2 and other.err.count("\n") == 1
-    assert "it is of another campaign: vary.scene.files.0.file is b.obj, b.obj" in other.err
-    assert ", was a.obj, b.obj" in other.err
-    assert "Only these may change: pool, and count, which may grow. Drop it" in other.err
-    assert "--fresh" in other.err and "give another folder" in other.err
+    assert "the campaign has changed: vary.scene.files.0.file changed from " in other.err
+    assert "a.obj, b.obj to b.obj, b.obj" in other.err
+    assert (
+        "Only `pool` and `count` may change, and `count` must not decrease. Remove it" in other.err
+    )
+    assert "--fresh" in other.err and "choose a different folder" in other.err
 
 
 def third_if(there: Path, made: list[int]) -> Callable[[int, np.random.Generator], Job]:
@@ -386,7 +388,7 @@ def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     assert [row.number for row in run.failed] == [2] and run.done == 3
     assert run.sensors == {"lidar": "old model, 10 Hz"}
     before = bytes_of(tmp_path / "ds")
-    with pytest.raises(LidarError, match=r"holds an unfinished run, 4 of 4 jobs"):
+    with pytest.raises(LidarError, match=r"contains an unfinished run with 4 of 4 jobs"):
         campaign.run(tmp_path / "ds", client=client)
     assert campaign.run(tmp_path / "ds", client=client, resume=True).failed == run.failed
     there.touch()
@@ -541,7 +543,7 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
     (files / "c.yaml").write_text(CAMPAIGN.replace("seed: 3", "seed: 4"))
     for more in (["--resume"], ["--job", 1]):
         other = lidarpool(*run, *more)
-        assert other.code == 2 and "is of another campaign: seed is " in other.err
+        assert other.code == 2 and "campaign: seed changed from 3 to 4" in other.err
     (files / "c.yaml").write_text(CAMPAIGN)
     record = files / "ds" / "campaign.json"
     made = unsealed(record.read_bytes())
@@ -581,7 +583,7 @@ def full_disk(slots, tmp_path_factory):
     ):  # the others would fail, too
         patched.setattr(DataSet, "write_job", fail)
         campaign.run(ds, client=client)
-    assert "of 3 jobs are kept in" in ended.value.__notes__[0] and bytes_of(ds)
+    assert "of 3 jobs are stored in" in ended.value.__notes__[0] and bytes_of(ds)
     shutil.copytree(ds, ds.with_name("copy"))
     return campaign, ds.parent
 
@@ -746,8 +748,8 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--job", 99], "there is no job 99"),
-        (["--resume", "--overwrite"], "overwrite remove what resume"),
+        (["--job", 99], "Job 99 does not exist"),
+        (["--resume", "--overwrite"], "`overwrite` cannot be combined with `resume`"),
         (["--only", "cloud"], "cannot be used with campaigns"),
         (["--resume", "--fresh"], "--fresh"),
         (["--retry-failed", "--fresh"], "--fresh"),
@@ -829,7 +831,7 @@ def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
         _, err = run.communicate(timeout=300)
     assert run.returncode == 130, err
     assert err.startswith("\nlidarpool: Interrupted. All processes were stopped")  # behind the ^C
-    assert re.search(r" of 100 jobs are kept in .*ds/run: continue with --resume .*\.\n$", err)
+    assert re.search(r" of 100 jobs are stored in .*ds/run\. Continue with `--resume` .*\.\n$", err)
 
 
 @pytest.mark.slow

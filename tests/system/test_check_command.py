@@ -183,7 +183,10 @@ def test_each_file_has_a_line_that_says_what_it_gave(check, tmp_path):
         {"objects": "m", "reflectance": 0.5}, {"objects": "*", "reflectance": "texture"}
     ]  # fmt: skip
     told = check(text=json.dumps(scenario)).out
-    assert "note: 4 of 8 objects with reflectance: texture have no colors and are gray: " in told
+    assert (
+        "note: 4 of 8 objects with `reflectance: texture` have no colors and are treated as gray: "
+        in told
+    )
     assert "gray: P, P.2, P.3, …\n" in told
 
 
@@ -217,7 +220,7 @@ def test_objects_that_sensors_do_not_see_are_named(check):
     assert outcome.code == 2 and "unseen of sensor 'rear' contains 'Nobody'" in outcome.err
     assert f"Available names: {names[0]}, " in outcome.err
     told = check(text=json.dumps(SHORT | {"sensor": {"unseen": "*"}})).out
-    assert "no ray hit anything at any distance: check unseen, poses and units" in told
+    assert "no ray hits a surface at any distance. Check unseen, poses and units" in told
 
 
 def test_a_disk_without_room(check, monkeypatch):
@@ -272,8 +275,8 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
     assert said["can_run"] is False
     assert len(said["reasons"]) == 3 and said["estimate"] is None
     assert "is a file" in said["reasons"][0]
-    assert "Casting one scan takes about 1 MB, more than the 0 MB" in said["reasons"][1]
-    assert "There are 0.95 MiB of memory" in said["reasons"][2]
+    assert "Casting one scan takes about 1 MB, but a casting worker" in said["reasons"][1]
+    assert "0.95 MiB of memory are available" in said["reasons"][2]
 
 
 def test_a_scenario_with_errors_gives_json_too(check):
@@ -299,7 +302,7 @@ def test_a_survey_that_hits_nothing_is_told_of(check):
     outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0, 1000]]}))
     assert outcome.code == 0
     [warning] = json.loads(outcome.out)["warnings"]
-    assert "the cloud has no points: no ray hit anything at any distance" in warning
+    assert "the cloud has no points: no ray hits a surface at any distance" in warning
     poses = yaml.safe_load(warning.partition("poses: ")[2])
     seen = check("--json", text=json.dumps(SHORT | {"poses": poses}))
     assert json.loads(seen.out)["estimate"]["hits"] > 0
@@ -311,7 +314,10 @@ def test_an_object_is_looked_at_from_around_it_and_no_gpu_is_spoken_of(tmp_path,
     assert outcome.code == 0
     assert "from 5 poses" in outcome.out and "points      about 0 " not in outcome.out
     assert "hits, rounded to 0.001 m;" in outcome.out
-    assert "note: this looks like an object of 1 x 1 x 1 m, not a place to stand in" in outcome.out
+    assert (
+        "note: the scene was recognized as an object of 1 x 1 x 1 m, so the default is"
+        in outcome.out
+    )
     assert "no GPU" not in outcome.out
     backend = next(name for name, missing in available_backends().items() if not missing)
     kind = "GPU" if backend == "cuda" else "CPU"
@@ -382,7 +388,7 @@ def test_an_unfinished_run_is_told_of(check, tmp_path):
     (tmp_path / "out" / "run" / "run.db").write_bytes(b"")
     outcome = check()
     assert outcome.code == 0
-    assert "holds an unfinished run: --resume continues it" in outcome.out
+    assert "contains an unfinished run. Continue it with `--resume`" in outcome.out
 
 
 @pytest.mark.slow
@@ -413,7 +419,7 @@ def test_a_cluster_that_can_do_it(check, cluster):
     outcome = check("--scheduler", cluster)
     assert outcome.code == 0, outcome.err
     assert "LIDAR       4 slots, at least 4 needed" in outcome.out
-    assert "no GPU in partition GPU" not in outcome.out, "nobody expects one"
+    assert "partition GPU has no worker" not in outcome.out, "nobody expects one"
     assert f"--scheduler {cluster}" in outcome.out.splitlines()[-1]
 
 
@@ -433,7 +439,7 @@ def test_sizes_that_speak_of_another_unit(size, unit, check, tmp_path, lidarpool
     outcome = lidarpool("check", tmp_path / "my box.stl")
     assert outcome.code == 0
     assert ("my box.stl states no unit" in outcome.out) == (unit is not None)
-    assert unit is None or f"give the file's unit ({unit}?) in scene.files" in outcome.out
-    assert unit is None or f"or --unit {unit} with a mesh file" in outcome.out
+    assert unit is None or f"possibly {unit}, or" in outcome.out
+    assert unit is None or f"or pass `--unit {unit}` with a mesh file" in outcome.out
     given = check(text="scene: {files: [{file: my box.stl, unit: m}]}")
     assert given.code == 0 and "states no unit" not in given.out

@@ -182,7 +182,7 @@ def test_a_path_that_there_is_not(run):
 def test_a_run_that_hits_nothing_says_so(run):
     outcome = run(text="scene: seed\nsteps: 1\nposes: [[0, 0, 1000]]\n")
     assert outcome.code == 0
-    assert "warning: the cloud has no points: no ray hit anything" in outcome.err
+    assert "warning: the cloud has no points: no ray hits a surface" in outcome.err
 
 
 def test_json_is_one_document_and_all_of_stdout(run, tmp_path):
@@ -332,7 +332,7 @@ def test_a_timeline_says_when_each_step_ended_and_no_process_is_left(tmp_path):
     wall_s = time.monotonic() - began_s
     time.sleep(1)
     assert processes_with(mark) == []
-    table = re.search(r"^step +takes +ends at\n(.*)", ended.stderr, re.DOTALL | re.MULTILINE)
+    table = re.search(r"^step +duration +end\n(.*)", ended.stderr, re.DOTALL | re.MULTILINE)
     lines = table[1].splitlines()
     rows = [re.fullmatch(r"(\D+?) +([\d.]+) s +([\d.]+) s", line).groups() for line in lines]
     steps = [name for name, _, _ in rows]

@@ -57,7 +57,7 @@ def waiting_run(tmp_path, address):
     scenario = "sensor: {layers: 2, step_deg: 90}\nsteps: 2\nplanning: {enabled: false}\n"
     options = ["--scheduler", address, "--wait", "10m", "--only", "cloud"]
     run = RunningCommand(tmp_path, scenario, *options)
-    yield run.wait_for(rf"note: waiting for the scheduler at {address}, for another 59\d s: ")
+    yield run.wait_for(rf"note: waiting for the scheduler at {address} for up to 59\d s more: ")
     run.close()
 
 
@@ -79,8 +79,8 @@ def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypat
     monkeypatch.setattr(watch, "TELL_EVERY_S", 0.0)
     told: list[str] = []
     with (
-        pytest.raises(LidarError, match=rf"answers at '{address}' within 1.5 s \("),
+        pytest.raises(LidarError, match=rf"responded at '{address}' within 1.5 s \("),
         connected(address, waiting=Waiting(1.5, told.append)),
     ):
         pytest.fail("it is connected")
-    assert told[0].startswith(f"waiting for the scheduler at {address}, for another ")
+    assert told[0].startswith(f"waiting for the scheduler at {address} for up to ")

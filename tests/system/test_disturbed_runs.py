@@ -102,7 +102,7 @@ def test_a_worker_that_dask_pauses_gets_no_more_batches(
 
     try:
         result = simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
-        assert any("Dask has paused worker GPU-0" in note for note in result.notes)
+        assert any("Dask paused worker GPU-0" in note for note in result.notes)
     finally:
         _pause(client, "GPU-0", on=False)
     assert same_cloud(result.cloud, undisturbed.cloud)

@@ -21,7 +21,7 @@ SURVEY: dict[str, Any] = {
     "steps": 12,
     "pool": {"backend": "numpy", "gpu": 1},
 }
-NOTHING = "no ray hit anything at any distance: check poses and units; the sensor begins at ("
+NOTHING = "no ray hits a surface at any distance. Check poses and units. The sensor starts at ("
 EMPTY = f"the cloud has no points: {NOTHING}"
 SMALL = Sensor.grid(90, layers=2, step_deg=10)
 
@@ -83,19 +83,19 @@ def test_json_has_the_warning_as_a_note(run):
     [
         (
             {"sensor": SURVEY["sensor"] | {"min_range_m": 500}, "poses": [[0, 0, 1]]},
-            "all surfaces are nearer than the sensor's minimum range: min_range_m is 500, and",
+            "all surfaces are closer than min_range_m, which is 500 m, at ranges",
         ),
         (
             {"sensor": SURVEY["sensor"] | {"max_range_m": 1}, "poses": [[0, 0, 1]]},
-            "all surfaces are farther than the sensor's maximum range: max_range_m is 1, and",
+            "all surfaces are farther than max_range_m, which is 1 m, at ranges",
         ),
         (
             {"noise": {"dropout": 1.0}, "poses": [[0, 0, 1]]},
-            "m, and no return is reported: check noise.dropout",
+            "m, but no return is reported. Check noise.dropout",
         ),
         (
             {"poses": [[0, 0, 1]], "noise": {"detection_range_m": 0.01}},
-            "m, and no return is reported: check noise.detection_range_m",
+            "m, but no return is reported. Check noise.detection_range_m",
         ),
     ],
     ids=["minimum range", "maximum range", "dropout", "detection"],
@@ -110,7 +110,7 @@ def test_check_gives_the_same_reason(tmp_path, lidarpool):
     (tmp_path / "s.yaml").write_text(json.dumps(SURVEY | {"sensor": sensor, "poses": [[0, 0, 1]]}))
     outcome = lidarpool("check", tmp_path / "s.yaml")
     assert outcome.code == 0
-    assert "warning: the cloud has no points: all surfaces are nearer than the" in outcome.out
+    assert "warning: the cloud has no points: all surfaces are closer than" in outcome.out
     assert lidarpool("check", tmp_path / "s.yaml", "--strict").code == 1
 
 
@@ -159,7 +159,7 @@ def test_a_campaign_names_its_jobs_without_points(campaign, lidarpool, slots, tm
 
 @pytest.mark.slow
 def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, slots, tmp_path):
-    for number, jobs in ((1, ""), (2, "2 jobs have no points: 0001, 0003; in job 0001 no ray hit")):
+    for number, jobs in ((1, ""), (2, "2 jobs have no points: 0001, 0003. Job 0001: no ray hits")):
         out = tmp_path / f"part-{number}"
         given = ("--shard", f"{number}/2", "--out", out, "--scheduler", slots, "--quiet")
         outcome = lidarpool("run", campaign, *given, "--strict")
@@ -170,7 +170,7 @@ def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, sl
     assert outcome.code == 1
     [warning] = warnings(outcome)
     assert warning.startswith(
-        "2 jobs have no points: 0001, 0003; lidarpool check CAMPAIGN --job N says"
+        "2 jobs have no points: 0001, 0003. To see the most likely reason, run"
     )
     assert json.loads((tmp_path / "set" / "report.json").read_text())["notes"] == [warning]
 
@@ -186,7 +186,7 @@ def test_python_logs_a_warning(client, caplog, tmp_path):
     run = campaign.run(tmp_path / "set", client=client)
     [record] = [one for one in caplog.records if one.levelno == logging.WARNING]
     assert record.message.startswith(
-        "2 jobs have no points: 0000, 0001; in job 0000 no ray hit anything"
+        "2 jobs have no points: 0000, 0001. Job 0000: no ray hits a surface"
     )
     assert run.notes == (record.message,)
     caplog.clear()
@@ -197,4 +197,4 @@ def test_python_logs_a_warning(client, caplog, tmp_path):
     [record] = [one for one in caplog.records if one.levelno == logging.WARNING]
     names, _, advice = record.message.partition("; ")
     assert names == "2 jobs have no points: 0000, 0001"
-    assert advice == "lidarpool check CAMPAIGN --job N says the most likely reason"
+    assert advice == "To see the most likely reason, run `lidarpool check CAMPAIGN --job N`"

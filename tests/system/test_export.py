@@ -195,7 +195,7 @@ def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
     assert failed.code == 2 and failed.err.count("\n") == 1
     assert f"Writing {out}/kitti failed: the worker" in failed.err
     assert "cannot write there: No space left on device. " in failed.err
-    assert "are kept in" in failed.err
+    assert "are stored in" in failed.err
     assert {path.name for path in out.iterdir()} == {"run"}
     assert run("--resume").code == 0
     assert len(list((out / "kitti").rglob("*.bin"))) == 10

@@ -76,12 +76,12 @@ def test_the_disk_of_the_run_is_full(disk, run, expected):
     folder = disk(100) / "run"
     for kilobytes in (160, 4000):  # some more room, and it is full again
         with pytest.raises(
-            LidarError, match=r"(cannot be kept in|cannot be written) .*: make room"
+            LidarError, match=r"(cannot be stored in|cannot be written) .*\. Free "
         ) as caught:
             run(folder=folder, resume=True)
         assert "\n" not in str(caught.value)
         assert re.search(
-            r"\d+ of 108 scans are kept in .*: continue with --resume", *caught.value.__notes__
+            r"\d+ of 108 scans are stored in .*\. Continue with `--resume`", *caught.value.__notes__
         )
         disk(kilobytes)
     result = run(folder=folder, resume=True)
@@ -93,7 +93,7 @@ def test_the_disk_of_the_run_is_full(disk, run, expected):
 def test_a_disk_without_room_for_anything(disk, run):
     folder = disk(4)
     (folder / "filler").write_bytes(bytes(4096))
-    with pytest.raises(LidarError, match=r"run\.db cannot be written .*: make room") as caught:
+    with pytest.raises(LidarError, match=r"run\.db cannot be written .*\. Free disk") as caught:
         run(folder=folder / "run")
     assert not hasattr(caught.value, "__notes__")
     assert [path.name for path in folder.iterdir()] == ["filler"]
@@ -117,7 +117,7 @@ def test_the_disk_of_the_result_is_full(
     failed = lidarpool(*command)
     assert failed.code == 2
     assert re.search(r"(?i)make room|no space", failed.err.splitlines()[-1])
-    assert f"108 of 108 scans are kept in {out}/run: continue with --resume (" in failed.err
+    assert f"108 of 108 scans are stored in {out}/run. Continue with `--resume` (" in failed.err
     assert {path.name for path in out.iterdir()} == {"run", *FILES}
     assert all((out / name).read_text() == f"an earlier {name}" for name in FILES)
     disk(40_000)

@@ -84,7 +84,7 @@ def untouched(tmp_path: Path) -> Callable[[], bool]:
     return untouched
 
 
-KEPT = r"[\d,]+ of 360,000 scans are kept in \S+/out/run: continue with --resume \(.*\)\.$"
+KEPT = r"[\d,]+ of 360,000 scans are stored in \S+/out/run\. Continue with `--resume` \(.*\)\.$"
 
 
 def check_interrupted(run: Any, code: int) -> None:
@@ -271,7 +271,7 @@ def test_ctrl_c_while_the_result_is_written(start, untouched, cluster):
     options = ("--pictures", "--scheduler", cluster)
     run = start(SHORT, *options, prelude=STAYS_WRITING).wait_for(WRITING)
     check_interrupted(run, run.signal(signal.SIGINT, group=True))
-    assert re.search(r"stopped\. 108 of 108 scans are kept in \S+/out/run", run.said)
+    assert re.search(r"stopped\. 108 of 108 scans are stored in \S+/out/run", run.said)
     assert untouched(kept=True)
 
 
@@ -284,8 +284,6 @@ def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside
     cluster.kill("scheduler")
     assert run.process.wait(300) == 2
     (message,) = said_besides_progress(run)
-    assert message.startswith(
-        f"lidarpool: The cluster at {cluster.address} cannot be reached any more"
-    )
+    assert message.startswith(f"lidarpool: The cluster at {cluster.address} is no longer reachable")
     assert re.search(KEPT, message)
     assert untouched(kept=True)

@@ -62,7 +62,7 @@ def test_a_worker_whose_backend_gives_other_bits_casts_nothing(outside, cluster_
         result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
     assert same_cloud(result.cloud, expected.cloud)
     [note] = [note for note in result.notes if note.startswith(f"worker {other} ")]
-    assert note.endswith("has numpy by hand, the run numpy: it cast nothing")
+    assert note.endswith("has the backend numpy by hand, but the run requires the backend numpy")
     assert {r.worker for r in result.records if r.stage == "intersect"} <= {*ours}
 
 
@@ -87,7 +87,9 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
 
     with (
         Client(cluster.address, set_as_default=False) as client,
-        pytest.raises(LidarError, match=r"sources 12345678\), the run .*: install the same"),
+        pytest.raises(
+            LidarError, match=r"sources 12345678\), but the run requires .*\. Install the same"
+        ),
     ):
         long = replace(SURVEY, steps=72 * 1000)  # so that it lasts until the other worker is there
         simulate(Scene.seed(), long, planning, client=client, backend="numpy", on_frame=on_frame)

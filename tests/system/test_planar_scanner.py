@@ -116,7 +116,7 @@ def test_a_campaign_of_bags_has_laser_scans(folder, lidarpool, slots):
 def test_thinned_returns_make_no_laser_scan_and_a_note(folder, lidarpool):
     thinned = SCANNER | {"cloud": {"keep_every": 2}, "output": {"write": ["mcap"]}}
     (folder / "s.yaml").write_text(json.dumps(thinned))
-    note = "note: bags have a LaserScan of a 2D scanner only if every return is kept"
+    note = "note: bags contain LaserScan messages of 2D scanners only if every return is kept"
     assert note in lidarpool("check", "s.yaml").out
 
 

@@ -102,7 +102,7 @@ def test_a_worker_without_the_plugin_is_named(tmp_path, monkeypatch, installed, 
     outcome = lidarpool("run", "scenario.yaml", *options)
     assert outcome.code == 2
     [line] = outcome.err.splitlines()
-    assert "has plug-in lidar-example not installed, the run plug-in lidar-example 0.1" in line
+    assert "has no plug-in lidar-example, but the run requires plug-in lidar-example 0.1" in line
     # Meshes and sensors are read by the driver alone.
     (tmp_path / "scenario.yaml").write_text(yaml.safe_dump(scenario))
     outcome = lidarpool("run", "scenario.yaml", *options)
@@ -112,7 +112,7 @@ def test_a_worker_without_the_plugin_is_named(tmp_path, monkeypatch, installed, 
 def test_a_worker_that_joins_with_another_version_does_no_task(cluster_client):
     plugin = Plugin("lidarpool.clouds", "gone", "gone:ROW", "lidar-gone", "0.2")
     task = cluster_client.submit(call_with_plugins, {plugin: "0.2 (sources 12345678)"}, int)
-    with pytest.raises(LidarError, match=r"plug-in lidar-gone not installed, the run .* 0\.2"):
+    with pytest.raises(LidarError, match=r"no plug-in lidar-gone, but the run requires .* 0\.2"):
         task.result()
     task.release()  # the error has frames that hold it
 

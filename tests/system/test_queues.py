@@ -119,7 +119,9 @@ def slurm_file(folder: Path, **gpu: Any) -> dict[str, Any]:
 def test_a_run_waits_for_its_jobs_and_takes_them_with_it(empty_queue, tmp_path):
     held = [*JOBS["GPU"]["job_extra_directives"], "--hold"]
     run = Command(tmp_path, slurm_file(tmp_path, job_extra_directives=held))
-    run.wait_for(r"waiting for workers, for another 35\d\d s: Partition 'GPU' has 0 of the 1 slot")
+    run.wait_for(
+        r"waiting for workers for up to 35\d\d s more: Partition 'GPU' has 0 of the 1 slot"
+    )
     states = {state for _, state in empty_queue.jobs().values()}
     assert states == {"PENDING", "RUNNING"}
     assert empty_queue.jobs()["gpu"][1] == "PENDING"
@@ -158,7 +160,7 @@ def test_jobs_of_a_run_that_is_stopped_go_away(empty_queue, tmp_path, number):
 def test_a_job_that_the_queue_refuses_takes_the_others_with_it(empty_queue, tmp_path):
     run = Command(tmp_path, slurm_file(tmp_path, queue="nowhere"))
     assert run.process.wait(300) == 2
-    assert "cluster.yaml: dask_jobqueue.SLURMCluster was not started" in run.said
+    assert "cluster.yaml: dask_jobqueue.SLURMCluster could not be started" in run.said
     assert "invalid partition specified: nowhere" in run.said
     assert "Traceback" not in run.said
     assert empty_queue.jobs() == {}
@@ -211,7 +213,9 @@ def test_a_run_waits_for_jobs_that_replace_lost_ones(empty_queue, tmp_path):
     run = Command(tmp_path, file, MINUTE)
     run.wait_for(r"survey +[1-9]")
     empty_queue.ask("scancel", empty_queue.jobs()["gpu"][0])
-    run.wait_for(r"waiting for workers of partition GPU, for another \d+ s: 1 job in the queue")
+    run.wait_for(
+        r"waiting for workers of partition GPU for up to \d+ s more: 1 job is in the queue"
+    )
     checksum, _ = run.result()
     assert checksum == expected
     assert empty_queue.jobs() == {}
@@ -275,7 +279,7 @@ def test_what_a_host_says_that_cannot_start_its_process(ssh, tmp_path, where):
         file["arguments"]["remote_python"] = "/nowhere/python"
     run = Command(tmp_path, file)
     assert run.process.wait(300) == 2
-    assert re.search(r"was not started \(.*/nowhere/python.*No such file", run.said), run.said
+    assert re.search(r"could not be started \(.*/nowhere/python.*No such file", run.said), run.said
     wait_until(lambda: not processes_in(tmp_path))
 
 

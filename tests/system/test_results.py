@@ -48,7 +48,7 @@ def test_it_is_told_in_three_lines_and_shown_as_a_table_with_pictures(result, sc
     monkeypatch.setattr("lidarpool.api.result.PICTURE_SIZE", (480, 480))
     survey, cloud, path = repr(result).splitlines()
     assert survey.startswith("survey: 36 scans (1 sweep), 540 rays, ") and "2 objects" in survey
-    assert "1 point, one of every 5 hits of a scan (keep_every): x, y" in cloud
+    assert "1 point, one in 5 hits of each scan (keep_every): x, y" in cloud
     assert path.startswith("path: ") and "no GPU" not in path
     shown = result._repr_html_()
     assert shown.startswith("<table>") and shown.count("data:image/png;base64,") == 2
@@ -79,7 +79,7 @@ def test_a_report_does_not_replace_that_of_another_survey_unasked(result, anothe
     with pytest.raises(LidarError, match=r"holds the result of another survey: .*overwrite"):
         another.report(tmp_path)
     sparse = replace(another, survey=replace(another.survey, keep_every=7))
-    words = r"of another survey, cloud\.keep_every is 7, was \d: .*overwrite"
+    words = r"of another survey, cloud\.keep_every changed from \d to 7: .*overwrite"
     with pytest.raises(LidarError, match=words):
         sparse.report(tmp_path)
     another.report(tmp_path, only_cloud=True, overwrite=True)

@@ -31,7 +31,7 @@ planning: {start: [25, 25], target: [-30, -20], trials: 4, iterations: 20}
 pool: {backend: numpy, gpu: 1, other: 1}
 """
 SCANS = 2 * 180
-KEPT = r"holds an unfinished run, [\d,]+ of \d+ scans: continue it with"
+KEPT = r"contains an unfinished run with [\d,]+ of \d+ scans\. Continue it with"
 
 
 @pytest.fixture(scope="module")
@@ -98,15 +98,15 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     refused = lidarpool(*arguments)
     assert (refused.code, refused.out) == (2, "")
     assert re.fullmatch(
-        rf"lidarpool: \S+/out/run {KEPT} --resume \(.*\), or drop it with --fresh \(.*\)\.\n",
+        rf"lidarpool: \S+/out/run {KEPT} `--resume` \(.*\), or remove it with `--fresh` \(.*\)\.\n",
         refused.err,
     )
     path, *rest = arguments[1:]
     path.with_name("t.yaml").write_text(SCENARIO.replace("trials: 4", "enabled: false"))
     other = lidarpool("run", path.with_name("t.yaml"), *rest, "--resume")
-    assert other.code == 2 and "is of another planning: " in other.err
+    assert other.code == 2 and "the planning has changed: " in other.err
     wrong = lidarpool(*arguments, "--resume", "--backend", "tiles")
-    assert wrong.code == 2 and "were cast with 'numpy': continue with that" in wrong.err
+    assert wrong.code == 2 and "were cast with the backend 'numpy', so" in wrong.err
     both = lidarpool(*arguments, "--resume", "--fresh")
     assert both.code == 2 and "cannot be combined" in both.err
     assert committed(out / "run") == before
@@ -125,7 +125,7 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     assert (out / "cloud.ply").read_bytes() == undisturbed
     report = report_of(out)
     assert sum(stop - first for first, stop in before[1:]) <= report["resumed_scans"] < SCANS
-    (note,) = (note for note in report["notes"] if note.startswith("cast again: "))
+    (note,) = (note for note in report["notes"] if note.startswith("repeated scan"))
     assert f"{part.name} was missing" in note
 
 
@@ -135,7 +135,7 @@ def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
     done = lidarpool(*arguments, "--only", "cloud", "-q", "--resume")
     assert (done.code, done.err) == (0, "")
-    assert f"note: there was nothing to resume in {tmp_path / 'out'}" in done.out
+    assert f"note: {tmp_path / 'out'} contained no unfinished run to resume" in done.out
 
 
 SURVEY = Survey(
@@ -163,10 +163,10 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
     with pytest.raises(ZeroDivisionError) as caught:
         run(on_frame=on_frame, backend="tiles")
     assert re.fullmatch(
-        rf"\d+ of 144 scans are kept in {folder}: continue with --resume \(.*\)\.",
+        rf"\d+ of 144 scans are stored in {folder}. Continue with `--resume` \(.*\)\.",
         *caught.value.__notes__,
     )
-    with pytest.raises(LidarError, match=rf"{KEPT} --resume .*resume=True.*remove_run"):
+    with pytest.raises(LidarError, match=rf"{KEPT} `--resume` .*resume=True.*remove_run"):
         run()
     result = run(resume=True, on_frame=lambda frame: second.append(frame.scan))
     assert first == list(range(51))

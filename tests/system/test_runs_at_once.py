@@ -53,7 +53,7 @@ def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
     assert len(results) == 3
     assert all(same_cloud(results[0].cloud, other.cloud) for other in results)
     assert waited == {"", "LIDAR"}
-    assert any("until other runs had left it 4 slots" in n for r in results for n in r.notes)
+    assert any("until other runs released 4 slots" in n for r in results for n in r.notes)
     with Client(cluster, set_as_default=False) as client:
         assert left_over(client) == ([], [], [])
 
@@ -63,7 +63,8 @@ def test_slots_that_are_gone_are_not_waited_for_forever(cluster, monkeypatch, le
     monkeypatch.setattr(Pool, "require", lambda *_: None)
     with Client(cluster, set_as_default=False) as client:
         with pytest.raises(
-            LidarError, match=r"'LIDAR' has had 4 of the 7 slots needed for 0 s: start another"
+            LidarError,
+            match=r"'LIDAR' has had 4 slots for 0 s, but the run needs 7\. Start another",
         ):
             simulate(Scene.seed(), SURVEY, client=client, collectors=5, patience_s=0.5)
         assert left_over(client) == ([], [], [])

@@ -49,7 +49,7 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     assert len(build(made).scene.names) == 2
     assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimeter"
     text = Path("a/b/scenario.yaml").read_text()
-    assert "# This looks like an object of " in text and len(text.splitlines()) < 22
+    assert "# The scene was recognized as an object of " in text and len(text.splitlines()) < 22
     assert made.sensor.horizontal_fov_deg < 45, "narrowed to them"
     rest = {"scene": {"files", "preset"}, "sensor": True, "poses": True}
     assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)

@@ -63,7 +63,7 @@ def test_addresses(address):
 
 def test_certificates_of_an_encrypted_cluster(tmp_path):
     ca = tmp_path / "ca.pem"
-    with pytest.raises(LidarError, match="is encrypted, and --tls-cert is missing"):
+    with pytest.raises(LidarError, match="uses TLS, but `--tls-cert` is missing"):
         check_certificates("tls://host:8786", TlsFiles(ca=ca))
     check_certificates("tls://host:8786", TlsFiles(ca, ca))
     check_certificates("tcp://host:8786", TlsFiles())

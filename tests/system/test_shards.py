@@ -658,7 +658,9 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
         merge(shards, survey / "moved")
     merge(shards, survey / "moved", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 25", "steps: 26")
-    with pytest.raises(LidarError, match=r"than these shards, steps is 26, was 25: give --scen"):
+    with pytest.raises(
+        LidarError, match=r"than these shards, steps changed from 25 to 26: give --scen"
+    ):
         merge(shards, survey / "none", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 26", "steps: 25")
     (survey / "elsewhere/s.yaml").rename(survey / "s.yaml")
@@ -670,7 +672,7 @@ def _another_shard_in_the_folder(survey: Path, lidarpool: Callable[..., Any], sl
     for shard in (["--shard", "3/3"], ["--shard", "2/4"], []):
         for more in ([], ["--resume"]):
             refused = lidarpool(*run, *shard, *more)
-            assert refused.code == 2 and "it is shard 2/3, not" in refused.err, refused
+            assert refused.code == 2 and "it is shard 2/3 rather than" in refused.err, refused
     assert lidarpool(*run, "--shard", "2/3", "--resume").code == 0
     assert content(survey / "part-2").keys() == before.keys()
 
@@ -725,14 +727,18 @@ SHARDS = [
     ("3/10", {}, Shard(3, 10)),
     ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
     ("auto", slurm(14, 10, 28, 2, 10), Shard(3, 10)),
-    ("auto", slurm(9, 1, 3, 1, 3), "no shard 9/3: they are 1/3 to"),
-    ("auto", slurm(2, 1, 9, 2, 6), "finds no shard in SLURM_ARRAY_TASK_ID=2, "),  # 1-3,5-9:2
-    ("auto", {}, "finds no shard in SLURM_ARRAY_TASK_ID="),
-    ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "finds no shard in JOB_COMPLETION_INDEX=x"),
-    ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "no shard 11/10"),
-    ("0/10", {}, "no shard 0/10"),
-    ("11/10", {}, "no shard 11/10"),
-    ("3", {}, "'3' is no shard"),
+    ("auto", slurm(9, 1, 3, 1, 3), "Shard 9/3 does not exist. The shards are 1/3 to"),
+    (
+        "auto",
+        slurm(2, 1, 9, 2, 6),
+        "cannot be determined from SLURM_ARRAY_TASK_ID=2, ",
+    ),  # 1-3,5-9:2
+    ("auto", {}, "cannot be determined from SLURM_ARRAY_TASK_ID="),
+    ("auto/10", {"JOB_COMPLETION_INDEX": "x"}, "cannot be determined from JOB_COMPLETION_INDEX=x"),
+    ("auto/10", {"JOB_COMPLETION_INDEX": "10"}, "Shard 11/10 does not exist"),
+    ("0/10", {}, "Shard 0/10 does not exist"),
+    ("11/10", {}, "Shard 11/10 does not exist"),
+    ("3", {}, "Invalid shard '3'"),
 ]
 
 

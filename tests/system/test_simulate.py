@@ -205,7 +205,7 @@ def test_a_pipe_that_another_client_closes_ends_the_run_with_its_name(client, pl
         closed.append(names[0])
 
     survey = Survey(SENSOR, [(0, 0, 0)], steps=4000)  # the pipe of scans fills often enough
-    with pytest.raises(LidarError, match=f"another client has closed.*-{kind}'"):
+    with pytest.raises(LidarError, match=f"a different client closed.*-{kind}'"):
         simulate(room(), survey, client=client, on_progress=close, on_frame=close)
     assert closed
     assert all(isinstance(item, ScanRange) for item in items)
@@ -218,7 +218,7 @@ def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(cli
     survey = Survey(SENSOR, [(0, 0, 0)])
     with (
         Client(address, set_as_default=False) as lost,
-        pytest.raises(LidarError, match=f"The cluster at {address} cannot be reached"),
+        pytest.raises(LidarError, match=f"The cluster at {address} is no longer reachable"),
     ):
         simulate(room(), survey, client=lost, on_frame=lambda _: lost.close())
 
@@ -240,27 +240,27 @@ def raise_at(scan: int | str | None, scan_of=None):
         (
             "lidarsim.survey.survey.Survey.scan",
             raise_at(0, lambda arguments: arguments[1]),
-            "stage generate failed: scan 0: FloatingPointError",
+            "Stage generate failed: scan 0: FloatingPointError",
         ),
         (
             "lidarsim.simulator.rig.Rig.cast",
             raise_at(None),
-            r"stage intersect failed: scan \d+: FloatingPointError",
+            r"Stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
             "lidarsim.simulator.casting.static_bodies.RayCaster",
             raise_at(None),
-            "preparing the scene on the casting workers failed: .*the mirror is loose",
+            "Preparing the scene on the casting workers failed: .*the mirror is loose",
         ),
         (
             "lidarpool.run.pipeline.long_stage_tasks.pack",
             raise_at(None),
-            r"stage collect failed: scan \d+: FloatingPointError",
+            r"Stage collect failed: scan \d+: FloatingPointError",
         ),
         (
             "lidarpool.run.pipeline.stage_messages.StageStart.trace",
             raise_at("sort", lambda arguments: arguments[0].stage),
-            "stage sort failed: the mirror is loose",
+            "Stage sort failed: the mirror is loose",
         ),
         (
             "lidarpool.run.planning_trials.run_trial",

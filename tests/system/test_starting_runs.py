@@ -133,7 +133,7 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
         assert run(wait_s=300) > 0
         comes.join()
         lose_gpu(lambda: cluster.kill("scheduler"))
-        with pytest.raises(LidarError, match=f"{cluster.address} cannot be reached any more"):
+        with pytest.raises(LidarError, match=f"{cluster.address} is no longer reachable"):
             run()
 
 
@@ -164,6 +164,7 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
     assert len(submitted) == 2  # they may wait in the queue: no others in their place
     assert "has no workers" in str(caught.value)
     assert caught.value.__notes__ == [
-        "2 jobs in the queue, or starting: if they wait, give --wait more time."
+        "2 jobs are in the queue or starting. If they are only waiting in the queue, increase "
+        "`--wait`."
     ]
     assert told == [f"The log {tmp_path}/gpu-1.err ends: no module named lidarpool"]

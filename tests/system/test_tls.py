@@ -67,7 +67,7 @@ def test_others_are_told_what_is_wrong(encrypted, tmp_path):
     mixed = files._replace(key=stranger.key)
     assert "KEY_VALUES_MISMATCH" in told(address, mixed)
     for said in (told(address), told(address.replace("tls:", "tcp:"))):
-        assert "of an encrypted one as tls://host:8786, with --tls-ca" in said
+        assert "pass tls://host:8786 with `--tls-ca`" in said
 
 
 @pytest.mark.slow

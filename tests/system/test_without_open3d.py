@@ -52,6 +52,6 @@ def test_what_writes_no_ply_does_without_it(cluster, lidarpool, tmp_path):
     assert done.returncode == 0, done.stderr
     *_, shown, refused = done.stdout.splitlines()
     assert shown == "shown"
-    assert refused.startswith("Clouds are written through Open3D, which does not load")
+    assert refused.startswith("Writing clouds requires Open3D, which cannot be loaded")
     assert (tmp_path / "out" / "cloud.laz").exists() and (tmp_path / "again.laz").exists()
     assert not (tmp_path / "again.ply").exists()

@@ -13,20 +13,24 @@ from ..columns.parts import StoredCloud, read_part
 
 @checked
 def to_dask(points: StoredCloud) -> Any:
-    """Return a Dask DataFrame of all columns of points in parts, a partition for each part.
+    """Return a Dask DataFrame with all columns of stored points, and one partition for each part.
 
-    The computing workers must see the parts, and the result must be kept until the frame is
-    computed.
+    The workers that compute the DataFrame must be able to read the parts. Keep the result until the
+    DataFrame is computed.
 
     Parameters
     ----------
     points
-        `Result.points`.
+        The stored points of a result, `Result.points`.
+
+    Returns
+    -------
+    The Dask DataFrame.
 
     Raises
     ------
     LidarError
-        If pandas or pyarrow, which Dask's dataframes need, is not installed.
+        If pandas or pyarrow is not installed.
     """
     need_packages("pandas", "pyarrow")
     import dask.dataframe as dd

@@ -28,9 +28,9 @@ _SHOWN = ("hits", "cloud")  # pictures of a result in a notebook
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(RunResult):
-    """A run's result, with the outputs of `lidarpool run`.
+    """Result of a survey, with methods that write and show it.
 
-    A notebook shows the result as a table with two pictures.
+    Notebooks display the result as a table with two pictures.
     """
 
     @property
@@ -48,28 +48,30 @@ class Result(RunResult):
         formats: Sequence[str | Mapping[str, Any]] = (),
         overwrite: bool = False,
     ) -> None:
-        """Write the files of `lidarpool run`: cloud, pictures and report, completely or not at all.
+        """Write the files of `lidarpool run`, which are the cloud, the pictures and the report.
+
+        Either all files are written, or none.
 
         Parameters
         ----------
         folder
-            Made if it does not exist; or a URL that fsspec opens. An earlier result of the same
-            survey in the folder is replaced.
+            Output folder, which is created if it does not exist, or a URL that fsspec can open. An
+            earlier result of the same survey in the folder is replaced.
         only_cloud
-            Leave `report.html` and `pictures.npz` out.
+            Whether to omit `report.html` and `pictures.npz`.
         pictures
-            Draw the pictures, too.
+            Whether to draw the pictures, too.
         formats
-            Other formats to write the cloud in as well, as under `output.write` of a scenario:
-            "laz", or {"format": "mcap", "layout": "ouster"}.
+            Additional formats of the cloud, as under `output.write` in a scenario, such as "laz" or
+            {"format": "mcap", "layout": "ouster"}.
         overwrite
-            Replace the result of another survey, too.
+            Whether to replace the result of a different survey, too.
 
         Raises
         ------
         LidarError
-            If a file cannot be written, the folder holds the result of another survey, or a
-            format lacks a package or column.
+            If a file cannot be written, the folder contains the result of a different survey, or a
+            format requires a package or column that is missing.
         """
         from ..clouds.folder import output_place
         from ..clouds.writing import Format
@@ -92,22 +94,23 @@ class Result(RunResult):
         size: tuple[int, int] = (1600, 1000),
         color: str = "z",
     ) -> list[Path]:
-        """Draw pictures, as `lidarpool plot` does.
+        """Draw pictures of the result, as `lidarpool plot` does.
 
         Parameters
         ----------
         folder
-            Folder of the pictures; made if it does not exist.
+            Output folder, which is created if it does not exist.
         only
-            Names of pictures: scene, hits, intensity, cloud, path; by default all.
+            Names of the pictures to draw, from scene, hits, intensity, cloud and path. By default,
+            all pictures are drawn.
         size
             Width and height in pixels.
         color
-            Column to color the points of the cloud by; "rgb" for red, green and blue.
+            Column that determines the color of the points, or "rgb" for red, green and blue.
 
         Returns
         -------
-        Files of the pictures.
+        The files of the pictures.
 
         Raises
         ------
@@ -121,16 +124,18 @@ class Result(RunResult):
 
     @checked
     def view(self, *, port: int = 8080, browser: bool = True) -> None:
-        """Show the result in the browser, as `lidarpool view` does, until Ctrl-C.
+        """Show the result in the browser until Ctrl-C, as `lidarpool view` does.
 
-        In a notebook the page is shown in the cell, and stays as long as the result is in use.
+        In a notebook, the page is shown in the cell and is available as long as the result is in
+        use.
 
         Parameters
         ----------
         port
-            Port on 127.0.0.1, or the next free port; 0 for any.
+            Port on 127.0.0.1. If the port is in use, the next free port is used. 0 selects any free
+            port.
         browser
-            Whether to open a browser where there is a desktop.
+            Whether to open a browser if there is a desktop.
         """
         from lidarsim.columns.cloud_file import CloudFile
         from lidarview.viewer.result_views import result_page, wait_for_interrupt

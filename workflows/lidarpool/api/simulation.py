@@ -59,78 +59,80 @@ def simulate(
     on_progress: Callable[[Progress], None] | None = None,
     **options: Unpack[RunKeywords],
 ) -> Result:
-    """Scan a scene on a partitioned cluster, and plan a path at the same time.
+    """Simulate a survey of a scene on a cluster, and plan a path at the same time.
 
     Parameters
     ----------
     scene, survey
-        The scene and the survey; poses in the scene's local coordinates.
+        The scene and the survey. Poses are in the local coordinates of the scene.
     planning
-        A path to plan on the OTHER partition while the survey runs; None for none.
+        The path to plan on the OTHER partition while the survey runs, or None.
     on_frame
-        Called with each frame, in scan order, while the survey runs; its points are in storage by
-        then (`ScanFrame.points`, `ScanFrame.hit_counts`). It is called in this thread: a slow
-        callback makes the pipeline wait, and nothing is lost.
+        Function that is called with each frame, in scan order, while the survey runs. The points of
+        the frame are already stored (`ScanFrame.points`, `ScanFrame.hit_counts`). The function is
+        called in this thread. If it is slow, the pipeline waits and no frame is lost.
     on_progress
-        Called about ten times a second with the progress. Without it there are bars in a notebook
-        and at a terminal.
+        Function that is called with the progress about ten times per second. By default, progress
+        bars are shown in notebooks and terminals.
 
     Other Parameters
     ----------------
     client
-        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. Its dashboard
-        has a page of partitions during the run; the log has its address. Without a client, a local
-        cluster is started on the loopback interface and stopped at the end.
+        Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. During the
+        run, the dashboard of the cluster has a page with the partitions, whose address is logged.
+        By default, a local cluster is started on the loopback interface and stopped at the end.
     backend
         Ray-casting backend of stage 2: auto, cuda, tiles or numpy.
     live
-        Show the run in the browser meanwhile, as `lidarpool run --live` does; in a notebook, in the
-        cell. `Result.view` shows the result afterwards. "foxglove" and "rerun" show its sweeps in
-        Foxglove and Rerun.
+        Whether to show the run in the browser, as `lidarpool run --live` does, or in the cell of a
+        notebook. "foxglove" and "rerun" show the sweeps in Foxglove and Rerun. To show the result
+        afterwards, call `Result.view`.
     pace
-        Speed at which `on_frame` and the live page get the frames, in scan order: 1 is the rate of
-        the scanner, 0.1 a tenth of it. By default, they get each frame once its points are in
-        storage.
+        Speed at which `on_frame` and the live page receive the frames, in scan order. 1 is the rate
+        of the scanner, and 0.1 is a tenth of it. By default, they receive each frame as soon as its
+        points are stored.
     queue_capacity
-        How many items stage 1 may be ahead of stage 2.
+        Maximum number of items that stage 1 is ahead of stage 2.
     collectors
-        Tasks of stage 4.
+        Number of tasks in stage 4.
     batch_mb
-        Most memory, in megabytes, that a GPU worker takes to cast a batch of scans; a scan is never
-        split.
+        Maximum memory, in megabytes, that a GPU worker uses to cast a batch of scans. A scan is
+        never split.
     gpu_workers, other_workers
-        Workers of a local cluster; by default chosen for the machine.
+        Number of workers in a local cluster. The defaults depend on the machine.
     tls
-        Encrypt the traffic of a local cluster, with a certificate made for the cluster.
+        Whether to encrypt the traffic of a local cluster with a new certificate.
     wait_s, patience_s
-        Seconds to wait for partitions that are empty at the start, and for partitions that become
-        empty later. A client waits for its scheduler by itself: ``Client(address, timeout=600)``.
+        Time in seconds to wait for partitions that have no workers at the start, and for partitions
+        that lose all their workers later. To wait for a scheduler, use ``Client(address,
+        timeout=600)``.
     folder
-        A folder for the run, so that the run can be resumed if this process or its machine dies;
-        its parent must exist. The run stays in the folder at the end: remove it with `remove_run`
-        once the result is saved. By default the points are in a temporary folder as long as the
-        result is in use. The folder may be a URL that fsspec opens, such as ``s3://bucket/run``.
+        Folder of the run, from which the run can be resumed if this process or its machine dies.
+        Its parent must exist. The run stays in the folder; remove it with `remove_run` once the
+        result is saved. By default, the points are stored in a temporary folder as long as the
+        result is in use. The folder may be a URL that fsspec can open, such as ``s3://bucket/run``.
     parts
-        Storage of the parts: a folder that the workers see, or a URL that fsspec opens, such as
-        ``s3://bucket/survey``. It needs a `folder`, whose database lists the parts; `remove_run`
-        removes both. By default the parts are in `folder`.
+        Location of the parts, which is a folder that the workers can access, or a URL that fsspec
+        can open, such as ``s3://bucket/survey``. It requires `folder`, whose database lists the
+        parts. `remove_run` removes both. By default, the parts are in `folder`.
     resume
-        Continue an unfinished run in `folder`; without an unfinished run, start from the
-        beginning. `on_frame` gets the frames that it has not had yet. It gets frames of the last
-        second before the earlier run died again, of the last seconds if `folder` is a URL.
+        Whether to continue an unfinished run in `folder`. If there is none, a new run is started.
+        `on_frame` is called with the frames that it has not received yet, and again with the frames
+        of the last second before the earlier run died, or of the last seconds if `folder` is a URL.
 
     Returns
     -------
     Result
-        The same survey gives the same cloud on any cluster.
+        The result. The same survey results in the same cloud on any cluster.
 
     Raises
     ------
     LidarError
-        If the cluster lacks a resource or a task fails, if `folder` has an unfinished run and
-        `resume` is not set, if that run is damaged, or of another scene, survey, planning or
-        version; the message says which and what to do. KeyboardInterrupt passes through once
-        the run has been stopped.
+        If the cluster lacks a resource, a task fails, `folder` contains an unfinished run and
+        `resume` is not set, or that run is damaged or has a different scene, survey, planning or
+        version. The message names the cause and the remedy.
+    KeyboardInterrupt
+        If the run is interrupted. The run is stopped before the error is raised.
 
     Examples
     --------
@@ -163,57 +165,60 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         shard: tuple[int, int] = (1, 1),
         **options: Unpack[RunKeywords],
     ) -> CampaignRun:
-        """Do the jobs, several at a time, and write the data set.
+        """Run the jobs of the campaign, several at a time, and write the data set.
 
         Parameters
         ----------
         out
-            Its folder, or a URL that fsspec opens.
+            Folder of the data set, or a URL that fsspec can open.
         on_progress
-            Called about ten times a second. Without it there are bars in a notebook and at a
-            terminal.
+            Function that is called with the progress about ten times per second. By default,
+            progress bars are shown in notebooks and terminals.
         shard
-            (3, 10): do the third of ten equal shares of the jobs, for `lidarpool.merge`.
+            Share of the jobs to run. For example, (3, 10) is the third of ten equal shares, which
+            `lidarpool.merge` combines.
 
         Other Parameters
         ----------------
         client
-            Client of a cluster whose workers declare the resources GPU and LIDAR; without one, a
-            local cluster is started. LIDAR needs a slot more than for a survey, to write jobs.
+            Client of a cluster whose workers declare the resources GPU and LIDAR. The LIDAR
+            partition needs one more slot than for a survey, to write jobs. By default, a local
+            cluster is started.
         backend, collectors, queue_capacity, batch_mb
-            As for `simulate`; by default as in the scenario.
+            As for `simulate`. By default, the values are taken from the scenario.
         gpu_workers
-            Workers of a local cluster that cast; by default as many as the scenario says.
+            Number of casting workers in a local cluster. By default, the number is taken from the
+            scenario.
         parts
-            Storage of the points during the run, as for `simulate`.
+            Location of the points during the run, as for `simulate`.
         resume
-            Continue an unfinished run in `out`; without an unfinished run, start from the
-            beginning.
+            Whether to continue an unfinished run in `out`. If there is none, a new run is started.
         fresh
-            Remove an unfinished run of a campaign in `out` first.
+            Whether to remove an unfinished run of a campaign in `out` first.
         retry_failed
-            Resume, and do the jobs that have failed again.
+            Whether to resume the run and repeat the jobs that have failed.
         verify
-            Resume, and compare every byte of the jobs that are done: jobs with other bytes are
-            damaged, and done again.
+            Whether to resume the run and compare every byte of the finished jobs. Jobs with
+            different bytes are damaged and are repeated.
         overwrite
-            Replace a finished data set, too, and with `fresh` even if some of its jobs have failed.
+            Whether to replace a finished data set. Together with `fresh`, a data set with failed
+            jobs is replaced, too.
         live
-            Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
-            in the cell. "foxglove" and "rerun" show sweeps of jobs in Foxglove and Rerun.
+            Whether to show the jobs in the browser, as `lidarpool run --live` does, or in the cell
+            of a notebook. "foxglove" and "rerun" show sweeps of the jobs in Foxglove and Rerun.
         tls, wait_s, patience_s
             As for `simulate`.
 
         Returns
         -------
         CampaignRun
-            Counts of the jobs, and the jobs that have failed: a failed job does not stop the run.
+            Counts of the jobs, and the jobs that have failed. A failed job does not stop the run.
 
         Raises
         ------
         LidarError
-            If the cluster lacks a resource, or `out` holds other files, or the unfinished run of
-            another campaign or version; the message says which and what to do.
+            If the cluster lacks a resource, or `out` contains other files or the unfinished run of
+            a different campaign or version. The message names the cause and the remedy.
         """
         target = output_place(out)
         chosen = options_of_call("run", options, without=_NOT_OF_CAMPAIGNS)
@@ -232,40 +237,47 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         split: str | None = None,
         **options: Unpack[RunKeywords],
     ) -> SweepStream:
-        """Stream the sweeps of the jobs while they are cast, without a data set.
+        """Stream the sweeps of the jobs while they are cast, without writing a data set.
 
-        The sweeps are the same as in a data set of the campaign, with all columns, in the order of
-        jobs, sensors and time. Points go from the workers to this process, past the scheduler. The
-        sweeps of a worker that dies are cast again. A job that fails is left out, and the log says
-        why.
+        The sweeps are the same as in a data set of the campaign, with all columns, and are ordered
+        by job, sensor and time. Points are sent from the workers directly to this process, and not
+        through the scheduler. If a worker dies, its sweeps are cast again. A job that fails is
+        skipped, and the reason is logged.
 
         Parameters
         ----------
         ahead
-            Largest number of sweeps that are being cast or wait to be read, which bounds the
-            memory: give twice the number of casting workers, or more.
+            Maximum number of sweeps that are being cast or wait to be read, which limits the
+            memory. Use at least twice the number of casting workers.
         split
-            Only the jobs of this split.
+            Name of a split. By default, the jobs of all splits are streamed.
 
         Other Parameters
         ----------------
         client
-            Client of a cluster whose workers declare the resource GPU; without one, each loop
-            starts a local cluster, and stops it.
+            Client of a cluster whose workers declare the resource GPU. By default, each loop starts
+            a local cluster and stops it at the end.
         backend, batch_mb, gpu_workers, tls, wait_s, patience_s
             As for `run`.
+
+        Returns
+        -------
+        SweepStream
+            An iterable of `Sweep` objects.
 
         Raises
         ------
         LidarError
-            If the split is unknown; in the loop, if the cluster lacks a resource or is lost.
+            If the split is unknown. The loop raises the error if the cluster lacks a resource or is
+            lost.
         """
         chosen = options_of_call("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:
             hint = (
-                did_you_mean(split, self.splits) or f" It has {', '.join(self.splits) or 'none'}."
+                did_you_mean(split, self.splits)
+                or f" Available splits: {', '.join(self.splits) or 'none'}."
             )
-            raise LidarError(f"The campaign has no split {split!r}.{hint}")
+            raise LidarError(f"Unknown split {split!r}.{hint}")
         numbers = [n for n in range(self.count) if split in (None, self.split(n))]
         run_options = RunOptions(**chosen).with_pool(self.pool, chosen)
         return SweepStream(self, numbers, ahead, run_options)

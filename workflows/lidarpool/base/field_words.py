@@ -22,7 +22,6 @@ _MAX_NUMBERS = 16  # numbers of a list that is written out
 _MAX_LOOKED_AT = 1000  # entries of a longer list
 _MAX_LETTERS = 80
 _MARK = " #"  # before the mark of content that words do not show
-_NOT_GIVEN = "not given"
 
 
 def fields_in_words(value: Any, path: str = "") -> Iterator[tuple[str, str]]:
@@ -88,17 +87,25 @@ def differences(earlier: Mapping[str, str], now: Mapping[str, str], max_fields: 
     Examples
     --------
     >>> differences({"steps": "3", "noise.range_m": "0.02"}, {"steps": "4"})
-    'steps is 4, was 3; noise.range_m is not given, was 0.02'
+    'steps changed from 3 to 4; noise.range_m was removed (it was 0.02)'
     """
-    clauses = []
-    for name in dict.fromkeys([*now, *earlier]):
-        values = [words.get(name, _NOT_GIVEN) for words in (now, earlier)]
-        if values[0] == values[1]:
-            continue
-        value, earlier_value = (text.partition(_MARK)[0] for text in values)
-        is_shown = value != earlier_value
-        clauses.append(
-            f"{name} is {value}, was {earlier_value}" if is_shown else f"{name} has other content"
-        )
+    clauses = [
+        _change(name, earlier.get(name), now.get(name))
+        for name in dict.fromkeys([*now, *earlier])
+        if earlier.get(name) != now.get(name)
+    ]
     further = len(clauses) - max_fields
     return "; ".join(clauses[:max_fields]) + (f"; and {further:,} more" if further > 0 else "")
+
+
+def _change(name: str, earlier_text: str | None, text: str | None) -> str:
+    """Return a clause on the change of a field, which is None where it is not set."""
+    earlier_value = earlier_text and earlier_text.partition(_MARK)[0]
+    value = text and text.partition(_MARK)[0]
+    if earlier_value is None:
+        return f"{name} was set to {value}"
+    if value is None:
+        return f"{name} was removed (it was {earlier_value})"
+    if value == earlier_value:
+        return f"the content of {name} changed"
+    return f"{name} changed from {earlier_value} to {value}"

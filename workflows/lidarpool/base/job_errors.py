@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from lidarsim.base.words import listed
 
 _NUMBER = re.compile(r"\bjob \d+: ")  # names the job in its error
-_VALUES = "\nIts values are "  # before the values of the job, in its error
+_VALUES = "\nThe values of the job are "  # before the values of the job, in its error
 
 
 def lines_of_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> list[str]:
@@ -35,5 +35,5 @@ def lines_of_errors(errors: Iterable[tuple[str, str]], max_jobs: int = 5) -> lis
     for reason, jobs in values_by_job.items():
         of_job = next(iter(jobs.values())) if len(jobs) == 1 else ""
         line = f"{'jobs' if len(jobs) > 1 else 'job'} {listed([*jobs], max_jobs)}: {reason}"
-        lines.append(f"{line} Its values are {of_job}" if of_job else line)
+        lines.append(f"{line}{_VALUES.replace(chr(10), ' ')}{of_job}" if of_job else line)
     return lines

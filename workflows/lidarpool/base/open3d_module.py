@@ -29,11 +29,16 @@ def load_open3d() -> Any:
         try:
             return _extension("open3d.pybind")
         except (ImportError, OSError) as error:
-            advice = "apt-get install libegl1 libgl1 libgomp1 libusb-1.0-0 (on Debian and Ubuntu)"
+            advice = (
+                "On Debian and Ubuntu, run `apt-get install libegl1 libgl1 libgomp1 libusb-1.0-0`."
+            )
             if isinstance(error, ModuleNotFoundError):
-                advice = f"{install_command('open3d-cpu')} (Linux x86_64) or open3d"
+                advice = (
+                    f"Run `{install_command('open3d-cpu')}`. "
+                    "On platforms other than Linux x86_64, install open3d instead."
+                )
             raise LidarError(
-                f"Clouds are written through Open3D, which does not load ({error}): {advice}."
+                f"Writing clouds requires Open3D, which cannot be loaded ({error}). {advice}"
             ) from error
 
 

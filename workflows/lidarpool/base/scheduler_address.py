@@ -73,7 +73,7 @@ def _read(path: Path) -> str:
     if not path.exists():
         raise MissingFileError(
             f"The scheduler file {path} does not exist. Start the scheduler with "
-            f"dask scheduler --scheduler-file {path}, or give more time with --wait."
+            f"`dask scheduler --scheduler-file {path}`, or increase `--wait`."
         )
     failure = f"The scheduler file {path} cannot be read"
     with explained(failure):
@@ -89,16 +89,16 @@ def check_address(address: str) -> None:
     scheme, separator, _ = address.partition("://")
     if separator and scheme not in _SCHEMES:
         raise LidarError(
-            f"The address {address!r} has the unknown scheme {scheme!r}. Give an address such as "
-            "tcp://host:8786 or, for an encrypted cluster, tls://host:8786."
+            f"The address {address!r} has the unknown scheme {scheme!r}. Use an address such as "
+            "tcp://host:8786 or, for a TLS cluster, tls://host:8786."
         )
     with suppress(ValueError):  # ValueError if the port is not a number, or out of range
         parts = urlsplit(f"//{address.rpartition('//')[2]}")
         if parts.hostname and parts.port:
             return
     raise LidarError(
-        f"The address {address!r} has no host, or no port of 1 to 65535. Give the address of the "
-        "scheduler, such as tcp://host:8786, or its scheduler file."
+        f"The address {address!r} must consist of a host and a port from 1 to 65535. Use the "
+        "address of the scheduler, such as tcp://host:8786, or its scheduler file."
     )
 
 
@@ -110,22 +110,22 @@ def check_certificates(address: str, files: TlsFiles) -> None:
     if not address.startswith(_ENCRYPTED):
         if any(files):
             raise LidarError(
-                f"--tls-ca, --tls-cert and --tls-key are for an encrypted cluster, and the address "
-                f"{address!r} does not begin with tls://. Start the scheduler with certificates, "
-                "or leave out these options."
+                "`--tls-ca`, `--tls-cert` and `--tls-key` require a TLS cluster, but the address "
+                f"{address!r} does not start with tls://. Start the scheduler with certificates, "
+                "or remove these options."
             )
         return
     from dask import config
 
     missing = [
-        option
+        f"`{option}`"
         for (option, key), file in zip(_NEEDED.items(), files, strict=False)
         if file is None and not config.get(key, None)
     ]
     if missing:
         raise LidarError(
-            f"The cluster at {address!r} is encrypted, and {' and '.join(missing)} "
-            f"{'is' if len(missing) == 1 else 'are'} missing. Give the certificates that the "
-            "scheduler was started with by --tls-ca, --tls-cert and --tls-key, or in Dask's "
-            "configuration as distributed.comm.tls."
+            f"The cluster at {address!r} uses TLS, but {' and '.join(missing)} "
+            f"{'is' if len(missing) == 1 else 'are'} missing. Pass the certificates that the "
+            "scheduler was started with as `--tls-ca`, `--tls-cert` and `--tls-key`, or set "
+            "`distributed.comm.tls` in Dask's configuration."
         )

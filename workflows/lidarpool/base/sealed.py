@@ -56,6 +56,6 @@ def unsealed(data: bytes) -> dict[str, Any]:
         raise ValueError("its last line has no checksum")
     text = data[: seal.start()]
     if zlib.crc32(text) != int(seal[1]):
-        raise ValueError("its checksum differs: it was damaged or edited")
+        raise ValueError("its checksum is wrong, so it was damaged or edited")
     content: dict[str, Any] = json.loads(text + b"}")
     return content

@@ -31,7 +31,8 @@ class Shard:
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.total:
             raise LidarError(
-                f"there is no shard {self}: they are 1/{self.total} to {self.total}/{self.total}."
+                f"Shard {self} does not exist. The shards are 1/{self.total} to "
+                f"{self.total}/{self.total}."
             )
 
     def __str__(self) -> str:
@@ -44,7 +45,9 @@ class Shard:
         LidarError for any further text, or without such a shard, array or index.
         """
         if not (match := re.fullmatch(r"(?:(\d+)|auto)/(\d+)|auto", text, re.ASCII)):
-            raise LidarError(f"{text!r} is no shard: give 3/10, auto/10 or auto.")
+            raise LidarError(
+                f"Invalid shard {text!r}. Expected N/M, such as 3/10, or auto/M, or auto."
+            )
         if match[1]:
             return cls(int(match[1]), int(match[2]))
         names = _KUBERNETES if match[2] else _SLURM
@@ -56,7 +59,10 @@ class Shard:
             return cls((index - first) // step + 1, count)
         except (LookupError, ValueError, ZeroDivisionError) as error:
             variables = ", ".join(f"{name}={environment.get(name, '')}" for name in names)
-            raise LidarError(f"{text!r} finds no shard in {variables}: give 3/10.") from error
+            raise LidarError(
+                f"The shard {text!r} cannot be determined from {variables}. Pass N/M instead, "
+                "such as 3/10."
+            ) from error
 
     def jobs(self, count: int) -> range:
         """Return the jobs of the share out of `count`.

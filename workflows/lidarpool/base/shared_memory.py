@@ -63,7 +63,7 @@ class SharedHandle(NamedTuple):
         """
         target = str(Path(self.path).readlink())
         if target.partition(" ")[0] != f"/memfd:{self.name}":
-            raise FileNotFoundError(f"{self.path} is another file")
+            raise FileNotFoundError(f"{self.path} is a different file")
         with Path(self.path).open("rb") as file:
             memory = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
         head, *buffers = [memory[start:stop] for start, stop in self.spans]
@@ -78,7 +78,7 @@ class SharedValue:
 
     def __init__(self, pickled: Pickled) -> None:
         if not hasattr(os, "memfd_create"):
-            raise OSError("this system has no memfd_create")
+            raise OSError("this system does not support memfd_create")
         name = f"lidarpool-{secrets.token_hex(8)}"
         self._file = os.fdopen(os.memfd_create(name), "wb", buffering=0)
         spans = []

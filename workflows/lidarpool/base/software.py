@@ -170,8 +170,8 @@ def _call(
     if differs := difference(installed, required):
         worker = get_worker()
         raise LidarError(
-            f"worker {worker.name} at {worker.address} has {differs}: install the same on both, "
-            "and start the worker again."
+            f"Worker {worker.name} at {worker.address} has {differs}. Install the same version on "
+            "both machines, and restart the worker."
         )
     return function(*arguments)
 
@@ -182,9 +182,18 @@ def _entry_of(plugin: Plugin) -> str:
 
 
 def difference(installed: Mapping[str, Any], required: Mapping[str, str]) -> str:
-    """Return a clause such as "numpy 2.3.1, the run 2.4.6", or "" if all software is the same."""
+    """Return a clause on software that differs, or "" if all software is the same.
+
+    Examples
+    --------
+    >>> difference({"numpy": "2.3.1"}, {"numpy": "2.4.6"})
+    'numpy 2.3.1, but the run requires numpy 2.4.6'
+    >>> difference({}, {"numpy": "2.4.6"})
+    'no numpy, but the run requires numpy 2.4.6'
+    """
     for name, value in required.items():
         if installed.get(name) != value:
-            label = "" if name == "backend" else f"{name} "
-            return f"{label}{installed.get(name) or 'not installed'}, the run {label}{value}"
+            label = "the backend" if name == "backend" else name
+            present = f"{label} {installed[name]}" if installed.get(name) else f"no {name}"
+            return f"{present}, but the run requires {label} {value}"
     return ""

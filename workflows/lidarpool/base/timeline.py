@@ -49,8 +49,8 @@ rect {{ fill: #2a6fb0 }}
 @media (max-width: 600px) {{ thead, tbody {{ display: block }}
   tr {{ display: grid; grid-template-columns: 1fr 5rem 6rem }}
   td, th {{ padding: .2rem 0 }} td:last-child {{ grid-column: 1 / -1; width: auto }} }}
-</style></head><body><h1>Timeline of a run</h1><p><code>{command}</code>, begun {begun}</p>
-<table><thead><tr><th>step</th><th>takes, s</th><th>ends at, s</th><th></th></tr></thead><tbody>
+</style></head><body><h1>Timeline of a run</h1><p><code>{command}</code>, started {begun}</p>
+<table><thead><tr><th>step</th><th>duration (s)</th><th>end (s)</th><th></th></tr></thead><tbody>
 {rows}
 </tbody></table></body></html>
 """
@@ -94,7 +94,7 @@ class Timeline:
 
     def table(self) -> str:
         """Return a line for each step: its name, its duration and its end, in seconds."""
-        lines = [f"{'step':<22}{'takes':>9}{'ends at':>9}"]
+        lines = [f"{'step':<22}{'duration':>9}{'end':>9}"]
         start_s = 0.0
         for step in self.steps:
             lines.append(f"{step.name:<22}{step.end_s - start_s:>7.2f} s{step.end_s:>7.2f} s")

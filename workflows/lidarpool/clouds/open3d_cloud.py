@@ -14,9 +14,12 @@ from ..base.open3d_module import load_open3d
 
 @checked
 def to_open3d(cloud: Cloud) -> Any:
-    """Return an `open3d.t.geometry.PointCloud` of all columns, by their names in files.
+    """Return a cloud as an `open3d.t.geometry.PointCloud` with all columns, named as in files.
 
-    LidarError if Open3D is not installed, or lacks a library of the system.
+    Raises
+    ------
+    LidarError
+        If Open3D is not installed, or a system library that it requires is missing.
     """
     o3d = load_open3d()
     positions = np.ascontiguousarray(cloud.positions)

@@ -259,14 +259,19 @@ def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
 
 @checked
 def read_cloud(path: str | Path) -> Cloud:
-    """Read a point cloud that a run or `save_cloud` wrote as .ply, with all its columns.
+    """Read a .ply point cloud that a run or `save_cloud` has written, with all its columns.
 
     A cloud from the folder of a result has sweeps, and can be saved in all formats.
+
+    Returns
+    -------
+    Cloud
+        The points in memory.
 
     Raises
     ------
     LidarError
-        If the file is missing, truncated, or not a binary PLY with x, y and z.
+        If the file is missing, truncated, or not a binary PLY file with x, y and z.
     """
     path = Path(path)
     rows = np.array(mapped_rows(path))

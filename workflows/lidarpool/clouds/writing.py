@@ -369,52 +369,58 @@ def save_cloud(
     intensity_full_scale: float | None = None,
     precision_m: float | None = None,
 ) -> list[str]:
-    """Write points in the format of the path's ending, completely or not at all.
+    """Write points in the format given by the extension of the path.
 
-    The same points give the same bytes, except in .rrd. About a million points are in memory at a
-    time, or all points of the largest sweep.
+    The file is written completely or not at all. The same points result in the same bytes, except
+    in .rrd files. About one million points are in memory at a time, or all points of the largest
+    sweep.
 
     Parameters
     ----------
     cloud
-        In memory, or the stored points of a result.
+        Points in memory, or the stored points of a result.
     path
-        Its ending is .ply, .las, .laz, .e57, .osi, .mcap, .rrd or .parquet, unless there is a
-        `format`.
-        Its folder must exist. An existing file is replaced, a folder is not.
+        File or folder to write. Without `format`, its extension must be .ply, .las, .laz, .e57,
+        .osi, .mcap, .rrd or .parquet. Its parent folder must exist. An existing file is replaced,
+        but an existing folder is not.
     format
-        Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",
-        "nuscenes", "webdataset" or "rosbag2"; also one of a plug-in.
+        Name of the format, such as "laz", or of a format with many files in a folder: "parquet",
+        "pcd", "images", "kitti", "nuscenes", "webdataset" or "rosbag2". It may be the format of a
+        plug-in.
     layout
-        Layout of points in mcap and rosbag2, of the driver of a maker: velodyne, ouster, hesai,
-        robosense or livox; autoware; or images, which is velodyne with range images.
+        Layout of the points in mcap and rosbag2, which is that of a manufacturer's driver
+        (velodyne, ouster, hesai, robosense or livox), autoware, or images, which is velodyne with
+        range images.
     compensated
-        In mcap, rosbag2 and pcd, points in the sensor's axes at the start of the sweep, without
-        times of points; by default each is in the sensor's axes at its firing, as of drivers.
+        Whether points in mcap, rosbag2 and pcd are in the sensor frame at the start of the sweep
+        and have no times. By default, each point is in the sensor frame at the time of its firing,
+        as drivers provide it.
     compensated_actors
-        In formats of single sweeps, move the points of each actor to where the actor was at the
-        start of the sweep, so that they lie in its box. The cloud needs the column `time`.
+        Whether the points of each actor are moved to the pose of the actor at the start of the
+        sweep, so that they are inside its box, in formats with one file or message per sweep. The
+        cloud must have the column `time`.
     pose_rate_hz
-        In mcap and rosbag2, poses per second on `/tf`. By default, there is one at the start of
-        each sweep and one at the end of the last.
+        Poses per second on `/tf` in mcap and rosbag2. By default, there is one at the start of each
+        sweep and one at the end of the last.
     organized
-        In mcap and rosbag2, a point for each ray, NaN without a return, in lines as the driver
-        of the layout has them: velodyne, ouster, images and robosense.
+        Whether mcap and rosbag2 contain a point for each ray, NaN without a return, in the rows
+        that the driver of the layout uses (velodyne, ouster, images and robosense only).
     intensity_full_scale
-        Intensity that .las and .laz store as 65,535. By default it is the smallest power of two at
-        which at most 1 % of the points are stored as 65,535.
+        Intensity that .las and .laz files store as 65,535. By default, it is the smallest power of
+        two for which at most 1 % of the points are stored as 65,535.
     precision_m
-        Step of stored positions, meters; by default the survey's precision, else 0.001.
+        Step of the stored positions in meters. By default, it is the precision of the survey, or
+        0.001.
 
     Returns
     -------
-    Names of the columns that the format cannot hold.
+    Names of the columns that the format cannot store.
 
     Raises
     ------
     LidarError
-        If the format is unknown, it lacks a column or package, it stores single sweeps and
-        the cloud is not of a result, or the file cannot be written.
+        If the format is unknown, requires a missing column or package, or stores single sweeps and
+        the cloud does not come from a result; or if the file cannot be written.
     """
     path = Path(path)
     name = format or _ENDINGS.get(path.suffix)

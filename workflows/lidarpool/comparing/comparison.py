@@ -58,7 +58,7 @@ class MeasuredPoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
-    """Result of `compare`, printed as a table."""
+    """Result of `compare`, which is printed as a table."""
 
     __signature__ = ReadableSignature()
 
@@ -74,10 +74,14 @@ class Comparison:
 
     @checked
     def save(self, folder: str | Path) -> list[Path]:
-        """Write compare.json, compare.html and pictures, and return their paths.
+        """Write compare.json, compare.html and the pictures, and return their paths.
 
-        The folder is created if necessary, and pictures of an earlier comparison are removed.
-        LidarError if it cannot be written to.
+        The folder is created if it does not exist. Pictures of an earlier comparison are removed.
+
+        Raises
+        ------
+        LidarError
+            If the folder cannot be written to.
         """
         path = Path(folder)
         with (

@@ -53,44 +53,52 @@ def compare(
 ) -> Comparison:
     """Compare two clouds or recordings of the same place.
 
-    B is the reference. Recordings of one sensor are compared sweep by sweep in the sensor frame:
-    range images, returns that only A or B has, intensities, and distances to nearest neighbors.
-    Without rings there are no range images. Clouds without sweeps, such as .las files, are compared
-    in world coordinates, by distances and intensities only. Nothing is aligned first.
+    B is the reference. Recordings of one sensor are compared sweep by sweep in the sensor frame.
+    The comparison includes range images, returns that only A or B has, intensities, and distances
+    to nearest neighbors. Recordings without rings have no range images. Clouds without sweeps, such
+    as .las files, are compared in world coordinates, by distances and intensities only. The clouds
+    are not aligned.
 
     Parameters
     ----------
     a, b
-        A result's folder or .ply, a data set, .pcd or a folder of them, .las, .laz, .e57, text
-        (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin, a bag of ROS 2 (.mcap or a folder), or a
-        cloud in memory.
+        The clouds, as the folder of a result or its .ply file, a data set, .pcd or a folder with
+        .pcd files, .las, .laz, .e57, text (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin, a ROS 2
+        bag (.mcap or a folder), or a cloud in memory.
     sweeps
-        Only these pairs of sweeps, from 0.
+        Indices of the pairs of sweeps to compare, counted from 0. By default, all pairs are
+        compared.
     match
-        Whether sweeps of the same number or of the same time belong together.
+        Whether sweeps are paired by number or by time.
     sensor_a, sensor_b
-        Of a recording of several: name of the sensor, or topic of a bag.
+        Name of the sensor, or topic of a bag, in recordings with several.
     intensity_a, intensity_b
-        Columns to compare as intensity, if not ``intensity``.
+        Columns that are compared as the intensity. The default is ``intensity``.
     unit_a, unit_b
-        Unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text (um, mm, cm, dm, m, km, in, ft,
-        yd or mi), in place of meters or of the units that a .las, a .laz or a header states.
+        Length unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text file (um, mm, cm, dm, m,
+        km, in, ft, yd or mi). By default, the unit is the one that a .las or .laz file or a header
+        states, and meters otherwise.
     keep_noise
-        Whether points are compared that a .las or .laz withholds or classifies as noise (classes 7
-        and 18), or that another cloud marks in such columns. By default they are left out.
+        Whether to include points that a .las or .laz file withholds or classifies as noise (classes
+        7 and 18), or that other clouds mark in such columns.
     azimuth_deg
-        Width of a cell; by default the step from pulse to pulse, the coarser one.
+        Width of a cell in degrees. By default, it is the larger of the two steps between pulses.
     distances_m
-        Distances within which a point counts as present in the compared cloud, for precision and
-        recall.
+        Distances in meters within which a point counts as present in the other cloud, for precision
+        and recall.
     most_points
-        Points of each cloud in memory; of more, a share is chosen evenly.
+        Maximum number of points of each cloud in memory. Larger clouds are subsampled evenly.
+
+    Returns
+    -------
+    Comparison
+        The statistics of the comparison.
 
     Raises
     ------
     LidarError
-        If A or B cannot be read or is empty, has lengths that are not true, as in Web Mercator, or
-        A and B share no quantity to compare.
+        If A or B cannot be read, is empty or has distorted lengths, as in Web Mercator, or if A and
+        B have no quantity in common.
     """
     if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
         raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in meters.")

@@ -53,11 +53,11 @@ class _Run:
 
 
 class SavedSweeps:
-    """A sequence of the sweeps of a data set in an order, made by `sweeps`.
+    """A sequence of the sweeps in a data set, which `sweeps` returns.
 
-    An item is read on access; a loop reads ahead in threads. Several threads may access items, and
-    forked processes or processes with a pickled copy. `classes` are names of semantic classes,
-    {number: name}.
+    Items are read on access. A loop reads the next items ahead in threads. Items can be accessed
+    from several threads, from forked processes, and from processes with a pickled copy. `classes`
+    contains the names of semantic classes as {number: name}.
     """
 
     classes: Mapping[int, str]
@@ -90,10 +90,7 @@ class SavedSweeps:
         return self.ahead(range(len(self)))
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
-        """Yield the sweeps of these indices in order.
-
-        The next sweeps are read meanwhile.
-        """
+        """Yield the sweeps with these indices in order, and read the next ones in advance."""
         if self._storage.is_local and self._written.row.raw:
             # Handing such a sweep from thread to thread takes as long as reading it.
             upcoming, current = tee(map(self._locate, indices))
@@ -145,19 +142,21 @@ class SavedSweeps:
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps.
 
-        The workers of a DataLoader share the sweeps, and so do the ranks of torch.distributed if
-        that is initialized when the loader begins. Each sweep is read by a single worker.
+        The sweeps are divided among the workers of a DataLoader, and among the ranks of
+        torch.distributed if it is initialized when the loader starts. Each sweep is read by a
+        single worker.
 
         Parameters
         ----------
         transform
-            Makes an item of a sweep. By default a dict of tensors: `points`, `pose`, the columns
-            (whole numbers as int64), `boxes` (k, 7: center, length, width, height, yaw),
-            `box_objects`; and `box_types`, `job`, `sensor`, `number`, `time_ns`.
+            Function that converts a sweep to an item. By default, an item is a dictionary with the
+            tensors `points`, `pose`, the columns (integers as int64), `boxes` (shape (k, 7):
+            center, length, width, height and yaw) and `box_objects`, and with `box_types`, `job`,
+            `sensor`, `number` and `time_ns`.
         even
-            Whether to leave out the last sweeps, fewer than the ranks, so that all ranks have the
-            same number: with different numbers, training with DistributedDataParallel waits for
-            ever.
+            Whether to omit the last sweeps, fewer than the number of ranks, so that all ranks have
+            the same number of sweeps. If the numbers differ, training with DistributedDataParallel
+            does not terminate.
 
         Raises
         ------
@@ -240,32 +239,32 @@ def sweeps(
     sensors: Sequence[str] | None = None,
     shuffle: Annotated[int, Field(ge=0)] | None = None,
 ) -> SavedSweeps:
-    """Open a data set that a campaign has written, sweep by sweep.
+    """Open the sweeps of a data set that a campaign has written.
 
     Parameters
     ----------
     location
         Folder or URL of the data set.
     split
-        Only the jobs of this split, or of these splits.
+        Names of one or several splits. By default, the jobs of all splits are used.
     jobs
-        Only these jobs, by number or name.
+        Numbers or names of jobs. By default, all jobs are used.
     sensors
-        Only the sweeps of these sensors, by name.
+        Names of sensors. By default, all sensors are used.
     shuffle
-        A seed for a random order of the sweeps of all jobs. Without a seed, sweeps are in the order
-        of jobs, sensors and time. Give another seed for each epoch.
+        Seed for a random order of the sweeps of all jobs. By default, sweeps are ordered by job,
+        sensor and time. Use a different seed for each epoch.
 
     Returns
     -------
-    A sequence of `Sweep`, which reads each on access; a loop reads a few ahead in threads. A second
-    loop gives the same order. In memory are a row for each job, 8 bytes for each sweep if shuffled,
-    and in each thread poses and boxes of 16 jobs.
+    A sequence of `Sweep` objects, which are read on access. A loop reads a few of them ahead in
+    threads. All loops have the same order. The sequence requires memory for one row per job, for 8
+    bytes per sweep if shuffled, and for the poses and boxes of 16 jobs in each thread.
 
     Raises
     ------
     LidarError
-        If the data set is missing, unfinished or damaged, a package that its format needs is not
+        If the data set is missing, unfinished or damaged, a package that its format requires is not
         installed, or the split, job or sensor is unknown.
     """
     storage = replace(Storage.at(location), named="")  # the user's own links may be followed

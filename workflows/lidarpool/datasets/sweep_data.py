@@ -23,10 +23,10 @@ from .job_table import JobRow, Value
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sweep:
-    """A sweep of a sensor: its points, the pose of the sensor, and the boxes of actors.
+    """A sweep of a sensor, with its points, the pose of the sensor and the boxes of actors.
 
-    The frame is the sensor frame at the start of the sweep: x ahead, y to the left, z up, unless
-    the mount is turned. The motion during the sweep is taken out of the points.
+    Coordinates are in the sensor frame at the start of the sweep. x is forward, y is left and z is
+    up, unless the mount is rotated. The points are compensated for the motion during the sweep.
     """
 
     __signature__ = ReadableSignature()
@@ -91,21 +91,18 @@ class Sweep:
 
     @property
     def intensity(self) -> Floats32 | None:
-        """Received energy, float32 (n,).
-
-        The value is None if the data set lacks the column.
-        """
+        """Received energy, float32 of shape (n,), or None if the data set lacks the column."""
         return self.columns.get("intensity")
 
     @property
     def classes(self) -> NDArray[np.uint16] | None:
-        """Semantic classes, uint16 (n,), 0 for points without a class.
+        """Semantic classes, uint16 of shape (n,), or None if the data set lacks the column.
 
-        The value is None if the data set lacks the column.
+        Points without a class have the value 0.
         """
         return self.columns.get("class")
 
     @property
     def objects(self) -> Ints32 | None:
-        """Instances, int32 (n,), indices into `object_names`, or None if the column is missing."""
+        """Indices into `object_names`, int32 of shape (n,), or None if the data set lacks them."""
         return self.columns.get("object")

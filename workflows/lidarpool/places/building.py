@@ -83,22 +83,24 @@ _MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Twin:
-    """A place that was rebuilt from a recording, the drive through it, and the sensor.
+    """A place that was reconstructed from a recording, with the recorded drive and the sensor.
 
     Attributes
     ----------
     scene
-        The place: surfels with reflectances as colors, and classes as materials.
+        The place as surfels, with reflectances as colors and classes as materials.
     poses
-        float64 (s, 4, 4): from the sensor frame at the stamp of each sweep to the scene frame.
+        Transformations from the sensor frame at the stamp of each sweep to the scene frame. float64
+        array of shape (s, 4, 4).
     times_s
-        float64 (s,): stamps of the sweeps, seconds from the first.
+        Stamps of the sweeps in seconds since the first. float64 array of shape (s,).
     origin
-        float64 (3,): of the scene frame in the world of the recording's poses, meters.
+        Origin of the scene frame in the world frame of the recorded poses, in meters. float64 array
+        of shape (3,).
     model
-        The sensor of the recording, with the noise that was fitted.
+        The recorded sensor, with the fitted noise.
     figures
-        Numbers and texts of the report; lengths in meters.
+        Statistics and texts of the report. Lengths are in meters.
     """
 
     __signature__ = ReadableSignature()
@@ -116,9 +118,14 @@ class Twin:
 
     @checked
     def save(self, folder: str | Path) -> list[Path]:
-        """Write the scene, the drive, the sensor, a scenario of the three, and a report.
+        """Write the scene, the drive, the sensor, a scenario that combines them, and a report.
 
-        LidarError if the folder, which is created, cannot be written to.
+        The folder is created if it does not exist.
+
+        Raises
+        ------
+        LidarError
+            If the folder cannot be written to.
         """
         path = Path(folder)
         with (
@@ -199,45 +206,53 @@ def twin(
     resume: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> Twin:
-    """Rebuild the place of a recording without what moved, to scan it again.
+    """Reconstruct the static scene of a recording, so that it can be scanned again.
 
-    The drive is divided into stretches, which processes rebuild one by one. Every second sweep is
-    held out first, and the rays of some are cast at the place that the other sweeps make: these are
-    the figures. The place is then made of all sweeps.
+    The drive is divided into submaps, which processes reconstruct one by one. For the statistics,
+    every second sweep is first held out, and the rays of some of these sweeps are cast in the scene
+    that is reconstructed from the other sweeps. The final scene is reconstructed from all sweeps.
 
     Parameters
     ----------
     recording
-        Sweeps in any format of `compare`, or a cloud in memory that has sweeps. Points are
-        compensated for the motion within their sweep, or the sensor is slow.
+        Sweeps in any format that `compare` supports, or a cloud in memory that has sweeps. The
+        points must be compensated for the motion during their sweep, unless the sensor is slow.
     model
-        The sensor, by name or file, for its optics and data sheet; needed for a sensor without
-        rings. By default a sensor with the recorded rings.
+        Sensor model, by name or file, from which the optics and the data sheet are taken. It is
+        required for a sensor without rings. By default, the model is a sensor with the recorded
+        rings.
     trajectory
-        File with the poses of the sensor: with times in the clock of the recording, or rows of
-        KITTI, one for each sweep. By default the poses are the recording's, and without these
-        sweeps are registered to each other.
+        File with the poses of the sensor, with times on the clock of the recording, or in the KITTI
+        format with one row for each sweep. By default, the poses are taken from the recording. If
+        it has none, the sweeps are registered to each other.
     voxel_m
-        Edge of the cubes in each of which all points become their mean.
+        Edge length in meters of the voxels in which points are averaged.
     sensor, intensity
-        Name of the sensor, or topic of a bag, if the recording has several; column with the
-        intensities, if not ``intensity``.
+        Name of the sensor, or topic of a bag, if the recording has several; and the column with the
+        intensities, which is ``intensity`` by default.
     client
-        Of a cluster whose OTHER workers see the recording, by the same path. By default processes
-        of this machine rebuild the stretches; of a recording in memory this process does.
+        Client of a cluster whose OTHER workers can read the recording at the same path. By default,
+        processes on this machine reconstruct the submaps. A recording in memory is always processed
+        by this process.
     folder
-        Folder for the results of finished steps, which is removed in the end. By default a
-        temporary folder.
+        Folder for the results of finished steps, which is removed at the end. By default, a
+        temporary folder is used.
     resume
-        Whether to go on with the finished steps that the folder holds.
+        Whether to continue with the finished steps in the folder.
     tell
-        Called with a line on each step.
+        Function that is called with a line for each step.
+
+    Returns
+    -------
+    Twin
+        The reconstructed scene, with the drive and the sensor.
 
     Raises
     ------
     LidarError
-        If the recording cannot be read, has less than four sweeps, no planes or no rings and no
-        `model`; an extra is missing; or the folder holds the steps of another twin.
+        If the recording cannot be read, has fewer than four sweeps, has no planes, or has no rings
+        and `model` is not set; if an extra is missing; or if the folder contains the steps of a
+        different twin.
     """
     need("scipy", "twin", "Places are rebuilt")
     base = None if model is None else read_model(model)  # before the recording, which takes long

@@ -22,8 +22,8 @@ from .geometry import segment_distances
 class Search:
     """Effort of a search by particle swarms.
 
-    More waypoints let a path turn about more discs; the time is proportional to their number, and
-    the swarms converge more slowly.
+    With more waypoints, a path can go around more discs. The time is proportional to the number of
+    waypoints, and the swarms converge more slowly.
     """
 
     trials: Annotated[int, about("particle swarms, each with its own seed", ge=1, le=10**6)] = 100
@@ -38,26 +38,25 @@ class Search:
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Planning(Search):
-    """Search for a path in the plane from `start` to `target` that enters no disc.
+    """Search for a path in the plane from `start` to `target` that avoids all discs.
 
     The search uses `trials` independent particle swarms (`run_trial`).
 
     Parameters
     ----------
     start, target
-        x and y of either end, in meters.
+        x and y of the start and of the target, in meters.
     centers
-        Centers of the discs to keep out of: (m, 2), meters; m may be 0.
+        Centers of the discs to avoid, in meters. Shape (m, 2), where m may be 0.
     radii
-        Radii in meters, above 0: (m,), or a number for all discs.
+        Radii of the discs in meters, greater than 0. Shape (m,), or one number for all discs.
     **search
-        The fields of `Search`. The same seed gives the same plan, to the bit, wherever the trials
-        run.
+        The fields of `Search`. The same seed results in the same plan, bit for bit, on all workers.
 
     Raises
     ------
     LidarError
-        If an end lies within a disc, both ends are the same point, or a value is outside its
+        If the start or the target is within a disc, both are the same point, or a value is out of
         range.
 
     Examples

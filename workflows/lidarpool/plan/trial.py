@@ -80,20 +80,20 @@ def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Best path of the trials.
+    """The best path of all planning trials.
 
     Parameters
     ----------
     path
-        Corners of the path from start to target, both included, in meters: (k + 2, 2).
+        Corners of the path from the start to the target, inclusive, in meters. Shape (k + 2, 2).
     length
-        Its length in meters.
+        Length of the path in meters.
     shortest_possible
-        Length in meters of the shortest path, computed from the discs' tangents; inf if discs cut
-        off the target.
+        Length of the shortest path in meters, computed from the tangents of the discs. It is inf if
+        discs block the way to the target.
     clearance
-        Smallest distance in meters from the path to a disc; negative if the path enters a disc,
-        inf without discs.
+        Minimum distance from the path to a disc in meters. It is negative if the path enters a
+        disc, and inf without discs.
     trial
         Number of the trial that found the path.
     trials
@@ -112,12 +112,15 @@ class Plan:
 
     @property
     def collision_free(self) -> bool:
-        """Whether the path enters no disc."""
+        """Whether the path is outside all discs."""
         return self.clearance >= 0
 
     @property
     def excess(self) -> float:
-        """Length of the path over the shortest possible length, less 1: 0.01 is 1%."""
+        """Relative excess of the path length over the shortest possible length.
+
+        For example, 0.01 is 1 %.
+        """
         return self.length / self.shortest_possible - 1
 
 

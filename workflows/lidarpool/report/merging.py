@@ -111,20 +111,22 @@ def merge(
 ) -> dict[str, Any]:
     """Merge shards into the data set or result that a single run would have written.
 
-    Every byte is compared with the checksums of its shard. The rows of jobs come from their
-    manifests, which have checksums. After a kill, the same call continues.
+    Every byte is compared with the checksums of its shard. The rows of the jobs are read from their
+    manifests, which have checksums. If the merge is interrupted, the same call continues it.
 
     Parameters
     ----------
     shards, out
-        Folders or URLs of the shards of one campaign or survey, and of the data set or result.
-        Shards can be added to a data set later. `out` may neither be in a shard nor hold one.
+        Folders or URLs of the shards of one campaign or survey, and of the merged data set or
+        result. Shards can be added to a data set later. `out` must not be inside a shard or contain
+        one.
     partial
-        Merge the shards at hand; a note lists missing shards.
+        Whether to merge the available shards if others are missing. A note lists the missing
+        shards.
     scenario
-        Of a survey: its scenario or mesh file, if moved since the shards ran.
+        Scenario or mesh file of a survey, if it was moved after the shards ran.
     screen
-        Shows the progress; by default the log.
+        Object that shows the progress. By default, the progress is logged.
 
     Returns
     -------
@@ -133,8 +135,8 @@ def merge(
     Raises
     ------
     LidarError
-        If shards are missing, damaged, given twice, unfinished, of another run or other software;
-        the error names the shards.
+        If shards are missing, damaged, passed twice or unfinished, or come from a different run or
+        different software. The message names the shards.
     """
     target = output_place(str(out))
     screen = screen or Screen()

@@ -57,12 +57,15 @@ class WorkerGroup(BaseModel):
     def mistake(self) -> str:
         """Return a message about a wrong number of workers, or no text without a mistake."""
         if self.adapt is None:
-            return "" if self.idle_s is None else "idle_s needs adapt beside it, such as [0, 8]."
+            return "" if self.idle_s is None else "idle_s requires adapt, such as `adapt: [0, 8]`."
         if "workers" in self.model_fields_set:
-            return "adapt is a number of workers too: leave out workers."
+            return "adapt and workers cannot be combined."
         min_workers, max_workers = self.adapt
         if not 0 <= min_workers <= max_workers <= 10_000 or max_workers < 1:
-            return f"adapt is {self.adapt}: give the least and the greatest number, such as [0, 8]."
+            return (
+                "adapt must be the minimum and the maximum number of workers, such as [0, 8], but "
+                f"is {self.adapt}."
+            )
         return ""
 
 
@@ -83,15 +86,16 @@ class ClusterFile(BaseModel):
         LidarError if the file cannot be read, a field is wrong, a package is missing, or the class
         is not a cluster.
         """
-        content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
+        content = read_yaml(path, "a cluster file contains cluster:, arguments: and partitions:")
         with sentences(cls, path, content):
             file = cls.model_validate(content)
         file._source = str(path)
         for name, workers in file.partitions.items():
             if name not in (GPU, LIDAR, OTHER):
                 raise LidarError(
-                    f"{path}: partitions.{name} is not a partition of a survey."
-                    f"{did_you_mean(name, (GPU, LIDAR, OTHER))} There are GPU, LIDAR and OTHER."
+                    f"{path}: Unknown partition {name!r}."
+                    f"{did_you_mean(name, (GPU, LIDAR, OTHER))} The partitions of a survey are "
+                    f"{GPU}, {LIDAR} and {OTHER}."
                 )
             if mistake := workers.mistake():
                 raise LidarError(f"{path}: partitions.{name}.{mistake}")
@@ -108,8 +112,9 @@ class ClusterFile(BaseModel):
         for name, required in required_slots.items():
             if (available := self.slots.get(name, 0)) < required:
                 raise LidarError(
-                    f"{self._source}: partition {name} has {available} of the {required} slots "
-                    f"needed: give it more slots or workers, such as {{slots: {required}}}."
+                    f"{self._source}: Partition {name} has {plural(available, 'slot')}, but the "
+                    f"run needs {required}. Increase its `slots` or `workers`, for example "
+                    f"`slots: {required}`."
                 )
 
     def __str__(self) -> str:
@@ -156,7 +161,7 @@ class ClusterFile(BaseModel):
             )
             reason = " ".join(f"{type(error).__name__}: {message}".split())[:400]
             raise LidarError(
-                f"{self._source}: {self.cluster} was not started ({reason})."
+                f"{self._source}: {self.cluster} could not be started ({reason})."
             ) from error
         with cluster:
             yield cluster
@@ -173,9 +178,9 @@ class ClusterFile(BaseModel):
                 factory = getattr(import_module(package), name, None)
         except ModuleNotFoundError as error:
             raise LidarError(
-                f"{self._source}: {self.cluster} is not installed ({error}): "
-                f"{install_command('lidarpool[clusters]')} has dask-jobqueue and what SSHCluster "
-                "needs."
+                f"{self._source}: {self.cluster} is not installed ({error}). "
+                f"To install dask-jobqueue and the requirements of SSHCluster, run "
+                f"{install_command('lidarpool[clusters]')}."
             ) from error
         except ValueError:  # no dot
             factory = None
@@ -183,9 +188,10 @@ class ClusterFile(BaseModel):
             isinstance(factory, type) and issubclass(factory, SpecCluster)
         ):
             raise LidarError(
-                f"{self._source}: {self.cluster} cannot be started by partition: "
-                "give dask_jobqueue.SLURMCluster, another of dask_jobqueue, or "
-                "distributed.SSHCluster. Start others yourself, and use --scheduler."
+                f"{self._source}: {self.cluster} cannot start workers for each partition. "
+                "Set `cluster` to a class of dask_jobqueue, such as dask_jobqueue.SLURMCluster, or "
+                "to distributed.SSHCluster. To use a different cluster, start it yourself and "
+                "pass `--scheduler`."
             )
         return factory
 

@@ -244,9 +244,9 @@ def _disk_mistakes(disk: dict[str, Any], *, stored: bool) -> list[str]:
     if disk["free"] >= required_bytes:
         return []
     return [
-        f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
-        f"needs about {format_bytes(required_bytes)}: make room, name another folder with "
-        f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
+        f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, but the run needs "
+        f"about {format_bytes(required_bytes)}. Free disk space, choose a different folder with "
+        f"{'`TMPDIR`' if stored else '`--out`'}, or increase `keep_every`."
     ]
 
 
@@ -255,9 +255,10 @@ def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
     if not available_bytes or available_bytes >= required_bytes:
         return []
     return [
-        f"There are {format_bytes(available_bytes)} of memory, and the run needs about "
-        f"{format_bytes(required_bytes)}: take a smaller scene, fewer casting workers (pool.gpu), "
-        "a smaller batch_mb, rays_per_revolution or planning.particles, or a machine with more."
+        f"{format_bytes(available_bytes)} of memory are available, but the run needs about "
+        f"{format_bytes(required_bytes)}. Reduce the scene, the number of casting workers "
+        "(`pool.gpu`), `batch_mb`, `rays_per_revolution` or `planning.particles`, or use a machine "
+        "with more memory."
     ]
 
 
@@ -331,11 +332,16 @@ def _folder_notes(location: Path | Storage) -> list[str]:
     if isinstance(location, Storage):
         location.claim()  # leaves nothing
     elif not (folder := _existing(location)).is_dir():
-        raise LidarError(f"{folder} is a file: give a folder for the results with --out.")
+        raise LidarError(f"{folder} is a file. Pass a folder for the results with `--out`.")
     elif not os.access(folder, os.W_OK | os.X_OK):
-        raise LidarError(f"Cannot write to the folder {folder}: give another with --out.")
+        raise LidarError(
+            f"The folder {folder} is not writable. Choose a different folder with `--out`."
+        )
     unfinished = FILE in Storage.at(location).below(RUN_FOLDER).sizes()
-    note = f"{location} holds an unfinished run: --resume continues it, --fresh deletes it"
+    note = (
+        f"{location} contains an unfinished run. Continue it with `--resume`, or delete it with "
+        "`--fresh`"
+    )
     return [note] if unfinished else []
 
 

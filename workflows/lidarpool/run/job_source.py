@@ -114,7 +114,7 @@ class Jobs(Protocol):
 
     @property
     def changeable(self) -> str:
-        """Words for what may change before a run is continued."""
+        """A sentence on what may change before a run is continued."""
         ...
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
@@ -150,7 +150,7 @@ class OneJob:
     numbers: range = range(1)
     title: str = ""
     names: tuple[str, ...] = ()
-    changeable: str = "pool, and formats of output that need no further columns"
+    changeable: str = "Only `pool` and output formats without additional columns may change."
 
     @cached_property
     def only_job(self) -> Job:

@@ -104,7 +104,7 @@ class Pace:
 def waiting_reason(progress: Progress) -> str:
     """Return why the run waits, or no text if the run does not wait."""
     slots = progress.waits_for
-    return f"waits for slots of {slots}, which other runs hold" if slots else ""
+    return f"waiting for {slots} slots held by other runs" if slots else ""
 
 
 @contextmanager

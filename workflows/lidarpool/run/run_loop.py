@@ -318,7 +318,10 @@ class RunLoop:
         self._store.notes += pipeline.notes
         if self._writer is not None and self._writer.hidden:
             storage = self._writer.dataset.storage
-            note = f"no worker of {LIDAR} sees {storage}: the driver wrote the data set"
+            note = (
+                f"no worker of partition {LIDAR} can access {storage}, so the driver wrote the "
+                "data set"
+            )
             self._store.notes.append(note)
 
     def _loop(self, first: Job, show: Show) -> None:

@@ -23,34 +23,36 @@ from .pipeline.task_records import TaskRecord
 
 @dataclass(frozen=True, eq=False)
 class RunResult:
-    """Result of a survey without files.
+    """Result of a survey, without files.
 
-    `lidarpool.api.result` adds methods to its result.
+    `lidarpool.Result` adds methods to this class.
 
     Parameters
     ----------
     points
-        The points, in parts: read in order a piece at a time, or written by `save_cloud`.
+        The points, stored in parts. They can be read in order, one piece at a time, or written by
+        `save_cloud`.
     plan, trials
-        The best path and all trials; None and empty without planning.
+        The best path and all planning trials, or None and an empty tuple without planning.
     backend
         Name of the ray-casting backend that was used.
     rays, hit_count
-        Rays fired, and rays that hit a surface.
+        Number of rays fired, and number of rays that hit a surface.
     stages
-        All tasks of each stage together.
+        Totals of the tasks in each stage.
     resumed
-        Scans from an earlier run. `records` and seconds are of this run only.
+        Number of scans from an earlier run. `records` and the times describe this run only.
     notes
-        Remarks for the user, such as that the GPU partition had no GPU.
+        Notes for the user, for example if the GPU partition had no GPU.
     identity
-        Fingerprints of scene, survey and planning, and versions of the software.
+        Fingerprints of the scene, the survey and the planning, and versions of the software.
     sample_rays
-        float32 (k, 2, 3): first and last point of some rays, meters, local coordinates.
+        First and last points of some rays, in meters in local coordinates. float32 array of shape
+        (k, 2, 3).
     seconds, survey_seconds, planning_seconds
-        Wall time of all, of the survey and of the planning.
+        Wall time of the run, of the survey and of the planning, in seconds.
     replayed
-        Batches that were offered again.
+        Number of batches that were cast or sent more than once.
     """
 
     __signature__ = ReadableSignature()
@@ -82,23 +84,24 @@ class RunResult:
         The clause is empty if all points are kept.
         """
         keep_every = self.survey.keep_every
-        return (
-            f", one of every {keep_every:,} hits of a scan (keep_every)" if keep_every > 1 else ""
-        )
+        return f", one in {keep_every:,} hits of each scan (keep_every)" if keep_every > 1 else ""
 
     @property
     def records(self) -> tuple[TaskRecord, ...]:
-        """Tasks of the run, with worker and time, every n-th of a stage with thousands."""
+        """Tasks of the run, with their worker and time.
+
+        If a stage has thousands of tasks, only every n-th task is included.
+        """
         return tuple(record for totals in self.stages for record in totals.records)
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The points in memory, read on first use."""
+        """The points, which are read into memory on first use."""
         return self.points.load()
 
     @cached_property
     def hit_counts(self) -> Ints:
-        """Hits for each counter of the scene, read on first use."""
+        """Number of hits for each counter of the scene, which are read on first use."""
         return self._hit_counts()
 
 
@@ -109,20 +112,20 @@ class CampaignRun:
     Parameters
     ----------
     failed
-        Jobs that have failed, with `number`, `name`, `values` and `error` (`jobs.csv`).
+        Jobs that have failed, with `number`, `name`, `values` and `error`, as in `jobs.csv`.
     done, points, rays
-        Jobs in the data set, their points, and the rays that were cast for them.
+        Number of jobs in the data set, number of their points, and number of rays cast for them.
     casting_seconds
-        Casting time of all tasks.
+        Casting time of all tasks, in seconds.
     resumed
-        Jobs of an earlier run.
+        Number of jobs from an earlier run.
     seconds
-        Wall time of this run.
+        Wall time of this run, in seconds.
     stages
-        Tasks of each stage.
+        Totals of the tasks in each stage.
     notes, sensors, classes
-        Remarks for the user, the sensors of the jobs that are done, {name: models and rates}, and
-        names of classes, {number: name}.
+        Notes for the user, the sensors of the finished jobs as {name: models and rates}, and the
+        names of semantic classes as {number: name}.
     """
 
     __signature__ = ReadableSignature()

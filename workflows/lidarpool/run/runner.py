@@ -182,7 +182,8 @@ class Run(Generic[R]):
     def _lock_output(self) -> None:
         if (self.options.fresh or self.options.overwrite) and self.resume:
             raise LidarError(
-                "fresh and overwrite remove what resume, retry_failed and verify go on with."
+                "`fresh` and `overwrite` cannot be combined with `resume`, `retry_failed` or "
+                "`verify`, because they remove the run that these options continue."
             )
         self.stack.enter_context(self.output.held())
 
@@ -199,7 +200,7 @@ class Run(Generic[R]):
         explained = self.store.committed_in_words or self.store.notes or self.jobs.shard != ALL
         if options.resume and self.store.only_job and not explained:
             location = options.out or options.folder
-            self.store.notes.append(f"there was nothing to resume in {location}")
+            self.store.notes.append(f"{location} contained no unfinished run to resume")
         self.stack.enter_context(self.store.kept_on_error())
         if self.store.only_job is not None:
             self.page.begun(self.store.only_job)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from distributed import Client
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, message_of
 from lidarsim.base.extras import install_command
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
@@ -60,11 +60,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class SweepStream:
-    """The sweeps of jobs of a campaign, which are cast while they are read.
+    """The sweeps of the jobs of a campaign, which are cast while they are read.
 
-    Each loop casts all sweeps again, with the same result. When a loop is over or left, its tasks
-    are cancelled and the workers that it has started are stopped. A pickled copy connects to the
-    scheduler of the client, and in a task of that cluster takes the client of the task's worker.
+    Each loop casts all sweeps again, with the same result. When a loop ends, its tasks are canceled
+    and the workers that it has started are stopped. A pickled copy connects to the scheduler of the
+    client. In a task of that cluster, it uses the client of the task's worker.
     """
 
     campaign: CampaignSpec
@@ -96,19 +96,27 @@ class SweepStream:
             except Exception as error:  # Dask has many kinds where a cluster is gone
                 if client.status == "running" and not isinstance(error, (PoolError, OSError)):
                     raise
-                raise LidarError(f"The stream has lost its cluster: {error}") from error
+                raise LidarError(f"The stream lost its cluster: {message_of(error)}") from error
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps, in the order of jobs.
 
-        Its DataLoader needs ``num_workers=0``, since the cluster works ahead. Ranks of
-        torch.distributed, if that is initialized when the loader begins, get the same number of
-        jobs each. `transform` makes an item of a sweep, as of `SavedSweeps.torch`.
+        The DataLoader must have ``num_workers=0``, since the cluster works ahead. If
+        torch.distributed is initialized when the loader starts, each rank receives the same number
+        of jobs.
 
-        LidarError if torch is not installed; in a worker of a DataLoader.
+        Parameters
+        ----------
+        transform
+            Function that converts a sweep to an item, as for `SavedSweeps.torch`.
+
+        Raises
+        ------
+        LidarError
+            If torch is not installed, or in a worker of a DataLoader.
         """
         if find_spec("torch") is None:
-            raise LidarError(f"This needs PyTorch: {install_command('torch')}.")
+            raise LidarError(f"`torch` requires PyTorch. Run {install_command('torch')}.")
         from ..datasets.torch_sweeps import TorchStream
 
         return TorchStream(self, transform)
@@ -325,10 +333,10 @@ class _Casting:
         self._warned = True
         job = streamed.job
         logger.warning(
-            "Job %s of the stream has no points: %s. Further jobs without points are not named.",
+            "Job %s of the stream has no points: %s. Further jobs without points are not reported.",
             job.name,
             empty_cloud_reason(job.scene, job.survey),
         )
 
     def _warn_of_failure(self, name: str, error: object) -> None:
-        logger.warning("Job %s is left out of the stream: %s", name, error)
+        logger.warning("Job %s of the stream was skipped: %s", name, error)

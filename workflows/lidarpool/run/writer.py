@@ -275,7 +275,7 @@ class LidarWorkers:
                 if not finished:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:
-            raise LidarError(f"The cluster was lost while it wrote {writer.storage}.") from error
+            raise LidarError(f"The cluster was lost while writing {writer.storage}.") from error
         finally:
             if running:
                 writer.stop()
@@ -309,6 +309,6 @@ def _fetch_writer(key: str) -> RangeWriter:
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
     """Write a range on a worker, and return its result and the record of the task."""
     recorder = Recorder(EXPORT, LIDAR)
-    with explained(f"the worker {recorder.finish().worker} cannot write there"):
+    with explained(f"The worker {recorder.finish().worker} cannot write there"):
         written_range = _fetch_writer(key)(span)
     return written_range, recorder.finish(span[1] - span[0])

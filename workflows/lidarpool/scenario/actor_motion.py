@@ -56,16 +56,16 @@ _ROBOT_FIELDS = {"file", "opacity", "assets"}  # fields of a mesh file that appl
 
 
 class MountSection(Section, InstrumentPose):
-    """Position and angles of a sensor on its carrier.
+    """Position and angles of a sensor on its platform.
 
-    In YAML, [x, y, z] alone will do.
+    In YAML, [x, y, z] alone is sufficient.
     """
 
     link: Annotated[
         Text | None,
         about(
-            "link of the robot that carries it, whose axes these are; what is seen of it is left "
-            "out of the scene",
+            "link of a robot on the platform, to whose axes the mount is relative; the visible "
+            "shape of the link is omitted from the scene",
             "top_lidar_link",
         ),
     ] = None
@@ -79,17 +79,23 @@ MountEntry = Annotated[MountSection, by_position(MountSection)]
 
 
 class CarriedSection(SensorSection):
-    """A sensor of a carrier: its mount, start and steps.
+    """A sensor on a platform, with its mount, start and time steps.
 
-    In YAML, the model alone will do.
+    In YAML, the model alone is sufficient.
     """
 
     mount: MountEntry = MountSection()
     start_s: Annotated[
-        float, about("start, in seconds after that of the survey or station", ge=0, le=1e9)
+        float,
+        about(
+            "start of the sensor in seconds after the start of the survey or station",
+            ge=0,
+            le=1e9,
+        ),
     ] = 0.0
     steps: Annotated[
-        StepCount | None, about("its time steps (scans), instead of the survey's", 120)
+        StepCount | None,
+        about("number of time steps (scans) of the sensor (default: from the survey)", 120),
     ] = None
 
     def mounted(
@@ -100,7 +106,7 @@ class CarriedSection(SensorSection):
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return the sensor on its carrier, with its start and time steps.
+        """Return the sensor on its platform, with its start and time steps.
 
         `path` returns the path of a file in the scenario. LidarError if a file cannot be used.
         """
@@ -117,11 +123,11 @@ CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
 class TimedPose(Section, Pose):
     """A pose at a time.
 
-    If no pose has an angle, the carrier is level and faces its direction of travel.
+    If no pose has an angle, the platform is level and faces its direction of travel.
     """
 
     # Any number: `seconds_of` names the unit that too large numbers probably have.
-    time_s: Annotated[float, about("seconds, by the clock of the trajectory", ge=-1e20, le=1e20)]
+    time_s: Annotated[float, about("time of the pose, in seconds", ge=-1e20, le=1e20)]
 
 
 Identity = Annotated[Text, BeforeValidator(lambda v: str(v) if type(v) is int else v)]
@@ -129,79 +135,91 @@ Identity = Annotated[Text, BeforeValidator(lambda v: str(v) if type(v) is int el
 
 TimeUnitEntry = Annotated[
     TimeUnit | None,
-    about("unit of the times in the file, if it differs from the unit that the file states", "ns"),
+    about("unit of the times in the file (default: the unit that the file states)", "ns"),
 ]
 
 
 class TrajectorySection(Section):
-    """Poses over time, from a file, points or traffic.
+    """Poses over time, from a file, from points or from traffic.
 
-    In YAML, the file's name alone will do.
+    In YAML, the file name alone is sufficient.
     """
 
     file: Annotated[
         Text | None,
         about(
-            "TUM, KITTI, .csv, a folder «oxts» or a bag of ROS 2, from the scenario's folder",
+            "trajectory file in the TUM or KITTI format, .csv table, «oxts» folder or ROS 2 bag, "
+            "relative to the folder of the scenario",
             "drive.tum",
         ),
     ] = None
     format: Annotated[
-        TrajectoryFormat | None, about("by default as the content of the file says")
+        TrajectoryFormat | None,
+        about("format of the file (default: detected from its content)"),
     ] = None
-    times: Annotated[Text | None, about("for KITTI poses: the file of times")] = None
+    times: Annotated[Text | None, about("file with the times of KITTI poses")] = None
     time_unit: TimeUnitEntry = None
     columns: Annotated[
         dict[str, str] | None,
         about(
-            "for a table: {time_s, x, y, z, qx, …, yaw_deg, …: name in the file}",
+            "column names of a table for time_s, x, y, z, qx, qy, qz, qw, yaw_deg and other "
+            "quantities",
             {"time_s": "stamp"},
         ),
     ] = None
     ignore: IgnoredColumns = ()
     topic: Annotated[
         Text | None,
-        about("for a bag with several: a topic of poses, or /tf:FRAME", "/odometry"),
+        about(
+            "topic with the poses, or /tf:FRAME; required for a bag with several topics",
+            "/odometry",
+        ),
     ] = None
     origin: Annotated[
         tuple[Latitude, Longitude, Height] | None,
         Strict(False),
         about(
-            "for latitudes and longitudes: those of the world's zero, degrees, and its height, "
-            "meters; by default the first position",
+            "latitude and longitude of the world origin in degrees, and its height in meters, for "
+            "files with latitudes and longitudes (default: the first position)",
             [48.7758, 9.1829, 290],
         ),
     ] = None
     camera_axes: Annotated[
         bool | None,
-        about("whether poses have camera axes (z ahead); by default those of KITTI have"),
+        about(
+            "whether the poses use camera axes, with z forward (default: true for KITTI poses only)"
+        ),
     ] = None
     points: Annotated[
-        Several[TimedPose], about("instead of a file: time_s, position and angles, world meters")
+        Several[TimedPose],
+        about("poses with time_s, position and angles, in world coordinates; replaces file"),
     ] = ()
     vehicle: Annotated[
         Identity | None,
         about(
-            "instead of a file, of the survey: identity of the vehicle of traffic that carries the "
-            "sensors; host is the host vehicle of OSI",
+            "identity of the vehicle in the traffic that carries the sensors of the survey; host "
+            "is the host vehicle of an OSI trace; replaces file",
             "host",
         ),
     ] = None
     interpolation: Annotated[
-        Literal["linear", "smooth"], about("of positions and rotations; IMUs need smooth")
+        Literal["linear", "smooth"],
+        about("interpolation of positions and rotations; IMUs require smooth"),
     ] = "linear"
-    offset_s: Annotated[Seconds, about("added to all times")] = 0.0
+    offset_s: Annotated[Seconds, about("offset in seconds that is added to all times")] = 0.0
     start_s: Annotated[
         Seconds | None,
-        about("start of the survey; by default the first time"),
+        about("time at which the survey starts (default: the first time)"),
     ] = None
     duration_s: Annotated[
-        Duration | None, about("duration of the survey; by default to the end")
+        Duration | None,
+        about("duration of the survey (default: to the end of the trajectory)"),
     ] = None
     surfaces: Annotated[
         TextOrTexts | None,
         about(
-            "names of objects to follow, with * and ?; heights are then above them",
+            "names of objects that the trajectory follows, so that its heights are above them; may "
+            "contain * and ?",
             "Terrain",
             min_length=1,
         ),
@@ -209,8 +227,8 @@ class TrajectorySection(Section):
     beyond: Annotated[
         Beyond,
         about(
-            "of actors, before the first and after the last time: an error (refuse), the same "
-            "pose (hold), or not in the scene (absent)"
+            "behavior of an actor before the first and after the last time: refuse raises an "
+            "error, hold keeps the pose, and absent removes the actor from the scene"
         ),
     ] = "refuse"
 
@@ -261,7 +279,8 @@ class TrajectorySection(Section):
             if piece.times_s[0] <= start + CLOCK_S and stop - CLOCK_S <= piece.times_s[-1]:
                 return replace(piece, beyond=track.beyond)
         raise LidarError(
-            f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
+            f"The trajectory leaves its surfaces ({', '.join(self.surfaces)}). Shorten it so that "
+            "it ends on them."
         )
 
     def footprint(self, path: PathOf) -> Floats:
@@ -315,47 +334,52 @@ TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection
 
 
 class JointTable(Section):
-    """Values of a robot's joints from a table.
+    """Joint values of a robot from a table.
 
-    In YAML, the file's name alone will do.
+    In YAML, the file name alone is sufficient.
     """
 
-    file: Annotated[Text, about("a table with a header, from the scenario's folder")]
+    file: Annotated[Text, about("table with a header, relative to the folder of the scenario")]
     time_unit: TimeUnitEntry = None
     ignore: IgnoredColumns = ()
 
 
 class ActorSection(DeformingSection):
-    """An object or robot that moves or stands.
+    """An object or robot that moves or is stationary.
 
-    Its axes have x ahead and z up.
+    In its own axes, x is forward and z is up.
     """
 
     name: Annotated[Text, about("name of the object")]
     file: Annotated[
         MeshEntry | None,
-        about("its mesh in its own axes, as in scene.files, or a robot: .urdf", "car.glb"),
+        about(
+            "mesh file in the axes of the object, with options as in scene.files, or robot (.urdf)",
+            "car.glb",
+        ),
     ] = None
     trajectory: Annotated[
         TrajectoryEntry | None,
         about(
-            "its trajectory, by the clock of the survey's; without it and at it is the carrier, "
-            "and has the survey's",
+            "trajectory with the same clock as the trajectory of the survey; an actor without "
+            "trajectory and at is the platform and follows the trajectory of the survey",
             "van.csv",
         ),
     ] = None
     at: Annotated[
         PoseEntry | None,
-        about("instead of a trajectory: where it stands, [x, y, z] or with angles", [4, 5, 0]),
+        about(
+            "pose of a stationary actor, as [x, y, z] or with angles; replaces trajectory",
+            [4, 5, 0],
+        ),
     ] = None
     spray: Annotated[
-        bool, about("whether its wheels raise spray, with weather.spray_g_m3; robots raise none")
+        bool,
+        about("whether the wheels raise spray if weather.spray_g_m3 is set; robots raise none"),
     ] = True
     joints: Annotated[
         Annotated[JointTable, by_text("file", JointTable)] | None,
-        about(
-            "of a robot: a table of time_s and the values of joints, radians or meters", "arm.csv"
-        ),
+        about("table with time_s and the joint values of a robot, in radians or meters", "arm.csv"),
     ] = None
 
     @model_validator(mode="after")
@@ -363,22 +387,27 @@ class ActorSection(DeformingSection):
         """Raise ValueError if fields of an actor or robot do not fit together."""
         trajectory = self.trajectory
         if trajectory is not None and self.at is not None:
-            raise ValueError("give either trajectory or at, not both.")
+            raise ValueError("`trajectory` and `at` cannot be combined.")
         if trajectory is not None and (
             trajectory.start_s is not None or trajectory.duration_s is not None
         ):
-            raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
+            raise ValueError(
+                "An actor starts with the survey, so `start_s` and `duration_s` are not allowed. "
+                "To shift its times, set `offset_s`."
+            )
         if trajectory is not None and trajectory.vehicle is not None:
             raise ValueError(
-                "trajectory.vehicle is of the survey's trajectory: vehicles of traffic are actors."
+                "`trajectory.vehicle` is only allowed in the trajectory of the survey. The "
+                "vehicles of `traffic` are already actors."
             )
         if not self.robot and self.joints is not None:
-            raise ValueError("joints are those of a robot: give a .urdf as its file.")
+            raise ValueError("`joints` requires a robot. Set `file` to a .urdf file.")
         if self.robot and (self.animation or self.wheels):
-            raise ValueError("a robot has joints: leave out animation and wheels.")
+            raise ValueError("A robot has joints, so `animation` and `wheels` are not allowed.")
         if self.robot and self.robot.model_fields_set - _ROBOT_FIELDS:
             raise ValueError(
-                "a robot is in meters and in its own axes: give just its file, opacity and assets."
+                "The file of a robot is in meters and in the axes of the robot. It can only be "
+                "combined with `opacity` and `assets`."
             )
         return self
 

@@ -47,21 +47,21 @@ def advice(built: Built) -> list[str]:
     """
     notes = built.findings.notes
     remarks = built.findings.remarks
-    axes = [f"{remark} (--up-axis AXIS with a mesh file)" for remark in remarks[:1]]
-    if remarks[1:]:
-        axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
+    axes = [f"{remark} (for a mesh file, `--up-axis AXIS`)" for remark in remarks[:1]]
+    if others := len(remarks[1:]):
+        axes = [f"{axes[0]}. The same applies to {plural(others, 'other file')}"]
     side = float(np.ptp(built.scene.bounds, axis=0).max())
     step = built.survey.precision_m
     every = built.survey.keep_every
     placed = "" if built.placing is None else built.placing.note
     likely = filter(None, (_size_note(built, side), placed, _color_note(built)))
     scanners = [
-        "bags have a LaserScan of a 2D scanner only if every return is kept: set cloud.keep_every "
-        "to 1"
+        "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
+        "`cloud.keep_every: 1`"
     ] * (_writes_bags(built.scenario) and every > 1 and has_planar_sensors(built.survey))
     coarse = [
-        f"points are rounded to {step:g} m, and the scene is {side:.3g} m long: give a smaller "
-        "cloud.precision_m in a scenario"
+        f"points are rounded to {step:g} m, but the scene is only {side:.3g} m long. Set a smaller "
+        "`cloud.precision_m` in a scenario"
     ] * (side < MIN_STEPS * step)
     unlabeled = [
         note for entry in built.scenario.output.write for note in entry.unlabeled(built.survey)
@@ -83,8 +83,8 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
         noun = "classes" if unnamed[1:] else "class"
         names = ", ".join(f"{number}: …" for number in unnamed)
         yield (
-            f"{noun} {listed([*map(str, unnamed)])} of materials or actors without a name: add "
-            f"{{{names}}} to classes"
+            f"{noun} {listed([*map(str, unnamed)])} of materials or actors "
+            f"{'have' if unnamed[1:] else 'has'} no name. Add `{{{names}}}` to `classes`"
         )
 
 
@@ -109,11 +109,15 @@ def _size_note(built: Built, side: float) -> str:
     if not (unitless or (surrounded and files)) or min_m <= side <= max_m:
         return ""
     unit = "mm" if side > max_m else "km"
-    stated = "states no unit" if unitless else "is in meters by its format"
+    name = (unitless or files)[0]
+    assumed = (
+        f"{name} states no unit. If it is in meters,"
+        if unitless
+        else f"the format of {name} prescribes meters, by which"
+    )
     return (
-        f"{(unitless or files)[0]} {stated}, and in meters the scene is {rounded(side, 5)} m long. "
-        f"If that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
-        "mesh file"
+        f"{assumed} the scene is {rounded(side, 5)} m long. If this is wrong, set the `unit` of "
+        f"the file in `scene.files`, possibly {unit}, or pass `--unit {unit}` with a mesh file"
     )
 
 
@@ -130,8 +134,8 @@ def _color_note(built: Built) -> str:
         return ""
     if not scene.colored:
         return (
-            "a column or reflectance: texture needs colors, but nothing in the scene has any, "
-            "so that all is gray"
+            "a column or `reflectance: texture` uses colors, but no object of the scene has "
+            "colors, so all surfaces are gray"
         )
     names = scene.object_names
     kinds = scene.surface_kinds
@@ -142,8 +146,9 @@ def _color_note(built: Built) -> str:
         return ""
     shown = ", ".join(names[i] for i in gray[:3]) + ", …" * (len(gray) > 3)
     return (
-        f"{len(gray):,} of {plural(int(textured.sum()), 'object')} with reflectance: texture "
-        f"have no colors and are gray: {shown}"
+        f"{len(gray):,} of {plural(int(textured.sum()), 'object')} with `reflectance: texture` "
+        f"{'has' if len(gray) == 1 else 'have'} no colors and {'is' if len(gray) == 1 else 'are'} "
+        f"treated as gray: {shown}"
     )
 
 
@@ -155,22 +160,28 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
     written = {entry.format for entry in scenario.output.write}
     if scenario.cloud.waveform_samples and not {"las", "laz"} & written:
         yield (
-            "cloud.waveform_samples: only LAS and LAZ files hold waveforms, and none is "
-            "written: add output: {write: [las]}"
+            "`cloud.waveform_samples` has no effect, because only LAS and LAZ files store "
+            "waveforms and none is written. Set `output: {write: [las]}`"
         )
     is_default = scenario.weather.fog_lidar_ratio_sr in (None, FOG_LIDAR_RATIO_SR)
     if not is_default and scenario.weather.visibility_km is None:
-        yield "weather.fog_lidar_ratio_sr without weather.visibility_km is no fog"
+        yield "`weather.fog_lidar_ratio_sr` has no effect without `weather.visibility_km`"
     if scenario.weather.spray_g_m3 and not (scenario.actors or scenario.traffic):
-        yield "weather.spray_g_m3 needs actors or traffic that move, and there are none"
+        yield "`weather.spray_g_m3` has no effect without moving actors or traffic"
     if scenario.noise.stray_light and not any(entry.retro for entry in scenario.materials):
-        yield "noise.stray_light needs materials with retro: true, and there are none"
+        yield "`noise.stray_light` has no effect without a material with `retro: true`"
     trajectory = scenario.trajectory
     imu = scenario.navigation and scenario.navigation.imu
     if imu and trajectory and trajectory.interpolation == "linear" and len(trajectory.points) != 2:
-        yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
+        yield (
+            "the measurements of `navigation.imu` jump at the poses of a trajectory with linear "
+            "interpolation. Set `trajectory.interpolation: smooth`"
+        )
     if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
-        yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
+        yield (
+            f"`noise.velocity_m_s` has no effect without the column {VELOCITY}. Add it to "
+            "`cloud.columns`"
+        )
 
 
 def _single_returns(built: Built) -> Iterator[str]:
@@ -196,8 +207,8 @@ def _single_returns(built: Built) -> Iterator[str]:
     of_sensors = f" of {listed(names)}" if all(names) else ""
     yield (
         f"the returns mode{of_sensors} is {reporting.mode}, but a pulse never has a second return, "
-        "because each beam is a single ray that meets one surface. Set returns: {subrays: 7"
-        f"{divergence}}}"
+        "because each beam is a single ray that hits one surface. Set `returns: {subrays: 7"
+        f"{divergence}}}`"
     )
 
 
@@ -207,7 +218,7 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
         return
     if survey.fog_lidar_ratio_sr is None:
         yield (
-            "weather.fog_lidar_ratio_sr is null: fog attenuates light, and no light returns from it"
+            "fog attenuates light but returns none, because `weather.fog_lidar_ratio_sr` is null"
         )
         return
     without = [
@@ -219,9 +230,9 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
         names = [carried.name for carried in without]
         of_sensors = f" of {listed(names)}" if all(names) else ""
         yield (
-            "fog attenuates light, and no light returns from it, because noise.detection_range_m"
-            f"{of_sensors} is not known. Set it to the range at 10 % reflectance, for example "
-            "noise: {detection_range_m: 90}"
+            "fog attenuates light but returns none, because `noise.detection_range_m`"
+            f"{of_sensors} is not set. Set it to the range at 10 % reflectance, for example "
+            "`noise: {detection_range_m: 90}`"
         )
 
 
@@ -231,18 +242,19 @@ def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
         return
     names = [*without_angles]
     note = (
-        f"the trajectory of {listed(names)} has no angles: it is level and faces the direction of "
-        "travel"
+        f"the trajectory of {listed(names)} has no angles, so its poses are level and face the "
+        "direction of travel"
     )
     if names[1:]:
         note = (
-            f"the trajectories of {listed(names)} have no angles: they are level and face the "
-            "direction of travel"
+            f"the trajectories of {listed(names)} have no angles, so their poses are level and "
+            "face the direction of travel"
         )
     if any(without_angles.values()):
         note += (
-            f". At a corner between straight lines, the turn takes {CORNER_M:g} m before and after "
-            "it; interpolation: smooth makes a path without corners"
+            f". At a corner between straight lines, they turn from {CORNER_M:g} m before to "
+            f"{CORNER_M:g} m after the corner. For a path without corners, set `interpolation: "
+            "smooth`"
         )
     yield note
 
@@ -259,23 +271,27 @@ def _timing_notes(built: Built) -> Iterator[str]:
         if START_FROM.timestamp() <= start_s < _LAST_DATE.timestamp():
             moment = datetime.fromtimestamp(start_s, UTC).isoformat()
             yield (
-                f"times of the trajectory begin at {start_s:.0f} s, and times of points at the "
-                f"survey's start: if these seconds are since 1970, give start: {moment} in cloud "
-                "to keep the date"
+                f"the times of the trajectory start at {start_s:.0f} s, but the times of points "
+                "count from the start of the survey. If the trajectory has seconds since 1970, set "
+                f"`cloud: {{start: {moment}}}` to keep the date"
             )
     end = np.array([built.survey.duration_ns])
     for number, (_, starts, _) in enumerate(survey.sweeps_each):
         for index, fault in survey.faults_of(number, "frozen").items():
             if not fault.during(starts).any():
                 sensor = survey.carried[number].name or "the sensor"
-                yield f"faults[{index}] does not freeze {sensor}: no sweep begins meanwhile"
+                yield (
+                    f"`faults[{index}]` does not freeze {sensor}, because no sweep starts during "
+                    "the fault"
+                )
     for actor in built.scene.actors:
         first, last = presence_ns(actor.trajectory)
         if first > end[0] or last < 0:
-            yield f"{actor.name} is not in the scene during the survey: check its times"
+            yield f"{actor.name} is not in the scene during the survey. Check its times"
         animation = actor.mesh.animation
         if animation and not animation.repeat and actor.seconds(end)[0][0] > animation.duration_s:
             yield (
-                f"{actor.name}: its animation of {rounded(animation.duration_s)} s ends before the "
-                "survey does, and its last pose remains: give repeat: true"
+                f"the animation of {actor.name} ends after {rounded(animation.duration_s)} s, "
+                "before the end of the survey, and its last pose is kept. To repeat the animation, "
+                "set `repeat: true`"
             )

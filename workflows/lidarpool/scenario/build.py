@@ -77,34 +77,32 @@ MESH_PRECISION_M = 0.001
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Job:
-    """A survey of a scene, possibly with path planning.
+    """A survey of a scene, optionally with path planning.
 
-    Jobs of a `Campaign` are numbered.
-
-    A function that makes jobs for a `Campaign` gives scene, survey and values: the campaign
-    numbers, names and splits the jobs.
+    A function that makes the jobs of a `Campaign` sets only the scene, the survey and the values.
+    The campaign sets the number, name and split of each job.
 
     Parameters
     ----------
     scene, survey, planning
-        As for `simulate`: in the scene's local coordinates.
+        As for `simulate`, in the local coordinates of the scene.
     values
-        Values that differ between the jobs of a campaign: {name: number, text, or True and
-        False}; None for an empty cell. All jobs of a campaign have the same names, the columns
-        of its table.
+        Values that differ between the jobs of a campaign, as a mapping from names to numbers, text,
+        True or False, or None for an empty cell. All jobs of a campaign have the same names, which
+        are columns of its job table.
     number, name, split
         Number of the job in its campaign, its name in files, and the name of its split.
     outputs
-        Formats that the cloud is written in besides PLY.
+        Formats of the cloud in addition to PLY.
     made_of
-        Names and SHA-256 of the files that the job was made of.
+        Names and SHA-256 hashes of the files that the job was made from.
 
     Raises
     ------
     LidarError
-        If a field has another type, the survey's precision is too fine for the scene, a
-        material is for no object, an object lacks a material while others have one, or the
-        survey's coordinate system is not in meters that are true where the scene is.
+        If a field has the wrong type, the precision of the survey is too small for the scene, a
+        material matches no object, an object has no material although others have one, or the
+        coordinate system of the survey is not in true meters at the location of the scene.
     """
 
     scene: Scene
@@ -133,8 +131,8 @@ class Job:
             reach_m = max(reach_m, float(np.abs(positions).max() + np.abs(actor.bounds).max()))
         if reach_m / survey.precision_m >= 2**31 - 1:
             raise LidarError(
-                f"precision_m {survey.precision_m} is too fine for a scene that reaches "
-                f"{reach_m:.0f} m from its origin: use at least {reach_m / 2e9:.2g}"
+                f"`precision_m` is {survey.precision_m}, which is too small for a scene that "
+                f"extends {reach_m:.0f} m from its origin. Set it to at least {reach_m / 2e9:.2g}"
                 f"{_outlier_advice(scene)}."
             )
         if survey.epsg is not None:
@@ -150,19 +148,22 @@ class Job:
 
     @cached_property
     def sweeps(self) -> Sweeps:
-        """Sweeps with poses and boxes of actors, in seconds for thousands of poses."""
+        """Sweeps with their poses and the boxes of actors.
+
+        The computation takes seconds for thousands of poses.
+        """
         return Sweeps.from_survey(self.survey, self.scene)
 
 
 def _outlier_advice(scene: Scene) -> str:
-    """Return advice to leave out the object that is far from all others, or an empty string."""
+    """Return advice to remove the object that is far from all others, or an empty string."""
     with np.errstate(invalid="ignore"):  # bounds of an object without triangles are infinite
         middles = scene.object_bounds.mean(axis=1)
     distances_m = np.linalg.norm(middles - np.nanmedian(middles, axis=0), axis=1)
     order = np.argsort(np.nan_to_num(distances_m))
     if len(order) < 3 or not distances_m[order[-1]] > 10 * distances_m[order[-2]]:
         return ""
-    return f", or leave out {scene.names[order[-1]]!r}, which is far from all else"
+    return f", or remove {scene.names[order[-1]]!r}, which is far from all other objects"
 
 
 def build(
@@ -292,7 +293,7 @@ def _carrier_track(shapes: Shapes, standing: StandingSurfaces) -> Track | None:
         return entry.track(
             scenario.path,
             standing,
-            name="the carrier",
+            name="the platform",
             without_angles=shapes.findings.without_angles,
         )
     section = scenario.traffic
@@ -363,15 +364,15 @@ def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
     if systems and (x or y):
         first = next(iter(systems.values()))
         raise LidarError(
-            f"{scenario.source}: world.origin would be added to {first.file} as well, whose "
-            f"coordinates are those of {first.crs[:60]} already: give the file translation: "
-            f"[{-x:.12g}, {-y:.12g}, 0], or leave out world.origin."
+            f"{scenario.source}: `world.origin` would also be added to {first.file}, whose "
+            f"coordinates are already in {first.crs[:60]}. Set `translation: "
+            f"[{-x:.12g}, {-y:.12g}, 0]` for the file, or remove `world.origin`."
         )
     if scenario.world.epsg is not None:
         world = f"EPSG:{scenario.world.epsg}"
         findings.notes += [
-            f"{system.file} is in {crs}, and {world} is written, because world.epsg states that: "
-            "leave out world.epsg if the file is right"
+            f"{system.file} is in {crs}, but the output states {world}, because `world.epsg` is "
+            "set. If the file is correct, remove `world.epsg`"
             for crs, system in systems.items()
             if crs != world and not system.is_raster
         ]
@@ -379,9 +380,9 @@ def _common_epsg(scenario: Scenario, findings: Findings) -> int | None:
     if len(systems) > 1:
         listed = ", ".join(f"{system.file} in {crs[:60]}" for crs, system in systems.items())
         raise LidarError(
-            f"{scenario.source}: files of one scene have several coordinate systems: {listed}. "
-            "Give world.epsg, the code of the one that all rasters are brought to, and bring other "
-            "files to it."
+            f"{scenario.source}: The files of the scene have different coordinate systems "
+            f"({listed}). Set `world.epsg` to the EPSG code of one system. Rasters are reprojected "
+            "to it, but you must convert all other files."
         )
     return next((system.epsg for system in systems.values()), None)
 
@@ -429,8 +430,9 @@ def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
     if len(matching_carriers) != 1:
         links = [link for _, robot in carriers for link in robot.links]
         raise LidarError(
-            f"mount.link is {mount.link!r}, which {len(matching_carriers) or 'no'} robots on the "
-            f"carrier have; one must.{name_hint(mount.link, links)}"
+            "`mount.link` must be a link of exactly one robot on the platform, but "
+            f"{plural(len(matching_carriers), 'robot has', 'robots have')} a link "
+            f"{mount.link!r}.{name_hint(mount.link, links)}"
         )
     ((entry, robot),) = matching_carriers
     with prefixed(f"actor {entry.name!r}"):
@@ -438,8 +440,8 @@ def _mount_pose(section: SensorSection, shapes: Shapes) -> Pose:
     if path.moves:
         file = None if entry.joints is None else entry.joints.file
         raise LidarError(
-            f"mount.link is {mount.link!r}, which {file} moves, and a mount is rigid: "
-            "mount the sensor on a link that does not move, or leave out those joints' columns."
+            f"`mount.link` is {mount.link!r}, which is moved by {file}, but a mount must be rigid. "
+            "Mount the sensor on a link that does not move, or remove the columns of these joints."
         )
     return path.pose(0).compose(mount.pose())
 
@@ -487,7 +489,10 @@ def _robot_actors(
     links = shapes.scenario.links
     sensor_links = links.intersection(robot.meshes) if entry.is_carrier else ()
     for link in sorted(sensor_links):
-        add_note(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
+        add_note(
+            f"link {link} of {entry.name} is not part of the scene, because a sensor is mounted "
+            "on it"
+        )
     joints = _joint_arguments(entry, shapes.scenario)
     return robot.actors(trajectory, name=entry.name, without=sensor_links, tell=add_note, **joints)
 
@@ -515,11 +520,11 @@ def _traffic_actors(
     actors = actors_of(section, content.passages, shapes.mesh_of, standing, start_s)
     if not actors:
         findings.notes.append(
-            f"{section.file}: no vehicle or person is in the scene from {file_start_s:g} to "
-            f"{file_stop_s:g} s of the file: check offset_s, translation and surfaces"
+            f"{section.file} has no vehicle or person in the scene from {file_start_s:g} to "
+            f"{file_stop_s:g} s. Check `offset_s`, `translation` and `surfaces`"
         )
     findings.sources[section.file] = (
-        f"{plural(len(actors), 'actor')} during the survey, of {content.counted} until its end"
+        f"{plural(len(actors), 'actor')} during the survey, out of {content.counted} until its end"
     )
     return actors
 
@@ -702,9 +707,9 @@ def _build_planning(scenario: Scenario, scene: Scene) -> Planning | None:
         if inside.any():
             first = int(inside.argmax())
             raise LidarError(
-                f"planning.{end} lies {discs[first, 2]:.2f} m or less from the middle of "
-                f"{labels[first]}, within its circle: move it, or list other "
-                "planning.obstacles."
+                f"`planning.{end}` must be outside all obstacles, but is within "
+                f"{discs[first, 2]:.2f} m of the center of {labels[first]}. Move it, or change "
+                "`planning.obstacles`."
             )
     search_options = declared(section, Search)
     return Planning(start_xy, target_xy, centers=discs[:, :2], radii=discs[:, 2], **search_options)
@@ -732,7 +737,7 @@ def _obstacle_discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]
         ]
         if not matches:
             raise LidarError(
-                f"planning.obstacles names {entry.object!r}, but no object has that name."
+                f"`planning.obstacles` contains {entry.object!r}, but no object has that name."
                 f"{name_hint(entry.object, scene.names)}"
             )
         discs |= {scene.names[i]: list(scene.footprints[i]) for i in matches}

@@ -35,33 +35,33 @@ from .scenario import Scenario
 from .sections import PoolSection
 from .static_scene import SceneCache
 
-_FORM = "a campaign has base:, count:, vary:, keep:, splits:"
+_FORM = "a campaign file contains base:, count:, vary:, keep: and splits:"
 MAX_SHOWN_FILES = 5  # files of a command that are named
 
 
 class CampaignSpec:
-    """Jobs (surveys) from a description, into a data set.
+    """Many jobs, which are surveys, that are written to a data set.
 
-    `Campaign.load` reads a campaign file, `Campaign.of_scenarios` takes scenario files as they
-    are, and the constructor asks a function of Python for each job.
+    `Campaign.load` reads a campaign file, and `Campaign.of_scenarios` uses scenario files as jobs.
+    The constructor uses a Python function that returns each job.
 
     Parameters
     ----------
     make
-        ``make(number, rng)`` returns the `Job` of a number from 0 on, with its scene, survey and
-        values. `rng` is a ``numpy.random.Generator`` that depends on the seed and the number alone:
-        equal numbers give equal jobs, in any order and on any worker.
+        Function ``make(number, rng)`` that returns the `Job` with a number, counted from 0, with
+        its scene, survey and values. `rng` is a ``numpy.random.Generator`` that depends only on the
+        seed and the number, so equal numbers result in equal jobs, in any order and on any worker.
     count
         Number of jobs.
     seed
-        Another seed gives other random numbers.
+        Seed of the random numbers.
     keep
-        Format of the data set: "kitti", "nuscenes", "webdataset", "mcap", "parquet", "images" or
-        "folder"; or ``{"format": "mcap", "layout": "ouster"}``.
+        Format of the data set, which is "kitti", "nuscenes", "webdataset", "mcap", "parquet",
+        "images" or "folder", or a mapping such as ``{"format": "mcap", "layout": "ouster"}``.
     splits
-        {name: share of the jobs}; they add up to 1.
+        Mapping from the names of splits to their shares of the jobs. The shares add up to 1.
     license, title
-        For the card of the data set.
+        License and title on the card of the data set.
 
     Raises
     ------
@@ -70,7 +70,7 @@ class CampaignSpec:
 
     Notes
     -----
-    A survey with noise whose seed is 0 gets a seed of the job's own.
+    If the noise of a survey has the seed 0, each job uses a different seed.
     """
 
     count: int
@@ -114,18 +114,19 @@ class CampaignSpec:
         self._jobs = jobs
         self._splits = Splits(self.splits, head.seed)
 
-    changeable = "pool, and count, which may grow"
+    changeable = "Only `pool` and `count` may change, and `count` must not decrease."
 
     @classmethod
     @checked
     def load(cls, path: str | Path) -> CampaignSpec:
-        """Read a campaign file, with its bases and tables.
+        """Read a campaign file with its bases and tables.
 
         Raises
         ------
         LidarError
-            With the file, the field or path, what was given and what is allowed: if a path leads
-            to no field, a value that can be drawn is not valid there, or a file is missing.
+            If a path does not refer to a field, a value that can be drawn is not valid, or a file
+            is missing. The message names the file, the field or path, the value and the allowed
+            values.
         """
         path = Path(path)
         content = read_yaml(path, _FORM)
@@ -150,9 +151,9 @@ class CampaignSpec:
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> CampaignSpec:
-        """Take scenario or mesh files as jobs, unchanged.
+        """Return a campaign whose jobs are scenario or mesh files.
 
-        A job has the name of its file.
+        Each job has the name of its file.
 
         Raises
         ------
@@ -180,64 +181,78 @@ class CampaignSpec:
 
     @property
     def numbers(self) -> range:
-        """Numbers of the jobs that a run does."""
+        """Numbers of the jobs in this campaign or shard."""
         return self.shard.jobs(self.count)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the values that differ from job to job, in the order of the table's columns.
+        """Names of the values that differ between jobs, in the order of the table columns.
 
-        Of a function, the first job that can be made is made to learn its names.
+        If a function makes the jobs, the names are taken from the first job that can be made.
         """
         return self._jobs.names
 
     def values(self, number: int) -> dict[str, Value]:
-        """Return the values of a job, {name: value}.
+        """Return the values of a job, as {name: value}.
 
-        The value of a sample is its number of rows.
-
-        A value of None is left out. Of a function, the job is made.
+        The value of a sample is its number of rows. Values that are None are omitted. If a function
+        makes the jobs, the job is made.
         """
         return self._jobs.values(self._checked_number(number))
 
     def name(self, number: int) -> str:
-        """Return the name of a job in files: the name of its scenario file, else «0017»."""
+        """Return the name of a job in files.
+
+        The name is that of its scenario file, or a number such as 0017.
+        """
         return self._jobs.name(self._checked_number(number))
 
     def split(self, number: int) -> str:
-        """Return the name of a job's split, or no text without splits."""
+        """Return the name of the split of a job, or an empty string without splits."""
         return self._splits(self._checked_number(number))
 
     def scenario(self, number: int) -> Scenario | None:
         """Return the scenario of a job, or None if a function makes the job.
 
-        LidarError if its values do not fit together; the message names job and values.
+        Raises
+        ------
+        LidarError
+            If the values of the job do not fit together. The message names the job and the values.
         """
         return self._jobs.scenario(self._checked_number(number))
 
     @property
     def pool(self) -> PoolSection:
-        """Section of the first job on the cluster that runs all jobs."""
+        """Section `pool` of the first job, which applies to all jobs."""
         scenario = self.scenario(0)
         return PoolSection() if scenario is None else scenario.pool
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
         """Make a job.
 
-        Equal numbers give equal jobs. Jobs plan no paths.
+        Equal numbers result in equal jobs. Jobs do not plan paths.
 
-        `cache` has static scenes of other jobs, which this job may share; `columns` are names of
-        columns that the data set needs.
+        Parameters
+        ----------
+        number
+            Number of the job.
+        cache
+            Static scenes of other jobs that this job may share.
+        columns
+            Names of the columns that the data set requires.
 
-        LidarError if the number is not a job's, or the job cannot be made; the message says why.
+        Raises
+        ------
+        LidarError
+            If the job does not exist or cannot be made. The message states the reason.
         """
         number = self._checked_number(number)
         fields = {"number": number, "name": self.name(number), "split": self.split(number)}
         job = self._jobs.job(number, cache, columns, fields)
         if job.survey.navigation is not None:
             raise LidarError(
-                "navigation is for single surveys, since a data set has no place for its files: "
-                "leave it out of the campaign's base."
+                "`navigation` is not supported in campaigns, because data sets have no files for "
+                "it. Remove `navigation` from the base of the campaign."
             )
         survey = with_laser_scans(job.survey, [self.keep.format])
         return job if survey is job.survey else replace(job, survey=survey)
@@ -257,7 +272,7 @@ class CampaignSpec:
         """Return the number of a job as an integer, or raise LidarError."""
         if not 0 <= number < self.count:
             raise LidarError(
-                f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
+                f"Job {number} does not exist. The jobs of the campaign are 0 to {self.count - 1}."
             )
         return int(number)  # converts a number of NumPy
 

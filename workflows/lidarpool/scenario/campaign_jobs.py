@@ -126,16 +126,16 @@ class FunctionJobs(JobSource):
         job = self._call(number)
         if extra := [name for name in job.values if name not in self.names]:
             raise LidarError(
-                f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
-                "the same names, with None where there is no value."
+                f"Job {number} has a value {extra[0]!r}, which the first job does not have. Use "
+                "the same names for all jobs, with None for missing values."
             )
         values: dict[str, Value] = {}
         for name, value in job.values.items():
             plain = value.item() if isinstance(value, np.generic) else value
             if not isinstance(name, str) or not isinstance(plain, Value | None):
                 raise LidarError(
-                    f"job {number} has the value {name!r}: {shown(plain)}; values are numbers, "
-                    "text, True or False, by names."
+                    "The values of a job must be numbers, text, True or False, and their names "
+                    f"must be text, but job {number} has {{{name!r}: {shown(plain)}}}."
                 )
             if plain is not None:
                 values[name] = plain
@@ -167,7 +167,7 @@ class FunctionJobs(JobSource):
                 raise LidarError(message) from error
             if not isinstance(job, Job):
                 raise LidarError(
-                    f"the function returned {shown(job)}; it must return a Job(scene, survey)."
+                    f"the function must return a Job(scene, survey), but returned {shown(job)}."
                 )
         return job
 
@@ -177,7 +177,7 @@ class ScenarioJobs(JobSource):
 
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
-            raise LidarError("a campaign needs a scenario at least: name one or more files.")
+            raise LidarError("A campaign requires at least one scenario.")
         self.paths = paths
         self.folders = {path.parent for path in paths}
         self.count = len(paths)
@@ -187,9 +187,7 @@ class ScenarioJobs(JobSource):
         for path in paths:
             with mistakes.noted():
                 if is_campaign(path):
-                    raise LidarError(
-                        f"{path} is a campaign, with jobs of its own: run it by itself."
-                    )
+                    raise LidarError(f"{path} is a campaign with its own jobs. Run it separately.")
                 scenario = Scenario.load(path)
                 fingerprints.append(_fingerprint(scenario))
                 files.update(scenario.files)
@@ -245,8 +243,8 @@ class VariedJobs(JobSource):
             with mistakes.noted(), prefixed(path):
                 file = path.parent / Path(name).expanduser()
                 if is_campaign(file):
-                    raise LidarError(f"base {name!r} is a campaign; give a scenario.")
-                label = f"vary, of {file.name}" if section.base[1:] else "vary"
+                    raise LidarError(f"base must be a scenario, but {name!r} is a campaign.")
+                label = f"vary for {file.name}" if section.base[1:] else "vary"
                 self._bases.append(_Base(file, section.vary, tables, label))
         mistakes.tell()
         for base in self._bases:
@@ -262,12 +260,12 @@ class VariedJobs(JobSource):
         drawn = [text for text in section.vary if text not in self._strides]
         if section.count is None and drawn:
             raise LidarError(
-                f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
+                f"{path}: count is required, because values of {drawn[0]} are drawn at random."
             )
         if section.count is None and grid > MAX_JOBS:
             raise LidarError(
-                f"{path}: count is missing: all values of each are {grid:,} jobs, of at most "
-                f"{MAX_JOBS:,}."
+                f"{path}: count is required, because the grid of all values would have {grid:,} "
+                f"jobs and the limit is {MAX_JOBS:,}."
             )
         self.count = section.count or grid
         self.choices = {text: choice.words for text, choice in section.vary.items()}
@@ -317,7 +315,9 @@ class VariedJobs(JobSource):
             return base.changed(changes, f"{self._source}: job {number}", noise_seed)
         except LidarError as error:
             listed = ", ".join(f"{name}: {value}" for name, value in values.items())
-            raise LidarError(f"{error}\nIts values are {listed or 'those of the base'}.") from error
+            raise LidarError(
+                f"{error}\nThe values of the job are {listed or 'those of the base'}."
+            ) from error
 
     def _draw(self, number: int) -> tuple[dict[str, Value], dict[str, Any]]:
         """Draw the values of a job: for the table of jobs, and for the scenario."""
@@ -370,7 +370,9 @@ class _Base:
                     max_rows = choice.sample.count[1]
                     if max_rows > len(tables[key]):
                         rows = plural(len(tables[key]), "row")
-                        raise LidarError(f"count is up to {max_rows:,}, and {table} has {rows}.")
+                        raise LidarError(
+                            f"count is up to {max_rows:,}, but {table} has only {rows}."
+                        )
         with mistakes.noted(), prefixed(label):
             self._check_disjoint()
         mistakes.tell()
@@ -381,11 +383,13 @@ class _Base:
         for first, second in combinations(keys, 2):
             short, long = sorted((second, first), key=lambda text: len(keys[text]))
             if keys[short] == keys[long]:
-                raise LidarError(f"{first} and {second} lead to the same field: leave one out.")
+                raise LidarError(
+                    f"{first} and {second} refer to the same field. Remove one of them."
+                )
             within = keys[long][: len(keys[short])] == keys[short]
             if within and self._vary[short].sample is None:
                 raise LidarError(
-                    f"{short} is chosen as a whole, and {long} is a part of it: leave one out."
+                    f"{short} and {long} cannot be combined, because {short} replaces {long}."
                 )
 
     def check(self, source: str, mistakes: Mistakes) -> None:

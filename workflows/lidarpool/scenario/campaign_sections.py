@@ -50,7 +50,7 @@ from lidarsim.base.section_fields import sections_in
 from lidarsim.base.tables import ignored_columns
 from lidarsim.base.textfile import read_text
 from lidarsim.base.validation import checked_fields
-from lidarsim.base.words import did_you_mean_each, in_yaml, printable
+from lidarsim.base.words import did_you_mean_each, in_yaml, joined, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
@@ -203,14 +203,16 @@ Weight = Annotated[float, Field(ge=0, le=1e9)]
 class Normal(Section):
     """A normal distribution.
 
-    Outside `limits` numbers are drawn again.
+    Numbers outside `limits` are drawn again.
     """
 
     mean: Annotated[float, about("mean")]
     std: Annotated[float, about("standard deviation", gt=0)]
     limits: Annotated[
         MinMax[float] | None,
-        about("least and largest number; by default 6 standard deviations", [0, 1]),
+        about(
+            "minimum and maximum (default: 6 standard deviations below and above the mean)", [0, 1]
+        ),
     ] = None
 
     @model_validator(mode="after")
@@ -220,10 +222,10 @@ class Normal(Section):
             lower_share, upper_share = map(NormalDist(self.mean, self.std).cdf, self.limits)
             if upper_share - lower_share < MIN_SHARE:
                 raise ValueError(
-                    f"limits must have at least {MIN_SHARE:.0%} of the distribution between them."
+                    f"`limits` must include at least {MIN_SHARE:.0%} of the distribution."
                 )
         if not isfinite(self.limit_values[1] - self.limit_values[0]):
-            raise ValueError("its numbers are too large.")
+            raise ValueError("The numbers of the distribution are too large.")
         return self
 
     @property
@@ -234,20 +236,20 @@ class Normal(Section):
 
 
 class Sample(Section):
-    """Rows of a table, as further entries of a list such as `actors`."""
+    """Rows of a table, as additional entries of a list such as `actors`."""
 
     file: Annotated[
         Text,
         about(
-            "a .csv with a header of fields of an entry (name, box, "
-            "trajectory.points); from the base's folder",
+            ".csv table whose header contains fields of an entry, such as name, box and "
+            "trajectory.points; relative to the folder of the base",
             alias="from",
         ),
     ]
     count: Annotated[
         MinMax[Annotated[int, Field(ge=0)]],
         short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
-        about("how many rows a job has: a number, or [least, largest]"),
+        about("number of rows in a job, or [minimum, maximum]"),
     ]
     ignore: IgnoredColumns = ()
 
@@ -256,35 +258,45 @@ _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "samp
 
 
 class Choice(Section):
-    """Choice of a value for each job, by a single field."""
+    """Choice of a value for each job, by exactly one field."""
 
     uniform: Annotated[
-        MinMax[float] | None, about("a number between two, all equally likely", [0.5, 2])
+        MinMax[float] | None,
+        about("uniformly distributed number between a minimum and a maximum", [0.5, 2]),
     ] = None
     log_uniform: Annotated[
         MinMax[Annotated[float, Field(gt=0)]] | None,
-        about("a number between two above 0, its logarithm uniform", [0.2, 20]),
+        about("number whose logarithm is uniformly distributed between two limits", [0.2, 20]),
     ] = None
     normal: Annotated[
-        Normal | None, about("a normally distributed number", {"mean": 0, "std": 1})
+        Normal | None, about("normally distributed number", {"mean": 0, "std": 1})
     ] = None
     integer: Annotated[
-        MinMax[int] | None, about("a whole number between two, both included", [1, 6])
+        MinMax[int] | None, about("integer from a minimum to a maximum, inclusive", [1, 6])
     ] = None
     choice: Annotated[
         Options,
-        about("one of a list, or of a mapping of names to values", ["velodyne/vlp16", "my.yaml"]),
+        about(
+            "random value from a list, or from a mapping of names to values",
+            ["velodyne/vlp16", "my.yaml"],
+        ),
     ] = None
-    weights: Annotated[Several[Weight] | None, about("of choice: how likely each is", [3, 1])] = (
-        None
-    )
+    weights: Annotated[
+        Several[Weight] | None, about("relative probabilities of the values of choice", [3, 1])
+    ] = None
     each: Annotated[
         Options,
-        about("all of a list in turn; several of these make a grid, the first changes fastest"),
+        about(
+            "all values of a list in turn; several fields with each form a grid, in which the "
+            "first field changes fastest"
+        ),
     ] = None
     sample: Annotated[
         Sample | None,
-        about("rows of a table, added to a list", {"from": "parked.csv", "count": [0, 40]}),
+        about(
+            "random rows of a table that are added to a list",
+            {"from": "parked.csv", "count": [0, 40]},
+        ),
     ] = None
 
     _one_kind = one_of(*_KINDS)
@@ -294,9 +306,9 @@ class Choice(Section):
         """Raise ValueError if the weights do not fit the values of `choice`."""
         if self.weights is not None:
             if self.choice is None or len(self.weights) != len(self.choice):
-                raise ValueError("give as many weights as there are values of choice.")
+                raise ValueError("`weights` must have one weight for each value of `choice`.")
             if not sum(self.weights):
-                raise ValueError("weights must not all be 0.")
+                raise ValueError("At least one of the `weights` must be greater than 0.")
         return self
 
     @property
@@ -336,8 +348,9 @@ class Choice(Section):
     def hint(self, error: str) -> str:
         """Return advice on a limit that a field refuses, to end a message."""
         if self.integer is None and "whole number" in error and not self.options:
-            return " Take integer: [least, largest]."
-        return " Give limits." if self.normal is not None and self.normal.limits is None else ""
+            return " Use `integer: [MIN, MAX]`."
+        has_limits = self.normal is None or self.normal.limits is not None
+        return "" if has_limits else " Set `limits`."
 
     @property
     def words(self) -> str:
@@ -359,7 +372,9 @@ class Choice(Section):
 def _choice(value: Any) -> Any:
     """Return an entry of `vary`, or raise an error for an entry that is not a choice."""
     if not isinstance(value, (dict, Choice)):
-        raise must_be("a way of choosing, {uniform: [0, 1]} or {choice: [1, 4]}")
+        raise must_be(
+            "a mapping that defines the choice, such as {uniform: [0, 1]} or {choice: [1, 4]}"
+        )
     return value
 
 
@@ -385,24 +400,28 @@ class Keep:
 
     format: Annotated[
         Literal[tuple(DATA_SETS)],  # type: ignore[valid-type]
-        about("kitti, nuscenes, webdataset, mcap, parquet, images; folder: a cloud a job"),
+        about(
+            "kitti, nuscenes, webdataset, mcap, parquet, images, or folder for one cloud per job"
+        ),
     ] = "kitti"
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        about("layout of points in mcap"),
+        about("layout of the points (mcap only)"),
     ] = "velodyne"
     compensated: Annotated[
         bool,
         about(
-            "points in mcap at the start of the sweep, without times; by default at their firing"
+            "whether points are motion-compensated to the start of the sweep and have no times; "
+            "otherwise, they are at the time of their firing (mcap only)"
         ),
     ] = False
 
     compensated_actors: Annotated[
         bool,
         about(
-            "points of actors where the actor was at the start of the sweep, so that they lie in "
-            "its box; by default where it was at their firing (not in parquet and folder)"
+            "whether points of actors are moved to the pose of the actor at the start of the "
+            "sweep, so that they are inside its box; otherwise, they are at the pose at the time "
+            "of their firing (not for parquet and folder)"
         ),
     ] = False
     pose_rate_hz: Annotated[
@@ -440,30 +459,33 @@ KeepEntry = Annotated[
 
 
 class CampaignSection(Section):
-    """Many jobs from a description: base scenarios, and fields that differ between jobs.
+    """Many jobs that are defined by base scenarios and by fields that differ between jobs.
 
-    Names of files start from the base's folder; the name of the base from the campaign's.
+    File names are relative to the folder of the base. The name of the base is relative to the
+    folder of the campaign.
     """
 
     base: Annotated[
         TextOrTexts,
-        about("a scenario or mesh file, or a list of them that jobs take in turn", min_length=1),
+        about("scenario or mesh file, or a list of them that the jobs use in turn", min_length=1),
     ]
     count: Annotated[
         int | None,
         about(
-            "how many jobs; by default one for each base and value of each, if nothing is drawn",
+            "number of jobs (default if no value is drawn at random: one for each combination of "
+            "bases and values of each)",
             1000,
             ge=1,
             le=MAX_JOBS,
         ),
     ] = None
-    seed: Annotated[Seed, about("another seed draws other values")] = 0
+    seed: Annotated[Seed, about("seed of the random values")] = 0
     vary: Annotated[
         dict[Text, ChoiceEntry],
         may_be_empty(dict[Text, Choice]),
         about(
-            "{path: how its value is chosen}; a path has keys, numbers of entries, or their names",
+            "mapping from the path of a field to the choice of its value; a path consists of keys, "
+            "and of the numbers or names of list entries",
             {"weather.visibility_km": {"log_uniform": [0.2, 20]}},
             {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}},
         ),
@@ -473,11 +495,12 @@ class CampaignSection(Section):
         dict[str, UnitShare],
         may_be_empty(dict[str, UnitShare]),
         about(
-            "{name: share of the jobs}; they add up to 1", {"train": 0.8, "val": 0.1, "test": 0.1}
+            "mapping from the name of a split to its share of the jobs; the shares add up to 1",
+            {"train": 0.8, "val": 0.1, "test": 0.1},
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
-    license: Annotated[str, about("license of the data set, for its card", "CC-BY-4.0")] = ""
-    title: Annotated[str, about("title of the data set; by default the file's name")] = ""
+    license: Annotated[str, about("license of the data set, stated on its card", "CC-BY-4.0")] = ""
+    title: Annotated[str, about("title of the data set (default: the file name)")] = ""
 
     @model_validator(mode="after")
     def _check_splits(self) -> CampaignSection:
@@ -485,11 +508,13 @@ class CampaignSection(Section):
         for name in self.splits:
             if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
                 raise ValueError(
-                    f"the split {name!r} gets a file of its name: take a-z, A-Z, 0-9, - and _."
+                    "The name of a split may only contain the characters a-z, A-Z, 0-9, - and _, "
+                    f"but is {name!r}."
                 )
         if self.splits and not isclose(sum(self.splits.values()), 1, abs_tol=1e-6):
             raise ValueError(
-                f"splits add up to {sum(self.splits.values()):.6g}; they must add up to 1."
+                "The shares of `splits` must add up to 1, but add up to "
+                f"{sum(self.splits.values()):.6g}."
             )
         return self
 
@@ -546,7 +571,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     kind
         Annotation of the list.
     ignore
-        Names of columns to leave out, with * and ?.
+        Names of columns to ignore, which may contain * and ?.
 
     Raises
     ------
@@ -556,7 +581,9 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     """
     entry = next(_entries(kind), None)
     if entry is None:
-        raise LidarError("sample adds entries to a list, such as actors, and this is none.")
+        raise LidarError(
+            "`sample` can only be used on a list such as `actors`, but this field is not a list."
+        )
     try:
         table = _read_cells(path)
         ignored = ignored_columns(table.header, ignore)
@@ -568,7 +595,7 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
     except FileNotFoundError as error:
         raise MissingFileError(not_found(path)) from error
     except (OSError, ValueError, csv.Error, LidarError) as error:
-        raise LidarError(f"{path} is not a usable table: {message_of(error)}") from error
+        raise LidarError(f"{path} cannot be used as a table: {message_of(error)}") from error
     adapter = TypeAdapter(entry)
     mistakes = Mistakes()
     rows = []
@@ -577,7 +604,8 @@ def read_rows(path: Path, kind: Any, ignore: Sequence[str] = ()) -> list[Any]:
         with mistakes.noted(), sentences(model, source):
             if len(cells) > len(table.header):
                 raise LidarError(
-                    f"{source}: it has {len(cells)} cells, and the header {len(table.header)}."
+                    f"{source}: The line has {len(cells)} cells, but the header has "
+                    f"{len(table.header)}."
                 )
             values = [cell for index, cell in enumerate(cells) if index not in ignored]
             rows.append(_checked(adapter, dict(zip(names, values, strict=False))))
@@ -620,12 +648,12 @@ def _check_columns(names: Sequence[str], model: Any) -> None:
         if name and fields and (first := name.split(".")[0]) not in fields and not first.isdigit()
     ]
     if unknown:
-        verb = "columns are" if unknown[1:] else "column is"
+        noun = "columns" if unknown[1:] else "column"
         pronoun = "them" if unknown[1:] else "it"
-        shown = ", ".join(map(printable, unknown))
+        shown = joined([printable(name) for name in unknown])
         raise ValueError(
-            f"its {verb} not known: {shown}.{did_you_mean_each(unknown, fields)} Rename {pronoun}, "
-            f"or leave {pronoun} out with ignore: {in_yaml(unknown)} beside from. Known are "
+            f"it contains the unknown {noun} {shown}.{did_you_mean_each(unknown, fields)} Rename "
+            f"{pronoun}, or set `ignore: {in_yaml(unknown)}`. The available columns are "
             f"{', '.join(fields)}"
         )
 

@@ -114,15 +114,15 @@ def _object_note(scene: Scene, poses: Sequence[Pose], grid: Mapping[str, Any]) -
     lengths_m = (*(upper_m - lower_m), distance_m)
     *sides, distance = (f"{float(f'{length:.3g}'):,g}" for length in lengths_m)
     note = (
-        f"this looks like an object of {' x '.join(sides)} m, not a place to stand in: "
-        f"{plural(len(poses), 'pose')} around and above it, {distance} m from its middle"
+        f"the scene was recognized as an object of {' x '.join(sides)} m, so the default is "
+        f"{plural(len(poses), 'pose')} around and above it, {distance} m from its center"
     )
     if grid:
         width = grid["horizontal_fov_deg"]
         height = grid["vertical_fov_deg"]
         note += (
-            f"; as no sensor is given, a grid of {grid['rays_per_revolution']:,} x "
-            f"{grid['layers']:,} rays from each, over {width:g} x {height:g} degrees around it"
+            f". The default sensor is a grid of {grid['rays_per_revolution']:,} x "
+            f"{grid['layers']:,} rays that covers {width:g} x {height:g} degrees"
         )
     return note
 
@@ -222,15 +222,15 @@ def _inside_note(
     if surroundings is None or not surroundings.views(positions).in_a_body:
         return ""
     return (
-        "the sensor is inside a closed body, and hits only the backs of its surfaces; "
+        "the sensor is inside a closed body and hits only the back faces of its surfaces. "
         f"{seen_from(scene, carried)}"
     )
 
 
 def seen_from(scene: Scene, carried: Mounted) -> str:
-    """Name two poses that see a scene from outside, in the form of a scenario."""
+    """Return a sentence, without its period, with two poses that see a scene from outside."""
     poses = [as_entry(pose) for pose in poses_around(scene, carried)[0:4:2]]
-    return f"from outside it is seen by poses: {on_one_line(poses)}"
+    return f"To view the scene from outside, use poses: {on_one_line(poses)}"
 
 
 def on_one_line(value: Any) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from lidarsim.base.arrays import Floats
-from lidarsim.base.words import plural, rounded
+from lidarsim.base.words import joined, plural, rounded
 from lidarsim.scene.scene import Scene
 from lidarsim.simulator.sampling import sample_ranges
 from lidarsim.survey.survey import Survey
@@ -24,7 +24,7 @@ MAX_TRIANGLES = 2_000_000
 
 
 def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None) -> str:
-    """Return the most likely reason why a survey gives no points, as a clause.
+    """Return the most likely reason why a survey gives no points, without a last period.
 
     Some rays are cast without limits of range and without effects: if these rays meet nothing, the
     reason is the pose, or the unit of the scene; else the range, or an effect. `scans` are the
@@ -34,22 +34,25 @@ def empty_cloud_reason(scene: Scene, survey: Survey, scans: range | None = None)
     if survey.scan_count == 0 or (scans is not None and not len(scans)):
         return "no scan was cast"
     if scene.triangles > MAX_TRIANGLES:
-        return f"check ranges, poses and units; {_start(scene, survey)}"
+        return f"check the ranges, poses and units. {_start(scene, survey)}"
     ranges = sample_ranges(scene, survey, scans)
     if not len(ranges):
         faults = "faults, " * bool(survey.faults)
         unseen = "unseen, " * any(carried.unseen for carried in survey.carried)
         poses_note = seen_from(scene, survey.carried[0])
         return (
-            f"no ray hit anything at any distance: check {unseen}{faults}poses and units; "
-            f"{_start(scene, survey)}; {poses_note}"
+            f"no ray hits a surface at any distance. Check {unseen}{faults}poses and units. "
+            f"{_start(scene, survey)}. {poses_note}"
         )
     limits = [*dict.fromkeys(_limits(survey, ranges))]
     if not limits:
-        return f"rays meet surfaces at {_span(ranges)}, and no return is reported: check " + (
-            ", ".join(_effects(survey)) or "the surfaces"
+        suspects = joined([*_effects(survey)]) or "the surfaces"
+        return (
+            f"rays hit surfaces at ranges from {_span(ranges)}, but no return is reported. "
+            f"Check {suspects}"
         )
-    return f"{'; '.join(limits)}: check ranges, poses and units; {_start(scene, survey)}"
+    clauses = ", and ".join(limits)
+    return f"{clauses}. Check the ranges, poses and units. {_start(scene, survey)}"
 
 
 def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
@@ -58,8 +61,8 @@ def empty_jobs_warning(empty: Sequence[JobRow], reason: str) -> str:
     if unnamed := len(empty) - NAMED_JOBS:
         names += f" and {unnamed:,} more" * (unnamed > 0)
     jobs = f"{plural(len(empty), 'job has', 'jobs have')} {NO_POINTS}{names}"
-    advice = "; lidarpool check CAMPAIGN --job N says the most likely reason"
-    return f"{jobs}; in job {empty[0].name} {reason}" if reason else jobs + advice
+    advice = "To see the most likely reason, run `lidarpool check CAMPAIGN --job N`"
+    return f"{jobs}. Job {empty[0].name}: {reason}" if reason else f"{jobs}. {advice}"
 
 
 def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
@@ -72,13 +75,13 @@ def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
         return
     if too_near.any():
         yield (
-            f"{'all' if too_near.all() else 'some'} surfaces are nearer than the sensor's minimum "
-            f"range: min_range_m is {min(lower):g}, and they are at {_span(ranges[too_near])}"
+            f"{'all' if too_near.all() else 'some'} surfaces are closer than min_range_m, which is "
+            f"{min(lower):g} m, at ranges from {_span(ranges[too_near])}"
         )
     if too_far.any():
         yield (
-            f"{'all' if too_far.all() else 'some'} surfaces are farther than the sensor's maximum "
-            f"range: max_range_m is {max(upper):g}, and they are at {_span(ranges[too_far])}"
+            f"{'all' if too_far.all() else 'some'} surfaces are farther than max_range_m, which is "
+            f"{max(upper):g} m, at ranges from {_span(ranges[too_far])}"
         )
 
 
@@ -106,4 +109,4 @@ def _span(ranges: Floats) -> str:
 def _start(scene: Scene, survey: Survey) -> str:
     """Return the first position of the sensor in words, in the coordinates of the scenario."""
     (x, y, z) = survey.pose(0).position + scene.origin
-    return f"the sensor begins at ({x:,.3f}, {y:,.3f}, {z:,.3f})"
+    return f"The sensor starts at ({x:,.3f}, {y:,.3f}, {z:,.3f})"

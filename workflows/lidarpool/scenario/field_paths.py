@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from lidarsim.base.errors import LidarError
 from lidarsim.base.field_advice import owner_of_file, owners_by_level
 from lidarsim.base.section_fields import fields_by_name, fields_of, is_section, sections_in
-from lidarsim.base.words import did_you_mean, plural, shortened
+from lidarsim.base.words import did_you_mean, listed, plural, shortened
 
 from .scenario import Scenario
 
@@ -53,10 +53,10 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             key, part_count = _match_entry(node, remaining, path)
             node = node[key]
         else:
-            reason = f"{path} has no fields of its own"
+            reason = f"{path} has no fields"
             if node is None:
                 reason = f"the base has no {path}"
-            raise LidarError(f"{text} leads to no field: {reason}.")
+            raise LidarError(f"{text} does not refer to a field, because {reason}.")
         steps.append((key, node))
         remaining = remaining[part_count:]
     return tuple(steps), kind
@@ -116,9 +116,9 @@ def _match_name(names: Sequence[str], path_parts: Sequence[str], path: str) -> t
         if (name := ".".join(path_parts[:part_count])) in names:
             return name, part_count
     hint = did_you_mean(path_parts[0], names) or (
-        f" It has {', '.join(names[:5])}." if names else ""
+        f" Available names: {listed(names, 5)}." if names else ""
     )
-    raise LidarError(f"{path} of the base has no {path_parts[0]!r}.{hint}")
+    raise LidarError(f"{path} of the base has no entry {path_parts[0]!r}.{hint}")
 
 
 def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -> tuple[int, int]:
@@ -129,8 +129,8 @@ def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -
         if index < len(entries):
             return index, 1
         raise LidarError(
-            f"{path} of the base has {plural(len(entries), 'entry', 'entries')}, counted from 0, "
-            f"and no entry {shortened(path_parts[0])}."
+            f"{path} of the base has {plural(len(entries), 'entry', 'entries')}, so entry "
+            f"{shortened(path_parts[0])} does not exist. Entries are counted from 0."
         )
     names = [getattr(entry, "name", None) for entry in entries]
     name, part_count = _match_name(

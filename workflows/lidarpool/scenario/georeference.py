@@ -30,11 +30,13 @@ def check_epsg(epsg: int, scene: Scene) -> None:
         meters. Without rasterio, only systems for maps of the world are refused.
     """
     x, y = _middle(scene).tolist()
-    problem = target_problem(epsg, x, y, why_there=", where the scene is (world.origin moves it)")
+    problem = target_problem(
+        epsg, x, y, why_there=", where the scene is (`world.origin` moves the scene)"
+    )
     if problem and outside_system(epsg, x, y):
         raise LidarError(place_problem(scene, epsg))
     if problem:
-        raise LidarError(f"world.epsg (in Python epsg=) is {problem}.")
+        raise LidarError(f"`world.epsg` (`epsg` in Python) is {problem}.")
 
 
 def warn_of_place(scene: Scene, epsg: int | None) -> None:
@@ -63,9 +65,9 @@ def place_problem(scene: Scene, epsg: int | None) -> str:
         origin = _in_words(scene.world_origin)
         in_files = _in_words(_middle(scene) - scene.world_origin[:2])
         return (
-            f"world.origin, {origin}, is added to coordinates that are near it already, as the "
-            f"files of the scene are at {in_files}. If these are world coordinates, remove "
-            "world.origin."
+            f"`world.origin` ({origin}) is added to the coordinates of the scene's files, although "
+            f"these are already close to it ({in_files}). If they are world coordinates, remove "
+            "`world.origin`."
         )
     return ""
 
@@ -91,17 +93,17 @@ def _remedies(epsg: int, scene: Scene) -> str:
     placed = _middle(scene)
     in_files = placed - scene.world_origin[:2]
     zone = zone_in_area(epsg, *placed.tolist())
-    example = "" if zone is None else f", such as EPSG:{zone}, by which they are inside this area"
-    other_system = f"set world.epsg to the system of these coordinates{example}"
+    example = "" if zone is None else f", such as EPSG:{zone}, in which they are inside this area"
+    other_system = f"set `world.epsg` to the system of these coordinates{example}"
     if (placed != in_files).any():
-        fits = "" if outside_system(epsg, *in_files.tolist()) else ", which puts it inside"
+        fits = "" if outside_system(epsg, *in_files.tolist()) else ", which moves it inside"
         return (
-            f"If the files of the scene have world coordinates, remove world.origin{fits}. "
+            f"If the files of the scene have world coordinates, remove `world.origin`{fits}. "
             f"Otherwise, {other_system}."
         )
     return (
         f"If the files of the scene have world coordinates, {other_system}. If they have local "
-        "coordinates, set world.origin to the place of their zero."
+        "coordinates, set `world.origin` to the world coordinates of their origin."
     )
 
 

@@ -49,20 +49,23 @@ class StandingSurfaces:
             return self._selections[key]
         if scene is None:
             raise LidarError(
-                "there is nothing to stand on: add scene.files, or scene.ground and a rectangle "
-                "(within)."
+                "The scene has no surface to place objects on. Add `scene.files`, or "
+                "`scene.ground` and a rectangle as `within`."
             )
         rows = [rows_named(name, scene.names) for name in names]
         for name, matches in zip(names, rows, strict=True):
             if not len(matches):
                 raise LidarError(
-                    f"surfaces names {name!r}, but no object has that name."
+                    f"`surfaces` contains {name!r}, but no object has that name."
                     f"{name_hint(name, scene.names)}"
                 )
         matches = np.unique(np.concatenate(rows))
         selected = self if len(matches) == len(scene.names) else StandingSurfaces(scene, matches)
         if not len(selected._tops[0]):
-            raise LidarError(f"nothing of {', '.join(map(repr, names))} faces up.")
+            raise LidarError(
+                f"{', '.join(map(repr, names))} cannot be used as surfaces, because none of their "
+                "triangles faces up."
+            )
         self._selections[key] = selected
         return selected
 
@@ -173,8 +176,8 @@ def _step_times(track: Track) -> Floats:
     steps = np.maximum(np.ceil(distances_m / STEP_M), 1).astype(np.int64)
     if steps.sum() > MAX_STEPS:
         raise LidarError(
-            f"the trajectory is {distances_m.sum() / 1000:,.0f} km long; at most "
-            f"{MAX_STEPS * STEP_M / 1000:,.0f} km can follow surfaces."
+            f"The trajectory is {distances_m.sum() / 1000:,.0f} km long, but the limit for "
+            f"following surfaces is {MAX_STEPS * STEP_M / 1000:,.0f} km."
         )
     shares = np.concatenate([np.arange(n) / n for n in steps.tolist()])
     segments = np.repeat(np.arange(len(steps)), steps)

@@ -105,7 +105,7 @@ class _PassageCollector:
             raise ValueError("a message has no timestamp")
         time_s = self._clock.seconds(truth.timestamp.seconds + truth.timestamp.nanos / 1e9)
         if time_s < self.time_s:
-            raise ValueError(f"the time {time_s:g} comes before {self.time_s:g} s")
+            raise ValueError(f"the time {time_s:g} s is before the previous time {self.time_s:g} s")
         if time_s == self.time_s:  # message of another topic, or of another sensor
             return
         self.time_s = time_s
@@ -176,20 +176,22 @@ def read_osi(
             break
     if collector.message < 0:
         raise LidarError(
-            f"{path} has no ground truth: give a trace of messages GroundTruth, or SensorView that "
-            "contain them."
+            f"{path} contains no ground truth. It must contain GroundTruth messages, or SensorView "
+            "messages with ground truth."
         )
     notes = []
     if collector.shapeless:
         kinds = ", ".join(sorted(set(collector.shapeless.values())))
         notes.append(
-            f"{section.file}: {plural(len(collector.shapeless), 'moving object')} without "
-            f"dimensions left out ({kinds}): give entries of traffic.vehicles for these types"
+            f"{plural(len(collector.shapeless), 'moving object')} in {section.file} "
+            f"{'was' if len(collector.shapeless) == 1 else 'were'} skipped because of missing "
+            f"dimensions ({kinds}). Add entries for these types to `traffic.vehicles`"
         )
     if stationary:
         notes.append(
-            f"{section.file}: {plural(stationary, 'stationary object')} left out: only moving "
-            "objects are actors"
+            f"{plural(stationary, 'stationary object')} in {section.file} "
+            f"{'was' if stationary == 1 else 'were'} skipped, because only moving objects are "
+            "actors"
         )
     present = [
         passage
@@ -220,8 +222,8 @@ def _ground_truths(path: Path) -> Iterator[Any]:
             if is_mcap or kind is not None:
                 raise
             raise LidarError(
-                "its first message is neither GroundTruth nor SensorView, or might be both: name "
-                "the file as in town_gt.osi or town_sv.osi."
+                "its first message is not clearly a GroundTruth or SensorView message. State the "
+                "type in the file name, as in town_gt.osi or town_sv.osi."
             ) from error
     while truth is not None:
         yield truth
@@ -238,7 +240,8 @@ def _message_type(osi: Any, path: Path) -> str | None:
     if kind in (None, "GroundTruth", "SensorView"):
         return kind
     raise LidarError(
-        f"it has messages {kind} by its name: give a trace of GroundTruth or SensorView."
+        f"its name states messages of type {kind}, but only GroundTruth and SensorView are "
+        "supported."
     )
 
 
@@ -265,7 +268,7 @@ def _size_of(moving: Any) -> tuple[float, float, float] | None:
     if sides == (0.0, 0.0, 0.0):
         return None
     if not all(0 < side <= _MAX_SIZE_M for side in sides):
-        raise ValueError(f"a moving object has the dimensions {sides}, meters")
+        raise ValueError(f"a moving object has the invalid dimensions {sides} m")
     return sides
 
 

@@ -133,10 +133,11 @@ def _position_warnings(
         inside = np.array([seen is not None and seen.in_a_body(xyz) for seen, xyz in pairs])
         advice = ""  # other poses replace poses, and no trajectory
         if (under | inside).any() and not survey.path.moves:
-            advice = f"; {seen_from(scene, survey.carried[0])}"
+            advice = f". {seen_from(scene, survey.carried[0])}"
         if under.any():
             yield (
-                f"the sensor is under the scene{where(under)}: check z, heights and up_axis{advice}"
+                f"the sensor is below the scene{where(under)}. Check z, the heights and `up_axis`"
+                f"{advice}"
             )
         inside &= ~under
         if inside.any():
@@ -144,10 +145,10 @@ def _position_warnings(
             seen = seen_by[first.sensor]
             assert seen is not None  # it is inside a body of these
             yield (
-                f"the sensor is inside a closed body{where(inside)}, in "
-                f"{printable(seen.name_around(first.position))!r}, and hits only the backs of its "
-                f"surfaces{advice}; if it is the sensor's housing, give its name as unseen of the "
-                "sensor"
+                "the sensor is inside the closed body "
+                f"{printable(seen.name_around(first.position))!r}{where(inside)} and hits only the "
+                f"back faces of its surfaces{advice}. If the body is the sensor housing, add its "
+                "name to `unseen` of the sensor"
             )
     for actor, name in enumerate(scene.object_names[len(scene.names) :]):
         masks = (unseen[sample.sensor] for sample in samples)
@@ -155,8 +156,8 @@ def _position_warnings(
         inside = _inside_actor(scene.actors[actor], samples) & is_seen
         if inside.any():
             yield (
-                f"the sensor is inside {name}{where(inside)}: check "
-                "its mount, and the trajectories, or give the name as unseen of the sensor"
+                f"the sensor is inside {name}{where(inside)}. Check its mount and the "
+                "trajectories, or add the name to `unseen` of the sensor"
             )
 
 
@@ -189,9 +190,7 @@ def _bad_positions(
     """
     first = samples[int(is_bad.argmax())]
     x, y, z = first.position + scene.origin
-    share = f" at {is_bad.sum()} of {len(is_bad)} positions that were tried, first" * (
-        not is_bad.all()
-    )
+    share = f" at {is_bad.sum()} of {len(is_bad)} tested positions, first" * (not is_bad.all())
     time = f", {rounded(first.time_ns / 1e9, 4)} s after the start" * moves
     return f"{share} at ({x:,.3f}, {y:,.3f}, {z:,.3f}){time}"
 
@@ -234,13 +233,13 @@ def _noise_warnings(survey: Survey, sight_m: float) -> Iterator[str]:
             value = float(np.max(np.abs(getattr(noise, field))))
             if value > NOISE_SHARE * range_m:
                 yield (
-                    f"noise.{field}{name} is {rounded(value, 4)} m, more than a tenth of the "
-                    f"range, {rounded(range_m, 4)} m: give it in meters"
+                    f"`noise.{field}`{name} is {rounded(value, 4)} m, which is more than a tenth "
+                    f"of the range ({rounded(range_m, 4)} m). Check that it is in meters"
                 )
         if noise.range_per_m > NOISE_SHARE:
             yield (
-                f"noise.range_per_m{name} is {noise.range_per_m:g}, more than a tenth of the "
-                "range: give meters for each meter of range"
+                f"`noise.range_per_m`{name} is {noise.range_per_m:g}, which is more than a tenth "
+                "of the range. Check that it is in meters per meter of range"
             )
 
 
@@ -286,16 +285,16 @@ def _speed_warnings(motion: _Motion, *, flies: bool) -> Iterator[str]:
     if (speeds > limit_m_s).any():
         fastest = int(speeds.argmax())
         yield (
-            f"the carrier moves at {rounded(speeds[fastest], 4)} m/s at {_time(motion, fastest)}, "
-            f"and carriers {medium} stay below {limit_m_s:g} m/s: check the units of positions and "
-            "times"
+            f"the platform moves at {rounded(speeds[fastest], 4)} m/s at {_time(motion, fastest)}, "
+            f"but platforms {medium} do not exceed {limit_m_s:g} m/s. Check the units of positions "
+            "and times"
         )
     if (rates > MAX_RATE_DEG_S).any():
         fastest = int(rates.argmax())
         yield (
-            f"the carrier turns at {rounded(rates[fastest], 4)} degrees a second at "
-            f"{_time(motion, fastest)}, and carriers stay below {MAX_RATE_DEG_S:g}: check times, "
-            "and the units and the order of angles or quaternions"
+            f"the platform rotates at {rounded(rates[fastest], 4)} degrees per second at "
+            f"{_time(motion, fastest)}, but platforms do not exceed {MAX_RATE_DEG_S:g} degrees per "
+            "second. Check the times, and the units and the order of angles or quaternions"
         )
 
 
@@ -321,9 +320,9 @@ def _up_axis_warnings(motion: _Motion, lowest_m: float) -> Iterator[str]:
         and extent_m[flat_axis] < _FLAT * extent_m[2]
     ):
         yield (
-            f"the trajectory rises and falls by {rounded(extent_m[2], 4)} m, and stays within "
-            f"{rounded(extent_m[flat_axis])} m along {'xy'[flat_axis]}: give positions with z up, "
-            f"in meters (is {'xy'[flat_axis]} the up axis of its file?)"
+            f"the trajectory extends over {rounded(extent_m[2], 4)} m along z, but only over "
+            f"{rounded(extent_m[flat_axis])} m along {'xy'[flat_axis]}. Positions must be in "
+            f"meters with z up. Check whether {'xy'[flat_axis]} is the up axis of its file"
         )
 
 
@@ -340,21 +339,21 @@ def _orientation_warnings(motion: _Motion) -> Iterator[str]:
     faults = []
     if tilted or is_w_first:
         tilt = np.degrees(np.arccos(np.clip(as_given.level, -1, 1)))
-        faults.append(f"the carrier's z axis is {tilt:.0f} degrees from up")
+        faults.append(f"the z axis of the platform is tilted by {tilt:.0f} degrees from vertical")
     if as_given.askew:
         faults.append(
-            f"the carrier faces {abs(as_given.angle_deg):.0f} degrees to the "
-            f"{'left' if as_given.angle_deg > 0 else 'right'} of its direction of travel, all along"
+            f"the platform constantly faces {abs(as_given.angle_deg):.0f} degrees to the "
+            f"{'left' if as_given.angle_deg > 0 else 'right'} of its direction of travel"
         )
-    advice = "check the order of quaternions (x, y, z, w), and the units and axes of angles"
+    advice = "Check the order of quaternions (x, y, z, w) and the units and axes of angles"
     if is_w_first:
         advice = (
-            "its quaternions are probably in the order w, x, y, z, by which it is level and faces "
-            "its direction of travel: give them in the order x, y, z, w"
+            "Its quaternions are probably in the order w, x, y, z, because in that order the "
+            "platform is level and faces its direction of travel. Use the order x, y, z, w"
         )
     elif not tilted:
-        advice += "; if the sensor is mounted so, give the angle as its mount"
-    yield f"{' and '.join(faults)}: {advice}"
+        advice += ". If the sensor is mounted at this angle, set the angle in its `mount`"
+    yield f"{' and '.join(faults)}. {advice}"
 
 
 class _Facing(NamedTuple):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32, Indices, Ints
-from lidarsim.base.errors import LidarError, explained, prefixed, unreadable
+from lidarsim.base.errors import LidarError, as_sentence, explained, prefixed, unreadable
 from lidarsim.base.input_files import check_input
 from lidarsim.base.words import plural, printable
 from lidarsim.scene.files.intensity_scales import from_zero
@@ -124,10 +124,10 @@ def read_points(
     reader = points_reader(path)
     if reader is None:
         if advice := advice_on(path):
-            raise LidarError(f"{path} is not read: {advice}.")
+            raise LidarError(f"{path} cannot be read. {as_sentence(advice)}")
         raise LidarError(
-            f"{path} has the ending {path.suffix or '(none)'}; point clouds are read from "
-            f"{' '.join(point_suffixes())}."
+            f"{path} has the extension {path.suffix or '(none)'}, but point clouds must have one "
+            f"of these extensions: {' '.join(point_suffixes())}."
         )
     try:
         with explained(f"{path} cannot be read"), prefixed(path):
@@ -148,11 +148,11 @@ def read_points(
         tell(f"{path} {note}")
     if content.no_returns:
         tell(
-            f"{path}: {content.no_returns:,} points at zero are left out, as pulses without a "
-            "return"
+            f"{plural(content.no_returns, 'point')} of {path} at the origin "
+            f"{'was' if content.no_returns == 1 else 'were'} skipped as pulses without a return"
         )
     if names := _left_out(content):
-        tell(f"{path}: not kept, because surfels have no room for them: {', '.join(names)}")
+        tell(f"{path} has data that surfels cannot store and that were skipped: {', '.join(names)}")
     return points
 
 
@@ -160,17 +160,14 @@ def _check_points(path: Path, points: ScannedPoints, left_out: LeftOut) -> None:
     """Raise LidarError if there are too few points, or a point is farther than any on Earth."""
     if len(points) < MIN_POINTS and (note := left_out.note()):
         raise LidarError(
-            f"{path} has {plural(len(points), 'point')} to use, and at least {MIN_POINTS} are "
-            f"needed: {note}."
+            f"{path} must have at least {MIN_POINTS} usable points, but has {len(points)}: {note}."
         )
     if len(points) < MIN_POINTS:
-        raise LidarError(
-            f"{path} has {plural(len(points), 'point')}, and at least {MIN_POINTS} are needed."
-        )
+        raise LidarError(f"{path} must have at least {MIN_POINTS} points, but has {len(points)}.")
     if (reach := np.abs(points.positions).max()) > MAX_COORDINATE_M:
         raise LidarError(
-            f"{path} reaches {reach:.3g} m from zero, farther than anything on Earth: it is "
-            "broken, or in another unit (--unit, in Python unit=)."
+            f"{path} extends {reach:.3g} m from the origin, which is farther than anything on "
+            "Earth. If the file is not damaged, set its unit with `--unit` (`unit` in Python)."
         )
 
 
@@ -204,7 +201,7 @@ def _to_meters(
     finite = content.positions[np.isfinite(content.positions).all(axis=1)]
     if epsg is not None:
         if unit is not None:
-            raise LidarError("epsg takes the units of the file's system: leave out unit.")
+            raise LidarError("`epsg` and `unit` cannot be combined.")
         reprojection = Reprojection(content.system, epsg)
         reprojection.check(finite[:: len(finite) // _SAMPLE + 1])
         notes = reprojection.notes
@@ -217,7 +214,7 @@ def _to_meters(
         elif content.units_m is not None and unit is None:
             meters = content.units_m
             lengths = ", ".join(f"{length:g}" for length in meters)
-            notes = [f"was converted to meters: its header names units of {lengths} m"]
+            notes = [f"was converted to meters, because its header states units of {lengths} m"]
         else:
             meters, notes = stated_meters(content.system, finite, unit)
         convert = partial(np.multiply, meters)
@@ -250,7 +247,7 @@ def _scanned_points(
             outward = scanners - positions
         except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
             scanners = outward = None
-            content.ignored.append("positions of scanners without a place in that system")
+            content.ignored.append("scanner positions that cannot be converted to that system")
     classes = _first(columns, CLASSES)
     intensities = _first(columns, INTENSITIES)
     if intensities is not None:
@@ -303,7 +300,7 @@ def _as_integers(classes: AnyArray) -> Ints:
         classes = np.where(np.isnan(classes), float(NO_CLASS), classes)
     numbers = classes.astype(np.int64)
     if not np.array_equal(numbers, classes):
-        raise ValueError("classes of its points are not whole numbers")
+        raise ValueError("the classes of its points must be integers")
     return numbers
 
 

@@ -42,7 +42,7 @@ _SAMPLE = 20_000  # points whose neighbors tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _MAX_VOXELS = 1 << 62  # voxels of the box around the points: 64 bits number voxels
 CLASS_MATERIAL = "class "  # and the number: name of the material of surfels with a class
-_GRAY = "take the mean color of their neighbors, or are gray"  # in notes
+_GRAY = "have the mean color of their neighbors, or are gray"  # in notes
 _LEAST_LOSS = 0.02  # share of returns lost in gaps that a note tells
 # docs/how-to/point-clouds.md has the scans
 _MEASURED_LOSS = "4 to 40 % in scenes of one to three scans of a city"
@@ -143,17 +143,17 @@ class PointScene(NamedTuple):
     def gap_note(self) -> str:
         """A note on returns that are lost in gaps between points, or ""."""
         larger_m = rounded(2 * self.voxel_m, 2)
-        advice = f"A larger --voxel-m (in Python voxel_m=), such as {larger_m}, closes gaps"
+        advice = f"To close gaps, increase `--voxel-m` (`voxel_m` in Python), such as to {larger_m}"
         if self.loss is None:
             return (
-                "returns are lost in gaps between points. The share cannot be estimated, because "
-                f"the scanner's positions are not known; it was {_MEASURED_LOSS}. {advice}"
+                "returns are lost in gaps between points. Their share cannot be estimated, because "
+                f"the scanner positions are unknown. It was {_MEASURED_LOSS}. {advice}"
             )
         if self.loss < _LEAST_LOSS:
             return ""
         return (
-            f"about {self.loss:.0%} of the returns would be lost in gaps between points, such as "
-            f"those between rings, in scans from the same positions. {advice}"
+            f"scans from the same positions would lose about {self.loss:.0%} of the returns in "
+            f"gaps between points, such as those between rings. {advice}"
         )
 
 
@@ -171,7 +171,7 @@ def points_to_scene(
     """Make a scene of a point cloud as `scene_of_points`, and estimate what it loses."""
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
-            raise LidarError(f"{name} is {value}; it must be a positive number.")
+            raise LidarError(f"{name} must be a positive number, but is {value}.")
     points = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
     points = _colored(path, points, color, tell)
     surfels = _surfels_of(path, points, voxel_m, size)
@@ -205,7 +205,7 @@ def _colored(
     present = {"rgb": points.colors is not None, "intensity": points.intensities is not None}
     if color is not None and not present[color]:
         quantity = "colors" if color == "rgb" else "intensities"
-        raise LidarError(f"{path} has no {quantity}: leave out color {color}.")
+        raise LidarError(f"`color` cannot be {color!r}, because {path} has no {quantity}.")
     if points.classes is not None:
         _note_unknown(path, "class", points.classes == NO_CLASS, "have no material", tell)
     if not any(present.values()):
@@ -213,7 +213,10 @@ def _colored(
     color = color or next(name for name, is_present in present.items() if is_present)
     if all(present.values()):
         other, choice = ("intensities", "intensity") if color == "rgb" else ("colors", "rgb")
-        tell(f"{path}: {other} are not kept, because surfels have a color: choose color {choice}")
+        tell(
+            f"the {other} of {path} are not stored, because a surfel has a single color. To use "
+            f"them, set `color` to {choice}"
+        )
     if points.colors is not None and color == "rgb":
         _note_unknown(path, "color", np.isnan(points.colors[:, 0]), _GRAY, tell)
         return replace(points, intensities=None)
@@ -242,19 +245,19 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
     o3d = load_open3d()
     voxel_m = voxel_m or _spacing_m(o3d, positions)
     if not voxel_m:
-        raise LidarError(f"{path} has most of its points in the same places: give voxel_m.")
+        raise LidarError(f"Most points of {path} have the same positions. Set `voxel_m`.")
     voxels = Voxels.of_points(path, positions, voxel_m)
     count = len(voxels.counts)
     if count * POINT_BYTES > memory() // 2:
         raise LidarError(
-            f"{path} makes {count:,} surfels, which take {bytes_of(count * POINT_BYTES)} of "
-            f"memory, of at most {bytes_of(memory() // 2)}: give a larger voxel_m than "
-            f"{voxel_m:.3g}."
+            f"{path} would result in {count:,} surfels, which require "
+            f"{bytes_of(count * POINT_BYTES)} of memory, but the limit is "
+            f"{bytes_of(memory() // 2)}. Increase `voxel_m`, which is {voxel_m:.3g}."
         )
     if count < _NEIGHBORS:
         raise LidarError(
-            f"{path} has {count} points in different voxels of {voxel_m:.3g} m, and at least "
-            f"{_NEIGHBORS} are needed: give a smaller voxel_m, or another cloud."
+            f"The points of {path} are in {plural(count, 'voxel')} of {voxel_m:.3g} m, but at "
+            f"least {_NEIGHBORS} are required. Reduce `voxel_m`, or use a different cloud."
         )
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(voxels.means(positions)))
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBORS))
@@ -299,7 +302,7 @@ class Voxels:
         spans = (positions.max(axis=0) - lower) / voxel_m + 1
         if spans.prod() > _MAX_VOXELS:
             raise LidarError(
-                f"{path} is too wide for voxels of {voxel_m:.3g} m: give a larger voxel_m."
+                f"{path} is too large for voxels of {voxel_m:.3g} m. Increase `voxel_m`."
             )
         # The first voxel has the lowest point in its middle.
         cells = np.floor((positions - lower) / voxel_m + 0.5).astype(np.int64)

@@ -52,8 +52,8 @@ _NAMING_FILES = {"file", "calibration", "model", "times"}  # fields whose texts 
 # Options of a mesh file without a scenario, and the fields of a scenario for them.
 MESH_OPTIONS = {
     "sensor": "sensor",
-    "unit": "unit of scene.files",
-    "up_axis": "up_axis of scene.files",
+    "unit": "scene.files.unit",
+    "up_axis": "scene.files.up_axis",
     "pose": "poses",
     "columns": "cloud.columns",
     "format": "output.write",
@@ -93,13 +93,16 @@ def _with_sensor(path: Path, data: Any, options: Mapping[str, Any]) -> Any:
     if is_campaign or {*options} != {"sensor"}:
         name = next((name for name in options if name != "sensor"), "sensor")
         raise LidarError(
-            f"--{name.replace('_', '-')} is for a mesh file: in {path}"
-            f"{', or rather its base' * is_campaign}, change {MESH_OPTIONS[name]}."
+            f"`--{name.replace('_', '-')}` requires a mesh file. Set `{MESH_OPTIONS[name]}` in "
+            f"{'the base of ' * is_campaign}{path} instead."
         )
     if not isinstance(data, dict):
         return data  # `from_data` says what is wrong
     if "sensors" in data:
-        raise LidarError(f"--sensor is for one sensor: in {path}, change sensors.")
+        raise LidarError(
+            f"`--sensor` requires a scenario with a single sensor. Change `sensors` in {path} "
+            "instead."
+        )
     return data | {"sensor": mesh_data([], path.parent, options)["sensor"]}
 
 
@@ -140,9 +143,9 @@ class Scenario(Section):
     poses: Annotated[
         Several[PoseEntry] | None,
         about(
-            "poses of the sensor in the scene, meters, Z-up; by default 1, 2 and 3 m "
-            "above the origin (objects of the demo) or the middle of the floor (files), below the "
-            "ceiling, or around an object that is no place to stand in",
+            "poses of the sensor in the scene, in meters with z up (default: 1, 2 and 3 m above "
+            "the origin for the objects of the demo; for files, above the center of the floor and "
+            "below the ceiling, or around the scene if it is a single object)",
             [[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}],
             min_length=1,
             max_length=1_000_000,
@@ -151,15 +154,15 @@ class Scenario(Section):
     trajectory: Annotated[
         TrajectoryEntry | None,
         about(
-            "instead of poses: the trajectory of a carrier, from a TUM, KITTI or "
-            ".csv file, points, or a vehicle of traffic",
+            "trajectory of the platform, from a TUM, KITTI or .csv file, from points or from a "
+            "vehicle in the traffic; replaces poses",
             "drive.tum",
         ),
     ] = None
     sensors: Annotated[
         dict[Text, CarriedEntry],
         about(
-            "instead of sensor: several on one carrier, by name, each with its mount",
+            "sensors on one platform, by name, each with its mount; replaces sensor",
             {"roof": {"model": "ouster/os1-64", "mount": [0, 0, 2]}, "front": "velodyne/vlp16"},
             max_length=MAX_SENSORS,
         ),
@@ -167,8 +170,8 @@ class Scenario(Section):
     actors: Annotated[
         Several[ActorSection],
         about(
-            "objects that move, or stand at a pose: meshes, boxes or robots; one without "
-            "trajectory and at is the carrier",
+            "meshes, boxes or robots that move or are stationary; an actor without trajectory and "
+            "at is the platform",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
             [{"name": "Crane", "file": "crane.urdf", "at": [4, 5, 0]}],
             max_length=10_000,
@@ -177,14 +180,14 @@ class Scenario(Section):
     traffic: Annotated[
         TrafficSection | None,
         about(
-            "vehicles and persons of a simulation with SUMO, or of a trace of OSI, as actors",
+            "vehicles and persons of a SUMO simulation or of an OSI trace, as actors",
             {"file": "fcd.xml", "vehicles": [{"box": [4.5, 1.8, 1.5], "class": 10}]},
         ),
     ] = None
     mount: Annotated[
         MountEntry | None,
         about(
-            "pose of the sensor on its carrier, in the carrier's axes",
+            "pose of the sensor on its platform, in the axes of the platform",
             [1, 0, 2],
             {"position": [1, 0, 2], "pitch_deg": 10},
         ),
@@ -192,22 +195,26 @@ class Scenario(Section):
     steps: Annotated[
         StepCount | None,
         about(
-            "time steps (scans) at each pose; by default along a trajectory as many as fit into it",
+            "number of time steps (scans) at each pose (default along a trajectory: as many as fit "
+            "into its duration)",
             36,
         ),
     ] = None
     materials: Annotated[
         Several[Material],
         about(
-            "materials by names of objects and of their materials; the first entry for a face "
-            "counts",
+            "materials, by names of objects and of materials in their files; the first matching "
+            "entry applies",
             [{"objects": "Window*", "transparent": "pass"}, {"objects": "*", "reflectance": 0.3}],
             max_length=100_000,
         ),
     ] = ()
     classes: Annotated[
         ClassNames,
-        about("names of classes, for reports and files; they add the column class", {40: "road"}),
+        about(
+            "names of semantic classes for reports and files; they add the column class",
+            {40: "road"},
+        ),
     ] = {}  # noqa: RUF012 - of a frozen model
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
@@ -215,13 +222,13 @@ class Scenario(Section):
     navigation: Annotated[
         Navigation | None,
         about(
-            "IMU and GNSS receiver of the carrier, with errors that drift",
+            "IMU and GNSS receiver of the platform, with drifting errors",
             {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
         ),
     ] = None
     faults: Annotated[
         Several[Fault],
-        about("faults of sensors", [{"kind": "dirt", "transmission": 0.3}], max_length=256),
+        about("faults of the sensors", [{"kind": "dirt", "transmission": 0.3}], max_length=256),
     ] = ()
     cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
     output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
@@ -317,16 +324,19 @@ class Scenario(Section):
         name_counts = Counter([*copies, *(entry.name for entry in self.actors)])
         if twice := next((name for name in copies if name_counts[name] > 1), None):
             yield (
-                f"{twice!r} is the name of two entries of scene.copies and actors: give each its "
-                "own."
+                f"The names in `scene.copies` and `actors` must be unique, but {twice!r} is used "
+                "more than once."
             )
         if self.sensors and (self.sensor != SensorSection() or self.mount):
-            yield "give either sensor and mount, or sensors, each with a mount."
+            yield (
+                "`sensors` cannot be combined with `sensor` or `mount`. Set the mount of each "
+                "entry of `sensors`."
+            )
         gnss = self.navigation and self.navigation.gnss
         if gnss and gnss.origin is not None and any(self.world.origin):
             yield (
-                "navigation.gnss.origin is where the world's zero is, and world.origin moves the "
-                "survey away from it: give world.epsg in place of navigation.gnss.origin."
+                "`navigation.gnss.origin` and `world.origin` cannot be combined. Set `world.epsg` "
+                "instead of `navigation.gnss.origin`."
             )
 
     def _planning_contradictions(self) -> Iterator[str]:
@@ -335,33 +345,40 @@ class Scenario(Section):
         if planning.enabled is False or (planning.start and planning.target):
             return
         if planning != PlanningSection():
-            yield "planning needs a start and a target: give planning.start and planning.target."
+            yield (
+                "`planning` requires a start and a target. Set `planning.start` and "
+                "`planning.target`."
+            )
 
     def _carrier_contradictions(self) -> Iterator[str]:
         """Yield the reasons why trajectory, poses, carrier and mounts do not fit together."""
         if self.trajectory is not None and self.trajectory.beyond != "refuse":
-            yield "trajectory.beyond is for actors; the carrier's has to cover the survey."
+            yield (
+                "`trajectory.beyond` is only allowed for actors, because the trajectory of the "
+                "platform must cover the survey."
+            )
         if self.trajectory is not None and self.poses is not None:
-            yield "give either poses or a trajectory, not both."
+            yield "`poses` and `trajectory` cannot be combined."
         if self.trajectory is not None and self.trajectory.vehicle is not None:
             if self.traffic is None:
-                yield "trajectory.vehicle is a vehicle of traffic: give traffic.file."
+                yield "`trajectory.vehicle` requires traffic. Set `traffic.file`."
             others = self.trajectory.model_fields_set - {"vehicle", "start_s", "duration_s"}
             if others:
                 yield (
-                    f"leave out trajectory.{min(others)}: beside trajectory.vehicle there are "
-                    "start_s and duration_s; offsets, surfaces and interpolation are traffic's."
+                    f"`trajectory.vehicle` cannot be combined with `trajectory.{min(others)}`, but "
+                    "only with `start_s` and `duration_s`. Set other options in `traffic`."
                 )
         carriers = [entry for entry in self.actors if entry.is_carrier]
         if carriers and self.trajectory is None:
             yield (
-                f"actor {carriers[0].name!r} has no trajectory: give it one, or at: [x, y, z] if "
-                "it stands, or give the survey a trajectory in place of poses, to be its carrier."
+                f"Actor {carriers[0].name!r} has no trajectory. Set its `trajectory`, or "
+                "`at: [x, y, z]` if it is stationary. If it is the platform, replace `poses` with "
+                "a `trajectory` of the survey."
             )
         if self.links and not any(entry.robot for entry in carriers):
             yield (
-                "mount names a link, and no robot is the carrier: give an actor with a .urdf as "
-                "its file, and without a trajectory."
+                "`mount.link` requires a robot as the platform. Add an actor with a .urdf file "
+                "and without a trajectory."
             )
 
     @property

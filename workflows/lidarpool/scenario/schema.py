@@ -54,13 +54,13 @@ class _Plain(GenerateJsonSchema):
 
 
 def scenario_schema() -> dict[str, Any]:
-    """Return the JSON Schema of scenario files, short forms and empty sections included.
+    """Return the JSON Schema of scenario files, including short forms and empty sections.
 
-    The schema does not check combinations of fields (a range that stops before its start):
-    `Scenario.load` does.
+    The schema does not check combinations of fields, such as a range that stops before its start.
+    `Scenario.load` checks them.
     """
     schema = _section_schema(Scenario, "lidarpool scenario")
-    return schema | {"description": "A lidar survey of a scene, and path planning."}
+    return schema | {"description": "A lidar survey of a scene, with optional path planning."}
 
 
 def campaign_schema() -> dict[str, Any]:
@@ -90,23 +90,23 @@ _COMMENT_COLUMN = 30  # column of the comments that stand beside a field
 _HEAD = f"# yaml-language-server: $schema={SCHEMA_FILE}"
 _FULL_HEAD = f"""\
 {_HEAD}
-# A lidar survey for lidarpool, with path planning. Every field has its default here, and may be
-# left out. A name after "# " is an example for a field whose default lidarpool chooses. Lengths
-# are in meters, angles in degrees, Z is up.
+# A lidar survey for lidarpool, with path planning. All fields have their default values and may be
+# omitted. A field after "# " is an example, because lidarpool determines its default. Lengths are
+# in meters and angles in degrees, and z is up.
 #
 #     lidarpool check {SCENARIO_FILE}
 #     lidarpool run {SCENARIO_FILE}"""
 _SHORT_HEAD = f"""\
 {_HEAD}
-# A lidar survey for lidarpool; lengths are in meters, Z is up. Fields that are left out have their
-# defaults; lidarpool init DIR --all writes all of them."""
+# A lidar survey for lidarpool. Lengths are in meters, and z is up. Omitted fields have default
+# values. To write all fields with their default values, run `lidarpool init DIR --all`."""
 # {section of a short scenario: (an example, its meaning)}
 _SECTIONS = {
-    "scene": ("seed", "mesh files, named from this folder; seed is six objects"),
-    "sensor": ("ouster/os1-64", "a model of `lidarpool sensors`, or your own .yaml"),
-    "poses": ("[[0, 0, 1], {position: [0, 0, 2], yaw_deg: 90}]", "where the sensor stands"),
-    "cloud": ("{columns: [range, intensity]}", "precision and further columns of the points"),
-    "output": ("{write: [las]}", "further formats of the cloud"),
+    "scene": ("seed", "mesh files relative to this folder, or seed for six objects"),
+    "sensor": ("ouster/os1-64", "model from `lidarpool sensors`, or a .yaml file"),
+    "poses": ("[[0, 0, 1], {position: [0, 0, 2], yaw_deg: 90}]", "poses of the sensor"),
+    "cloud": ("{columns: [range, intensity]}", "precision and additional columns of the points"),
+    "output": ("{write: [las]}", "additional formats of the cloud"),
 }
 
 

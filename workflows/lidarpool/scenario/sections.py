@@ -66,7 +66,7 @@ MAX_COPIES = 1_000_000  # limit for an entry
 PathOf = Callable[[str], Path]  # returns the path of a file that a scenario names
 
 IgnoredColumns = Annotated[
-    TextOrTexts, about("names of columns to leave out, with * and ?", "remarks")
+    TextOrTexts, about("names of columns to ignore; may contain * and ?", "remarks")
 ]
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Two[Coordinate]
@@ -88,17 +88,17 @@ class Section(BaseModel):
 class MeshFile(Section):
     """A mesh file or raster and its placement.
 
-    In YAML, the file's name alone will do.
+    In YAML, the file name alone is sufficient.
 
-    The mesh is scaled, rotated about the world's x, y and z axes, and moved; `matrix` replaces
-    all three. Relative names start from the scenario's folder.
+    The mesh is first scaled, then rotated about the x, y and z axes of the world, then translated.
+    `matrix` replaces these three steps. Relative file names refer to the folder of the scenario.
     """
 
     file: Annotated[
         str,
         about(
-            f"a mesh file or a raster of heights, {' '.join(endings())}, or a robot that stands "
-            "still (.urdf); from the scenario's folder",
+            f"mesh file or height raster ({' '.join(endings())}) or stationary robot (.urdf), "
+            "relative to the folder of the scenario",
             min_length=1,
             max_length=4096,
         ),
@@ -107,17 +107,26 @@ class MeshFile(Section):
     up_axis: UpAxis = None
     translation: Annotated[Triple, about("translation in meters, applied last")] = (0, 0, 0)
     rotation_deg: Annotated[
-        Three[AngleDeg], about("rotation about the world's x, y and z axes, degrees")
+        Three[AngleDeg], about("rotations about the x, y and z axes of the world, in degrees")
     ] = (0, 0, 0)
-    scale: Annotated[Scale, about("one factor, or one for each axis; applied first")] = (1, 1, 1)
+    scale: Annotated[Scale, about("scale factor, or one factor for each axis; applied first")] = (
+        1,
+        1,
+        1,
+    )
     matrix: Annotated[
-        Four[Four[Factor]] | None, about("instead of the three: 4 rows of 4, meters")
+        Four[Four[Factor]] | None,
+        about(
+            "4 x 4 transformation matrix as four rows, in meters; cannot be combined with "
+            "translation, rotation_deg and scale"
+        ),
     ] = None
     opacity: Opacity = "mask"
     assets: Annotated[
         Text | None,
         about(
-            "a folder besides its own from which it may take files, from the scenario's folder",
+            "additional folder from which the file may load other files, relative to the folder "
+            "of the scenario",
             "..",
         ),
     ] = None
@@ -169,9 +178,9 @@ class MeshFile(Section):
         """Raise ValueError for two placements of a mesh, or a scale of 0."""
         placed = self.model_fields_set & {"translation", "rotation_deg", "scale"}
         if self.matrix is not None and placed:
-            raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
+            raise ValueError(f"`matrix` and `{min(placed)}` cannot be combined.")
         if 0 in self.scale:
-            raise ValueError("scale must not be 0: it would flatten the mesh.")
+            raise ValueError("`scale` must not be 0.")
         return self
 
     def transform(self) -> Transform:
@@ -202,8 +211,8 @@ def _pose(value: Any) -> Any:
         return {"position": value}
     if not isinstance(value, (dict, Pose)):
         raise must_be(
-            "x, y and z in meters, [0, 0, 1], or position and angles, {position: [0, 0, 1], "
-            "yaw_deg: 90}"
+            "x, y and z in meters, such as [0, 0, 1], or a position and angles, such as "
+            "{position: [0, 0, 1], yaw_deg: 90}"
         )
     return value
 
@@ -220,93 +229,113 @@ PointXYZ = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # 
 class CopySection(Section, Pose):
     """Position, angles and scale of a copy.
 
-    In YAML, [x, y] or [x, y, z] alone will do.
+    In YAML, [x, y] or [x, y, z] alone is sufficient.
     """
 
     position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
         PointXYZ,
-        about("x, y and z of the mesh's origin, meters; without z it stands on the surface"),
+        about("x, y and z of the mesh origin, in meters; without z, the copy is on the surface"),
     ]
-    scale: Annotated[Scale, about("one factor, or one for each axis of the mesh")] = (1, 1, 1)
+    scale: Annotated[Scale, about("scale factor, or one factor for each axis of the mesh")] = (
+        1,
+        1,
+        1,
+    )
 
 
 class CopyTable(Section):
     """Poses of copies from a table.
 
-    In YAML, the file's name alone will do.
+    In YAML, the file name alone is sufficient.
     """
 
-    file: Annotated[Text, about("a table with a header, from the scenario's folder")]
+    file: Annotated[Text, about("table with a header, relative to the folder of the scenario")]
     columns: Annotated[
         dict[str, str],
-        about("{x, y, z, yaw_deg, pitch_deg, roll_deg, scale, scale_x, …: name in the file}"),
+        about(
+            "column names in the file for x, y, z, yaw_deg, pitch_deg, roll_deg, scale, scale_x, "
+            "scale_y and scale_z, such as {x: easting}"
+        ),
     ] = {}
     ignore: IgnoredColumns = ()
 
 
 class Scatter(Section):
-    """Copies that stand upright on surfaces, at random.
+    """Copies at random positions, upright on surfaces.
 
-    The same fields give the same copies.
+    The same fields result in the same copies.
     """
 
-    count: Annotated[int, about("how many", ge=1, le=MAX_COPIES)]
+    count: Annotated[int, about("number of copies", ge=1, le=MAX_COPIES)]
     surfaces: Annotated[  # not "on", which YAML takes for true
         TextOrTexts,
-        about("names of the objects to stand on, with * and ?; by default all", min_length=1),
+        about(
+            "names of the objects to place copies on; may contain * and ? (default: all objects)",
+            min_length=1,
+        ),
     ] = ("*",)
     within: Annotated[
-        Rectangle | None, about("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]")
+        Rectangle | None,
+        about("rectangle [x0, y0, x1, y1] with the minimum and maximum x and y, in meters"),
     ] = None
     spacing_m: Annotated[
-        float, about("least distance between two, seen from above, meters", ge=0, le=1e6)
+        float, about("minimum horizontal distance between two copies, in meters", ge=0, le=1e6)
     ] = 0.0
     scale: Annotated[
-        MinMax[Annotated[float, Field(gt=0, le=1e9)]], about("least and largest factor")
+        MinMax[Annotated[float, Field(gt=0, le=1e9)]],
+        about("minimum and maximum of the random scale factor"),
     ] = (1, 1)
-    yaw_deg: Annotated[AngleDeg | None, about("of all of them; by default each has its own")] = None
-    seed: Annotated[Seed, about("another seed gives other places")] = 0
+    yaw_deg: Annotated[
+        AngleDeg | None, about("yaw of all copies (default: a random yaw for each copy)")
+    ] = None
+    seed: Annotated[Seed, about("seed of the random positions, scales and yaws")] = 0
 
 
 class ShapeSection(Section):
-    """Shape of an object, a file or a box, and the class of its points."""
+    """Shape of an object, as a file or a box, and the class of its points."""
 
     name: Annotated[Text | None, about("name of the object")] = None
     file: Annotated[
-        MeshEntry | None, about("its mesh in its own axes, as in scene.files", "car.glb")
+        MeshEntry | None,
+        about("mesh file in the axes of the object, with options as in scene.files", "car.glb"),
     ] = None
     box: Annotated[
-        Three[Length] | None, about("instead of a file: length, width and height of a box, meters")
+        Three[Length] | None,
+        about("length, width and height of a box, in meters; replaces file"),
     ] = None
     semantic_class: Annotated[
         SemanticClass | None,
-        about("class of its points; by default that of its material", alias="class"),
+        about("semantic class of the points (default: the class of the material)", alias="class"),
     ] = None
 
     _one_shape = one_of("file", "box")
 
 
 class AnimationSection(Section):
-    """An animation of an actor's .glb, .gltf or .usd.
+    """An animation in the .glb, .gltf or .usd file of an actor.
 
-    In YAML, its name alone will do.
+    In YAML, the name of the animation alone is sufficient.
     """
 
-    name: Annotated[Text | None, about("its name in the file; by default the first", "Walk")] = None
+    name: Annotated[
+        Text | None, about("name of the animation in the file (default: the first)", "Walk")
+    ] = None
     speed_m_s: Annotated[
         float | None,
         about(
-            "speed of an actor that plays it as it was made; the rate follows the actor's speed, "
-            "and who stands stays as it is; by default it is played by time",
+            "speed of the actor at which the animation plays at its original rate; the rate is "
+            "proportional to the speed (default: the rate does not depend on the speed)",
             1.4,
             gt=0,
             le=1000,
         ),
     ] = None
-    repeat: Annotated[bool, about("begin again at its end; else the last pose remains")] = True
-    offset_s: Annotated[float, about("where in it the survey begins, seconds", ge=-1e9, le=1e9)] = (
-        0.0
-    )
+    repeat: Annotated[
+        bool, about("whether the animation repeats; otherwise, its last pose is kept")
+    ] = True
+    offset_s: Annotated[
+        float, about("time in the animation at the start of the survey, in s", ge=-1e9, le=1e9)
+    ] = 0.0
 
 
 class DeformingSection(ShapeSection):
@@ -314,12 +343,13 @@ class DeformingSection(ShapeSection):
 
     animation: Annotated[
         Annotated[AnimationSection, by_text("name", AnimationSection)] | None,
-        about("how it moves by itself: an animation of its file", {"name": "Walk"}),
+        about("animation in the file that deforms the object", {"name": "Walk"}),
     ] = None
     wheels: Annotated[
         TextOrTexts | None,
         about(
-            "names of its file's objects that are wheels, with * and ?: they turn as it drives",
+            "names of objects in the file that rotate like wheels as the actor moves; may contain "
+            "* and ?",
             "wheel*",
             min_length=1,
         ),
@@ -330,29 +360,35 @@ class DeformingSection(ShapeSection):
         """Raise ValueError for a deformation without a file, or two deformations."""
         deformations = [name for name in ("animation", "wheels") if getattr(self, name) is not None]
         if deformations and self.file is None:
-            raise ValueError(f"{deformations[0]} is of a mesh file: give its file.")
+            raise ValueError(f"`{deformations[0]}` requires a mesh file. Set `file`.")
         if len(deformations) > 1:
-            raise ValueError("give either animation or wheels, not both.")
+            raise ValueError("`animation` and `wheels` cannot be combined.")
         return self
 
 
 class CopiesSection(ShapeSection):
-    """An object that stands at many positions, its mesh stored once.
+    """An object at many positions, whose mesh is stored once.
 
-    Each copy is an object.
+    Each copy is a separate object.
     """
 
-    name: Annotated[Text, about("name of the first; the others are numbered: Tree, Tree.2, …")]
+    name: Annotated[
+        Text, about("name of the first copy; further copies are numbered, as in Tree, Tree.2")
+    ]
     at: Annotated[
         Several[Annotated[CopySection, by_position(CopySection, PointXYZ)]],
-        about("places: [x, y], [x, y, z], or with angles and scale", max_length=MAX_COPIES),
+        about(
+            "positions [x, y] or [x, y, z] in meters, or poses with angles and a scale",
+            max_length=MAX_COPIES,
+        ),
     ] = ()
     table: Annotated[
         Annotated[CopyTable, by_text("file", CopyTable)] | None,
-        about("instead of at: a table of places", "trees.csv"),
+        about("table with poses; replaces at", "trees.csv"),
     ] = None
     scatter: Annotated[
-        Scatter | None, about("instead of at: so many on surfaces, at random", {"count": 100})
+        Scatter | None,
+        about("copies at random positions on surfaces; replaces at", {"count": 100}),
     ] = None
 
     _one_list = one_of("at", "table", "scatter")
@@ -361,12 +397,12 @@ class CopiesSection(ShapeSection):
 class Ground(Section):
     """A horizontal rectangle under the objects, poses, trajectories and actors of a scenario."""
 
-    height_m: Annotated[Coordinate, about("z of the rectangle, meters")] = 0.0
+    height_m: Annotated[Coordinate, about("z coordinate of the rectangle, in meters")] = 0.0
     margin_m: Annotated[
         float,
         about(
-            "how far it extends beyond the objects, poses, trajectories and actors on each side, "
-            "meters",
+            "distance in meters that the ground extends beyond the objects, poses, trajectories "
+            "and actors on each side",
             ge=0,
             le=1e6,
         ),
@@ -374,20 +410,21 @@ class Ground(Section):
 
 
 class SceneSection(Section):
-    """The scene: mesh files, copies of meshes, a ground, the six objects of the demo, or a mixture.
+    """The scene, which consists of mesh files, copies of meshes, a ground and a preset.
 
-    In YAML, a file's name, a list of files, or seed for the objects of the demo alone will do.
+    In YAML, a file name, a list of files or the name of a preset alone is sufficient.
     """
 
     preset: Annotated[
-        Literal["seed"] | None, about("seed: the six objects of `lidarpool demo`", "seed")
+        Literal["seed"] | None,
+        about("predefined scene; seed contains the six objects of `lidarpool demo`", "seed"),
     ] = None
     files: Annotated[
         MeshEntries,
         short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
         about(
-            "mesh files and rasters of heights, by name or with unit, up_axis, scale, "
-            "rotation_deg, translation",
+            "mesh files and height rasters, as file names or with options such as unit, up_axis, "
+            "scale, rotation_deg and translation",
             ["hall.glb", {"file": "part.stl", "unit": "mm", "translation": [1, 0, 0]}],
             max_length=10_000,
         ),
@@ -395,7 +432,7 @@ class SceneSection(Section):
     copies: Annotated[
         Several[CopiesSection],
         about(
-            "objects in many places, by lists, tables, or at random",
+            "objects at many positions, from lists or tables, or at random",
             [{"name": "Crate", "box": [1, 1, 1], "at": [[4, 5, 0], [6, 5, 0]], "class": 4}],
             [{"name": "Tree", "file": "tree.glb", "scatter": {"count": 100, "surfaces": "Ground"}}],
             max_length=10_000,
@@ -403,12 +440,15 @@ class SceneSection(Section):
     ] = ()
     same_names: Annotated[
         Literal["number", "join"],
-        about("objects of files with equal names: number them (Wall, Wall.2), or join them to one"),
+        about(
+            "treatment of objects with the same name in files: number renames them, as in Wall, "
+            "Wall.2, and join combines them into one object"
+        ),
     ] = "number"
     ground: Annotated[
         Ground | None,
         about(
-            "a horizontal rectangle under the objects, poses, trajectories and actors, meters",
+            "horizontal rectangle under the objects, poses, trajectories and actors",
             {"height_m": 0, "margin_m": 5},
         ),
     ] = None
@@ -420,17 +460,17 @@ class SceneSection(Section):
 
 
 class WorldSection(Section):
-    """Coordinate system of what is written, and the place of the survey in it.
+    """Coordinate system of the output, and the position of the survey in it.
 
-    Scene, poses, trajectories and plans stay in the coordinates of the scenario: `origin` is added
-    to points and poses as they are written.
+    The scene, poses, trajectories and plans use the coordinates of the scenario. `origin` is added
+    to points and poses when they are written.
     """
 
     epsg: Annotated[
         EpsgCode | None,
         about(
-            "EPSG code of the coordinate system, which files of clouds state and rasters are "
-            "converted to; by default that of the scene's files",
+            "EPSG code of the coordinate system that point cloud files state and to which rasters "
+            "are converted (default: from the files of the scene)",
             25832,
         ),
     ] = None
@@ -442,50 +482,56 @@ class WorldSection(Section):
             Pair | Triple,
         ),
         about(
-            "where the scenario's zero is in that system: x and y (east and north), perhaps z, "
-            "meters"
+            "coordinates of the scenario's origin in this system, as [x, y] or [x, y, z] in "
+            "meters, where x is easting and y is northing"
         ),
     ] = (0, 0, 0)
 
 
 class PacketSection(Section):
-    """Packets of the sensor's maker: values in place of the values of the sensor's data file."""
+    """Settings of the manufacturer's packets, which override those of the sensor file."""
 
     ports: Annotated[
         dict[str, Annotated[int, Field(ge=1, le=65_535)]],
-        about("UDP port of each kind of packets", {"lidar": 7502}),
+        about("UDP port of each packet type", {"lidar": 7502}),
     ] = {}
     identifiers: Annotated[
         dict[str, Identifier],
-        about("values that the format of the packets knows", {"profile": "LEGACY"}),
+        about("identifiers that the packet format defines", {"profile": "LEGACY"}),
     ] = {}
 
 
 class SensorSection(Section):
-    """The lidar: a model, a calibrated unit, or a turning head with evenly spaced beams.
+    """The lidar, which is a model, a calibrated unit, or a rotating head with evenly spaced beams.
 
-    In YAML also just the model. `load_sensor` reads models and calibrations; `Sensor` describes
-    the grid.
+    In YAML, the model alone is sufficient. `load_sensor` reads models and calibrations, and
+    `Sensor` describes the rotating head.
     """
 
     model: Annotated[
         str | None,
         about(
-            "a sensor model, see `lidarpool sensors`, or your own .yaml, "
-            "from the scenario's folder",
+            "sensor model from `lidarpool sensors`, or a .yaml file relative to the folder of the "
+            "scenario",
             "velodyne/vlp16",
         ),
     ] = None
     calibration: Annotated[
         str | None,
         about(
-            "calibration file of a Velodyne, Ouster, Hesai, RoboSense, Livox, or a table of beams",
+            "calibration file of a Velodyne, Ouster, Hesai, RoboSense or Livox sensor, or a beam "
+            "table",
             "unit.json",
         ),
     ] = None
     columns: Annotated[
         int | None,
-        about("for an Ouster or a table of beams: azimuths in one turn", 512, ge=1, le=100_000),
+        about(
+            "azimuth steps per revolution (Ouster sensors and beam tables only)",
+            512,
+            ge=1,
+            le=100_000,
+        ),
     ] = None
     rays_per_revolution: RaysPerRevolution = 1000
     layers: Layers = 40
@@ -493,21 +539,26 @@ class SensorSection(Section):
     horizontal_fov_deg: Sector = 360.0
     step_deg: Step = 10.0
     rate_hz: Annotated[
-        Rate | None, about("turns, lines or frames a second; by default the model's, or 10", 20.0)
+        Rate | None,
+        about(
+            "revolutions, lines or frames per second (default: from the model, otherwise 10)", 20.0
+        ),
     ] = None
     min_range_m: Annotated[
-        MinRange | None, about("nearer returns are ignored; by default the model's, or 0", 0.5)
+        MinRange | None,
+        about("minimum range in meters (default: from the model, otherwise 0)", 0.5),
     ] = None
     max_range_m: Annotated[
         MaxRange | None,
-        about("farther returns are ignored; by default the model's, or .inf", 100.0),
+        about("maximum range in meters (default: from the model, otherwise .inf)", 100.0),
     ] = None
 
     performance: Annotated[
         Sheet | None,
         about(
-            "datasheet: noise, detection range and beam by the model's data sheet; what noise and "
-            "returns say counts more; ideal: none; by default datasheet of a file that states it",
+            "datasheet uses the noise, the detection range and the beam of the model's data sheet, "
+            "which fields of noise and returns override; ideal uses none of them (default: "
+            "datasheet if the model file states these values)",
             "ideal",
         ),
     ] = None
@@ -515,7 +566,7 @@ class SensorSection(Section):
     unseen: Annotated[
         TextOrTexts,
         about(
-            "names of the objects that it does not see, with * and ?: its rays pass through them",
+            "names of objects that the rays of the sensor pass through; may contain * and ?",
             ["housing*"],
         ),
     ] = ()
@@ -523,7 +574,7 @@ class SensorSection(Section):
     packets: Annotated[
         PacketSection | None,
         about(
-            "packets of its maker, for pcap, in place of the model's",
+            "settings of the manufacturer's packets in pcap files (default: from the model)",
             {"ports": {}, "identifiers": {}},
         ),
     ] = None
@@ -537,11 +588,19 @@ class SensorSection(Section):
         names = ("rays_per_revolution", "layers", "vertical_fov_deg", "horizontal_fov_deg")
         grid = [name for name in names if getattr(self, name) != fields[name].default]
         if sources and grid:
-            raise ValueError(f"a {sources[0]} defines the beams: leave out {grid[0]}.")
+            raise ValueError(
+                f"`{sources[0]}` and `{grid[0]}` cannot be combined, because the {sources[0]} "
+                "defines the beams."
+            )
         if self.performance == "datasheet" and self.model is None:
-            raise ValueError("performance: datasheet needs a model: give its name.")
+            raise ValueError(
+                "`performance: datasheet` requires a sensor model. Set `model`, for example "
+                "`model: ouster/os1-64`."
+            )
         if self.columns is not None and "rays_per_revolution" in grid:
-            raise ValueError("columns and rays_per_revolution mean the same: give one of them.")
+            raise ValueError(
+                "`columns` and `rays_per_revolution` have the same meaning and cannot be combined."
+            )
         return self
 
     @property
@@ -615,14 +674,14 @@ def _with_packets(sensor: Sensor, section: str) -> Sensor:
 
 
 class OutputSection(Section):
-    """Further files of the result.
+    """Additional files of the result.
 
-    The columns that they need are written.
+    The columns that they require are written.
     """
 
     write: Annotated[
         Several[Annotated[Format, by_text("format", Format)]],
-        about("further formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
+        about("additional formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
     ] = ()
 
     @model_validator(mode="after")
@@ -631,8 +690,8 @@ class OutputSection(Section):
         names = [entry.format for entry in self.write]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(
-                f"write has {twice} twice, which are the same file: lidarpool export --out writes "
-                "another beside it."
+                f"`write` contains {twice} twice, but both would be the same file. To write a "
+                "second file of this format, use `lidarpool export --out`."
             )
         return self
 
@@ -643,22 +702,24 @@ class OutputSection(Section):
 
 
 class ReturnsSection(Section, Returns):
-    """Sub-rays of a beam, and the choice of its reported returns."""
+    """Sub-rays of a beam, and the selection of reported returns."""
 
 
 class NoiseSection(Section, Noise):
-    """Noise of ranges and angles, lost and false returns."""
+    """Noise of ranges and angles, and lost and false returns."""
 
 
 class Obstacle(Section):
-    """A disc as an obstacle, or the bounding circle of named objects.
+    """An obstacle, which is a disc or the bounding circle of named objects.
 
-    `object` may have * and ?; the short form is just that name: `- Shelf*`.
+    `object` may contain * and ?. In YAML, this name alone is sufficient, as in `- Shelf*`.
     """
 
-    object: Annotated[Text | None, about("name of objects of the scene, with * and ?")] = None
-    center: Annotated[Pair | None, about("center of a disc, x and y, meters")] = None
-    radius_m: Annotated[float | None, about("radius of the disc, meters", gt=0, le=1e6)] = None
+    object: Annotated[Text | None, about("name of objects in the scene; may contain * and ?")] = (
+        None
+    )
+    center: Annotated[Pair | None, about("x and y of the center of a disc, in meters")] = None
+    radius_m: Annotated[float | None, about("radius of the disc, in meters", gt=0, le=1e6)] = None
 
     @model_validator(mode="after")
     def _check_kind(self) -> Obstacle:
@@ -667,7 +728,7 @@ class Obstacle(Section):
         if (self.object is None) != disc or (
             self.object is not None and self.model_fields_set > {"object"}
         ):
-            raise ValueError("give either object, or both center and radius_m.")
+            raise ValueError("Set either `object`, or both `center` and `radius_m`.")
         return self
 
 
@@ -678,29 +739,30 @@ class _Route:
     """Fields in world coordinates and by names, which come before the fields of `Search`."""
 
     enabled: Annotated[
-        bool | None, about("by default whether start and target are given", True)
+        bool | None,
+        about("whether to plan a path (default: true if start and target are set)", True),
     ] = None
-    start: Annotated[Pair | None, about("x and y, meters", [25, 25])] = None
-    target: Annotated[Pair | None, about("x and y, meters", [-30, -20])] = None
+    start: Annotated[Pair | None, about("x and y of the start, in meters", [25, 25])] = None
+    target: Annotated[Pair | None, about("x and y of the target, in meters", [-30, -20])] = None
     obstacles: Annotated[
         Obstacles | None,
         short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
         about(
-            "bounding circles of all objects that are not flat (auto), or a list",
+            "list of obstacles, or auto for the bounding circles of all objects that are not flat",
             "auto",
             ["Shelf*", {"center": [-6, -1], "radius_m": 1}],
         ),
     ] = None
     clearance_m: Annotated[
-        float, about("distance to keep from obstacles, meters", ge=0, le=1000)
+        float, about("minimum distance to obstacles, in meters", ge=0, le=1000)
     ] = 0.0
 
 
 class PlanningSection(Section, Search, _Route):
     """Path planning in the plane, in world coordinates.
 
-    A path is planned if there are a start and a target, unless `enabled` is false. `obstacles` is
-    'auto' (the bounding circle of each object that is not flat) or a list; `clearance_m` is added
+    A path is planned if `start` and `target` are set, unless `enabled` is false. `obstacles` is a
+    list, or 'auto' for the bounding circle of each object that is not flat. `clearance_m` is added
     to each radius.
     """
 
@@ -709,21 +771,25 @@ class PlanningSection(Section, Search, _Route):
 class TaskOptions:
     """Tasks of a run, on any cluster."""
 
-    collectors: Annotated[int, about("tasks that write the parts", ge=1, le=64)] = 2
+    collectors: Annotated[int, about("number of tasks that write the parts", ge=1, le=64)] = 2
     queue_capacity: Annotated[
-        int, about("how many items stage 1 may be ahead of stage 2", ge=1, le=100_000)
+        int,
+        about("maximum number of items that stage 1 is ahead of stage 2", ge=1, le=100_000),
     ] = 10
     batch_mb: Annotated[
         int,
         about(
-            "most memory of a batch, the scans that a GPU worker casts at a time, megabytes",
+            "maximum memory, in megabytes, of the batch of scans that a GPU worker casts at once",
             ge=1,
             le=1_000_000,
         ),
     ] = 256
     backend: Annotated[
         Literal[BACKENDS],  # type: ignore[valid-type]
-        about("cuda, tiles (compiled, on CPUs) or numpy; auto takes the fastest available"),
+        about(
+            "ray-casting backend: cuda, tiles (compiled code for CPUs) or numpy; auto selects the "
+            "fastest one that is available"
+        ),
     ] = "auto"
 
 
@@ -731,11 +797,17 @@ class _Workers:
     """Workers of a local cluster, which come first."""
 
     gpu: Annotated[
-        int | None, about("workers that cast rays; by default one for each GPU", 1, ge=1, le=10_000)
+        int | None,
+        about("number of workers that cast rays (default: one for each GPU)", 1, ge=1, le=10_000),
     ] = None
     other: Annotated[
         int | None,
-        about("workers that plan paths; by default by the number of cores", 1, ge=1, le=10_000),
+        about(
+            "number of workers that plan paths (default: depends on the number of cores)",
+            1,
+            ge=1,
+            le=10_000,
+        ),
     ] = None
 
 
@@ -744,8 +816,8 @@ class PoolSection(Section, TaskOptions, _Workers):
 
     Default sizes depend on the machine.
 
-    `gpu` and `other` set the workers of a local cluster, not of a cluster that is already
-    running. The fields of `TaskOptions` apply to both.
+    `gpu` and `other` set the number of workers in a local cluster. They have no effect on a cluster
+    that is already running. The fields of `TaskOptions` apply to both.
     """
 
 

@@ -16,7 +16,7 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, Mistakes, message_of, prefixed
 from lidarsim.base.tables import NUMBERS, Quantity, read_table
 from lidarsim.base.textfile import read_text
-from lidarsim.base.words import plural
+from lidarsim.base.words import joined, plural
 from lidarsim.motion.pose_columns import ANGLES, POSITION, REFUSED_COLUMNS, angles_of, with_yaw
 from lidarsim.motion.rotations import rotations_of
 from lidarsim.scene.actors import Actor, box, join_meshes
@@ -248,7 +248,7 @@ def _check_not_empty(scenario: Scenario) -> None:
         return
     if scenario.actors or scenario.traffic is not None:
         raise LidarError(
-            f"{scenario.source}: The scene has actors, but nothing that stands still. Add "
+            f"{scenario.source}: The scene has actors, but no stationary object. Add "
             "`scene: {ground: {}}`, or mesh files as `scene.files`."
         )
     raise LidarError(
@@ -364,13 +364,16 @@ class Shapes:
         """Return the links of a robot as static objects, with the joints at zero."""
         if refused_fields := sorted(entry.model_fields_set - _ROBOT_FIELDS):
             raise LidarError(
-                f"{self.scenario.path(entry.file)} is a robot, which is in meters and Z-up: leave "
-                f"out {' and '.join(refused_fields)}."
+                f"{self.scenario.path(entry.file)} is a robot, which is always in meters with z "
+                f"up. Remove {joined([f'`{name}`' for name in refused_fields])}."
             )
         robot = self.robot(entry)
         tell = self.findings.notes.append
         if robot.moving:
-            tell(f"{entry.file} has its joints at zero; joints of an actor move them")
+            tell(
+                f"all joints of {entry.file} are at zero. To move them, add the robot as an actor "
+                "with `joints`"
+            )
         links = Objects((), robot.actors(tell=tell)).at_start(lambda _: None)
         return Objects(tuple(o.moved(o.name, transform.linear, transform.offset) for o in links))
 
@@ -447,9 +450,9 @@ def _ground(scenario: Scenario, static: _StaticObjects) -> SceneMesh:
     footprints = [static.corners, *_footprints(scenario)]
     if not any(map(len, footprints)):
         raise LidarError(
-            f"{scenario.source}: `scene.ground` lies under the objects, poses, trajectories and "
-            "actors of the scenario, which has none of them. Add `poses`, or mesh files as "
-            "`scene.files`."
+            f"{scenario.source}: The extent of `scene.ground` cannot be determined, because the "
+            "scenario has no objects, poses, trajectories or actors. Add `poses`, or mesh files "
+            "as `scene.files`."
         )
     return _ground_mesh(scenario.scene, footprints)
 
@@ -530,8 +533,8 @@ class _CopyPoses(NamedTuple):
         if len(rows := np.flatnonzero(np.isnan(positions[:, 2]))):
             x, y = positions[rows[0], :2].tolist()
             raise LidarError(
-                f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
-                f"on ({plural(len(rows), 'copy', 'copies')}): give z."
+                f"There is no upward-facing surface at x {x:g}, y {y:g} to place a copy on. Set "
+                f"the z coordinate of {plural(len(rows), 'copy', 'copies')}."
             )
 
     def check_scales(self) -> None:
@@ -539,8 +542,8 @@ class _CopyPoses(NamedTuple):
         scales = self.scales
         if (np.abs(scales) < MIN_SCALE).any():
             raise LidarError(
-                f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
-                f"at least {MIN_SCALE:g}."
+                f"The absolute value of a scale must be at least {MIN_SCALE:g}, but a scale is "
+                f"{scales.flat[np.abs(scales).argmin()]:g}."
             )
 
 
@@ -558,12 +561,16 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
             )
         )
         if "scale" in columns and any(name in columns for name in _SCALE_NAMES):
-            raise ValueError("it has both scale and scales of axes: ignore one")
+            raise ValueError(
+                "it has both a scale and scales of axes. Ignore one of them with `ignore`"
+            )
     except (OSError, ValueError, LidarError) as error:
-        raise LidarError(f"{path} is not a usable table of copies: {message_of(error)}") from error
+        raise LidarError(
+            f"{path} cannot be used as a table of copies: {message_of(error)}"
+        ) from error
     count = len(columns["x"])
     if count > MAX_COPIES:
-        raise LidarError(f"{path} has {count:,} rows; at most {MAX_COPIES:,} are allowed.")
+        raise LidarError(f"{path} has {count:,} rows, but the limit is {MAX_COPIES:,}.")
 
     def columns_of(names: Sequence[str], default: Any) -> Floats:
         return np.stack([columns.get(name, np.full(count, default)) for name in names], axis=1)
@@ -612,9 +619,9 @@ def _scatter_positions(scatter: Scatter, seeds: list[int], standing: StandingSur
     while len(positions) < scatter.count:
         if drawn_count > max(MAX_DRAWS, MAX_DRAWS_PER_COPY * scatter.count):
             raise LidarError(
-                f"only {len(positions):,} of {scatter.count:,} found room on "
+                f"Only {len(positions):,} of {scatter.count:,} copies fit on "
                 f"{', '.join(scatter.surfaces)} within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to "
-                f"{y1:.6g}: take fewer, a smaller spacing_m, or other surfaces."
+                f"{y1:.6g}. Reduce `count` or `spacing_m`, or choose other `surfaces`."
             )
         draws = rng.random((DRAW_SIZE, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
         heights, objects = standing.heights_below(draws)

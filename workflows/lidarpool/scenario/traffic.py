@@ -72,55 +72,65 @@ _KNOWN = _UNUSED.union(_ROW, ("id", "type"))
 
 
 class VehicleSection(DeformingSection):
-    """Shapes of vehicles and persons, by their types in SUMO or OSI."""
+    """Shapes of vehicles and persons, by type in SUMO or OSI."""
 
     types: Annotated[
         TextOrTexts,
         about(
-            "types of SUMO, or of OSI such as heavy_truck, with * and ?; of several entries the "
-            "first that fits",
+            "SUMO types, or OSI types such as heavy_truck; may contain * and ?; the first matching "
+            "entry applies",
             min_length=1,
         ),
     ] = ("*",)
     name: Annotated[
-        Text | None, about("of its objects, before the identity in brackets; by default the type")
+        Text | None,
+        about("name of the objects, followed by the identity in parentheses (default: the type)"),
     ] = None
 
 
 class TrafficSection(Section):
-    """Vehicles and persons of a simulation.
+    """Vehicles and persons of a traffic simulation.
 
-    Actors while they are in the simulation.
+    They are actors while they are in the simulation.
     """
 
     file: Annotated[
         Text,
         about(
-            "what sumo --fcd-output writes, .xml or .xml.gz; or a trace of OSI with ground truth, "
-            ".osi or .mcap"
+            "output of `sumo --fcd-output` (.xml, .xml.gz), or OSI trace with ground truth (.osi, "
+            ".mcap)"
         ),
     ]
     vehicles: Annotated[
         Several[VehicleSection],
-        about("shapes of vehicles and persons, by type; of OSI by default boxes of their sizes"),
+        about(
+            "shapes of vehicles and persons, by type (default: boxes with the dimensions in an OSI "
+            "trace)"
+        ),
     ] = ()
-    host: Annotated[bool, about("of OSI: whether the host vehicle is an actor as well")] = True
+    host: Annotated[bool, about("whether the host vehicle is also an actor (OSI traces only)")] = (
+        True
+    )
     ignore: Annotated[
-        TextOrTexts, about("names of attributes in the file to leave out, with * and ?", "battery*")
+        TextOrTexts,
+        about("names of attributes in the file to ignore; may contain * and ?", "battery*"),
     ] = ()
     time_unit: TimeUnitEntry = None
-    offset_s: Annotated[Seconds, about("added to all times")] = 0.0
-    translation: Annotated[Triple, about("added to all positions, meters")] = (0, 0, 0)
+    offset_s: Annotated[Seconds, about("offset in seconds that is added to all times")] = 0.0
+    translation: Annotated[
+        Triple, about("translation in meters that is added to all positions")
+    ] = (0, 0, 0)
     surfaces: Annotated[
         TextOrTexts | None,
         about(
-            "names of objects to stand on, with * and ?; by default heights are the file's",
+            "names of objects that the vehicles and persons are on; may contain * and ? (default: "
+            "heights from the file)",
             min_length=1,
         ),
     ] = None
-    interpolation: Annotated[Literal["linear", "smooth"], about("of poses between time steps")] = (
-        "linear"
-    )
+    interpolation: Annotated[
+        Literal["linear", "smooth"], about("interpolation of poses between time steps")
+    ] = "linear"
 
     def entry_of(self, vehicle_type: str) -> VehicleSection | None:
         """Return the first entry that fits a type of vehicles, or None."""
@@ -201,8 +211,9 @@ class Passage:
         if matching is not None:
             return matching
         raise LidarError(
-            f"{section.file} has vehicles of type {self.kind!r}, but no entry of traffic.vehicles "
-            f"fits: add one, such as {{types: {self.kind!r}, box: [4.5, 1.8, 1.5]}}."
+            f"{section.file} has vehicles of type {self.kind!r}, but no entry of "
+            "`traffic.vehicles` matches this type. Add one, such as "
+            f"`{{types: {self.kind!r}, box: [4.5, 1.8, 1.5]}}`."
         )
 
     def track(
@@ -314,11 +325,13 @@ class _PassageCollector:
         """
         time_s = _readable_seconds(text)
         if time_s is not None and self._time_unit is not None:
-            raise ValueError("its times are hours, minutes and seconds: leave out time_unit")
+            raise ValueError(
+                "its times are hours, minutes and seconds, so `time_unit` cannot be set"
+            )
         if time_s is None:
             time_s = self._clock.seconds(_number("a timestep", "time", text))
         if not self.time_s < time_s < math.inf:
-            raise ValueError(f"the time {time_s} does not come after the one before")
+            raise ValueError(f"the time {time_s} is not after the previous time")
         self.time_s = time_s
         self.step += 1
         self._vehicle_xy = None
@@ -377,7 +390,9 @@ def _number(element: str, key: str, text: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise ValueError(f"{element} has the {key} {printable(text)!r}; give a number") from None
+        raise ValueError(
+            f"{key} of {element} must be a number, but is {printable(text)!r}"
+        ) from None
 
 
 def read_fcd(
@@ -399,13 +414,13 @@ def read_fcd(
         far more than its size.
     """
     try:
-        allowance = Allowance(input_size(path), "simulate a shorter time, or fewer vehicles")
+        allowance = Allowance(input_size(path), "Simulate a shorter time, or fewer vehicles")
         collector = _PassageCollector(section, first_s, choice, allowance)
         with prefixed(path):
             collector.collect(_elements(path), last_s)
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
         raise LidarError(
-            f"{path} is not usable as floating car data, which sumo --fcd-output writes: "
+            f"{path} cannot be read as floating car data of `sumo --fcd-output`: "
             f"{message_of(error)}"
         ) from error
     present = [
@@ -422,8 +437,8 @@ def _check_ignored(tag: str, names: Set[str], ignore: Sequence[str]) -> None:
     for name in sorted(names):
         if not any(fits(name, pattern) for pattern in ignore):
             raise ValueError(
-                f"its {tag} has the attribute {printable(name)!r}, which --fcd-output does not "
-                f"define: leave it out with {{file: …, ignore: {in_yaml([name])}}}"
+                f"its {tag} has the attribute {printable(name)!r}, which SUMO does not define. To "
+                f"ignore it, set `ignore: {in_yaml([name])}`"
             )
 
 
@@ -437,7 +452,7 @@ def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
     parser.EntityDeclHandler = refuse_entity
     parser.StartElementHandler = lambda tag, attributes: elements.append((tag, attributes))
     is_packed = path.suffix.lower() == ".gz"
-    allowance = Allowance(input_size(path), "unpack it with gunzip first", in_parts=True)
+    allowance = Allowance(input_size(path), "Decompress it with gunzip first", in_parts=True)
     with open_input(path) as file:
         content: BufferedIOBase = gzip.GzipFile(fileobj=file) if is_packed else file
         for _ in parse_pieces(parser, iter(partial(content.read, PIECE_BYTES), b"")):
@@ -474,10 +489,10 @@ def carrier_of(
         known = sorted(content.left_out)
         hint = name_hint(entry.vehicle or "", known) if known else ""
         if entry.vehicle == HOST:
-            hint = f" It may not name its host vehicle: give an identity.{hint}"
+            hint = f" If the trace does not state its host vehicle, set an identity.{hint}"
         raise LidarError(
-            f"trajectory.vehicle is {entry.vehicle!r}, which {section.file} does not have for two "
-            f"time steps.{hint}"
+            f"`trajectory.vehicle` is {entry.vehicle!r}, but {section.file} does not contain this "
+            f"vehicle in at least two time steps.{hint}"
         )
     start_s = entry.start_s
     if start_s is not None:
@@ -486,8 +501,8 @@ def carrier_of(
     if len(tracks) > 1:
         spans = ", ".join(f"{t.times_s[0]:g} to {t.times_s[-1]:g}" for t in tracks[:4])
         raise LidarError(
-            f"vehicle {entry.vehicle!r} is in the traffic from {spans} s: give trajectory.start_s "
-            "and duration_s within one of these times."
+            f"Vehicle {entry.vehicle!r} is in the traffic from {spans} s. Set "
+            "`trajectory.start_s` and `trajectory.duration_s` within one of these periods."
         )
     return replace(tracks[0], start_s=start_s, duration_s=entry.duration_s, beyond="refuse")
 
@@ -545,6 +560,6 @@ def actors_of(
         if len(actors) > MAX_ACTORS:
             raise LidarError(
                 f"{section.file} has more than {MAX_ACTORS:,} vehicles and persons during the "
-                "survey: make the survey shorter, or simulate a part of the network."
+                "survey. Shorten the survey, or simulate a part of the network."
             )
     return actors

@@ -45,7 +45,7 @@ _MAX_RING_OFFSET_DEG = 2.0  # a ring farther from all beams of a model is not on
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit:
-    """Result of `fit`, printed as a table."""
+    """Result of `fit`, which is printed as a table."""
 
     __signature__ = ReadableSignature()
 
@@ -57,9 +57,12 @@ class Fit:
 
     @checked
     def save(self, file: str | Path) -> list[Path]:
-        """Write the sensor file and a .html page beside the file, and return both paths.
+        """Write the sensor file and an .html page next to it, and return both paths.
 
-        LidarError if the file is not a .yaml, or cannot be written.
+        Raises
+        ------
+        LidarError
+            If the file is not a .yaml file, or cannot be written.
         """
         model_path = Path(file)
         if model_path.suffix not in MODEL_FILES:
@@ -88,34 +91,43 @@ def fit(
     intensity: str | None = None,
     white: Annotated[float, Field(gt=0)] | None = None,
 ) -> Fit:
-    """Fit the performance of a sensor to sweeps of the sensor at a standstill, or in a scene.
+    """Fit the performance of a sensor to recorded sweeps.
+
+    The sensor is stationary, or the recorded place is known as a scene.
 
     Parameters
     ----------
     recording
-        Sweeps in any format of `compare`, or a cloud in memory that has sweeps.
+        Sweeps in any format that `compare` supports, or a cloud in memory that has sweeps.
     model
-        The sensor, by name or file; the model keeps its figures that the recording does not
-        determine. By default a sensor with the recorded beams.
+        Sensor model, by name or file. Values that the recording does not determine are taken from
+        the model. By default, the model is a sensor with the recorded beams.
     scene
-        The recorded place as a scene. By default the recording has the surfaces, and the
-        sensor has to stand.
+        The recorded place as a scene. By default, the surfaces are taken from the recording, and
+        the sensor must be stationary.
     pose
-        Pose of the sensor in the scene: a pose, or a pose for each sweep; also matrices (n, 4, 4).
-        By default the recording has the poses; without poses, the scene's origin. A result
-        has the poses of all its pulses; other poses hold for a sweep.
+        Pose of the sensor in the scene, as one pose, as one pose for each sweep, or as matrices of
+        shape (n, 4, 4). By default, the poses are taken from the recording. If it has none, the
+        sensor is at the origin of the scene. A result has a pose for each pulse. Otherwise, a pose
+        applies to a whole sweep.
     sensor, intensity
-        Name of the sensor, or topic of a bag, if the recording has several; column with the
-        intensities, if not ``intensity``.
+        Name of the sensor, or topic of a bag, if the recording has several; and the column with the
+        intensities, which is ``intensity`` by default.
     white
-        Intensity that the sensor reports of a white surface, if the intensity is the same at all
-        ranges. By default the value of Velodyne and Ouster for their recordings, else unknown.
+        Intensity that the sensor reports for a white surface, if the intensity does not depend on
+        the range. By default, the value of Velodyne and Ouster sensors is used for their
+        recordings, and the value is unknown for others.
+
+    Returns
+    -------
+    Fit
+        The fitted sensor and the statistics of the fit.
 
     Raises
     ------
     LidarError
-        If the recording cannot be read, has no sweeps or rings, or is of several sensors; if the
-        sensor moves, and the scene or the poses are unknown; or scipy is missing.
+        If the recording cannot be read, has no sweeps or rings, or contains several sensors; if the
+        sensor moves, but the scene or the poses are unknown; or if scipy is missing.
     """
     need("scipy", "fit", "Figures are fitted")
     named = None if model is None else read_model(model)  # before the recording, which takes long

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -105,10 +106,14 @@ def find_workers(
             # as waiting: the remaining time is taken at the start of this attempt.
             if waiting is None or not waiting.remaining_s(start_s):
                 if coming:
-                    error.add_note(f"{queued(coming)}: if they wait, give --wait more time.")
+                    error.add_note(
+                        f"{queued(coming)}. If they are only waiting in the queue, increase "
+                        "`--wait`."
+                    )
                 raise
-            reason = str(error).partition(": start ")[0] + (f"; {queued(coming)}" if coming else "")
-            waiting.tell("workers", reason)  # a user who waits has started workers
+            # Without the advice to start workers: a user who waits has started some.
+            shortage = re.split(r"(?i)[:.] start ", str(error), maxsplit=1)[0]
+            waiting.tell("workers", shortage + (f"; {queued(coming)}" if coming else ""))
         time.sleep(LOOK_EVERY_S)
 
 
@@ -123,16 +128,17 @@ def check_memory(
     if (all_scans := peak_bytes(job.survey.scan_count)) <= available_bytes:
         return
     scan_bytes = peak_bytes(1)
-    limit = f"more than the {available_bytes / MB:,.0f} MB that {worker} has for each slot"
+    limit = f"{worker} has only {available_bytes / MB:,.0f} MB for each slot"
     if scan_bytes > available_bytes:
         raise JobError(
-            f"Casting one scan takes about {scan_bytes / MB:,.0f} MB, {limit}: take a smaller "
-            "step_deg, fewer rays or columns, or give casting workers a larger --memory-limit."
+            f"Casting one scan takes about {scan_bytes / MB:,.0f} MB, but {limit}. Use a smaller "
+            "`step_deg`, fewer rays or fewer columns, or start the casting workers with a larger "
+            "`--memory-limit`."
         )
     if min(tasks.batch_mb * MB, all_scans) > available_bytes:
         raise JobError(
-            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give casting workers a "
-            "larger --memory-limit."
+            f"`batch_mb` is {tasks.batch_mb:,}, but {limit}. Reduce it, or start the casting "
+            "workers with a larger `--memory-limit`."
         )
 
 
@@ -154,8 +160,8 @@ def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: boo
     workers = worker_identities(client)
     if not workers:
         raise TooFewWorkersError(
-            f"The cluster at {client.scheduler.address} has no workers: start some, for "
-            f'example dask worker {client.scheduler.address} --resources "GPU=1"'
+            f"The cluster at {client.scheduler.address} has no workers. Start workers, for "
+            f'example with `dask worker {client.scheduler.address} --resources "GPU=1"`.'
         )
     # Only workers of this run: a cluster may have other workers, with other packages.
     _check_versions(
@@ -170,7 +176,7 @@ def _survey_pool(client: Client, required_slots: Mapping[str, int], writing: boo
         GPU: "stage 2 casts the rays",
         LIDAR: f"{GENERATE}, {SORT} and {required_slots.get(LIDAR, 0) - 2 - writing} x {COLLECT}"
         f"{', and writing jobs of a campaign' if writing else ''}",
-        OTHER: "path planning; or remove planning from the scenario",
+        OTHER: "path planning, unless `planning` is removed from the scenario",
     }
     try:
         pool.require(required_slots, purpose)
@@ -186,20 +192,21 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
         # Code is sent to workers by value, which needs the same minor version.
         if str(python).split(".")[:2] != driver_version.split(".")[:2]:
             raise LidarError(
-                f"The worker at {address} has Python {python}, here it is {driver_version}: "
-                "install the same one on both sides."
+                f"The worker at {address} has Python {python}, but the run requires Python "
+                f"{driver_version}. Install the same version on both machines."
             )
     driver_sources = software()["lidarpool"]
     for address, answer in _answers(client, software_query(), workers).items():
         if not answer:
             raise LidarError(
-                f"The worker at {address} does not have lidarpool: install lidarpool "
-                f"{__version__} in the environment that dask worker is started from."
+                f"The worker at {address} does not have lidarpool. Install lidarpool "
+                f"{__version__} in the environment from which `dask worker` is started."
             )
         if answer["lidarpool"] != driver_sources:
             raise LidarError(
-                f"The worker at {address} has lidarpool {answer['lidarpool']}, here it is "
-                f"{driver_sources}: install the same on both sides, and start the worker again."
+                f"The worker at {address} has lidarpool {answer['lidarpool']}, but the run "
+                f"requires lidarpool {driver_sources}. Install the same version on both machines, "
+                "and restart the worker."
             )
 
 
@@ -223,8 +230,8 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None
     for address, answer in _answers(client, software_query(plugins=plugins), writing).items():
         if differs := difference(answer, required):
             raise LidarError(
-                f"The worker at {address} has {differs}: install the same on both sides, and start "
-                "the worker again."
+                f"The worker at {address} has {differs}. Install the same version on both "
+                "machines, and restart the worker."
             )
     can_write = partial(_check_installed, written)
     for address, answer in ask_workers(client, can_write, writing).items():
@@ -249,9 +256,9 @@ def common_software(
     if earlier and dict(earlier) not in answers.values():
         address, installed = next(iter(answers.items()))
         raise LidarError(
-            "The scans of the run were cast with other software than the casting workers have: "
-            f"the worker at {address} has {difference(installed, earlier)}. Continue it there, or "
-            "drop it with --fresh (in Python remove_run)."
+            "The run was started with different software than the casting workers have. "
+            f"The worker at {address} has {difference(installed, earlier)}. Continue the run with "
+            "the earlier software, or remove it with `--fresh` (`remove_run` in Python)."
         )
     counts = Counter(tuple(answer.items()) for answer in answers.values())
     common = max(counts, key=lambda items: (counts[items], items))
@@ -265,7 +272,7 @@ def _answers(
     answers = ask_workers(client, question, workers)
     if workers and not answers:
         raise TooFewWorkersError(
-            "The workers of partition 'GPU' left before the run started: their logs say why."
+            "The workers of partition 'GPU' left before the run started. See their logs."
         )
     for answer in answers.values():
         if isinstance(answer, BaseException):
@@ -278,8 +285,14 @@ def gpu_note(pool: Iterable[WorkerInfo], casting: Sequence[WorkerInfo], backend:
     if backend == "cuda" or not any(worker.gpus for worker in pool):
         return ""
     if any(worker.gpus for worker in casting):
-        return f"the GPUs of partition GPU are not used: the rays are cast with {backend}"
-    return f"no GPU in partition GPU: CPU workers cast the rays with {backend}"
+        return (
+            "the GPUs of partition GPU are not used, because the rays are cast with the backend "
+            f"{backend!r}"
+        )
+    return (
+        "partition GPU has no worker with a GPU, so CPU workers cast the rays with the backend "
+        f"{backend!r}"
+    )
 
 
 def common_backend(
@@ -296,7 +309,7 @@ def common_backend(
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
     for address, reasons in answers.items():
-        if reason := reasons.get(requested, "there is no backend of that name"):
+        if reason := reasons.get(requested, "it has no backend of that name"):
             raise LidarError(
                 f"Backend {requested!r} cannot be used on the casting worker at {address}: "
                 f"{reason}. {advice}"

@@ -99,7 +99,7 @@ class Cluster:
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         if client.asynchronous:
-            raise LidarError("The client is asynchronous: give one made without asynchronous=True.")
+            raise LidarError("The client is asynchronous. Create it without `asynchronous=True`.")
         self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
             self._request_slots(first, store, required_slots)
@@ -160,8 +160,8 @@ class Cluster:
 
     def _lost_error(self) -> LidarError:
         return LidarError(
-            f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
-            "the tasks of this run; it has ended without a result."
+            f"The cluster at {self.address} is no longer reachable, or the tasks of this run were "
+            "cancelled by a different client. The run ended without a result."
         )
 
     def tasks(self, name: str) -> Tasks[Any]:

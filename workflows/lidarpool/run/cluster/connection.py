@@ -98,14 +98,15 @@ def check_starts_workers() -> None:
     """Raise LidarError if this process may not start workers: in a task of Dask or a daemon."""
     try:
         get_worker()
-        context = "in a task of Dask"
+        context = "a Dask task"
+        advice = "Pass `client=distributed.get_client()`, or start the run in a separate process."
     except ValueError:  # outside of tasks
-        context = "in a daemonic process, such as a worker of a DataLoader,"
+        context = "a daemonic process, such as a worker of a DataLoader"
+        advice = "Pass a client, or start the run in a separate process."
         if not current_process().daemon:
             return
     raise LidarError(
-        f"A run without a client starts workers, which {context} cannot be done: give "
-        "client=distributed.get_client() in a task, or call it in a process of its own."
+        f"A run without a client starts workers, which is not possible in {context}. {advice}"
     )
 
 
@@ -181,7 +182,7 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
         try:
             yield client
         except TooFewWorkersError as error:
-            error.add_note("Jobs that began and failed say why in their logs.")
+            error.add_note("If jobs of the queue failed, see their logs.")
             raise
 
 
@@ -234,9 +235,9 @@ def connected(
     except Exception as error:
         waited = f" within {waiting.seconds:g} s" if waiting.seconds and _absent(error) else ""
         raise LidarError(
-            f"No Dask scheduler answers at {scheduler!r}{waited} ({_reason(error)}): start one "
-            "with dask scheduler, and give its address as tcp://host:8786; of an encrypted one as "
-            "tls://host:8786, with --tls-ca, --tls-cert and --tls-key."
+            f"No Dask scheduler responded at {scheduler!r}{waited} ({_reason(error)}). Start one "
+            "with `dask scheduler`, and pass its address, such as tcp://host:8786. For a TLS "
+            "cluster, pass tls://host:8786 with `--tls-ca`, `--tls-cert` and `--tls-key`."
         ) from error
     with client:
         yield client
@@ -247,7 +248,7 @@ async def _reach(address: str, security: Security, waiting: Waiting) -> None:
 
     A client would wait for ever for a silent scheduler.
     """
-    reason = "nobody answers"
+    reason = "no response"
     while True:
         timeout: float = CONNECT_TIMEOUT_S
         if waiting.seconds:

@@ -10,7 +10,7 @@ from typing import Any
 from dask.utils import format_bytes
 from distributed import Client
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, as_sentence
 from lidarsim.base.vocabulary import PATIENCE_S
 from lidarsim.base.words import plural
 from poolpart.task_locations import look_for_tasks
@@ -51,13 +51,13 @@ class Waiting:
             TELL_EVERY_S, (now_s - self._start_s) / 10
         ):
             self._told_at = now_s
-            remaining = f"for another {self.remaining_s(now_s):.0f} s"
-            self._tell(f"waiting for {awaited}, {remaining}{f': {reason}' if reason else ''}")
+            remaining = f"for up to {self.remaining_s(now_s):.0f} s more"
+            self._tell(f"waiting for {awaited} {remaining}{f': {reason}' if reason else ''}")
 
 
 def queued(jobs: int) -> str:
     """Return a clause about jobs in a queue or starting."""
-    return f"{plural(jobs, 'job')} in the queue, or starting"
+    return f"{plural(jobs, 'job is', 'jobs are')} in the queue or starting"
 
 
 class Watch:
@@ -115,7 +115,7 @@ class Watch:
             elif not waiting.remaining_s():
                 raise LidarError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
             elif name in paused:
-                advice = "give them a larger --memory-limit"
+                advice = "their memory is nearly full. Start them with a larger `--memory-limit`"
                 waiting.tell(f"paused workers of partition {name}", advice)
             else:
                 coming = look_for_tasks(self.client, name).coming
@@ -124,8 +124,9 @@ class Watch:
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
         """Report a paused worker at its first appearance."""
         note = (
-            f"Dask has paused worker {worker['name']} of partition {partition}, whose memory limit "
-            f"is {format_bytes(worker['memory_limit'])}: others get its work until memory is free"
+            f"Dask paused worker {worker['name']} of partition {partition}, whose memory limit is "
+            f"{format_bytes(worker['memory_limit'])}. Other workers take over its work until "
+            "memory is free"
         )
         if note not in self.notes:
             self.notes.append(note)
@@ -134,11 +135,14 @@ class Watch:
 
 def _lacking(name: str, paused: bool, seconds: str) -> str:
     """Return a message about a partition that had no workers, or only paused workers."""
-    start = f'start some with --resources "{name}=1" and run it again.'
+    start = f'start workers with `--resources "{name}=1"` and repeat the run.'
     if paused:
         return (
-            f"The workers of partition {name!r} have taken no tasks for {seconds}, so the run "
-            "was ended: Dask pauses those whose memory is nearly full. Give them a larger "
-            f"--memory-limit, or {start}"
+            f"The run was stopped because the workers of partition {name!r} have accepted no tasks "
+            f"for {seconds}. Dask pauses workers whose memory is nearly full. Increase their "
+            f"`--memory-limit`, or {start}"
         )
-    return f"Partition {name!r} has had no workers for {seconds}, so the run was ended: {start}"
+    return (
+        f"The run was stopped because partition {name!r} has had no workers for {seconds}. "
+        f"{as_sentence(start)}"
+    )

@@ -25,11 +25,11 @@ class Outcome(Enum):
     PENDING = "pending"
     DONE = "done"
     DIED = "its worker died"
-    GONE = "its worker is gone or silent"
-    REFUSED = "its worker takes no tasks"
+    GONE = "its worker has left or does not respond"
+    REFUSED = "its worker accepts no tasks"
     LATE = "it is late"
-    NO_RIG = "its worker has no scene any more"
-    SEPARATE_JOBS = "its task failed, perhaps because of another job"
+    NO_RIG = "its worker no longer has the scene"
+    SEPARATE_JOBS = "its task failed, possibly because of a different job"
 
 
 @dataclass(eq=False)

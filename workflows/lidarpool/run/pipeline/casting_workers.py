@@ -16,7 +16,7 @@ import cloudpickle
 from distributed import Future
 from distributed.utils import get_ip
 
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, message_of
 from lidarsim.scene.scene import Scene
 from lidarsim.survey.survey import Survey
 from poolpart import Partition
@@ -40,8 +40,8 @@ ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of l
 RELEASE_S = 3.0  # time for workers to drop their rigs
 SPARE_SCENES = 2  # scenes without a survey under way, kept for the next survey
 INLINE_BYTES = 1 << 17  # larger payloads are sent to one worker, and fetched by other workers
-CHECKING = "checking the casting workers"
-PREPARING = "preparing the scene on the casting workers"
+CHECKING = "Checking the casting workers"
+PREPARING = "Preparing the scene on the casting workers"
 
 
 @dataclass(eq=False)
@@ -186,7 +186,9 @@ class CastingWorkers:
             plan = static_scene.name, scene.actors, packed, self._backend
             self._jobs[job] = self._payload(str(job), lambda: plan), static_scene
         except _UNSENT as error:  # raised by pickling classes of the user
-            raise JobError(f"The survey cannot be sent to the workers: {error}") from error
+            raise JobError(
+                f"The survey cannot be sent to the workers: {message_of(error)}"
+            ) from error
         return packed, static_scene.name
 
     def remove(self, job: int) -> None:
@@ -304,7 +306,7 @@ class CastingWorkers:
             return Outcome.DIED
         if status == "error" and len(jobs) > 1:
             return Outcome.SEPARATE_JOBS
-        activity = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
+        activity = PREPARING if isinstance(error, RigFailed) else f"Stage {INTERSECT}"
         raise_if_failed(future, activity, JobError)  # the message names the scans
         return Outcome.PENDING
 
@@ -318,16 +320,16 @@ class CastingWorkers:
         self._lost_devices.add(error.process)
         # Until its process ends; the next has another address.
         self._workers[worker] = _Worker(None, WorkerState.REFUSED)
-        self.notes.append(f"The GPU of {worker} answered no call any more ({error}).")
+        self.notes.append(f"the GPU of {worker} stopped responding ({error})")
         if not error.restarts:
             raise LidarError(
-                f"The GPU of {worker} answers no call any more, and no nanny restarts the worker: "
-                f"start it anew and continue with --resume ({error})."
+                f"The GPU of {worker} stopped responding ({error}), and the worker has no nanny "
+                "that would restart it. Restart the worker and continue with `--resume`."
             )
         if len(self._lost_devices) >= LOST_DEVICES:
             raise LidarError(
-                f"GPUs of workers have failed {LOST_DEVICES} times, the last of {worker}: look at "
-                f"nvidia-smi and dmesg there, then continue with --resume ({error})."
+                f"GPUs have failed {LOST_DEVICES} times, most recently on {worker} ({error}). "
+                "Check the output of nvidia-smi and dmesg there, and continue with `--resume`."
             )
 
     def forget(self, key: str) -> None:
@@ -427,12 +429,13 @@ class CastingWorkers:
         if differs := difference(software, self._software):
             worker.state = WorkerState.REFUSED
             self.notes.append(
-                f"worker {identity['name']} at {address} has {differs}: it cast nothing"
+                f"worker {identity['name']} at {address} was not used because it has {differs}"
             )
             if self._in_state(WorkerState.REFUSED).keys() >= self.locations.members:
                 raise LidarError(
-                    f"No worker of partition {self._partition.name!r} has the run's software: the "
-                    f"one at {address} has {differs}. Install the same on all."
+                    f"No worker of partition {self._partition.name!r} has the software of the run. "
+                    f"The worker at {address} has {differs}. Install the same versions on all "
+                    "workers."
                 )
             return
         slots = identity["resources"].get(self._partition.name, 1)
@@ -452,9 +455,8 @@ class CastingWorkers:
             self._died.append(address)
         if len(self._died) >= SETUP_DEATHS and not self.slots:
             raise LidarError(
-                f"{CHECKING} has killed {len(self._died)} of them in a row"
-                f"{memory_clause(self._client, self._died)}: "
-                "look into their logs."
+                f"{len(self._died)} casting workers in a row died while they were checked"
+                f"{memory_clause(self._client, self._died)}. See their logs."
             )
 
 

@@ -278,10 +278,9 @@ class Dispatcher:
         elif kills >= policies.MAX_KILLS:
             partition = GPU if stage == INTERSECT else LIDAR
             batch.job.condemned.append(
-                f"{scans_in_words(batch.first, batch.stop)} kills the worker that runs stage "
-                f"{stage}: {policies.MAX_KILLS} workers died, one after the other, with no other "
-                f"scan in that stage{self._workers.memory_clause(worker)}. Look into the logs of "
-                f"the {partition} workers."
+                f"{policies.MAX_KILLS} workers in a row died in stage {stage} while they processed "
+                f"only {scans_in_words(batch.first, batch.stop)}"
+                f"{self._workers.memory_clause(worker)}. See the logs of the {partition} workers."
             )
             self._remove(batch)
             self._fail_condemned(batch.job)
@@ -306,10 +305,9 @@ class Dispatcher:
         if len(killers) >= policies.MAX_KILLS:
             names = ", ".join(scans_in_words(killer.first, killer.stop) for killer in killers)
             error = JobError(
-                f"Casting workers die whatever they cast first: {len(killers)} died, one "
-                f"after the other, with nothing but {names}"
+                f"{len(killers)} casting workers in a row died in their first batch ({names})"
                 f"{self._workers.memory_clause(worker)}. The scene may need more memory than "
-                "they have: look into their logs, or try another backend."
+                "they have. See their logs, or try a different backend."
             )
             self.failed.setdefault(batch.job, error)
 

@@ -61,8 +61,8 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
 
 def storing(storage: Storage) -> AbstractContextManager[None]:
     """Turn an OSError of the body into a LidarError with advice on storage."""
-    advice = "make room there, or give another place with --parts"
-    return explained(f"The points cannot be kept in {storage.url}", advice)
+    advice = "Free space there, or choose a different location with `--parts`"
+    return explained(f"The points cannot be stored in {storage.url}", advice)
 
 
 def error_of(future: Future) -> BaseException | None:
@@ -82,7 +82,7 @@ def raise_if_failed(future: Future, activity: str, kind: type[LidarError] = Lida
         words = str(error) or type(error).__name__  # some of Dask's have no message
         raise kind(f"{activity} failed: {words}") from error
     if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
-        raise LidarError(f"{activity} was cancelled from outside this run.")
+        raise LidarError(f"{activity} was cancelled by a different client.")
 
 
 def memory_clause(client: Client, workers: Collection[str]) -> str:
@@ -92,4 +92,4 @@ def memory_clause(client: Client, workers: Collection[str]) -> str:
     ended = {event.get("worker") for _, event in events} & set(workers)
     if not ended:
         return ""
-    return " (ended by their nanny for exceeding the memory limit)"
+    return " (terminated by their nanny because they exceeded the memory limit)"

@@ -33,7 +33,7 @@ with suppress(ImportError):  # a check says why the module cannot be loaded
     from raybeam import moving_loops, tile_casts  # noqa: F401
 
     if tile_casts.COMPILED:
-        print("note: compiled the ray caster for this processor, once", file=sys.stderr)  # noqa: T201
+        print("note: the ray caster was compiled for this processor", file=sys.stderr)  # noqa: T201
 # What each worker would read from many files: versions of packages, and a hash of the sources.
 distributed.versions.get_versions()
 software.sources()

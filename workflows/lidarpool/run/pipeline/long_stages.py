@@ -25,6 +25,7 @@ from distributed import Future, Lock
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
+from lidarsim.base.words import plural
 from poolpart import Partition, Pipe, PipeFailed
 from poolpart.fetch import fetch_available, take_held
 from poolpart.pipe import advise, forget_pipes, take_news
@@ -119,7 +120,7 @@ class LongStages:
     def notes(self) -> list[str]:
         """Notes for the user."""
         workers = f"{', '.join(sorted(self._hidden))} of partition {self.partition.name}"
-        note = f"{workers} cannot see {self._storage.url}: the driver wrote their parts"
+        note = f"{workers} cannot access {self._storage.url}, so the driver wrote their parts"
         return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
@@ -223,14 +224,16 @@ class LongStages:
                 self._waited_from = self._waited_from or now_s
                 self._enough_at = now_s
             elif now_s - self._enough_at > self._patience_s:
-                count = f"has had {locations.slots} of the {slot_count} slots needed for"
-                raise self._too_few(f"Partition {self.partition.name!r} {count}")
+                raise self._too_few(
+                    f"Partition {self.partition.name!r} has had {plural(locations.slots, 'slot')} "
+                    f"for {self._patience_s:.0f} s, but the run needs {slot_count}."
+                )
             return
         self.waiting = False
         if self._waited_from is not None:
             self._notes.append(
-                f"the survey waited {now_s - self._waited_from:.1f} s for partition "
-                f"{self.partition.name}, until other runs had left it {slot_count} slots"
+                f"the survey waited {now_s - self._waited_from:.1f} s until other runs released "
+                f"{slot_count} slots of partition {self.partition.name}"
             )
         for name in self._names:
             self._submit(name, free)
@@ -238,10 +241,10 @@ class LongStages:
         while len(self._look().tasks) < slot_count and time.monotonic() < now_s + SETTLE_S:
             time.sleep(0.005)
 
-    def _too_few(self, problem: str, since: str = "") -> LidarError:
+    def _too_few(self, problem: str) -> LidarError:
         return LidarError(
-            f"{problem} {self._patience_s:.0f} s{since}: start another worker with --resources "
-            f'"{self.partition.name}=1" and run it again.'
+            f'{problem} Start another worker with `--resources "{self.partition.name}=1"` and '
+            "repeat the run."
         )
 
     def _look(self) -> TaskLocations:
@@ -272,7 +275,7 @@ class LongStages:
             return {}, [*self._tasks]
         for name, task in self._tasks.items():
             if not was_killed(task.future):
-                raise_if_failed(task.future, f"stage {name}")
+                raise_if_failed(task.future, f"Stage {name}")
         return self._restart(now_s)
 
     def _restart(self, now_s: float) -> tuple[dict[str, str], list[str]]:
@@ -316,16 +319,19 @@ class LongStages:
         # A single collector is not needed while others run: they do its work.
         spare = name.startswith(COLLECT) and self.collectors
         if task.dead_since and now_s - task.dead_since > self._patience_s and not spare:
-            problem = f"no free slot in partition {self.partition.name!r} for"
-            raise self._too_few(f"Stage {name} has had {problem}", " since its worker died")
+            raise self._too_few(
+                f"Since the worker of stage {name} died, the stage has waited "
+                f"{self._patience_s:.0f} s for a free slot in partition {self.partition.name!r}."
+            )
 
     def _check_end(self, name: str) -> None:
         """Raise LidarError if a stage has ended before `close`: another client has ended a pipe."""
         if self._closed_at is None:
             pipes = ", ".join(repr(pipe.name) for pipe in self._pipes)
             raise LidarError(
-                f"Stage {name} has ended too early: another client has closed, failed or deleted a "
-                f"Queue or Variable of this run ({pipes}). Leave these alone, and run it again."
+                f"Stage {name} ended too early because a different client closed, failed or "
+                f"deleted a Queue or Variable of this run ({pipes}). Repeat the run without "
+                "changing them."
             )
 
     def _count_death(self, name: str, worker: str) -> None:
@@ -337,9 +343,9 @@ class LongStages:
         died.append(worker)
         if len(died) > MAX_DEATHS:
             raise LidarError(
-                f"stage {name} was started {len(died)} times, and each time its worker died before "
-                f"anything was committed{memory_clause(self.client, died)}: look into the logs "
-                "of the LIDAR workers."
+                f"Stage {name} was started {len(died)} times, and each time its worker died before "
+                f"any scan was committed{memory_clause(self.client, died)}. See the logs of the "
+                "LIDAR workers."
             )
 
     def _submit(self, name: str, free: dict[str, int]) -> None:

@@ -242,7 +242,7 @@ class Pipeline:
                 if message.stage == GENERATE:
                     self._announced.pop(message.job, None)
                 if job is not None:
-                    self._end(job, JobError(f"stage {message.stage} failed: {message.reason}"))
+                    self._end(job, JobError(f"Stage {message.stage} failed: {message.reason}"))
             case Summaries():
                 if job is not None:
                     self.progress += job.hand_out(message)

@@ -145,7 +145,7 @@ def _unpickled(data: Packed) -> Any:
         try:
             return data.load()
         except OSError as error:
-            raise MemoryUnseen(f"This worker does not see the driver's memory: {error}") from error
+            raise MemoryUnseen(f"This worker cannot access the driver's memory: {error}") from error
     return data.load()
 
 
@@ -249,7 +249,7 @@ def leaving_with_device(rig: Rig) -> Iterator[None]:
             raise
         worker = get_worker()
         restarts = worker.nanny is not None
-        logger.error("The GPU answers no call of this process any more: %s", error)
+        logger.error("The GPU no longer responds to calls of this process: %s", error)
         if restarts:  # when the error has been sent
             threading.Timer(LEAVE_S, os._exit, [1]).start()
         raise DeviceLost(str(error), f"{worker.address} {os.getpid()}", restarts) from None

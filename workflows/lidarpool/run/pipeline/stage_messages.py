@@ -170,18 +170,18 @@ Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """A scan in the order of stage 3, whose points are in storage.
+    """A scan in scan order, whose points are already stored.
 
     Parameters
     ----------
     scan
-        Its number.
+        Number of the scan.
     sensor
-        Name of its sensor; "" for a single one without a name.
+        Name of the sensor, or "" for a single sensor without a name.
     rays, hit_count, count
-        Rays fired, rays that hit a surface, and points of the cloud.
+        Number of rays fired, number of rays that hit a surface, and number of points in the cloud.
     samples
-        float32 (m, 3): ends of a few rays, meters, local coordinates.
+        End points of a few rays, in meters in local coordinates. float32 array of shape (m, 3).
     """
 
     __signature__ = ReadableSignature()
@@ -199,21 +199,21 @@ class ScanFrame:
 
     @property
     def pose(self) -> Pose:
-        """Pose of the sensor at the start of the scan, in the scene's local coordinates."""
+        """Pose of the sensor at the start of the scan, in the local coordinates of the scene."""
         return self._survey.pose(self.scan)
 
     @property
     def time_ns(self) -> float:
-        """Start of the scan, nanoseconds since the start of the survey."""
+        """Start of the scan in nanoseconds since the start of the survey."""
         return self._survey.begins_ns(self.scan)
 
     def points(self) -> Cloud:
-        """Points of this scan, read from its part.
+        """Points of this scan, which are read from its part.
 
         Raises
         ------
         LidarError
-            If the part cannot be read, such as after a run that was not kept.
+            If the part cannot be read, for example because the run was removed.
         """
         return self._read(self.scan)
 
@@ -222,13 +222,14 @@ class ScanFrame:
 
         Returns
         -------
-        int64 (triangles,), for `Scene.faces`, then the triangles of each instance, then those of
-        each actor.
+        int64 array of shape (triangles,), for `Scene.faces`, then for the triangles of each
+        instance, then for the triangles of each actor.
 
         Raises
         ------
         LidarError
-            If the survey lacks the column `triangle` or thins out its hits, or as `points`.
+            If the survey does not store the column `triangle` or thins out its hits, or if the part
+            cannot be read.
 
         Examples
         --------

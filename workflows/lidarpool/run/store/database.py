@@ -110,7 +110,7 @@ class RunDatabase:
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
         if (version := self.meta.get("format")) != str(FORMAT):
             raise sqlite3.DatabaseError(
-                f"it is of format {version}, and this version reads {FORMAT}"
+                f"its format is {version}, but this version reads only format {FORMAT}"
             )
         _checked_location(self.meta)
         (state,) = self._sql.execute("PRAGMA integrity_check(1)").fetchone()  # pages, indices
@@ -122,7 +122,9 @@ class RunDatabase:
             with closing(self._sql.execute(query)) as rows:
                 count = sum(crc != _crc32(*values) for *values, crc in rows)
             if count:
-                raise sqlite3.DatabaseError(f"{count:,} rows of {table} have another checksum")
+                raise sqlite3.DatabaseError(
+                    f"{count:,} rows of the table {table} have a wrong checksum"
+                )
         with closing(self._sql.execute("SELECT number FROM jobs")) as rows:
             for (number,) in rows:
                 self._mark_ended(number)
@@ -379,12 +381,13 @@ def _explained(path: Path) -> Iterator[None]:
         of_disk = any(phrase in words.lower() for phrase in _DISK_ERRORS)
         if not isinstance(error, sqlite3.OperationalError) or not of_disk:
             raise DamagedError(
-                f"{path} is damaged ({words}): drop the run with --fresh, or give another folder."
+                f"{path} is damaged ({words}). Remove the run with `--fresh`, or choose a "
+                "different folder."
             ) from error
         if "locked" in words:
             raise LidarError(f"Another run is using {path.parent}.") from error
         raise LidarError(
-            f"{path} cannot be written ({words}): make room on its disk, or give another folder."
+            f"{path} cannot be written ({words}). Free disk space, or choose a different folder."
         ) from error
 
 
@@ -411,7 +414,7 @@ def _checked_location(meta: Mapping[str, str]) -> tuple[str, str]:
     if not re.fullmatch("[0-9a-f]{16}", mark):
         raise ValueError(f"{mark!r} is not the mark of a run")
     if location and not location.endswith(f"/{parts_folder(mark)}"):
-        raise ValueError(f"{location!r} is not the place of this run's parts")
+        raise ValueError(f"{location!r} is not the location of this run's parts")
     return mark, location
 
 
@@ -431,8 +434,8 @@ def read_parts_location(path: Path) -> tuple[str, str] | None:
             tables = {name for (name,) in sql.execute("SELECT name FROM sqlite_master")}
             if tables and not tables >= {"meta", "parts", "trials"}:
                 raise LidarError(
-                    f"{path} is not the database of a run: move it elsewhere, or give another "
-                    "folder."
+                    f"{path} is not the database of a run. Move it elsewhere, or choose a "
+                    "different folder."
                 )
             rows = sql.execute("SELECT name, value, crc FROM meta").fetchall()
             if any(_crc32(name, value) != crc for name, value, crc in rows):

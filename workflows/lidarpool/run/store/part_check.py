@@ -71,8 +71,8 @@ def _state(job: JobUnderWay, part: Receipt, sizes: Mapping[str, int]) -> str:
 
 
 def _note(job: JobUnderWay, receipts: Sequence[Receipt], state: str) -> str:
-    """Return a note that scans are cast again because their parts were missing or damaged."""
+    """Return a note that scans are repeated because their parts were missing or damaged."""
     names = listed([part.name for part in receipts])
     scans = listed([scans_in_words(part.first, part.stop) for part in receipts])
     verb = "was" if len(receipts) == 1 else "were"
-    return f"cast again: {scans}; {names} {verb} {state} in {job.storage.url}"
+    return f"repeated {scans}, because {names} {verb} {state} in {job.storage.url}"

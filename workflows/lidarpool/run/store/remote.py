@@ -67,11 +67,12 @@ class RemoteRun:
                 self.lost = True
         if self.lost:
             raise LidarError(
-                f"A later run has taken over or deleted {self.storage.url}: this one has ended."
+                f"A later run has taken over or deleted {self.storage.url}, so this run was "
+                "stopped."
             )
 
     def _explained(self) -> AbstractContextManager[None]:
-        return explained(f"The run cannot be kept in {self.storage.url}")
+        return explained(f"The run cannot be stored in {self.storage.url}")
 
 
 def fetch_database(storage: Storage, path: Path) -> None:

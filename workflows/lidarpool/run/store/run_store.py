@@ -45,8 +45,8 @@ MAX_SENSOR_KINDS = 8  # kinds of a sensor that are named in full
 _AND_OTHERS = "and others"
 
 # On the command line, and in Python.
-_RESUME = "--resume (in Python resume=True)"
-_DROP = "--fresh (in Python remove_run)"
+_RESUME = "`--resume` (`resume=True` in Python)"
+_DROP = "`--fresh` (`remove_run` in Python)"
 
 
 class _EarlierDatabase(NamedTuple):
@@ -98,8 +98,7 @@ class RunStore:
     ) -> None:
         if parts_location is not None and location is None:
             raise LidarError(
-                "parts are given a place, and nothing would know of them afterwards: give a "
-                "folder for the run as well."
+                "`parts` requires `folder`, because the database in that folder lists the parts."
             )
         self.jobs = jobs
         self._requested_backend = backend
@@ -120,8 +119,8 @@ class RunStore:
         folder = self._folder.local()
         if location is None or self._remote:
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        advice = "make the one that it lies in first, or give another"
-        with explained(f"The run's folder {folder} cannot be made", advice):
+        advice = "Create its parent folder first, or choose a different folder"
+        with explained(f"The run folder {folder} cannot be created", advice):
             folder.mkdir(exist_ok=True)
         self.under_way: dict[int, JobUnderWay] = {}  # {number: job}
         self.only_job: JobUnderWay | None = None  # the only job, of a survey; None for a campaign
@@ -195,7 +194,7 @@ class RunStore:
         self._check_same(meta)
         self.begun = True
         if not earlier_mark:
-            self.notes.append(f"{FILE} was missing or damaged, and is made again from the parts")
+            self.notes.append(f"{FILE} was missing or damaged and was rebuilt from the parts")
         return meta
 
     def _discard(self, earlier: _EarlierDatabase) -> None:
@@ -229,7 +228,7 @@ class RunStore:
     def _claim(self, resume: bool) -> None:
         """Find the parts, and mark their folder as this run's."""
         self.storage = replace(parts_of(self.location, self.db.meta["parts"]), durable=self.lasting)
-        with explained(f"{self.storage.url} cannot be looked at"):
+        with explained(f"{self.storage.url} cannot be listed"):
             self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
         self._strays: dict[int, list[str]] = {}  # {job: names of parts that a run has left}
         for name in self._sizes:
@@ -261,20 +260,20 @@ class RunStore:
         """Raise LidarError if the existing run of the same jobs may not be continued."""
         if not resume:
             raise LidarError(
-                f"{self.location} holds an unfinished run, {self.committed_in_words}: continue it "
-                f"with {_RESUME}, or drop it with {_DROP}."
+                f"{self.location} contains an unfinished run with {self.committed_in_words}. "
+                f"Continue it with {_RESUME}, or remove it with {_DROP}."
             )
         if self.backend and self._requested_backend not in ("auto", self.backend):
             raise LidarError(
-                f"Backend {self._requested_backend!r} is asked for, and the scans in "
-                f"{self.location} were cast with {self.backend!r}: continue with that, or drop "
-                f"them with {_DROP}."
+                f"The scans in {self.location} were cast with the backend {self.backend!r}, so "
+                f"the run cannot continue with {self._requested_backend!r}. Use "
+                f"{self.backend!r}, or remove the scans with {_DROP}."
             )
 
     def _difference(self, meta: Mapping[str, str]) -> str:
-        """Return how the run of a database differs, as a clause.
+        """Return how the run of a database differs, as a clause with a period.
 
-        The clause is empty if the runs are the same.
+        The text is empty if the runs are the same.
         """
         earlier = json.loads(meta["identity"])
         for name, value in self._run_identity.items():
@@ -282,24 +281,24 @@ class RunStore:
                 if name == "shard":
                     shards = str(earlier.get(name)), str(value)
                     earlier_shard, requested_shard = map(shard_in_words, shards)
-                    return f"it is {earlier_shard}, not {requested_shard}"
+                    return f"it is {earlier_shard} rather than {requested_shard}."
                 if name != "lidarpool":
                     changed = differences(json.loads(meta.get("fields", "{}")), self.jobs.fields)
-                    differs = changed or f"its {name} differs"
                     kind = name if name in CONTENT else "campaign"
-                    return (
-                        f"it is of another {kind}: {differs}. Only these may change: "
-                        f"{self.jobs.changeable}"
-                    )
-                return f"it was written with {name} {earlier.get(name, 'none')}, here it is {value}"
+                    differs = f"the {kind} has changed{f': {changed}' if changed else ''}"
+                    return f"{differs}. {self.jobs.changeable}"
+                return (
+                    f"it was started with {name} {earlier.get(name, '(unknown version)')}, but "
+                    f"this is {name} {value}."
+                )
         return ""
 
     def _check_same(self, meta: Mapping[str, str]) -> None:
         """Raise LidarError if an earlier run in this location differs from this run."""
         if difference := self._difference(meta):
             raise LidarError(
-                f"The run in {self.location} cannot be continued, {difference}. Drop it with "
-                f"{_DROP}, or give another folder."
+                f"The run in {self.location} cannot be continued because {difference} Remove it "
+                f"with {_DROP}, or choose a different folder."
             )
 
     # -- reading ---------------------------------------------------------------------------
@@ -345,8 +344,8 @@ class RunStore:
         if not self.committed_in_words:
             return AUTO_TAKES
         return (
-            f"The scans in {self.location} were cast with it: continue where it is to be had, or "
-            f"drop them with {_DROP}."
+            f"The scans in {self.location} were cast with this backend. Continue where it is "
+            f"available, or remove them with {_DROP}."
         )
 
     def rows(self) -> Iterator[JobRow]:
@@ -467,7 +466,9 @@ class RunStore:
             committed = self.committed_in_words
             self.close()
             if committed and self._folder.local(FILE).exists():
-                error.add_note(f"{committed} are kept in {self.location}: continue with {_RESUME}.")
+                error.add_note(
+                    f"{committed} are stored in {self.location}. Continue with {_RESUME}."
+                )
             raise
 
     def close(self) -> None:
@@ -519,20 +520,21 @@ def parts_of(location: Storage, parts_location: str) -> Storage:
 
 @checked
 def remove_run(folder: str | Path | Storage) -> None:
-    """Remove a stored run and its parts, wherever the parts are, and no further file.
+    """Remove a stored run and its parts, and no other files.
 
-    If the database is damaged, only parts in the run's folder are found.
+    The parts are removed even if they are stored in a different location. If the database is
+    damaged, only parts in the folder of the run are found.
 
     Parameters
     ----------
     folder
-        The run's folder, or its URL.
+        Folder or URL of the run.
 
     Raises
     ------
     LidarError
-        If another run uses the database, the files cannot be removed, or there is a link in place
-        of the run's files.
+        If another run uses the database, the files cannot be removed, or a file of the run is a
+        symbolic link.
     """
     location = Storage.at(folder)
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:

@@ -59,23 +59,24 @@ def show(
 ) -> ScannerPage:
     """Show the sweeps of a scanner in the browser, in real time, on the page of `lidarpool view`.
 
-    A script prints the address of the page. The cell of a notebook shows the page if the returned
-    object is the cell's value, or is given to `display`.
+    Scripts print the address of the page. In a notebook, the page is shown in the cell if the
+    returned object is the value of the cell or is passed to `display`.
 
     Parameters
     ----------
     scanner
-        The scanner, or several scanners in one scene, with names.
+        The scanner, or several scanners with names in one scene.
     to
-        ADDRESS:PORT to listen on; by default 127.0.0.1:8080, or another port if it is in use.
+        Address and port to listen on, as ADDRESS:PORT. By default, the port is 8080 on 127.0.0.1,
+        or another port if it is in use.
     browser
-        Whether to open a browser where there is a desktop.
+        Whether to open a browser if there is a desktop.
 
     Returns
     -------
     ScannerPage
-        A context manager, whose `show` gets each sweep and its pose, and whose `close` ends the
-        page.
+        A context manager. Pass each sweep and its pose to its method `show`. Its method `close`
+        ends the page.
 
     Raises
     ------

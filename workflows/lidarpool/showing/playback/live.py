@@ -43,40 +43,42 @@ def play(
     ready: Callable[[str], Any] | None = None,
     note: Callable[[str], Any] | None = None,
 ) -> Lateness:
-    """Send the packets of a scanner as its sensor would, each at its time, until the end.
+    """Send the packets of a scanner in real time, as its sensor would.
 
     Parameters
     ----------
     scanner
-        The scanner, with the columns of `Packets`. Sweeps of a pose or trajectory are cast beside
-        each other, one on each core: ``threads=1`` is fastest then.
+        The scanner, with the columns of `Packets`. The sweeps of a pose or trajectory are cast in
+        parallel, one on each core, so ``threads=1`` is fastest in this case.
     trajectory
-        Pose of a static sensor; trajectory of a moving sensor, at whose end this function returns;
-        or a function that returns the pose, or trajectory, of the sweep that starts at a time,
-        seconds. The function is called in this thread, up to a sweep before that time. Poses may
-        jump.
+        Pose of a stationary sensor, trajectory of a moving sensor, or a function that returns the
+        pose or trajectory of the sweep that starts at a given time in seconds. At the end of a
+        trajectory, `play` returns. The function is called in this thread, up to one sweep before
+        that time. Poses may jump.
     to, api
-        Where packets go, and where the sensor's interface listens, HOST or HOST:PORT, as of
-        `lidarpool play`.
+        Destination of the packets, and address on which the sensor interface listens, as HOST or
+        HOST:PORT, as for `lidarpool play`.
     rate
-        Speed: 0.5 takes twice as long.
+        Playback speed. For example, 0.5 takes twice as long.
     duration_s
-        Length of time that is played, seconds of the scanner; by default the trajectory's length,
-        else until Ctrl-C.
+        Duration in seconds of scanner time. By default, it is the length of the trajectory. Without
+        a trajectory, packets are sent until Ctrl-C.
     start
-        Date and time of time 0, as in `Survey`, for the stamps.
+        Date and time of time 0 for the stamps, as in `Survey`.
     ready, note
-        Get the addresses once all is ready, and notes, as lines for a user.
+        Functions that are called with the addresses once the scanner is ready, and with notes for
+        the user.
 
     Returns
     -------
     Lateness
-        How many packets were sent, and how late they were.
+        Number of packets that were sent, and how late they were.
 
     Raises
     ------
     LidarError
-        If the scanner lacks a column, the sensor has no packets, or an address cannot be used.
+        If the scanner lacks a column, the packets of the sensor are not supported, or an address
+        cannot be used.
 
     Examples
     --------

@@ -130,23 +130,23 @@ class _InViewer(ScannerView):
 
 
 class Foxglove(_InViewer):
-    """Shows the sweeps of a scanner in Foxglove, in real time.
+    """Show the sweeps of a scanner in Foxglove, in real time.
 
-    A context manager. It prints the link that opens Foxglove.
+    The object is a context manager. It prints the link that opens Foxglove.
 
     Parameters
     ----------
     scanner
-        The scanner, or the first of several in one scene.
+        The scanner, or the first of several scanners in one scene.
     to
-        ADDRESS:PORT to listen on, of this machine alone; by default 127.0.0.1:8765, or another port
-        if it is in use.
+        Address and port to listen on, as ADDRESS:PORT. The address must be local to this machine.
+        By default, the port is 8765 on 127.0.0.1, or another port if it is in use.
 
     Raises
     ------
     LidarError
-        If foxglove-sdk is missing (the extra `live`), the address cannot be used, or
-        others than this machine can reach the address.
+        If foxglove-sdk is missing (extra `live`), the address cannot be used, or the address can be
+        reached from other machines.
     """
 
     @checked
@@ -155,10 +155,11 @@ class Foxglove(_InViewer):
 
 
 class Rerun(_InViewer):
-    """Shows the sweeps of a scanner in Rerun, in real time, as `Foxglove` does.
+    """Show the sweeps of a scanner in Rerun, in real time.
 
-    It prints the link of the viewer in the browser. By default it listens on 127.0.0.1:9876, with
-    the page on the next port. It needs rerun-sdk (the extra `rerun`).
+    The object is used like `Foxglove`. It prints the link of the viewer in the browser. By default,
+    it listens on 127.0.0.1:9876, and the page is served on the next port. It requires rerun-sdk
+    (extra `rerun`).
     """
 
     @checked
