@@ -19,7 +19,7 @@ from .scan import Collector, Scan
 
 
 class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
-    """The requested backend cannot be used on this machine, for the reason in the message."""
+    """The requested backend cannot be used on this machine; the message states the reason."""
 
 
 @dataclass(frozen=True)

@@ -23,29 +23,31 @@ from .scan import Scan, check_scan
 
 
 class RayCaster:
-    """Caster of rays at a triangle mesh, or at instances of meshes (`from_instances`).
+    """Ray caster for a triangle mesh, or for instances of meshes (`from_instances`).
 
-    Both sides of a triangle count. A ray in a triangle's plane does not hit that triangle. A
-    ray through an edge or a corner hits every triangle there, so closed meshes do not leak.
-    The same ray gives the same bits in every batch.
+    Both sides of a triangle can be hit. A ray in the plane of a triangle does not hit it. A ray
+    through an edge or a vertex hits every adjacent triangle, so closed meshes do not leak. The
+    results for a ray are bit-identical in every batch.
 
     Parameters
     ----------
     vertices
-        (v, 3) real numbers, meters. Large coordinates lose no precision: they are made local.
+        (v, 3) real numbers, in meters. Large coordinates do not lose precision, because they are
+        stored relative to a local origin.
     faces
-        (f, 3) integers, rows of `vertices`. A triangle without an area is never hit.
+        (f, 3) integers, indices into `vertices`. Triangles with zero area are never hit.
     backend
         "cuda", "tiles", "numpy", or "auto" for the first of these three that can be used.
     threads
         Maximum number of CPU threads; None for the default of the backend.
     device
-        Number of the CUDA device; None for the current device. Other backends ignore the number.
+        Index of the CUDA device; None for the current device. Other backends ignore it.
 
     Raises
     ------
     ValueError
-        If the mesh is not finite, of a wrong shape, has faces without vertices, or no area.
+        If the mesh is not finite, has a wrong shape, has faces with missing vertices, or has no
+        area.
     BackendUnavailable
         If the requested backend cannot be used; the message says what to install.
 
@@ -77,23 +79,24 @@ class RayCaster:
         threads: int | None = None,
         device: int | None = None,
     ) -> RayCaster:
-        """Create a caster for instances of meshes, numbered from 0 in the given order.
+        """Create a ray caster for instances of meshes, numbered from 0 in the order given.
 
-        Each mesh has a single tree, so memory and build time grow with the meshes. A single
-        instance without a transform is the same as its mesh alone.
+        Each mesh has a single acceleration structure, so memory and build time depend on the
+        meshes and hardly on the number of instances. A single instance without a transform is
+        equivalent to its mesh.
 
         Parameters
         ----------
         instances
-            At least one.
+            Instances of meshes; at least one.
         backend, threads, device
             As for `RayCaster`.
 
         Raises
         ------
         ValueError
-            If no instance is given, or a transform is not an invertible, finite (3, 4) or (4, 4)
-            matrix; the message has the instance's number.
+            If there are no instances, or if a transform is not an invertible, finite (3, 4) or
+            (4, 4) matrix. The message contains the index of the instance.
         BackendUnavailable
             If the requested backend cannot be used; the message says what to install.
 
@@ -142,12 +145,12 @@ class RayCaster:
 
     @property
     def device_lost(self) -> bool:
-        """Whether a CUDA device answers no call of this process any more, after an error of it."""
+        """Whether the CUDA device no longer responds to calls from this process after an error."""
         return self._engine.device_lost
 
     @property
     def face_count(self) -> int:
-        """Number of triangles of all meshes, triangles without an area included."""
+        """Number of triangles in all meshes, including triangles with zero area."""
         return self._scene.face_count
 
     @property
@@ -177,25 +180,26 @@ class RayCaster:
         self.engine.cast_bodies(bodies, nearest)
 
     def move(self, number: int | ArrayLike, transform: ArrayLike) -> None:
-        """Set other transforms of instances, for all later casts.
+        """Set new transforms of instances for all subsequent casts.
 
-        Only the tree over the instances is built anew, once for all moves before a cast. The
-        results equal the results of a new caster. No cast of this caster may be under way.
+        Only the acceleration structure over the instances is rebuilt, once before the next cast.
+        The results are the same as those of a new caster. Do not call this method while a cast
+        is in progress.
 
         Parameters
         ----------
         number
-            Number of the instance, or numbers (k,) without duplicates.
+            Index of the instance, or indices (k,) without duplicates.
         transform
             (3, 4) or (4, 4), as for `Instance`; for k instances (k, 3, 4) or (k, 4, 4).
 
         Raises
         ------
         IndexError
-            If an instance does not exist; no instance has moved then.
+            If an instance does not exist. In this case, no instance is moved.
         ValueError
-            If a transform is invalid, or the caster has a single mesh without a transform; no
-            instance has moved then.
+            If a transform is invalid, or if the caster has a single mesh without a transform. In
+            this case, no instance is moved.
 
         Examples
         --------
@@ -239,23 +243,23 @@ class RayCaster:
         t_min: float = 0.0,
         t_max: float = np.inf,
     ) -> Hits:
-        """Return the closest hit of every ray.
+        """Return the closest hit of each ray.
 
         Parameters
         ----------
         origins
-            (n, 3) or (3,), meters.
+            (n, 3), or (3,) for all rays, in meters.
         directions
-            (n, 3), any length but zero.
+            (n, 3), of any length greater than zero.
         t_min, t_max
-            Hits with ``t_min <= distance <= t_max`` count, meters. With `t_min` 0 a surface
-            that the ray starts on is a hit at distance 0.
+            Minimum and maximum distance of hits in meters, both inclusive. With a `t_min` of 0, a
+            ray that starts on a surface hits it at the distance 0.
 
         Raises
         ------
         ValueError
-            If a direction is zero, a value is NaN or infinite (the message names the first such
-            row), or the shapes do not fit.
+            If a direction is zero, a value is NaN or infinite, or the shapes do not match. The
+            message contains the index of the first invalid row.
         """
         return self.engine.cast(check_rays(origins, directions, t_min, t_max))
 
@@ -275,49 +279,56 @@ class RayCaster:
         motion: PoseMotion | None = None,
         room: Floats | None = None,
     ) -> ScanReturns:
-        """Cast a pattern of rays from a pose or a series of poses: the fastest cast of a lidar.
+        """Cast a ray pattern from a pose or a series of poses.
 
-        Rays are numbered from 0 at the window's start. `pattern_rays` returns the rays.
+        This is the fastest way to simulate a lidar.
+
+        Rays are numbered from 0 at the start of the window. Use `pattern_rays` to compute their
+        origins and directions.
 
         Parameters
         ----------
         pattern
-            Rays in the sensor's axes, checked once; the cuda backend keeps and rotates the
-            directions on the device.
+            Rays in the sensor frame, which are validated once. The cuda backend stores and rotates
+            the directions on the device.
         positions
-            (3,) or (k, 3), meters; or poses from `check_poses`, which replace the next arguments.
+            (3,) or (k, 3), in meters; or poses from `check_poses`, which replace the arguments
+            below.
         rotations
-            (3, 3) or (k, 3, 3) from the sensor's axes to the mesh's; None if the axes are equal.
+            (3, 3) or (k, 3, 3): rotations from the sensor frame to mesh coordinates; None if their
+            axes are parallel.
         window
-            Rows ``start <= row < stop`` of the pattern to cast; None for all. Beyond its end the
-            pattern repeats: row r is row ``r % len(pattern)``.
+            Rows ``start <= row < stop`` of the pattern to cast; None for all rows. The pattern
+            repeats beyond its end, so row r is row ``r % len(pattern)``.
         rays_per_pose
-            Ray i is cast from pose ``i // rays_per_pose``: the number of beams, if a moving
-            lidar has a pose for each firing. A single pose applies to all rays.
+            Number of consecutive rays that share a pose, so that ray i is cast from pose
+            ``i // rays_per_pose``. Use the number of beams if a moving lidar has one pose per
+            firing. A single pose applies to all rays.
         t_min, t_max
-            Hits with ``t_min <= distance <= t_max`` count, meters.
+            Minimum and maximum distance of hits in meters, both inclusive.
         keep_every
-            Keep the first and then every n-th hit of each group, in ray order.
+            Store the first and then every n-th hit of each group, in ray order.
         groups
-            Ascending numbers of the first rays of groups, from 0: scans that are cast together.
-            None for a single group.
+            Indices of the first ray of each group, ascending and starting at 0, for scans that are
+            cast together. None for a single group.
         tally
-            Count the hits of each triangle, hits that are not kept included.
+            Whether to count the hits on each triangle, including hits that are not stored.
         motion
-            How the lidar moves within each pose, if its rays have different delays.
+            Motion of the lidar within each pose, if its rays have different delays.
         room
-            float64 (6, rays), contiguous: output for origins and directions of all rays, as
-            `pattern_rays` returns; (3, rays) for directions alone. None for no output.
+            Output array for the origins and directions of all rays, as returned by `pattern_rays`:
+            float64 (6, rays), contiguous, or (3, rays) for the directions only. None for no
+            output.
 
         Raises
         ------
         ValueError
             If a position is not finite, a rotation is invalid, there are too few poses for the
-            rays, the window is not of rows, or there are more than 2**32 rays.
+            rays, the window is not a valid range of rows, or there are more than 2**32 rays.
 
         Examples
         --------
-        A head with two beams that moves between its three firings; the pattern has one firing.
+        A head with two beams moves between its three firings. The pattern contains one firing.
 
         >>> caster = RayCaster([[0, 0, 0], [9, 0, 0], [0, 9, 0]], [[0, 1, 2]], backend="numpy")
         >>> down = Pattern([[0, 0, -1], [0.1, 0, -1]])
@@ -350,15 +361,15 @@ class RayCaster:
         counters: tuple[Ints, int] | None = None,
         other_hits: OtherHits | None = None,
     ) -> tuple[Ints, Counted | None]:
-        """Cast a scan, and pass its hits to a function on the CUDA device.
+        """Cast a scan and pass its hits to a function on the CUDA device.
 
         Parameters
         ----------
         scan
-            From `check_scan`, which has the arguments of `RayCaster.scan`.
+            Scan from `check_scan`, which accepts the arguments of `RayCaster.scan`.
         use
-            Called with the kept hits of consecutive parts of the scan, in ray order, on the
-            caster's device. The arrays may be used after the call.
+            Function that is called with the stored hits of consecutive parts of the scan, in ray
+            order, on the device of the caster. The arrays remain valid after the call.
         counters
             Table and length of the scan's tally. The table is int64 (instances, 2): hits of
             triangle t of instance i count in row ``table[i, 0] + table[i, 1] * t``. None for the
@@ -370,14 +381,14 @@ class RayCaster:
         Returns
         -------
         hits
-            int64 (g,): number of hits of each group, kept or not.
+            int64 (g,): number of hits in each group, including hits that are not stored.
         counted
-            Numbers of the counters that are not 0, and their hits: int64 (k,) each; None without
-            a tally.
+            Indices of the counters that are not 0 and their number of hits, int64 (k,) each; None
+            without a tally.
 
         Raises
         ------
         BackendUnavailable
-            If this caster's backend is not cuda.
+            If the backend of this caster is not cuda.
         """
         return self.engine.visit(scan, use, counters, other_hits)

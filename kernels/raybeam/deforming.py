@@ -26,17 +26,17 @@ _LEAF_SIZE = 4
 
 @dataclass(frozen=True, eq=False)
 class Deforming:
-    """A mesh whose vertices move straight from frame to frame: a shape of `Moving`.
+    """A mesh whose vertices move linearly between frames, for use as a shape in `Moving`.
 
-    Frame 1.5 is halfway between the second and the third. Before the first and after the last frame
-    the mesh keeps its shape.
+    Frame numbers start at 0, and frame 1.5 is halfway between the second and the third frame. The
+    mesh keeps its shape before the first and after the last frame.
 
     Attributes
     ----------
     vertices
-        float64 (f, v, 3): vertices at each frame, meters; at least two frames.
+        float64 (f, v, 3): vertices at each of at least two frames, in meters.
     faces
-        int64 (t, 3): rows of the vertices of each triangle.
+        int64 (t, 3): indices of the vertices of each triangle.
     """
 
     vertices: Floats
@@ -45,7 +45,7 @@ class Deforming:
 
     @property
     def box(self) -> Floats:
-        """Lower and upper corner of the box around all frames: (2, 3), meters."""
+        """Lower and upper corner of the bounding box of all frames, in meters. Shape (2, 3)."""
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:

@@ -17,21 +17,21 @@ Counted = tuple[Ints, Ints]
 
 @dataclass(frozen=True)
 class Hits:
-    """The closest hit of every ray, misses included.
+    """Closest hit of each ray, with a row for each ray, including rays that miss.
 
     Attributes
     ----------
     distance
-        float64 (n,): meters from the ray's origin, whatever the length of its direction; inf for
-        a miss.
+        float64 (n,): distance from the origin of the ray in meters, independent of the length of
+        its direction; inf for a miss.
     triangle
-        int32 (n,): row of the `faces` of the mesh that is hit; -1 for a miss. Of triangles at
-        exactly the same distance, the lowest instance is reported, and in it the lowest row.
+        int32 (n,): index of the triangle in the `faces` of its mesh; -1 for a miss. Ties are
+        resolved in favor of the lowest instance, and within it of the lowest triangle index.
     u, v
-        float64 (n,): barycentric weights of the triangle's second and third corner; the first
-        corner's is ``1 - u - v``. 0 for a miss.
+        float64 (n,): barycentric weights of the second and third vertex of the triangle. The weight
+        of the first vertex is ``1 - u - v``. 0 for a miss.
     instance
-        int32 (n,): number of the instance that is hit; 0 for a plain mesh, -1 for a miss.
+        int32 (n,): index of the instance; 0 for a mesh without instances, -1 for a miss.
     """
 
     distance: Floats
@@ -45,28 +45,28 @@ class Hits:
 
     @property
     def hit(self) -> Bools:
-        """Mask (n,) of the rays that hit a triangle."""
+        """Mask of the rays that hit a triangle. Shape (n,)."""
         return self.triangle >= 0
 
 
 @dataclass(frozen=True)
 class ScanReturns:
-    """Result of a scan: the kept hits, in ray order, and counts of all hits.
+    """Result of a scan: the stored hits in ray order, and the counts of all hits.
 
     Attributes
     ----------
     ray
-        uint32 (k,): number of the ray, ascending, from 0 at the window's start.
+        uint32 (k,): index of the ray, ascending, starting at 0 for the first ray of the window.
     distance
-        float64 (k,): as in `Hits`, meters.
+        float64 (k,): as in `Hits`, in meters.
     triangle
         int32 (k,): as in `Hits`.
     hit_counts
-        int64 (g,): number of hits of each group, kept or not.
+        int64 (g,): number of hits in each group, including hits that are not stored.
     tally
-        int64 (face_count,): hits of each triangle, kept or not, whichever instance shows it: the
-        rows of all meshes in sequence, in their order of first use by instances. None if not
-        requested.
+        int64 (face_count,): number of hits on each triangle, summed over its instances and
+        including hits that are not stored. The rows are the triangles of all meshes, in the order
+        in which instances first use the meshes. None if not requested.
     instance
         int32 (k,): as in `Hits`.
     """

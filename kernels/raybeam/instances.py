@@ -36,17 +36,18 @@ class Mesh:
     Parameters
     ----------
     vertices
-        (v, 3) real numbers, meters. Large coordinates lose no precision: they are made local.
+        (v, 3) real numbers, in meters. Large coordinates do not lose precision, because they are
+        stored relative to a local origin.
     faces
-        (f, 3) integers, rows of `vertices`. A triangle without an area is never hit.
+        (f, 3) integers, indices into `vertices`. Triangles with zero area are never hit.
     opacity
-        The parts of the triangles that stop a ray; None for opaque triangles.
+        Mask of the opaque parts of the triangles; None if all triangles are opaque.
 
     Raises
     ------
     ValueError
-        If the mesh or its opacity is not finite or of a wrong shape, or the mesh has faces
-        without vertices, or no area.
+        If the mesh or its opacity is not finite or has a wrong shape, if faces refer to missing
+        vertices, or if the mesh has no area.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Mesh:
 
     @property
     def face_count(self) -> int:
-        """Number of triangles, triangles without an area included."""
+        """Number of triangles, including triangles with zero area."""
         return self._local.face_count
 
 
@@ -70,10 +71,10 @@ class Instance:
     Attributes
     ----------
     mesh
-        The mesh, shared by any number of instances, which take hardly any memory.
+        The mesh. Any number of instances can share a mesh with very little additional memory.
     transform
-        (3, 4), or (4, 4) with the last row 0, 0, 0, 1: from the mesh's coordinates to the
-        scene's, meters. It may rotate, move, mirror, shear and scale, also unevenly; None for the
+        (3, 4), or (4, 4) with the last row 0, 0, 0, 1: transform from mesh to scene coordinates, in
+        meters. It may rotate, translate, mirror, shear and scale, also non-uniformly. None for the
         identity.
     """
 

@@ -43,26 +43,26 @@ _NO_FRAMES = np.zeros(0)
 
 @dataclass(frozen=True, eq=False)
 class Moving:
-    """Bodies that move: shapes, each with a pose at every time.
+    """Moving bodies, each with a shape and a pose at every time.
 
     Attributes
     ----------
     shapes
-        Casters of the rigid shapes, and meshes that deform; each in the axes of its bodies.
+        Ray casters of rigid shapes, and deforming meshes, each in the frame of its bodies.
     boxes
-        float64 (s, 2, 3): lower and upper corner of each shape, over all frames, in the shape's
-        axes, meters.
+        float64 (s, 2, 3): lower and upper corner of the bounding box of each shape over all frames,
+        in the frame of the shape, in meters.
     shape
-        intp (b,): number of each body's shape.
+        intp (b,): index of the shape of each body.
     presence
-        float64 (b, 2): first and last time at which each body is present, seconds.
+        float64 (b, 2): first and last time at which each body is present, in seconds.
     poses
-        Function of numbers of bodies (m,) and times (m,) that returns poses (12, m): positions,
-        meters, and rotations from the body's axes, by rows.
+        Function of body indices (m,) and times (m,) that returns poses (12, m): positions in
+        meters, and rotation matrices from the body frame, row by row.
     frames
-        Function of numbers of deforming bodies (m,) and times (m,) that returns the frame of each
-        body's shape, float64 (m,): 1.5 is halfway between frames 1 and 2 (`Deforming`). None
-        without deforming bodies.
+        Function of the indices (m,) of deforming bodies and times (m,) that returns the frame of
+        the shape of each body, float64 (m,). Frame 1.5 is halfway between frames 1 and 2 of a
+        `Deforming` mesh. None without deforming bodies.
     """
 
     shapes: tuple[RayCaster | Deforming, ...]
@@ -79,17 +79,17 @@ class Moving:
 
     @cached_property
     def middle(self) -> Floats:
-        """Centers of the shapes' boxes (s, 3), in the shapes' axes, meters."""
+        """Centers of the bounding boxes in the frames of the shapes, in meters. (s, 3)."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
     def half(self) -> Floats:
-        """Halves of the sides of the shapes' boxes (s, 3), meters."""
+        """Half side lengths of the bounding boxes of the shapes, in meters. Shape (s, 3)."""
         return (self.boxes[:, 1] - self.boxes[:, 0]) / 2
 
     @cached_property
     def radius(self) -> Floats:
-        """Radii of the spheres around the shapes' boxes (s,), meters."""
+        """Radii of the bounding spheres of the boxes, in meters. Shape (s,)."""
         return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:

@@ -23,12 +23,12 @@ class Opacity:
     Attributes
     ----------
     mask
-        bool (h, w): True where a ray is stopped.
+        bool (h, w): True where the surface is opaque.
     uv
-        (f, 3, 2) real numbers within 2**31: texture coordinates of each triangle's corners; kept in
-        single precision. As in glTF, (0, 0) is the outer corner of the mask's first element, u
-        grows to (1, 0) along its first row, v to (0, 1) along its first column, and the mask
-        repeats beyond.
+        (f, 3, 2) real numbers within ±2**31: texture coordinates of the vertices of each triangle,
+        stored in single precision. As in glTF, (0, 0) is the outer corner of the first element of
+        the mask, u increases along the first row to (1, 0), v increases along the first column to
+        (0, 1), and the mask repeats outside this range.
     """
 
     mask: ArrayLike

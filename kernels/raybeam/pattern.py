@@ -28,32 +28,32 @@ _ROUGH = 0.1
 class Pattern:
     """Rays that are cast repeatedly, for example a revolution of a lidar.
 
-    Rays are checked and normalized once; a backend may keep a copy on its device.
+    Rays are validated and normalized once, and a backend can keep a copy on its device.
 
     Parameters
     ----------
     directions
-        (n, 3), any length but zero, in the sensor's axes.
+        (n, 3): directions in the sensor frame, of any length greater than zero.
     origins
-        (n, 3), meters, in the sensor's axes: start of each ray relative to the sensor's position;
-        (3,) for all rays; None if all start at that position.
+        (n, 3), or (3,) for all rays: start of each ray in the sensor frame, relative to the sensor
+        position, in meters. None if all rays start at the sensor position.
     sub_rays
-        Sub-rays of each direction, in sequence: these become the rays, computed during a cast.
-        None for a single ray of each direction.
+        Sub-rays of each direction. They replace the directions as rays, one beam after the other,
+        and are computed during the cast. None for a single ray per direction.
     offsets
-        (n, 2): angles across and up, radians, added to the angles of the sub-rays of each
-        direction.
+        (n, 2): angles across and up, in radians, that are added to the angles of the sub-rays of
+        each direction.
     step
-        Rows from one firing of a channel to its next, that is from a ray to its neighbor along a
-        ring: the number of channels if each firing has all channels, 1 for ring after ring. None to
-        guess the step, which may fail above 256. A wrong step makes casting slower, and changes no
-        hit.
+        Number of rows between consecutive firings of a channel, that is, between neighboring rays
+        in a ring. It is the number of channels if each firing contains all channels, and 1 if the
+        rays are stored ring by ring. By default it is estimated, which can fail for steps above
+        256. A wrong step makes casting slower but does not affect the results.
 
     Raises
     ------
     ValueError
-        For a wrong shape, or a direction that is zero or not finite, or an origin that is not
-        finite, or a step below 1.
+        If a shape is wrong, a direction is zero or not finite, an origin is not finite, or `step`
+        is less than 1.
 
     Examples
     --------
@@ -118,22 +118,22 @@ class Pattern:
 
     @property
     def subrays_per_beam(self) -> int:
-        """Number of rays of each direction."""
+        """Number of rays per direction."""
         return 1 if self.sub_rays is None else len(self.sub_rays)
 
     @property
     def directions(self) -> Floats:
-        """Unit vectors (n, 3) of the beams, read-only, contiguous when transposed."""
+        """Unit vectors of the beams, read-only, contiguous when transposed. Shape (n, 3)."""
         return self._directions.T
 
     @property
     def origins(self) -> Floats | None:
-        """Origins of the beams (n, 3), meters, read-only, contiguous when transposed, or None."""
+        """Origins of the beams in meters, read-only, contiguous when transposed; or None."""
         return None if self._origins is None else self._origins.T
 
     @cached_property
     def step(self) -> int:
-        """Rows between successive firings of a channel, as given or guessed."""
+        """Number of rows between consecutive firings of a channel, passed or estimated."""
         if self._step is not None:
             return self._step
         return _repetition(self._directions) or _least_difference(self._directions)

@@ -27,32 +27,33 @@ def pattern_rays(
     rays_per_pose: int | None = None,
     motion: PoseMotion | None = None,
 ) -> tuple[Floats, Floats]:
-    """Return origins and directions, in the mesh's axes, of numbered rays of a scan.
+    """Return the origins and directions of the rays of a scan in mesh coordinates.
 
-    The rays have the same bits as the rays that `RayCaster.scan` casts, in any batch.
+    The rays are bit-identical to the rays that `RayCaster.scan` casts, in any batch.
 
     Parameters
     ----------
     pattern
-        The pattern that is cast.
+        The pattern of the scan.
     numbers
-        (m,) whole numbers: rays numbered as in `ScanReturns`, from 0 at the window's start.
+        (m,) integers: ray indices as in `ScanReturns`, starting at 0 for the first ray of the
+        window.
     positions, rotations, rays_per_pose, motion
         As for `RayCaster.scan`.
     start
-        Start of the window.
+        First row of the window.
 
     Returns
     -------
     origins
-        float64 (m, 3), or (1, 3) if all rays share an origin, meters.
+        float64 (m, 3), or (1, 3) if all rays share an origin, in meters.
     directions
         float64 (m, 3), unit vectors.
 
     Raises
     ------
     ValueError
-        If poses are invalid, or a ray has no pose or no row in the pattern.
+        If poses are invalid, or if a ray has no pose or no row in the pattern.
 
     Examples
     --------

@@ -16,18 +16,19 @@ _SLACK = 2e-9  # tolerance for products of a rotation's rows
 
 @dataclass(frozen=True, eq=False)
 class PoseMotion:
-    """Motion of a lidar during the rays of a pose, which are fired in sequence.
+    """Motion of a lidar while the rays that share a pose are fired one after the other.
 
     Parameters
     ----------
     delays
-        float64 (m,): delay of each of the m rays of a pose after the pose's time, seconds.
+        float64 (m,): delay of each of the m rays of a pose relative to the time of the pose, in
+        seconds.
     velocities
-        float64 (k, 3): velocity at each pose, meters a second along the mesh's axes.
+        float64 (k, 3): velocity at each pose in mesh coordinates, in meters per second.
     rates
-        float64 (k, 3): angular rate at each pose, radians a second about the mesh's axes. A
-        vector v becomes ``v + delay * cross(rate, v)``: off by (delay * rate)^2 / 2, which is 2e-9
-        for 36 us at 100 degrees a second.
+        float64 (k, 3): angular velocity at each pose in mesh coordinates, in radians per second. A
+        vector v is rotated to ``v + delay * cross(rate, v)``, with an error of
+        (delay * rate)^2 / 2, which is 2e-9 for 36 us at 100 degrees per second.
     """
 
     delays: Floats

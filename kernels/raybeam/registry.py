@@ -12,7 +12,9 @@ BACKENDS: tuple[type[Backend], ...] = (CudaBackend, TileBackend, NumpyBackend)
 
 
 def available_backends() -> dict[str, str]:
-    """Return all backends by name, fastest first: "" if usable, else the reason and a remedy.
+    """Return the state of all backends by name, fastest first.
+
+    The state is "" if a backend can be used; otherwise it is the reason and a remedy.
 
     Examples
     --------

@@ -11,18 +11,18 @@ from .arrays import Floats, Indices
 
 @dataclass(frozen=True, eq=False)
 class SubRays:
-    """Sub-rays of each beam of a pattern.
+    """Sub-rays of each beam in a pattern.
 
     Attributes
     ----------
     angles
-        float64 (k, 2): tangents of the angles off the beam's direction, across and up.
+        float64 (k, 2): tangents of the angles from the beam direction, across and up.
     starts
-        float64 (k, 2): origin of each sub-ray, across and up from the beam's origin, meters; None
-        if sub-rays start at the beam's origin.
+        float64 (k, 2): origin of each sub-ray relative to the beam origin, across and up, in
+        meters. None if the sub-rays start at the beam origin.
     axis
-        float64 (3,): the axis about which "across" points counter-clockwise, and towards which "up"
-        points, in the sensor's axes; None if any two axes across the beam will do.
+        float64 (3,): axis in the sensor frame about which "across" points counterclockwise and
+        toward which "up" points. None if any two axes perpendicular to the beam can be used.
     """
 
     angles: Floats

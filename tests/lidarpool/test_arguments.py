@@ -170,7 +170,7 @@ WRONG = {
     ],
     compare: [
         (3, "a.ply", "a must … but is 3"),
-        ("a.ply", "b.ply", "a.ply does not exist: give the folder of a result"),
+        ("a.ply", "b.ply", "a.ply does not exist. Specify the folder of a result"),
     ],
     load_robot: [(3, "path must … but is 3"), (None, "path must … but is None")],
     Scene.load: [(3, "path must … but is 3"), (None, "path must … but is None")],
@@ -194,7 +194,7 @@ WRONG = {
     merge: [
         ("part-1", "ds", "shards must … but is 'part-1'"),
         (["a"], 3, "out must … but is 3"),
-        ([], "ds", "nothing to"),
+        ([], "ds", "no shards to"),
     ],
     remove_run: [(3, "folder must … but is 3"), ([], "text, a path or a Storage")],
     save_cloud: [
@@ -212,7 +212,7 @@ WRONG = {
     ],
     sweeps: [
         (3, "location must … but is 3"),
-        ("nowhere", "nowhere does not exist: give the folder of a data set"),
+        ("nowhere", "nowhere does not exist. Specify the folder of a data set"),
     ],
     to_dask: [
         (3, "points must … but is 3"),

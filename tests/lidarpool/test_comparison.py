@@ -206,7 +206,10 @@ def test_the_first_of_several_returns_counts():
     [
         (np.arange(RINGS) + 1, "ring n of A is ring n - 1 of B"),
         (RINGS - 1 - np.arange(RINGS), "ring n of A is ring 15 - n of B"),
-        (np.arange(RINGS) * 7 % RINGS, "the rings are numbered in other orders"),
+        (
+            np.arange(RINGS) * 7 % RINGS,
+            "the rings of the two clouds are numbered in different orders",
+        ),
     ],
 )
 def test_rings_are_matched_whatever_their_numbers(numbers, note):
@@ -238,8 +241,8 @@ def test_what_has_no_range_image_says_why():
             replace(made, positions=made.positions + far),
             "cloud B are 5,423 km from the origin",
         ),
-        (made, replace(made, positions=made.positions * [1, 1, 9]), "not of the same sensor"),
-        (whole, whole, "cloud A has no sweeps: all points are compared at once in world"),
+        (made, replace(made, positions=made.positions * [1, 1, 9]), "come from different sensors"),
+        (whole, whole, "cloud A has no sweeps. All points are compared at once in world"),
         (made, whole, "cloud B has no sweeps"),
     ):
         found = compare(a, b).figures
@@ -257,7 +260,10 @@ def test_of_many_points_and_cells_some_are_compared(monkeypatch):
     assert "2,000 points and cells" in found["notes"][0]
     whole = Cloud(cloud().positions, {})
     thin = compare(whole, whole, most_points=3000).figures
-    assert thin["a"]["points"] == 3000 and "11,520 points; 26 % are compared" in thin["notes"][1]
+    assert (
+        thin["a"]["points"] == 3000
+        and "11,520 points, of which 26 % are compared" in thin["notes"][1]
+    )
     assert "from 2,000 points of each cloud" in thin["notes"][3]
     assert thin["distances"]["a_to_b"]["points"] == 2000
 
@@ -334,7 +340,9 @@ def test_sweeps_left_over_are_noted_unless_sweeps_are_chosen(written, tmp_path):
     for name in ("000000.pcd", "000001.pcd"):
         (tmp_path / name).write_bytes((folder / "pcd" / name).read_bytes())
     found = compare(tmp_path, folder / "pcd")
-    assert found.figures["notes"] == ["A has 2 sweeps, B 3: 2 pairs by order"]
+    assert found.figures["notes"] == [
+        "A has 2 sweeps and B has 3. Matching by order results in 2 pairs"
+    ]
     head_a, head_b = repr(found).splitlines()[:2]
     assert head_a.endswith(" points, 2 sweeps")
     assert head_b.endswith(" points, 2 of 3 sweeps (the reference)")
@@ -392,7 +400,7 @@ def test_a_survey_that_moved_is_compared_with_a_map(written):
         assert found["distances"]["b_to_a"]["points"] == len(made)
         assert max(found["distances"][way]["max_m"] for way in ("a_to_b", "b_to_a")) < 1e-3
         assert "cloud.laz has no sweeps" in found["notes"][0]
-    with pytest.raises(LidarError, match="does not say where that was"):
+    with pytest.raises(LidarError, match="does not contain the pose of the sensor"):
         compare(folder / "cloud.mcap", folder / "cloud.laz")
 
 
@@ -403,14 +411,17 @@ def test_sweeps_are_matched_by_time(written, tmp_path):
     later.save(tmp_path / "sweeps.npz")
     found = compare(tmp_path, folder, match="time").figures
     assert found["pairs"] == 2
-    assert found["notes"][0] == "A has 3 sweeps, B 3: 2 pairs by time"
+    assert found["notes"][0] == "A has 3 sweeps and B has 3. Matching by time results in 2 pairs"
     assert found["distances"]["a_to_b"]["max_m"] < 20  # one turn on: in the sensors' own axes
-    with pytest.raises(LidarError, match="has no times of sweeps: leave out --match time"):
+    with pytest.raises(LidarError, match=r"has no sweep times\. Omit `--match time`"):
         compare(folder / "pcd", folder, match="time")
     for name in ("0.pcd", "1.pcd"):
         (tmp_path / name).write_bytes((folder / "pcd/000000.pcd").read_bytes())
     (tmp_path / "cloud.ply").unlink()
-    assert compare(tmp_path, folder).figures["notes"][0] == "A has 2 sweeps, B 3: 2 pairs by order"
+    assert (
+        compare(tmp_path, folder).figures["notes"][0]
+        == "A has 2 sweeps and B has 3. Matching by order results in 2 pairs"
+    )
 
 
 def test_one_of_several_sensors_is_chosen(tmp_path):
@@ -422,8 +433,11 @@ def test_one_of_several_sensors_is_chosen(tmp_path):
         form.write(tmp_path / form.row.file, made, of)
     of.save(tmp_path / "sweeps.npz")
     bag = tmp_path / "cloud.mcap"
-    for place, names in ((tmp_path, "sensors front, rear/left"), (bag, "/front/points, /rear")):
-        with pytest.raises(LidarError, match=rf"{names}.*: choose one \(--sensor-a"):
+    for place, names in (
+        (tmp_path, "sensors front and rear/left"),
+        (bag, "/front/points and /rear"),
+    ):
+        with pytest.raises(LidarError, match=rf"{names}.*Choose one of them with `--sensor`"):
             compare(place, tmp_path, sensor_b="front")
     found = compare(bag, tmp_path, sensor_a="/rear_left/points", sensor_b="rear/left").figures
     assert found["pairs"] == 3 and found["distances"]["a_to_b"]["max_m"] < 2e-3
@@ -436,7 +450,7 @@ def test_sweeps_of_data_sets(tmp_path, kind):
     found = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="front").figures
     assert found["pairs"] == found["a"]["sweeps"] == 15  # of five jobs
     assert found["distances"]["a_to_b"]["max_m"] == 0
-    assert "pairs with an empty sweep are left out" in found["notes"]
+    assert "pairs with an empty sweep are skipped" in found["notes"]
     other = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="rear/left", sweeps=[3]).figures
     assert other["pairs"] == 1 and other["distances"]["a_to_b"]["median_m"] > 1
 
@@ -556,24 +570,27 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
     header = laspy.LasHeader(point_format=6, version="1.4")
     laspy.LasData(header).write(tmp_path / "none.las")
     for path, says in (
-        ("nowhere.pcd", "does not exist: give the folder of a result"),
-        ("notes.md", "is not read: give the folder of a result"),
-        ("empty", "is not read"),
-        ("none.las", "has no points: there is nothing to compare"),
+        ("nowhere.pcd", r"does not exist\. Specify the folder of a result"),
+        ("notes.md", r"format of .* is not supported\. Specify the folder of a result"),
+        ("empty", "is not supported"),
+        ("none.las", "contains no points, so there is nothing to compare"),
     ):
         with pytest.raises(LidarError, match=says):
             compare(tmp_path / path, made)
     for options, says in (
-        ({"sweeps": [3]}, r"there is no sweep 3: 3 pairs of sweeps, from 0"),
-        ({"sensor_a": "roof"}, r"does not have 'roof'. It has no names of sensors"),
-        ({"sensor_b": "/points"}, "does not have '/points'"),
-        ({"distances_m": [0.0]}, "it must be lengths in meters"),
+        (
+            {"sweeps": [3]},
+            r"There is no pair 3 of sweeps\. Pairs are numbered from 0, and there are 3",
+        ),
+        ({"sensor_a": "roof"}, r"does not contain 'roof'\. Its sensors have no names"),
+        ({"sensor_b": "/points"}, "does not contain '/points'"),
+        ({"distances_m": [0.0]}, "it must contain positive lengths in meters"),
     ):
         with pytest.raises(LidarError, match=says):
             compare(folder, folder, **options)
-    with pytest.raises(LidarError, match="has no sweeps: leave out --sweep and --match"):
+    with pytest.raises(LidarError, match=r"has no sweeps\. Omit `--sweep` and `--match`"):
         compare(made, folder, sweeps=[0])
-    with pytest.raises(LidarError, match=r"'/point'\. Did you mean '/points'\? It has"):
+    with pytest.raises(LidarError, match=r"'/point'\. Did you mean '/points'\? It contains"):
         open_recording(folder / "cloud.mcap", "/point")
 
 
@@ -623,7 +640,7 @@ def test_a_ring_that_only_one_sees_is_noted():
     there = np.ones((RINGS, COLUMNS), bool)
     there[3] = False
     notes = compare(cloud(there=there), cloud()).figures["notes"]
-    assert "only one of the two has returns of 1 ring" in str(notes)
+    assert "only one of the clouds has returns of 1 ring" in str(notes)
 
 
 def test_maps_of_georeferenced_clouds_have_short_numbers():

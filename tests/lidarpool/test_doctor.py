@@ -25,7 +25,7 @@ SOUND = {
 
 def test_nothing_is_wrong_without_a_gpu():
     assert doctor._fix_first(SOUND) == ""
-    assert doctor.advice_in_words({"fix_first": ""}) == "nothing needs to be fixed."
+    assert doctor.advice_in_words({"fix_first": ""}) == "No problems were found."
 
 
 @pytest.mark.parametrize(

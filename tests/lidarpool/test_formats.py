@@ -527,20 +527,20 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     cloud, sweeps, tmp_path, monkeypatch
 ):
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
-    with pytest.raises(LidarError, match=r"kitti needs reflectivity, class, .*output\.write"):
+    with pytest.raises(LidarError, match=r"kitti requires reflectivity and class, .*output\.write"):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
-    with pytest.raises(LidarError, match="mcap with the layout ouster needs signal, time"):
+    with pytest.raises(LidarError, match="mcap with the layout ouster requires signal, time"):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     (tmp_path / "cloud.laz").write_text("mine")
-    with pytest.raises(LidarError, match=r"exists: .* --overwrite"):
+    with pytest.raises(LidarError, match=r"exists.* `--overwrite`"):
         Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
     assert (tmp_path / "cloud.laz").read_text() == "mine"
     Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps, overwrite=True)
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
-    with pytest.raises(LidarError, match="gone does not exist: make it first"):
+    with pytest.raises(LidarError, match=r"gone does not exist\. Create it first"):
         Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
-    with pytest.raises(LidarError, match=r'laspy and lazrs: pip install -e "\.\[las\]"'):
+    with pytest.raises(LidarError, match=r'laspy and lazrs\. Run pip install -e "\.\[las\]"'):
         Format("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}
 
@@ -638,7 +638,7 @@ def test_zones_of_utm_need_no_other_package(epsg, middle, north):
 def test_other_coordinate_systems_come_from_rasterio(monkeypatch):
     if well_known_text.find_spec("rasterio"):
         assert wkt(2056).startswith('PROJCS["CH1903+ / LV95"')
-        with pytest.raises(LidarError, match="rasterio cannot write EPSG:1024 as WKT 1"):
+        with pytest.raises(LidarError, match="rasterio cannot convert EPSG:1024 to WKT 1"):
             wkt(1024)
     monkeypatch.setattr(well_known_text, "find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r"EPSG:2056 is not a UTM zone .*\.\[geo\]"):
@@ -758,18 +758,24 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
 
     before = sorted(tmp_path.rglob("*"))
     for told, path, more in (
-        (r"has no format: use .ply, .las, .*, or give a format", "x.xyz", {}),
+        (r"does not belong to a format\. Use .ply, .las, .*, or specify a format", "x.xyz", {}),
         ("Unknown cloud format 'xyz'. The available names are ply, las, ", "x", {"format": "xyz"}),
         ("layout must be 'velodyne', .* but is 'sick'", "x.mcap", {"layout": "sick"}),
-        ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
+        (r"is a folder\. Remove it, or use another path", "kitti", {"format": "kitti"}),
         ("is a folder", "result", {"format": "laz"}),
-        ("precision_m is -1; it must be a length in meters", "x.las", {"precision_m": -1}),
+        (
+            "`precision_m` is -1; it must be a positive length in meters",
+            "x.las",
+            {"precision_m": -1},
+        ),
     ):
         with pytest.raises(LidarError, match=told):
             save_cloud(known, tmp_path / path, **more)
-    with pytest.raises(LidarError, match="mcap stores single sweeps, but this cloud has none"):
+    with pytest.raises(LidarError, match="mcap stores single sweeps, but the cloud has no sweeps"):
         save_cloud(bare, tmp_path / "x.mcap")
-    with pytest.raises(LidarError, match="kitti needs scan, object, reflectivity, class, which"):
+    with pytest.raises(
+        LidarError, match="kitti requires scan, object, reflectivity and class, but"
+    ):
         save_cloud(
             Cloud(cloud.positions, {}, sweeps=lambda: sweeps), tmp_path / "x", format="kitti"
         )

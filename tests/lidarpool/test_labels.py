@@ -116,10 +116,10 @@ def test_the_note_on_classes_without_names_says_what_to_give():
     for name, title in (("mcap", "MCAP"), ("nuscenes", "nuScenes")):
         told = [note for note in Format(name).notes(cloud, sweeps) if "class" in note]
         assert told == [
-            f"{title} holds class only if classes have names: give classes: {{1: ground, …}} "
-            "(docs/how-to/labels.md)"
+            f"{title} can store class only if classes have names. Set `classes: {{1: ground, …}}`; "
+            "see docs/how-to/labels.md"
         ]
         named = replace(sweeps, classes={1: "ground"})
         assert not [note for note in Format(name).notes(cloud, named) if "class" in note]
     (note,) = [note for note in Format("e57").notes(cloud, sweeps) if "class" in note]
-    assert note.startswith("E57 does not hold ") and "classes:" not in note
+    assert note.startswith("E57 cannot store ") and "classes:" not in note

@@ -28,7 +28,7 @@ def test_stations_of_a_mesh_that_lies_on_its_side(tmp_path):
     aside = CliRunner().invoke(cli, [*command, "--out", str(tmp_path / "a")])
     lines = aside.stderr.splitlines()
     (note,) = [number for number, line in enumerate(lines) if "up_axis" in line]
-    (looking,) = [number for number, line in enumerate(lines) if "looking from all" in line]
+    (looking,) = [number for number, line in enumerate(lines) if "computing the visibility" in line]
     assert note < looking and "--up-axis" in lines[note]
     told = [*command, "--up-axis", "z", "--json", "--out", str(tmp_path / "b")]
     upright = json.loads(CliRunner().invoke(cli, told).stdout)
@@ -53,13 +53,13 @@ def test_a_view_and_a_played_mesh_have_its_unit_and_axis(tmp_path):
 def test_options_of_a_mesh_are_refused_for_what_is_none(tmp_path):
     (tmp_path / "points.csv").write_text("x,y,z\n1,2,3\n4,5,6\n")
     (tmp_path / "s.yaml").write_text("scene: seed\n")
-    with pytest.raises(LidarError, match=r"points\.csv is not a mesh, and --up-axis says how"):
+    with pytest.raises(LidarError, match=r"points\.csv is not a mesh\. Remove `--up-axis`"):
         open_view(tmp_path / "points.csv", of_mesh={"up_axis": "z"})
     for opened in (open_view, lambda path, of_mesh: scenario_job(path, None, of_mesh)):
         with pytest.raises(LidarError, match=r"--unit is for a mesh file: in .*change unit of"):
             opened(tmp_path / "s.yaml", of_mesh={"unit": "mm"})
     with (
-        pytest.raises(LidarError, match="is a result: leave them out"),
+        pytest.raises(LidarError, match=r"is a result\. Omit them"),
         open_source(tmp_path, None, {"unit": "mm"}),
     ):
         pass

@@ -264,7 +264,7 @@ actors: [{name: Van, box: [1, 1, 1], at: [3, 1, 0.5]}]
     )
     view = open_view(tmp_path / "drive.yaml")
     state = state_of(view)
-    assert state["preview"] and "before a run" in state["note"] and not state["exports"]
+    assert state["preview"] and "before the run" in state["note"] and not state["exports"]
     assert [sensor["name"] for sensor in state["sensors"]] == ["roof", "nose"]
     assert [actor["name"] for actor in state["actors"]] == ["Van"]
     scans = np.unique(view.points.values("scan", slice(None)))
@@ -281,7 +281,7 @@ vary: {sensors.roof.mount.position.2: {uniform: [1, 2]}}
 keep: kitti
 """
     )
-    assert "of 3 of the campaign" in state_of(open_view(tmp_path / "campaign.yaml"))["note"]
+    assert "of 3 in the campaign" in state_of(open_view(tmp_path / "campaign.yaml"))["note"]
 
 
 def test_a_mesh_in_a_ply_is_no_cloud(tmp_path, exported):
@@ -329,8 +329,8 @@ def test_one_of_several_versions_of_nuscenes_is_asked_for(nuscenes):
         with pytest.raises(LidarError) as told:
             open_it(root)
         assert str(told.value) == (
-            f"{root} has several versions of nuScenes: v1.0-lidarpool, v1.0-mini. Give the folder "
-            f"of one of them, for example {root}/v1.0-lidarpool."
+            f"{root} contains several versions of nuScenes: v1.0-lidarpool, v1.0-mini. Specify the "
+            f"folder of one version, for example {root}/v1.0-lidarpool."
         )
     assert open_recording(table.parent, "LIDAR_TOP").count == sweeps
     one = open_recording(mini.parent)
@@ -443,18 +443,24 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
         ("cut", "poses.txt has no row for frames 1 to 2. It has 1 row, and row k"),
         ("bad", r"poses.txt: line 1 has 11 cells, and 12 were expected \(m00, m01"),
         ("uncalibrated", "calib.txt: line 1 has 'x' as m00, and a number was expected"),
-        ("long", "They are probably nanoseconds. Write seconds into times.txt"),
+        ("long", "They are probably nanoseconds. Write seconds to times.txt"),
         ("cut.bin", "cut.bin"),
         ("cut.tar", "cut.tar"),
         ("cut.parquet", "cut.parquet"),
         ("cut.e57", "cut.e57"),
-        ("notes.txt", r"line 1 is 'none', .* If it is a trajectory, name it in a scenario, as "),
-        ("way.tum", "is not read: name it in a scenario, as trajectory: FILE, or give"),
-        ("empty", "is not read: give a result, data set, cloud, recording, scenario or mesh"),
-        ("run.rrd", "is not read: it is a recording of Rerun, open it with the command rerun, or"),
-        ("gt.osi", "is not read: it is a trace of OSI, name it as the traffic of a scenario, or"),
+        ("notes.txt", r"line 1 is 'none', .* If it is a trajectory, set `trajectory: FILE` "),
+        (
+            "way.tum",
+            r"is not supported\. If it is a trajectory, set `trajectory: FILE` in a scenario",
+        ),
+        (
+            "empty",
+            r"is not supported\. Specify a result, data set, cloud, recording, scenario or mesh",
+        ),
+        ("run.rrd", r"is not supported\. It is a Rerun recording\. Open it with the command rerun"),
+        ("gt.osi", r"is not supported\. It is an OSI trace\. Use it as the traffic of a scenario"),
         ("osi.mcap", "osi.mcap: it has no ROS 2 messages. Record PointCloud2, or set an OSI trace"),
-        ("none.ply", "none.ply has no points"),
+        ("none.ply", "none.ply contains no points"),
         ("robot.xacro", "Expand it first"),
         ("lost", r"lost cannot be read: No such file or directory, .*lost/samples/.*bin"),
         ("none.las", "does not exist"),
@@ -479,7 +485,7 @@ def test_a_data_set_is_a_list_of_jobs_with_the_points_of_each(tmp_path, kind, ti
     jobs = JobList(tmp_path / "set")
     told, _ = jobs.answer("jobs", {}, bool)
     assert (told["count"], told["done"], told["failed"], told["over"]) == (6, 5, 1, True)
-    assert told["state"] == f"data set in the format {title}"
+    assert told["state"] == f"data set in {title} format"
     assert [job["name"] for job in told["ended"]] == ["00", "01", "02", "04", "05"]
     assert [job["error"] for job in told["failures"]] == ["failed"]
     assert told["ended"][1]["values"] == ["0.5"] and told["names"] == ["rain"]

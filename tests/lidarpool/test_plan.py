@@ -151,7 +151,7 @@ def test_where_no_path_is_free_the_plan_says_so():
     plan = best([trial_of(0, CROSSES), trial_of(1, GRAZES)], ONE_DISC)
     assert (plan.trial, plan.collision_free) == (1, False)
     assert plan.clearance == pytest.approx(-0.5)
-    with pytest.raises(LidarError, match="No planning trial was finished"):
+    with pytest.raises(LidarError, match="No planning trial was completed"):
         best([], ONE_DISC)
 
 
@@ -177,19 +177,25 @@ def test_a_disc_between_samples_is_not_missed():
 
 
 BAD = {
-    "start within": ({"centers": [(25, 24)], "radii": 2}, r"start \(25, 25\) lies within disc 0"),
+    "start within": (
+        {"centers": [(25, 24)], "radii": 2},
+        r"start of the path \(25, 25\) lies within disc 0",
+    ),
     "target within": ({"centers": [(0, 0), (-30, -21)], "radii": 2}, "target .* within disc 1"),
-    "no way to go": ({"start": (1, 2), "target": (1, 2)}, "nothing to plan"),
+    "no way to go": ({"start": (1, 2), "target": (1, 2)}, "Move one of them"),
     "start not finite": (
         {"start": (np.nan, 0)},
         "start\\[0\\] must be a finite number, but is nan",
     ),
     "target in space": ({"target": (0, 0, 0)}, "target must have at most 2 items"),
-    "centers not finite": ({"centers": [(0, np.inf)], "radii": 1}, "centers is .*inf"),
-    "centers in space": ({"centers": [(0, 0, 0)], "radii": 1}, r"centers is .*\(m, 2\)"),
+    "centers not finite": ({"centers": [(0, np.inf)], "radii": 1}, "centers` is .*inf"),
+    "centers in space": ({"centers": [(0, 0, 0)], "radii": 1}, r"centers` is .*\(m, 2\)"),
     "radii too many": ({"centers": [(0, 0)], "radii": [1, 2]}, "one for each disc or one for all"),
-    "radius below 0": ({"centers": [(0, 0)], "radii": -1}, "above 0"),
-    "radius not finite": ({"centers": [(0, 0)], "radii": np.inf}, "radii is inf; it must be fin"),
+    "radius below 0": ({"centers": [(0, 0)], "radii": -1}, "positive"),
+    "radius not finite": (
+        {"centers": [(0, 0)], "radii": np.inf},
+        "radii` is inf; it must be positive fin",
+    ),
     "no trials": ({"trials": 0}, "trials must be from 1 to"),
 }
 

@@ -139,12 +139,12 @@ def test_stations_are_in_world_coordinates_and_stand_on_pavements():
 @pytest.mark.parametrize(
     ("given", "says"),
     [
-        ({"count": 2, "coverage": 0.9}, "give one of them"),
+        ({"count": 2, "coverage": 0.9}, "cannot be combined"),
         ({"coverage": 95.0}, "coverage must be .* but is 95.0"),
         ({"spacing_m": 0.001}, "larger spacing"),
         ({"sensor": Sensor.grid(max_range_m=0.5)}, "Nothing is visible"),
         ({"scene": Scene.from_meshes(POLES), "spacing_m": 3.0}, "The scene has no floor"),
-        ({"scene": Scene.from_meshes(POLES[:1])}, "There is no room on the floor"),
+        ({"scene": Scene.from_meshes(POLES[:1])}, "The floor has no space"),
     ],
 )
 def test_what_cannot_be_is_refused(given, says):
@@ -171,7 +171,9 @@ def test_targets_are_covered_and_other_objects_only_occlude():
     open_scene = Scene.from_meshes(house[:2])
     unscreened = plan_stations(open_scene, EVERYWHERE, targets=["House"], count=1, **options)
     assert unscreened.visible_m2[1] == pytest.approx(96, rel=0.02)
-    with pytest.raises(LidarError, match=r"target 'Hose' fits no object\. Did you mean 'House'\?"):
+    with pytest.raises(
+        LidarError, match=r"target 'Hose' does not match any object\. Did you mean 'House'\?"
+    ):
         plan_stations(scene, EVERYWHERE, targets=["House", "Hose"])
     with pytest.raises(LidarError, match="No target is visible"):
         buried = [*house, placed("Buried", (1, 1, 1), (0, 0, 1))]
@@ -196,7 +198,7 @@ def test_the_report_names_the_targets(tmp_path):
     assert figures["seen_m2"] == pytest.approx(8, rel=0.1)  # the side that faces the station
     assert figures["covered"] == pytest.approx(0.2 / 2, rel=0.2)  # a strip of 0.2 m
     text = CliRunner().invoke(cli, [*command, "--target", "Tower"]).stdout
-    assert re.match(r"1 station see [\d,]+ m² of H\* and Tower, and [\d.]+% of it is within", text)
+    assert re.match(r"[\d,]+ m² of H\* and Tower are visible from 1 station, and [\d.]+% of", text)
     assert "Ground" not in text
 
 
@@ -215,16 +217,19 @@ def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
     assert figures["covered"] == pytest.approx(
         sum(entry["covered_m2"] for entry in figures["objects"].values()) / figures["seen_m2"]
     )
-    assert "2 stations see " in CliRunner().invoke(cli, [*command, "--within", "0.02"]).stdout
+    assert (
+        " m² are visible from 2 stations"
+        in CliRunner().invoke(cli, [*command, "--within", "0.02"]).stdout
+    )
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["hall.glb", "--of", "scan.npy"], "it has no poses: give stations.yaml"),
-        (["hall.glb", "--of", "scan.npy", "--count", "2"], "--count: not with --of"),
-        (["hall.glb", "--of", "scan.npy", "--within", "0"], "--within is 0; it must be greater"),
-        (["hall.glb"], "--sensor is required, because hall.glb names no sensor model"),
+        (["hall.glb", "--of", "scan.npy"], "the scenario has no poses"),
+        (["hall.glb", "--of", "scan.npy", "--count", "2"], "`--count` cannot be used with `--of`"),
+        (["hall.glb", "--of", "scan.npy", "--within", "0"], "`--within` is 0; it must be greater"),
+        (["hall.glb"], "`--sensor` is required, because hall.glb does not specify a sensor model"),
     ],
 )
 def test_a_scan_that_cannot_be_compared(tmp_path, monkeypatch, options, says):

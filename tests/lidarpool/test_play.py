@@ -64,7 +64,7 @@ def test_sweeps_of_a_scenario_and_its_result_leave_at_their_times(kept, tmp_path
     scenario.write_text(f"{SCENARIO}output: {{write: [pcap]}}\n")
     outcome = play(scenario, "--as", "kept", "--rate", 2)
     assert outcome.exit_code == 0, outcome.output
-    assert outcome.stdout == "ready: nowhere; Ctrl-C stops\nkept\n"
+    assert outcome.stdout == "ready: nowhere. Press Ctrl-C to stop.\nkept\n"
     *cast, closed = kept
     assert closed == "closed"
     assert [sweep for sweep, *_ in cast] == [0, 1, 2]
@@ -100,7 +100,9 @@ def test_a_result_gives_the_points_of_its_scenario(cluster, tmp_path):
 
 def test_what_cannot_be_played_is_refused_in_a_line(tmp_path):
     (tmp_path / "a.pcap").write_bytes(b"")
-    needs_packets = pytest.raises(LidarError, match="holds packets: play it with --as packets")
+    needs_packets = pytest.raises(
+        LidarError, match=r"contains packets\. Play it with `--as packets`"
+    )
     with needs_packets, open_source(tmp_path / "a.pcap"):
         pass
     lacks_cloud = pytest.raises(LidarError, match=r"holds no cloud\.ply: give a scenario")

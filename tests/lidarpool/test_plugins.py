@@ -234,7 +234,7 @@ def test_formats_of_clouds_that_cannot_be_used(distribution):
         },
     )
     assert "half_cloud.write" in refused(Format("half").check_installed)
-    assert "has data sets" in refused(row_of, "set")
+    assert "defines the data set" in refused(row_of, "set")
     assert "writes 'cloud.ply'" in refused(row_of, "taken")
     told = refused(Format, "quarter")
     assert "Unknown cloud format 'quarter'" in told and "half" in told
@@ -280,7 +280,7 @@ def test_a_plugin_writes_a_cloud_to_a_file(tmp_path, distribution):
     )
     cloud = Cloud([[0.0, 0.0, 1.0]], {})
     told = refused(save_cloud, cloud, tmp_path / "a.text", format="text")
-    assert "needs no_such: pip install no_such" in told
+    assert "requires no_such. Run pip install no_such" in told
     object.__setattr__(row_of("text"), "packages", ())
     save_cloud(cloud, tmp_path / "a.text", format="text")
     assert (tmp_path / "a.text").read_text() == "1 points"
@@ -310,7 +310,10 @@ def test_a_plugin_reads_a_cloud_as_sweeps_and_as_points(tmp_path, distribution):
     scanned = read_points(tmp_path / "a.lines", None, tell=print)
     np.testing.assert_array_equal(scanned.positions, points)
     told = refused(save_cloud, Cloud(points, {}), tmp_path / "b.lines", format="lines")
-    assert told == "'lines' is only read: write another format, such as ply."
+    assert (
+        told
+        == "The format 'lines' can be read, but not written. Write another format, such as ply."
+    )
 
 
 # -- software ------------------------------------------------------------------------------------

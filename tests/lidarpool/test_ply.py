@@ -206,7 +206,7 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
 
     monkeypatch.setattr(ply, "write_with_open3d", faulty)
     expected = {
-        "cut": (LidarError, "could not be written"),
+        "cut": (LidarError, "cannot be written"),
         "fewer": (LidarError, "999 of 1,000 points"),
         "interrupted": (KeyboardInterrupt, None),
         "no space": (LidarError, "No space left"),
@@ -225,13 +225,15 @@ def test_a_disk_without_room_is_told_the_size_of_the_file(tmp_path, monkeypatch,
     free = 0
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
-    with pytest.raises(LidarError, match="could not be written: it takes") as caught:
+    with pytest.raises(LidarError, match="cannot be written: it requires") as caught:
         save_cloud(sample(count), path)
-    numbers = re.search(r"takes ([\d,]+) bytes, and ([\d,]+) beside it", str(caught.value))
+    numbers = re.search(
+        r"requires ([\d,]+) bytes and temporarily another ([\d,]+) bytes", str(caught.value)
+    )
     size, piece = (int(number.replace(",", "")) for number in numbers.groups())
     assert piece == min(count, 300) * (3 * 4 + 4 + 2 + 4)
     free = size + piece - 1
-    with pytest.raises(LidarError, match=f"the disk has {free:,} bytes free"):
+    with pytest.raises(LidarError, match=f"only {free:,} bytes are free on the disk"):
         save_cloud(sample(count), path)
     assert not any(tmp_path.iterdir())
     free += 1

@@ -91,7 +91,7 @@ def test_rows_of_kitti_belong_to_the_frames_with_their_numbers(tmp_path):
     for number in range(3):
         assert recording.read_points(number, in_world=True).points[0, 0] == pytest.approx(50)
     assert recording.notes[0].endswith(
-        "some has no file of points for frames 0 to 9, 12, 14 to 19 of poses.txt"
+        "some has no point file for frames 0 to 9, 12, 14 to 19 of poses.txt"
     )
     assert open_recording(kitti(tmp_path / "all", range(3), 3, 3)).notes == ()
 
@@ -125,7 +125,9 @@ def test_files_that_are_not_numbered_have_a_row_each(tmp_path):
 def test_poses_of_kitti_without_a_calibration(tmp_path):
     folder = kitti(tmp_path / "s", range(3), 3, calibrated=False)
     recording = open_recording(folder)
-    assert recording.notes[0].endswith("no calib.txt, so its poses count as poses of the lidar")
+    assert recording.notes[0].endswith(
+        "no calib.txt, so its poses are assumed to be poses of the lidar"
+    )
     np.testing.assert_allclose(recording.poses(range(3))[:, 0, 3], [0, 1, 2])
     (folder / "calib.txt").write_text("P0: 1 0 0 0 0 1 0 0 0 0 1 0\n")
     with pytest.raises(LidarError, match=r"calib\.txt has no line `Tr:`, the transform from the"):
@@ -280,7 +282,7 @@ def test_poses_by_registration_are_moved_to_the_stamps():
     matrices[:, 0, 3] = np.arange(4)
     for first_s, moved_m in ((0.0, -0.5), (-0.1, 0.5), (-0.05, 0.0)):
         poses = RecordedPoses(
-            matrices, 0.1 * np.arange(4), "by registration", np.zeros(3), 0.5, first_s
+            matrices, 0.1 * np.arange(4), "from registration", np.zeros(3), 0.5, first_s
         )
         found = Alignment.unaligned(poses, 0.1, Motion.TIMED, 1)
         np.testing.assert_allclose(found.poses[:, 0, 3], np.arange(4) + moved_m, atol=1e-9)
@@ -303,7 +305,7 @@ def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):
     expected_ns = START_NS + 1e8 * np.arange(1, SWEEPS + 1)
     np.testing.assert_allclose([*recording.times()], expected_ns, rtol=0, atol=512)
     assert recording.notes[0].endswith(
-        "bag has no stamps, so its sweeps have the times at which they were recorded"
+        "bag has no timestamps, so its sweeps have the times at which they were recorded"
     )
     # A simulation may begin at zero.
     simulated = [(stamp_ns - START_NS, columns) for stamp_ns, columns in drive(relative)]
@@ -380,7 +382,7 @@ def test_rows_of_kitti_are_poses_of_the_sweeps(tmp_path):
     np.savetxt(poses, lidar_rows(4))
     np.testing.assert_allclose(find_poses(files, poses).matrices[:, 0, 3], range(4))
     np.savetxt(poses, lidar_rows(3))
-    with pytest.raises(LidarError, match=r"has 3 rows without times, and .* has 4 sweeps"):
+    with pytest.raises(LidarError, match=r"contains 3 rows without times, but .* has 4 sweeps"):
         find_poses(files, poses)
 
 

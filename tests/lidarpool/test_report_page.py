@@ -207,13 +207,13 @@ def test_sensors_within_the_points_are_marked_from_above(write):
     assert second - first == pytest.approx(pixels, abs=0.11)
     assert pixels - 0.1 <= first <= pixels + 1.1
     assert y == other_y and rows - pixels - 1.1 <= y <= rows - pixels + 0.1
-    assert "the positions of sensors in red" in page.text_content()
+    assert "the sensor positions in red" in page.text_content()
 
 
 def test_the_title_has_the_scenario_where_no_sensor_has_a_model(write):
     assert "<h1>hall, from 2 positions</h1>" in write()[0]
     assert "<h1>Sensor with 16 channels from 2 positions</h1>" in write(scenario=None)[0]
-    assert "<dd>2</dd><dt>positions of the sensor</dt>" in write()[0]
+    assert "<dd>2</dd><dt>sensor positions</dt>" in write()[0]
 
 
 def test_cells_of_wide_tables_have_the_names_of_their_columns(write):
@@ -246,14 +246,17 @@ def test_numbers_are_those_of_the_report(write):
     text, report = write()
     page = html.fromstring(text)
     pairs = {dt.text: dt.getnext().text for dt in page.xpath("//dl[@class='pairs']//dt")}
-    assert pairs["batches offered again because a worker was lost"] == "3"
+    assert pairs["batches repeated because a worker was lost"] == "3"
     assert pairs["tasks outside their partition"] == "0"
-    assert pairs["shortest possible"] == f"{report['planning']['shortest_possible']:.2f} m"
+    assert pairs["shortest possible path"] == f"{report['planning']['shortest_possible']:.2f} m"
     lead = page.xpath("//p[@class='lead']")[0].text_content()
     assert lead.startswith(
-        f"120 scans (4 sweeps) from 2 positions sent {report['rays']:,} rays at 2 objects"
+        f"120 scans (4 sweeps) from 2 positions with {report['rays']:,} rays and 2 objects"
     )
-    assert "2,500 hit, and 500 points of them are in the cloud; 3 particle swarms" in lead
+    assert (
+        "2,500 hits. The cloud contains 500 points. A path was searched with 3 particle swarms"
+        in lead
+    )
     rows = {row.get("data-stage"): row for row in page.xpath("//tr[@data-stage]")}
     assert list(rows) == list(report["stages"])
     for stage, told in report["stages"].items():
@@ -307,7 +310,7 @@ def test_figures_have_the_digits_that_are_read(write):
     assert told["firings per turn"] == "1,808.4" and told["range"] == "0.4 m to 1,234.6 m"
     assert (told["detection_range_m"], told["visibility_km"]) == ("100.9", "3.333")
     assert told["local origin"] == "(500,000.123, 0, 1.5) m"
-    assert told["survey and planning overlap"] == "0 s"
+    assert told["overlap of survey and planning"] == "0 s"
 
 
 def test_scanning_of_a_flight_is_on_its_lines(write):
@@ -317,13 +320,13 @@ def test_scanning_of_a_flight_is_on_its_lines(write):
     steps = 3.0 * np.stack([np.cos(headings), np.sin(headings), 0 * headings], axis=1)
     track = Track(np.arange(401) * 0.05, np.cumsum(steps, axis=0))
     text, report = write(survey=Survey(load_sensor("airborne/riegl-vq780i"), trajectory=track))
-    assert "<dt>of scanning on 2 flight lines</dt>" in text
+    assert "<dt>scanning time on 2 flight lines</dt>" in text
     lines = report["parameters"]["flight_lines"]
     assert lines["count"] == 2
     assert lines["seconds"] == pytest.approx(16, abs=0.5)
     assert lines["length_m"] == pytest.approx(60 * 16, rel=0.04)
     text, report = write(survey=Survey(Sensor.grid(), trajectory=track))
-    assert re.search("<dd>20[^<]*</dd><dt>of scanning</dt>", text)
+    assert re.search("<dd>20[^<]*</dd><dt>scanning time</dt>", text)
     assert report["parameters"]["flight_lines"] is None
 
 
@@ -333,8 +336,8 @@ def test_hits_on_nothing_are_told_from_those_on_surfaces(write):
     on = np.full(len(scene_of(("Tower", "Wall")).faces), 2, np.int64)
     text, report = write(cloud=cloud, _hit_counts=lambda: on)
     assert report["hits_on_surfaces"] == on.sum() < report["hits"] == 2500
-    assert f"2,500 hit ({2500 - on.sum():,} of them no surface), and" in text
-    assert f"The {on.sum():,} hits on surfaces per square meter" in text
+    assert f"2,500 hits ({2500 - on.sum():,} of them not on a surface)." in text
+    assert f"The {on.sum():,} hits on surfaces, per square meter" in text
 
 
 def test_points_by_object_are_all_accounted_for(write):
@@ -398,7 +401,7 @@ def test_the_density_is_that_of_the_ground_from_above(write, each):
     assert told["median"] == pytest.approx(each, rel=0.08)
     assert 0.85 * whole < told["mean"] < whole < told["median"]
     assert 30 <= told["median"] * told["cell_m"] ** 2 < 30 * 4 * 1.1
-    assert f"median of the cells of {told['cell_m']:.3g} m that have points" in text
+    assert f"median of the cells of {told['cell_m']:.3g} m that contain points" in text
 
 
 def test_clouds_of_other_densities_have_other_numbers(write):
@@ -436,7 +439,7 @@ def test_the_timeline_shows_who_worked_when_and_is_bounded(write):
     text, _ = write(tasks=records(workers=200, tasks=10_000))
     assert len(text) < 2_000_000
     assert len(lanes(text)) == 5 + 3 + 2 * MAX_ROWS
-    assert "; the busiest 24 of 200 rows" in text and f"{20_004:,} tasks in" in text
+    assert "; only the 24 busiest of 200 rows are shown" in text and f"{20_004:,} tasks in" in text
 
 
 CLOUD = cloud_of(500, 2, 120, 16)
@@ -448,13 +451,19 @@ STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"points": 0, "hit_count": 0}, "has no points: no ray hit anything within range."),
-        ({"points": 1}, "1 point of them is in the cloud"),
-        ({"tasks": (), "resumed": 120}, "No task ran"),
-        ({"plan": ENCLOSED}, "none, the obstacles leave no way"),
-        ({"plan": Planning((0, 0), (10, 0), trials=1, particles=5, iterations=1)}, "there are non"),
-        ({"tasks": [*records(), STRAY]}, "A task of trial ran on GPU-0, which is not in OTHER."),
-        ({}, "left no record"),
+        (
+            {"points": 0, "hit_count": 0},
+            "contains no points, because no ray hit a surface within range.",
+        ),
+        ({"points": 1}, "The cloud contains 1 point"),
+        ({"tasks": (), "resumed": 120}, "No tasks were run"),
+        ({"plan": ENCLOSED}, "none, because the obstacles block the way"),
+        ({"plan": Planning((0, 0), (10, 0), trials=1, particles=5, iterations=1)}, "no obstacle"),
+        (
+            {"tasks": [*records(), STRAY]},
+            "A task of the stage trial ran on GPU-0, which is not in the partition OTHER.",
+        ),
+        ({}, "are not recorded"),
         ({"cloud": RANGED}, "0.5 to 98.7 m"),
     ],
 )
@@ -466,9 +475,9 @@ def test_what_is_unusual_is_told(write, changes, words):
     ("note", "shown"),
     [
         ("all points are of class 0", "All points are of class 0"),
-        ("KITTI does not hold time", "KITTI does not hold time"),
-        ("nuScenes does not hold time", "nuScenes does not hold time"),
-        ("rosbag2 does not hold time", "rosbag2 does not hold time"),
+        ("KITTI cannot store time", "KITTI cannot store time"),
+        ("nuScenes cannot store time", "nuScenes cannot store time"),
+        ("rosbag2 cannot store time", "rosbag2 cannot store time"),
         ("wall.obj has no faces", "wall.obj has no faces"),
     ],
 )

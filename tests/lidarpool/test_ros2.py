@@ -125,7 +125,7 @@ def test_nodes_read_what_is_played(playing, dds):
     frames = nodes.subscribe("/tf", "tf2_msgs/msg/TFMessage", reliable=True)
     clock = nodes.subscribe("/clock", "rosgraph_msgs/msg/Clock", reliable=False)
     assert playing.stdout.readline() == (
-        f"ready: topics of ROS 2 in domain {DOMAIN} on 127.0.0.1; Ctrl-C stops\n"
+        f"ready: ROS 2 topics in domain {DOMAIN} on 127.0.0.1. Press Ctrl-C to stop.\n"
     )
     clouds = messages_of(points, 3)
     # A node that starts later gets the frames of the sensors.
@@ -191,11 +191,11 @@ def test_messages_of_all_types_are_read(dds):
 @pytest.mark.parametrize(
     ("hosts", "environment", "message"),
     [
-        ((), {"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233': set it to a number from 0 to 232"),
+        ((), {"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233'; it must be a number from 0 to 232"),
         ((), {"ROS_DOMAIN_ID": "one"}, "ROS_DOMAIN_ID is 'one'"),
-        ((), {"ROS_DOMAIN_ID": "9" * 5000}, "ROS_DOMAIN_ID is '9999.*': set it to a number"),
-        (("127.0.0.1:7400",), {}, "--to 127.0.0.1:7400: no such host: give a host or an IPv4 add"),
-        (("239.255.0.1",), {}, "--to 239.255.0.1 is a multicast address"),
+        ((), {"ROS_DOMAIN_ID": "9" * 5000}, "ROS_DOMAIN_ID is '9999.*; it must be a number"),
+        (("127.0.0.1:7400",), {}, "The host 127.0.0.1:7400 of `--to` does not exist"),
+        (("239.255.0.1",), {}, "239.255.0.1 of `--to` is a multicast address"),
         (("::1",), {}, "--to ::1: no such host"),
     ],
 )
@@ -232,7 +232,10 @@ def test_a_domain_whose_ports_are_taken_is_one_line(dds):
     ("arguments", "message"),
     [
         (["--as", "ros2", "--layout", "sick"], "'sick' is not one of"),
-        (["--as", "ros2", "--layout", "hesai", "--organized"], "organized is an option of the lay"),
+        (
+            ["--as", "ros2", "--layout", "hesai", "--organized"],
+            "does not have the option `organized`",
+        ),
         (["--as", "packets", "--layout", "hesai"], "--layout is not for --as packets"),
     ],
 )
@@ -263,5 +266,7 @@ def test_without_the_extra_the_error_says_what_to_install(monkeypatch):
             monkeypatch.setitem(sys.modules, name, None)
         elif name.startswith("lidarpool.showing.playback."):
             monkeypatch.delitem(sys.modules, name)
-    with pytest.raises(LidarError, match=r'--as ros2 needs cyclonedds.*pip install -e "\.\[ros'):
+    with pytest.raises(
+        LidarError, match=r'`--as ros2` requires cyclonedds.*pip install -e "\.\[ros'
+    ):
         bridge_class("ros2")

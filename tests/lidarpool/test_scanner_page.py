@@ -43,7 +43,7 @@ def test_the_page_shows_the_newest_sweep_its_sensor_and_its_actors(hall, coordin
     sensor = Mounted(Sensor.grid(200, 8), mount)
     scanner = Scanner(hall, sensor, columns=["range"], coordinates=coordinates, backend="numpy")
     with show(scanner, to=":0") as view:
-        assert capsys.readouterr().err == f"page: open {view.url}\n"
+        assert capsys.readouterr().err == f"The page is available at {view.url}\n"
         assert view.url.startswith("http://127.0.0.1:")
         state = ask(view.url, "state")
         assert state["state"] == "waiting for the first sweep"
@@ -106,7 +106,7 @@ def test_faults_are_one_line(hall):
         address = view.url
         assert f'<iframe src="{address}"' in view._repr_html_()
     view.close()  # again
-    with pytest.raises(LidarError, match=r"view is closed and shows no more sweeps: open another"):
+    with pytest.raises(LidarError, match=r"view is closed and cannot show further sweeps"):
         view.show(scanner.sweep(Pose((0, 0, 1))), Pose((0, 0, 1)))
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(address, timeout=5)
@@ -123,4 +123,4 @@ def test_a_script_ends_though_its_page_is_open():
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120
     )
     assert ended.returncode == 0
-    assert ended.stderr == f"page: open {ended.stdout}"
+    assert ended.stderr == f"The page is available at {ended.stdout}"

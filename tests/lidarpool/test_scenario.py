@@ -512,8 +512,10 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
         "scene: seed\ncloud: {coordinates: sensor}\noutput: {write: [mcap, laz, kitti]}"
     )
     las, kitti = (note for note in advice(build(read)) if "class" not in note)
-    assert "expect points in one coordinate system" in las and "use world" in las
-    assert "KITTI holds points compensated for motion" in kitti
+    assert (
+        "expect points in one coordinate system" in las and "Set `cloud.coordinates: world`" in las
+    )
+    assert "KITTI stores points compensated for motion" in kitti
     assert advice(build(scenario("scene: seed\noutput: {write: [laz, pcd]}"))) == []
 
 
@@ -566,7 +568,7 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     sensors = "scene: seed\nsensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
     (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, pcd]}")))
-    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuScenes")
+    assert note.startswith("nuScenes expects the name 'LIDAR_TOP' for the first sensor")
     assert advice(build(scenario("scene: seed\noutput: {write: [nuscenes]}"))) == []
 
 

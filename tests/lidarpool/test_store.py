@@ -230,7 +230,9 @@ def test_a_part_that_is_damaged_meanwhile_is_made_again_by_the_next_run(folder):
     for read in (lambda: store.only_job.points().load(), store.only_job.hit_counts):
         with pytest.raises(LidarError, match="cannot be used") as caught:
             read()
-        assert "Resuming the run (--resume, in Python resume=True) casts its" in str(caught.value)
+        assert "Resume the run with `--resume` (`resume=True` in Python) to cast its" in str(
+            caught.value
+        )
         assert "anew" not in str(caught.value)
     with pytest.raises(LidarError) as caught, store.kept_on_error():
         store.only_job.points().load()

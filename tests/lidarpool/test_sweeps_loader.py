@@ -150,10 +150,10 @@ def test_sweeps_are_chosen_by_split_job_and_sensor(written):
     assert len(lidarpool.sweeps(place, jobs=[])) == 0
     for options, words in (
         ({"split": "trian"}, r"no split 'trian'\. Did you mean 'train'"),
-        ({"split": "x"}, r"no split 'x'\. It has train, val, test"),
-        ({"sensors": ["roof"]}, r"no sensor 'roof'\. It has front, rear/left"),
-        ({"jobs": [3]}, r"no job 3 that is done: jobs.csv lists all"),
-        ({"jobs": [4], "split": "train"}, "no job 4 in split 'train'"),
+        ({"split": "x"}, r"no split 'x'\. The splits are train, val and test"),
+        ({"sensors": ["roof"]}, r"no sensor 'roof'\. The sensors are front and rear/left"),
+        ({"jobs": [3]}, r"no completed job 3. All jobs are listed in jobs.csv"),
+        ({"jobs": [4], "split": "train"}, "no completed job 4 in split 'train'"),
         ({"jobs": "04"}, "jobs must be a list of whole numbers or None, but is '04'"),
         ({"shuffle": True}, "shuffle must be a whole number or None, but is True"),
         ({"shuffle": -1}, "shuffle must be at least 0 or None, but is -1"),
@@ -194,7 +194,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
 
     told(
         lambda: lidarpool.sweeps(tmp_path / "nowhere"),
-        "nowhere does not exist: give the folder of a data set",
+        "nowhere does not exist. Specify the folder of a data set",
     )
     first = lidarpool.sweeps(place)
     points = place / "sequences/00/velodyne/000000.bin"
@@ -202,7 +202,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     points.write_bytes(whole[:-3])
     told(lambda: first[0], r"sequences/00/velodyne/000000\.bin is missing or damaged")
     points.write_bytes(whole[:-16])
-    told(lambda: first[0], r"labels/000000\.label is .* has \d+ points, and .*000000\.bin \d+\)")
+    told(lambda: first[0], r"labels/000000\.label is .* has \d+ points, but .*000000\.bin has \d+")
     points.unlink()
     told(lambda: first[0], r"sequences/00/velodyne/000000\.bin cannot be read: No such file")
     points.write_bytes(whole)
@@ -216,14 +216,17 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     text = index.read_text()
     for bad in (text[:50], "[]", text.replace('"version": 2', '"version": 1')):
         index.write_text(bad)
-        told(lambda: lidarpool.sweeps(place), r"dataset\.json is damaged or of another version")
+        told(
+            lambda: lidarpool.sweeps(place),
+            r"dataset\.json is damaged or was written by another version",
+        )
     index.write_text(text)
     assert len(lidarpool.sweeps(place)) == len(first)
     table = place / "jobs.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:2]))
-    told(lambda: lidarpool.sweeps(place), r"jobs\.csv is damaged or edited, .*--resume")
+    told(lambda: lidarpool.sweeps(place), r"jobs\.csv is damaged or has been edited, .*--resume")
     index.unlink()
-    told(lambda: lidarpool.sweeps(place), "is an unfinished data set: .*--resume")
+    told(lambda: lidarpool.sweeps(place), "contains an unfinished data set.*--resume")
     written("parquet"), written("mcap")
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
     told(lambda: lidarpool.sweeps(written("parquet")), r'pip install -e "\.\[parquet\]"')
@@ -393,7 +396,7 @@ def test_torch_divides_sweeps_between_ranks_and_workers(written, torch, ranks, w
 
 def test_without_torch(written, monkeypatch):
     monkeypatch.setattr("lidarpool.datasets.loader.find_spec", lambda name: None)
-    with pytest.raises(LidarError, match="needs PyTorch: pip install torch"):
+    with pytest.raises(LidarError, match=r"requires PyTorch\. Run pip install torch"):
         lidarpool.sweeps(written("kitti")).torch()
 
 

@@ -270,7 +270,7 @@ def test_a_twin_is_a_scenario_that_runs_with_another_sensor(place, tmp_path):
     other = build(Scenario.load(path, {"sensor": "velodyne/vlp16"}))
     assert other.survey.carried[0].sensor.channels == 16
     result = CliRunner().invoke(cli, ["twin", str(tmp_path), "--out", str(path.parent)])
-    assert "already contains scenario.yaml. Use another folder, or pass --overwrite." in str(
+    assert "already contains scenario.yaml. Use another folder, or pass `--overwrite`." in str(
         result.exception
     )
 
@@ -370,21 +370,23 @@ def test_few_points_and_unknown_intensities_change_no_others(drive):
 
 def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     recording = without_poses(drive)
-    with pytest.raises(LidarError, match="has 3 sweeps, and a twin needs at least 4"):
+    with pytest.raises(LidarError, match="has 3 sweeps, but a reconstruction requires at least 4"):
         twin(replace(recording, count=3))
     shuffled = without_poses(
         drive, lambda points, _: np.random.default_rng(1).permutation(len(points))
     )
-    with pytest.raises(LidarError, match=r"the order of its points shows none, .* Name its sensor"):
+    with pytest.raises(
+        LidarError, match=r"cannot be determined from the order .* Specify its sensor"
+    ):
         twin(shuffled)
-    with pytest.raises(LidarError, match="has no column 'nope' to compare as intensity"):
+    with pytest.raises(LidarError, match="has no column 'nope' that could be used as intensity"):
         twin(replace(recording, intensity_column="nope"))
     empty = Recording("drive", 9, lambda _: (np.zeros((0, 3)), {}, None))
-    with pytest.raises(LidarError, match="drive has no points"):
+    with pytest.raises(LidarError, match="drive contains no points"):
         twin(empty)
     unknown = np.tile(np.eye(4), (SWEEPS, 1, 1))
     unknown[7, 0, 3] = np.nan
-    with pytest.raises(LidarError, match="has a pose of sweep 7 that is not a number"):
+    with pytest.raises(LidarError, match="contains an invalid pose for sweep 7"):
         twin(replace(recording, frame_poses=lambda: unknown))
     trajectory = tmp_path / "poses.csv"
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
@@ -480,7 +482,7 @@ def test_rings_are_found_by_elevations_in_any_order(street, survey):
     moved = points + np.outer(np.linspace(0, 0.5, len(points)), [1, 0, 0])
     compensated = Recording("drive", 4, lambda number: (moved[number::4], {}, None))
     notes = RecordedSweeps.of_recording(compensated).notes
-    assert "their elevations are not those of a few cones" in notes[0]
+    assert "its rings cannot be determined" in notes[0]
 
 
 @pytest.mark.extended
@@ -549,8 +551,8 @@ def test_poses_are_found_in_a_city(tmp_path):
 
     truth = opened.poses(range(24))
     found = twin(Recording("drive", 24, read))
-    assert found.figures["poses"] == "by registration"
-    assert found.figures["motion"] == "as fired, at the times of the points"
+    assert found.figures["poses"] == "from registration"
+    assert found.figures["motion"] == "as fired, with point times"
     relative = np.linalg.inv(found.poses[0]) @ found.poses
     expected = np.linalg.inv(truth[0]) @ truth
     assert np.abs(relative[:, :3, 3] - expected[:, :3, 3]).max() < 0.05
@@ -567,11 +569,11 @@ def test_a_mirrored_recording_is_refused_and_a_sensor_that_stood_is_noted(drive)
         points, columns, pose = recording.read(number)
         return points * (1, -1, 1), columns, pose
 
-    with pytest.raises(LidarError, match="its points fit their poses better with y turned to -y"):
+    with pytest.raises(LidarError, match="fit its poses better with y inverted"):
         twin(replace(recording, read=mirrored, fired=None))
     first = opened.read(0)
     stood = twin(replace(opened, read=lambda _: first, count=6, times=None, frame_poses=None))
-    assert any("the sensor stood" in note for note in stood.figures["notes"])
+    assert any("the sensor was stationary" in note for note in stood.figures["notes"])
 
 
 @pytest.mark.extended
@@ -589,7 +591,7 @@ def test_sweeps_that_are_tilted_against_the_sensor_tell_no_noise(drive, tmp_path
     found = twin(Recording("drive", SWEEPS, read, frame_poses=lambda: poses))
     assert found.model.performance is None
     assert found.model.firings_per_turn == pytest.approx(480, rel=0.02)
-    assert any("the noise of the sensor is unknown: " in note for note in found.figures["notes"])
+    assert any("the sensor noise is unknown: " in note for note in found.figures["notes"])
     found.save(tmp_path / "twin")
     build(Scenario.load(tmp_path / "twin" / "scenario.yaml"))
 

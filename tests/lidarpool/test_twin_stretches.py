@@ -142,12 +142,16 @@ def test_the_same_place_by_any_number_of_workers_and_after_a_kill(bag, tmp_path)
     process.wait()
     runner = CliRunner()
     again = runner.invoke(cli, ["twin", str(bag), "--out", str(folder)])
-    assert "holds an unfinished twin: continue it with --resume" in str(again.exception)
+    assert "contains an unfinished reconstruction. Continue it with `--resume`" in str(
+        again.exception
+    )
     other = runner.invoke(
         cli, ["twin", str(bag), "--out", str(folder), "--voxel-m", "0.2", "--resume"]
     )
-    assert "an unfinished twin of another recording, of other options" in str(other.exception)
-    with pytest.raises(LidarError, match="an unfinished twin of another recording"):
+    assert "an unfinished reconstruction of another recording, or one with other options" in str(
+        other.exception
+    )
+    with pytest.raises(LidarError, match="an unfinished reconstruction of another recording"):
         twin(bag, intensity="ring", folder=folder / STEPS_FOLDER, resume=True)
     start = time.perf_counter()
     resumed = runner.invoke(cli, ["twin", str(bag), "--out", str(folder), "--resume"])

@@ -239,7 +239,9 @@ def test_ctrl_c_ends_a_loop_with_its_server(tmp_path):
         text=True,
     )
     ready = process.stdout.readline()
-    assert ready.startswith("ready: Foxglove: open https://app.foxglove.dev/?ds=foxglove-websocket")
+    assert ready.startswith(
+        "ready: Foxglove is available at https://app.foxglove.dev/?ds=foxglove-websocket"
+    )
     with FoxgloveClient(port_of(ready)) as client:
         count = len({0.0})
         client.receive(lambda client: len(client.of("/tf")) > 8 * count)
@@ -265,14 +267,16 @@ def test_a_port_in_use_is_refused_and_by_default_another_is_taken(played):
     with pytest.raises(LidarError, match=r"203\.0\.113\.1:8765 cannot be used: Cannot assign"):
         open_viewer("foxglove", "203.0.113.1")
     options = BridgeOptions(("127.0.0.1:0", "127.0.0.1:1"))
-    with pytest.raises(LidarError, match="--to is given 2 times: foxglove listens on one address"):
+    with pytest.raises(
+        LidarError, match="`--to` was passed 2 times, but foxglove listens on a single address"
+    ):
         bridge_class("foxglove")(played[0], Schedule(), options, print)
 
 
 @needs_foxglove
 @pytest.mark.parametrize("to", ["0.0.0.0:0", "[::]:0"])
 def test_foxglove_is_served_to_this_machine_only(to):
-    with pytest.raises(LidarError, match="listens on this machine only") as raised:
+    with pytest.raises(LidarError, match="can only listen on this machine") as raised:
         open_viewer("foxglove", to)
     assert "ssh -L" in str(raised.value)
 
@@ -288,12 +292,14 @@ def test_addresses_have_defaults(text, address, monkeypatch):
 
 @pytest.mark.parametrize("text", ["127.0.0.1:http", "127.0.0.1:99999", "a:-1", "a:\u0661"])
 def test_what_is_no_address_is_refused(text):
-    with pytest.raises(LidarError, match=f"'{text}' is not an address: give ADDRESS:PORT"):
+    with pytest.raises(LidarError, match=f"'{text}' is not a valid address. Expected ADDRESS:PORT"):
         Address.choose(text, 8765)
 
 
 def test_a_port_of_thousands_of_digits_is_refused_in_a_line():
-    with pytest.raises(LidarError, match="is not an address: give ADDRESS:PORT") as raised:
+    with pytest.raises(
+        LidarError, match=r"is not a valid address\. Expected ADDRESS:PORT"
+    ) as raised:
         Address.choose(f"127.0.0.1:{'9' * 5000}", 8765)
     assert len(str(raised.value)) < 200
 
@@ -301,11 +307,15 @@ def test_a_port_of_thousands_of_digits_is_refused_in_a_line():
 def test_what_is_missing_names_its_extra(room, monkeypatch, tmp_path):
     monkeypatch.setattr("lidarpool.showing.viewers.viewer.find_spec", lambda name: None)
     scanner = Scanner(room, Sensor.grid(), backend="numpy")
-    with pytest.raises(LidarError, match=r'needs foxglove-sdk: pip install -e "\.\[live\]"'):
+    with pytest.raises(
+        LidarError, match=r'requires foxglove-sdk\. Run pip install -e "\.\[live\]"'
+    ):
         Foxglove(scanner)
-    with pytest.raises(LidarError, match=r'needs rerun-sdk: pip install -e "\.\[rerun\]"'):
+    with pytest.raises(LidarError, match=r'requires rerun-sdk\. Run pip install -e "\.\[rerun\]"'):
         Rerun(scanner)
-    with pytest.raises(LidarError, match=r'needs foxglove-sdk: pip install -e "\.\[live\]"'):
+    with pytest.raises(
+        LidarError, match=r'requires foxglove-sdk\. Run pip install -e "\.\[live\]"'
+    ):
         simulate(room, Survey(poses=[(0, 0, 1)]), live="foxglove")
     scenario = write_scenario(tmp_path)
     outcome = CliRunner().invoke(cli, ["play", str(scenario), "--as", "foxglove"])

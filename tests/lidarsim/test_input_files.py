@@ -152,7 +152,7 @@ def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
     ("name", "advice"),
     [
         ("a.bag", "rosbags-convert"),
-        ("a.glb", "run a survey of it first"),
+        ("a.glb", "Run a survey of it first"),
     ],
 )
 def test_recordings_that_are_not_read_say_what_to_do(tmp_path, name, advice):

@@ -194,7 +194,7 @@ def test_equal_numbers_of_feet_and_meters_are_apart(tmp_path):
 
 def test_what_is_in_meters_has_no_unit_to_give(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"0")
-    with pytest.raises(LidarError, match=r"a\.mcap is in meters: leave out its unit, 'ft'"):
+    with pytest.raises(LidarError, match=r"unit of .*a\.mcap is the meter\. Remove the unit 'ft'"):
         compare(tmp_path / "a.mcap", tmp_path / "a.mcap", unit_a="ft")
 
 

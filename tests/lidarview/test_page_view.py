@@ -98,11 +98,11 @@ def test_no_points_and_points_that_are_nowhere_are_no_reason_to_fail(tmp_path):
 
 def test_what_is_no_result_is_refused(tmp_path):
     for name, words in (
-        ("", "is not read: give a result, data set"),
+        ("", r"is not supported\. Specify a result, data set"),
         ("nothing", "does not exist"),
         ("none.ply", "none.ply does not exist"),
         ("cut.ply", "cut.ply"),
-        ("run", "continue it with"),
+        ("run", "Continue it with"),
     ):
         (tmp_path / "cut.ply").write_bytes(b"ply\n")
         (tmp_path / "run" / "run").mkdir(parents=True, exist_ok=True)

@@ -196,7 +196,9 @@ def test_pictures_that_there_are_not(coordinates, pictures, left_out, unplanned,
 
 def test_a_result_in_storage(result, tmp_path):
     url = f"memory://{tmp_path.name}/result"
-    with pytest.raises(LidarError, match=f"^{url} has no complete result, which has a report"):
+    with pytest.raises(
+        LidarError, match=f"^{url} contains no complete result, because it has no report"
+    ):
         plot(url, "--only", "path")
     for name in ("cloud.ply", PICTURE_FILE):
         Storage.at(url).put(result / name, name)
@@ -208,16 +210,16 @@ def test_a_result_in_storage(result, tmp_path):
 
 @pytest.mark.parametrize("size", ["big", "480", "480x", "0x0", "479x480", "9000x9000", "1000x480"])
 def test_sizes_that_cannot_be(size, result):
-    words = "is not a picture size.*such as 1600x1000|cannot be .* pixels: .*such as 1600 x 1000"
+    words = "is not a picture size.*such as 1600x1000|cannot have .* pixels.*use 1600 x 1000"
     with pytest.raises((click.UsageError, LidarError), match=words):
         plot(result, "--size", size)
 
 
 def test_folders_that_cannot_be_used(result, tmp_path):
-    with pytest.raises(LidarError, match=r"none does not exist: give the folder of a f"):
+    with pytest.raises(LidarError, match=r"none does not exist\. Specify the folder of a f"):
         plot(tmp_path / "none")
     (tmp_path / "file").write_text("")
-    with pytest.raises(LidarError, match=r"file.below cannot be made"):
+    with pytest.raises(LidarError, match=r"file.below cannot be created"):
         plot(result, "--out", tmp_path / "file" / "below")
 
 

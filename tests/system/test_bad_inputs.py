@@ -70,19 +70,19 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is not a position. Expected X,Y,Z"),
     "no time": (["run", "good.yaml", "--wait", "soon"], "'soon' is not a duration"),
     "both": (["run", "good.yaml", "--resume", "--fresh"], "cannot be combined"),
-    "certificates alone": (["doctor", "--tls-key", "a.stl"], "are for the cluster of --scheduler"),
+    "certificates alone": (["doctor", "--tls-key", "a.stl"], "require `--scheduler` with"),
     "certificate that is not there": (["doctor", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
     "two clusters": (
         ["run", "good.yaml", "--cluster", "c.yaml", "--scheduler", "tcp://127.0.0.1:1"],
-        "--cluster starts a cluster, --scheduler is for one that runs",
+        "`--cluster` and `--scheduler` cannot be combined",
     ),
     "tls of a cluster file": (
         ["run", "good.yaml", "--cluster", "c.yaml", "--tls"],
-        "--tls is for a cluster of this machine",
+        "`--tls` can only be used with the local cluster",
     ),
     "tls elsewhere": (
         ["run", "good.yaml", "--tls", "--scheduler", "tls://127.0.0.1:1"],
-        "--tls is for a cluster of this machine",
+        "`--tls` can only be used with the local cluster",
     ),
     "scenario is a folder": (["run", "."], "Is a directory"),
     "name that no file can have": (["run", 300 * "x"], "File name too long"),
@@ -115,7 +115,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     ),
     "address and file": (
         ["doctor", "--scheduler", "tcp://127.0.0.1:1", "--scheduler-file", "sched.json"],
-        "--scheduler and --scheduler-file cannot be combined",
+        "`--scheduler` and `--scheduler-file` cannot be combined",
     ),
     "scene that is there": (["scene", "city", "good.ply"], "already exists. Use another name"),
     "no scheduler": (  # nor is a folder left behind

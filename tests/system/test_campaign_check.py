@@ -33,7 +33,7 @@ def test_it_shows_what_varies_and_five_jobs(campaign, lidarpool):
     assert outcome.code == 0
     lines = outcome.out.splitlines()
     assert lines[:4] == [
-        "campaign    9 jobs, seed 0, kept as mcap, ouster",
+        "campaign    9 jobs, seed 0, stored as mcap, ouster",
         "varied      sensor.layers: 4 to 8, integer",
         "varied      weather.visibility_km: none, 0.5, choice of 2",
         "splits      train 0.5, test 0.5",
@@ -47,7 +47,7 @@ def test_it_shows_what_varies_and_five_jobs(campaign, lidarpool):
     # Four steps of 28 azimuths, from three poses.
     assert rays[:5] == [layers * rays[0] // jobs[0][1] for _, layers in jobs]
     assert rays[5] == round(sum(rays[:5]) * 9 / 5)
-    assert lines[-1].startswith(f"it can run: lidarpool run {campaign}")
+    assert lines[-1].startswith(f"The scenario can be run: lidarpool run {campaign}")
     assert not (campaign.parent / "out").exists()
 
 
@@ -93,7 +93,7 @@ def test_jobs_that_cannot_run_are_reasons(campaign, lidarpool):
     ("name", "job", "says"),
     [
         ("campaign.yaml", 9, "Job 9 does not exist. The jobs of the campaign are 0 to 8"),
-        ("base.yaml", 1, "base.yaml is no campaign, and has no job 1"),
+        ("base.yaml", 1, "base.yaml is not a campaign, so it has no job 1"),
         ("campaign.yaml", -1, "-1 is not in the range"),
     ],
 )

@@ -138,7 +138,7 @@ def test_names_of_classes_are_in_the_data_set_and_its_card(client, tmp_path, kee
     run = Campaign(make_named, 2, keep=keep).run(tmp_path / "ds", client=client)
     assert run.classes == sweeps(tmp_path / "ds").classes == names
     assert "| 40 road |" in (tmp_path / "ds/README.md").read_text()
-    assert verify(Storage.at(tmp_path / "ds")).endswith("is whole: 2 jobs")
+    assert verify(Storage.at(tmp_path / "ds")).endswith("is intact, with 2 jobs")
     again = Campaign(make_named, 2, keep=keep).run(tmp_path / "ds", client=client, overwrite=True)
     assert again.done == 2, "all files are known as the data set's own"
 
@@ -353,10 +353,10 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
         failed = lidarpool(*run, *option)
         assert failed.code == 2 and "Traceback" not in failed.err
         lines = failed.err.splitlines()
-        assert lines[0] == "lidarpool: 2 jobs failed, the other 2 are done:"
+        assert lines[0] == "lidarpool: 2 jobs failed and 2 succeeded:"
         value = "(scene.files.0.file b.obj)"
         assert lines[1].startswith(f"jobs 0001 {value}, 0003 {value}: b.obj ")
-        assert lines[2:] == ["--retry-failed does these jobs again."]
+        assert lines[2:] == ["To run the failed jobs again, use `--retry-failed`."]
     (files / "c.yaml").write_text((files / "c.yaml").read_text().replace("[a.obj", "[b.obj"))
     other = lidarpool(*run, "--resume")
     assert other.code == 2 and other.err.count("\n") == 1
@@ -436,7 +436,7 @@ def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool
     run = ["run", files / "c.yaml", "--scheduler", slots, "--out", files / "ds"]
     shutil.copytree(finished, files / "ds")
     sound = lidarpool("run", "--verify", files / "ds")
-    assert (sound.code, sound.out) == (0, f"{files / 'ds'} is whole: 6 jobs\n")
+    assert (sound.code, sound.out) == (0, f"{files / 'ds'} is intact, with 6 jobs\n")
     change(files / "ds" / name)
     for command in (["run", "--verify", files / "ds"], [*run, "-q", "--job", 2]):
         found = lidarpool(*command)
@@ -465,7 +465,10 @@ def test_jobs_of_an_unfinished_campaign_are_looked_at(client, tmp_path):
 
 def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
     (files / "report.json").write_text("{}")
-    for place, says in ((files, "is no data set of lidarpool"), (files / "none", "does not exist")):
+    for place, says in (
+        (files, "is not a data set of lidarpool"),
+        (files / "none", "does not exist"),
+    ):
         refused = lidarpool("run", "--verify", place)
         assert refused.code == 2 and says in refused.err
     for option in (["--verify"], ["--job", 1], ["--retry-failed"]):
@@ -495,7 +498,7 @@ def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, sl
     a.write_text(SQUARE.replace("9", "8"))
     mixed = lidarpool(*run, "--retry-failed")
     assert mixed.code == 2 and mixed.err.count("\n") == 1
-    assert "were made of another a.obj than there is now: 0000. Bring that back" in mixed.err
+    assert "were created from a different version of a.obj: 0000. Restore that version" in mixed.err
     a.write_text(SQUARE)
     b.unlink()  # fails its job, and no other
     assert "b.obj" in lidarpool(*run, "--retry-failed").err
@@ -515,7 +518,10 @@ def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots):
     (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 3"))
     fewer = lidarpool(*run)
     assert fewer.code == 2 and fewer.err.count("\n") == 1
-    assert "has job 0003, and count is 3" in fewer.err
+    assert (
+        "contains job 0003, which is not part of this run, because the campaign has 3 jobs"
+        in fewer.err
+    )
     assert bytes_of(files / "ds") == whole and not (files / "ds" / "run").exists()
 
 
@@ -538,7 +544,7 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
     (files / "c.yaml").write_text(CAMPAIGN)
     shutil.copytree(finished, files / "ds")
     again = lidarpool(*run)
-    assert again.code == 2 and "needs a folder of its own" in again.err
+    assert again.code == 2 and "each data set requires a separate folder" in again.err
     assert lidarpool(*run, "--resume").code == 0, "it is complete"
     (files / "c.yaml").write_text(CAMPAIGN.replace("seed: 3", "seed: 4"))
     for more in (["--resume"], ["--job", 1]):
@@ -550,7 +556,7 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
     made["casting"]["numpy"] = "1.0"
     record.write_bytes(sealed(made))
     old = lidarpool(*run, "--job", 1)
-    assert old.code == 2 and "was made with numpy 1.0, " in old.err and old.err.count("\n") == 1
+    assert old.code == 2 and "was created with numpy 1.0, " in old.err and old.err.count("\n") == 1
 
 
 def all_of(folder: Path) -> dict[str, bytes]:
@@ -701,7 +707,9 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
         (ds / name).write_text("mine")
         before = all_of(ds)
         for how in ("fresh", "resume"):
-            with pytest.raises(LidarError, match=f"holds {name}: a data set needs a folder"):
+            with pytest.raises(
+                LidarError, match=f"contains {name}, but a data set requires a separate folder"
+            ):
                 unwritten.run(ds, client=client, **{how: True})
         assert before == all_of(ds) | {"run/run.db": before["run/run.db"]}
         (ds / name).unlink()
@@ -727,7 +735,7 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     before = all_of(ds)
     other = Campaign(failing(1), 2, keep="folder")
     for options in ({}, {"fresh": True}):
-        with pytest.raises(LidarError, match=r"holds a finished data set, .* --overwrite"):
+        with pytest.raises(LidarError, match=r"contains a finished data set, .* `--overwrite`"):
             other.run(ds, client=client, **options)
         assert all_of(ds) == before
     (ds / "run").mkdir()
@@ -741,7 +749,7 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
         "run", ".jobs", "jobs", "campaign.json", "dataset.json", "jobs.csv", "jobs.parquet",
         "README.md", "report.html", "report.csv", "report.json", "pictures",
     }  # fmt: skip
-    with pytest.raises(LidarError, match="holds a finished data set"):
+    with pytest.raises(LidarError, match="contains a finished data set"):
         other.run(ds, client=client, fresh=True)
 
 

@@ -69,7 +69,7 @@ def check(tmp_path, lidarpool) -> Callable[..., Any]:
 def test_clear_air_leaves_all_of_the_light(tmp_path, lidarpool):
     (tmp_path / "clear.yaml").write_text("scene: seed\nweather: {visibility_km: 1000}\n")
     shown = lidarpool("check", tmp_path / "clear.yaml").out
-    assert "air         takes 0.00135/km: 100 % of the light from 50 m is left\n" in shown
+    assert "air         extinction 0.00135/km: 100 % of the light returns from 50 m\n" in shown
 
 
 @pytest.mark.extended
@@ -141,7 +141,10 @@ def test_it_tells_what_a_run_would_do_and_starts_nothing(check, tmp_path):
     ):
         assert said in outcome.out
     last = outcome.out.splitlines()[-1]
-    assert last == f"it can run: lidarpool run {tmp_path / 's.yaml'} --out {tmp_path / 'out'}"
+    assert (
+        last
+        == f"The scenario can be run: lidarpool run {tmp_path / 's.yaml'} --out {tmp_path / 'out'}"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["s.yaml"]
 
 
@@ -227,8 +230,11 @@ def test_a_disk_without_room(check, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(10**9, 10**9, 1_000_000))
     outcome = check()
     assert outcome.code == 2
-    assert "it cannot run. The disk of" in outcome.err and "has 0.95 MiB free" in outcome.err
-    assert "it can run" not in outcome.out
+    assert (
+        "The scenario cannot be run. The disk of" in outcome.err
+        and "has 0.95 MiB free" in outcome.err
+    )
+    assert "The scenario can be run" not in outcome.out
 
 
 def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
@@ -241,7 +247,10 @@ def test_what_the_cloud_is_exported_to_counts(check, monkeypatch):
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
     outcome = check(text=exported)
     assert outcome.code == 2
-    assert 'it cannot run:\nThe format las needs laspy and lazrs: pip install -e "' in outcome.err
+    assert (
+        'The scenario cannot be run:\nThe format las requires laspy and lazrs. Run pip install -e "'
+        in outcome.err
+    )
 
 
 def test_an_error_of_several_jobs_is_a_line_with_its_jobs(tmp_path, lidarpool):
@@ -260,7 +269,7 @@ def test_an_error_of_several_jobs_is_a_line_with_its_jobs(tmp_path, lidarpool):
     outcome = lidarpool("check", tmp_path / "c.yaml", "--out", tmp_path / "out")
     assert outcome.code == 2
     start, streets, house = outcome.err.splitlines()[-3:]
-    assert start == "lidarpool: it cannot run:"
+    assert start == "lidarpool: The scenario cannot be run:"
     assert streets.startswith("jobs 0000, 0002: ") and streets.count("Street*") == 1
     assert "Available names: " in streets and "tree* (9), " in streets and "Did you" not in streets
     assert house.startswith("job 0001: ")
@@ -292,9 +301,12 @@ def test_a_backend_that_is_not_here(check, monkeypatch):
     if not available_backends()["cuda"]:
         pytest.skip("there is a GPU")
     outcome = check("--backend", "cuda")
-    assert outcome.code == 2 and "it cannot run. Backend 'cuda' cannot be used" in outcome.err
+    assert (
+        outcome.code == 2
+        and "The scenario cannot be run. Backend 'cuda' cannot be used" in outcome.err
+    )
     assert re.search(
-        r"^cast by     \d+ casting workers? \(backend not known yet\)$", outcome.out, re.M
+        r"^cast by     \d+ casting workers? \(backend not yet known\)$", outcome.out, re.M
     )
 
 
@@ -340,7 +352,7 @@ def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
         "size        8.00 x 6.00 x 3.00 m" in outcome.out
         and "72 scans (2 sweeps) from 2" in outcome.out
     )
-    words = shlex.split(outcome.out.splitlines()[-1].partition("it can run: ")[2])
+    words = shlex.split(outcome.out.splitlines()[-1].partition("The scenario can be run: ")[2])
     assert words[:14] == ["lidarpool", "run", "there/my part.stl", *options[:11]]
     assert lidarpool(*words[1:], "--only", "cloud", "--quiet").code == 0
     # The scenario that init writes of the same options gives the same.
@@ -380,7 +392,7 @@ def test_a_flight_is_told_by_its_lines_without_turns(check):
     [turn] = json.loads(check("--json", text=json.dumps(scenario)).out)["drive"]["sensors"]
     assert turn["meters_a_turn"] < 0.95 * scanner["meters_a_turn"], "it fires during the turn only"
     assert re.search(r"^trajectory  .* s; 2 flight lines, [\d,]+ m in 1\d\.\d s$", told, re.M)
-    assert re.search(r"in one the carrier moves 0\.30\d m on the flight lines$", told, re.M)
+    assert re.search(r"the platform moves 0\.30\d m per cycle on the flight lines$", told, re.M)
 
 
 def test_an_unfinished_run_is_told_of(check, tmp_path):
@@ -402,7 +414,7 @@ def test_the_command_that_is_named_runs_where_another_result_is(
     for k, number in enumerate((2, 3), 4):  # a result of another survey is in the way each time
         outcome = check("--scheduler", cluster, text=json.dumps(SHORT | {"steps": k}))
         assert "holds the result of another survey" in outcome.out
-        words = shlex.split(outcome.out.splitlines()[-1].partition("it can run: ")[2])
+        words = shlex.split(outcome.out.splitlines()[-1].partition("The scenario can be run: ")[2])
         assert str(tmp_path / f"out-{number}") in words
         assert lidarpool(*words[1:], "--only", "cloud").code == 0
 
@@ -411,7 +423,7 @@ def test_workers_that_cast_are_no_gpus_without_any(check):
     outcome = check()
     assert re.search(r"^cast by     \d+ casting workers? \(CPU, numpy\)$", outcome.out, re.M)
     assert re.search(
-        r"^casting     \d+ slots? of partition GPU, at least 1 needed$", outcome.out, re.M
+        r"^casting     \d+ slots? in partition GPU, at least 1 needed$", outcome.out, re.M
     )
 
 

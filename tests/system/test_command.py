@@ -96,7 +96,7 @@ def test_the_demo_makes_all_files_and_says_so(demo):
     told = re.search(r"108 scans .* points in the cloud", ended.stdout)
     assert told and told[0] in shown
     assert f"{len(read_cloud(out / 'cloud.ply')):,} points in the cloud" in ended.stdout
-    assert re.search(r"path of 71\.\d\d m, free of collisions; the shortest possible", ended.stdout)
+    assert re.search(r"collision-free path of 71\.\d\d m; the shortest possible", ended.stdout)
     assert ended.stdout.splitlines()[-1] == f"results in {out}: {', '.join(MADE)}"
 
 
@@ -176,7 +176,7 @@ def test_a_path_that_there_is_not(run):
     planning = f"planning: {{{ENDS}, trials: 2, iterations: 5, obstacles: [{', '.join(ring)}]}}\n"
     outcome = run(text="scene: seed\nsensor: {layers: 2}\n" + planning)
     assert outcome.code == 0, outcome.err
-    assert "no path free of collisions was found; no path is possible" in outcome.out
+    assert "no collision-free path was found; no path is possible" in outcome.out
 
 
 def test_a_run_that_hits_nothing_says_so(run):

@@ -55,15 +55,18 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["clean", "nowhere"], "nowhere does not exist: give the folder of a result"),
-        (["clean", "clean.yaml"], "clean.yaml is not read: give the folder of a result"),
-        (["clean", "clean", "--sweep", "3"], "there is no sweep 3: 3 pairs of sweeps, from 0"),
+        (["clean", "nowhere"], "nowhere does not exist. Specify the folder of a result"),
+        (["clean", "clean.yaml"], "clean.yaml is not supported. Specify the folder of a result"),
+        (
+            ["clean", "clean", "--sweep", "3"],
+            "There is no pair 3 of sweeps. Pairs are numbered from 0",
+        ),
         (
             ["clean", "clean", "--sensor-a", "roof"],
-            "'roof'. It has no names of sensors: give none.",
+            "does not contain 'roof'. Its sensors have no names",
         ),
         (["clean", "clean", "--intensity-b", "signal"], "it has no column 'signal'"),
-        (["clean", "clean", "--distance", "0"], "it must be lengths in meters"),
+        (["clean", "clean", "--distance", "0"], "it must contain positive lengths in meters"),
         (["clean", "clean", "--out", "clean.yaml"], "clean.yaml' is a file"),
         (["clean"], "Missing argument 'B'"),
     ],

@@ -39,7 +39,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     assert {path.name for path in out.iterdir()} == made
     report = json.loads((out / "report.json").read_text())
     assert {*report["files"]} == made
-    left = [note for note in report["notes"] if "does not hold" in note]
+    left = [note for note in report["notes"] if "cannot store" in note]
     assert [note.split()[0] for note in left] == ["MCAP", "KITTI"]
     assert left[1] in done.out and "channel" in left[1]
     assert report["stages"]["export"]["items"] == 6  # sweeps, written by workers
@@ -57,21 +57,21 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     refused = lidarpool(
         "export", out, "-f", "mcap", "--layout", "autoware", "--out", tmp_path / "no"
     )
-    assert refused.code == 2 and "layout autoware needs return_number, returns" in refused.err
+    assert refused.code == 2 and "layout autoware requires return_number and returns" in refused.err
     assert not (tmp_path / "no").exists()
     mixed = ("export", out, "-f", "pcd", "-f", "kitti", "--compensated", "--out", tmp_path / "mix")
     mixed = lidarpool(*mixed)
-    assert mixed.code == 0 and "note: PCD does not hold time" in mixed.err
+    assert mixed.code == 0 and "note: PCD cannot store time" in mixed.err
     assert b"start of the sweep" in (tmp_path / "mix/pcd/000000.pcd").read_bytes()[:100]
     scaled = ("export", out, "-f", "pcd", "-f", "las", "--intensity-full-scale", "100")
     assert lidarpool(*scaled, "--out", tmp_path / "scaled").code == 0
     faint = laspy.read(tmp_path / "scaled/cloud.las").intensity
     np.testing.assert_allclose(faint, before["energy"] / 100 * 65_535, atol=0.51)
     refused = lidarpool("export", out, "-f", "kitti", "--compensated", "--out", tmp_path / "no")
-    assert refused.code == 2 and "compensated is an option of pcd" in refused.err
+    assert refused.code == 2 and "kitti does not have the option `compensated`" in refused.err
     (out / ".lidarpool-writing-01234567").mkdir()  # of an export that was killed
     refused = lidarpool("export", out, "-f", "pcd", "-f", "laz")
-    assert refused.code == 2 and "cloud.laz exists" in refused.err
+    assert refused.code == 2 and "cloud.laz already exists" in refused.err
     assert not (out / "pcd").exists()
     done = lidarpool("export", out, "-f", "pcd", "-f", "laz", "--overwrite")
     assert (done.code, done.out) == (0, f"{out}/pcd\n{out}/cloud.laz\n")
@@ -84,7 +84,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
         refused = lidarpool("export", out, "-f", "las")
     assert refused.code == 2 and "Another run or export is using the folder" in refused.err
     elsewhere = lidarpool("export", out, "-f", "nuscenes", "--out", tmp_path / "other")
-    assert elsewhere.code == 0 and "nuScenes does not hold" in elsewhere.err
+    assert elsewhere.code == 0 and "nuScenes cannot store" in elsewhere.err
     assert len(list((tmp_path / "other/nuscenes/samples/rear").iterdir())) == 3
 
     # What the earlier run left would pass for this one's; an export is in no report, and stays.
@@ -138,7 +138,7 @@ def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):
     )
     for command in (("export", "-f", "laz"), ("plot",), ("merge", "--out", tmp_path / "all")):
         told = lidarpool(*command, tmp_path / "nowhere")
-        assert told.code == 2 and "nowhere does not exist: give the folder" in told.err
+        assert told.code == 2 and "nowhere does not exist. Specify the folder" in told.err
     for name in ("cloud.ply", "report.json"):
         (tmp_path / name).touch()
     (tmp_path / "sweeps.npz").write_bytes(b"PK")
@@ -165,7 +165,10 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
     monkeypatch.setattr(Format, "write", interrupted)
     told = lidarpool("export", tmp_path, "-f", "las", "-f", "nuscenes")
     assert told.code == 130
-    assert f"All processes were stopped. Written before: {tmp_path}/cloud.las." in told.err
+    assert (
+        f"All processes were stopped. These files have already been written: {tmp_path}/cloud.las."
+        in told.err
+    )
 
 
 def many_files(lidarpool, tmp_path, address):

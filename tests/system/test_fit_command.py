@@ -70,11 +70,14 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["nowhere"], "nowhere does not exist: give the folder of a result"),
+        (["nowhere"], "nowhere does not exist. Specify the folder of a result"),
         ([".", "--model", "no-such"], "Unknown sensor model 'no-such'"),
         ([".", "--scene", "none.glb"], "none.glb"),
-        ([".", "--out", "mine.txt"], "no sensor file: give a name such as mine.yaml"),
-        ([".", "--pose", "0,0,0", "--pose", "1,0,0"], "pose has 2 poses, and . has 4 sweeps: give"),
+        ([".", "--out", "mine.txt"], "not a sensor file. Use a file name with"),
+        (
+            [".", "--pose", "0,0,0", "--pose", "1,0,0"],
+            "`pose` contains 2 poses, but . has 4 sweeps. Pass",
+        ),
         ([".", "--white", "0"], "white must be above 0"),
     ],
 )

@@ -103,7 +103,9 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     Storage.at(url).write("path.png", b"of an earlier result")
     arguments = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--out", url]
     refused = lidarpool(*arguments, "--only", "cloud", "-q")
-    assert refused.code == 2 and "holds path.png, which no result there lists" in refused.err
+    assert (
+        refused.code == 2 and "contains path.png, which does not belong to a result" in refused.err
+    )
     done = lidarpool(*arguments, "--only", "cloud", "--json", "-q", "--overwrite")
     assert (done.code, done.err) == (0, "")
     out = Storage.at(url)
@@ -189,7 +191,7 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
     system.rm(f"{folder}/{job_file(format, '00', SWEEPS_FILE)}")
     assert [bool(wrong) for _, (_, wrong) in data.look(rows)] == [True, False]
     system.rm(f"{folder}/dataset.json")
-    with pytest.raises(package.LidarError, match="is an unfinished data set"):
+    with pytest.raises(package.LidarError, match="contains an unfinished data set"):
         package.sweeps(url)
 
 

@@ -75,7 +75,7 @@ def test_a_run_writes_laser_scans_beside_points(folder, lidarpool, slots):
     assert lidarpool("check", "s.yaml", "--strict").code == 0
     outcome = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", slots, "--pictures")
     assert outcome.code == 0, outcome.err
-    assert "does not hold ray" not in outcome.out
+    assert "cannot store ray" not in outcome.out
     cloud = read_cloud(folder / "out/cloud.ply")
     assert (cloud["range"] <= 4.5).all() and np.abs(cloud.positions[:, 2]).max() < 1e-3
     for bag in ("cloud.mcap", "rosbag2"):

@@ -76,7 +76,7 @@ def test_a_report_does_not_replace_that_of_another_survey_unasked(result, anothe
     result.report(tmp_path, only_cloud=True)
     assert len(read_cloud(tmp_path / "cloud.ply")) == len(result.points)
     result.report(tmp_path, only_cloud=True)  # its own
-    with pytest.raises(LidarError, match=r"holds the result of another survey: .*overwrite"):
+    with pytest.raises(LidarError, match=r"contains the result of a different survey.*overwrite"):
         another.report(tmp_path)
     sparse = replace(another, survey=replace(another.survey, keep_every=7))
     words = r"of another survey, cloud\.keep_every changed from \d to 7: .*overwrite"
@@ -95,12 +95,14 @@ def test_files_of_no_result_are_neither_replaced_nor_removed_unasked(result, tmp
     own.write_text("mine")
     result.report(tmp_path, only_cloud=True)
     result.report(tmp_path, only_cloud=True)
-    with pytest.raises(LidarError, match=r"holds kitti, which no result there lists: .*--over"):
+    with pytest.raises(
+        LidarError, match=r"contains kitti, which does not belong to a result .*--over"
+    ):
         result.report(tmp_path, only_cloud=True, formats=["kitti"])
     assert own.read_text() == "mine"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "cloud.ply").write_text("mine")
-    with pytest.raises(LidarError, match=r"other holds cloud\.ply, which no"):
+    with pytest.raises(LidarError, match=r"other contains cloud\.ply, which does not"):
         result.report(tmp_path / "other", only_cloud=True)
     result.report(tmp_path / "other", only_cloud=True, overwrite=True)
     result.report(tmp_path / "other", only_cloud=True)
@@ -111,7 +113,7 @@ def test_a_folder_of_a_format_with_a_file_of_the_user_is_not_replaced(result, tm
     own = tmp_path / "pcd" / "notes.txt"
     own.write_text("mine")
     for formats in (["pcd"], []):  # it would be replaced, and removed
-        with pytest.raises(LidarError, match=r"pcd/notes\.txt is not a file of lidarpool"):
+        with pytest.raises(LidarError, match=r"pcd/notes\.txt was not written by lidarpool"):
             result.report(tmp_path, only_cloud=True, formats=formats, overwrite=True)
     assert own.read_text() == "mine" and (tmp_path / "report.json").exists()
     own.unlink()

@@ -96,7 +96,7 @@ def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
         (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
         (["--mesh", "notes.txt"], "notes.txt is not read: if it is a point cloud, make a mesh"),
         (["--sensor", "vlp61"], "Did you mean 'vlp16'?"),
-        (["--unit", "mm"], "require --mesh"),
+        (["--unit", "mm"], "require `--mesh`"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),
     ],
 )
@@ -160,12 +160,12 @@ def test_sensors_writes_a_file_and_says_what_the_file_lacks(tmp_path, lidarpool)
     outcome = lidarpool("sensors", "vlp16", *options)
     assert outcome.code == 0, outcome.err
     lacks = "beam divergence; rays after 0.001051 s, where the pattern does not repeat"
-    assert outcome.out.endswith(f"\n304 rays: v.csv\nnot in the file: {lacks}\n")
+    assert outcome.out.endswith(f"\n304 rays: v.csv\nnot stored in the file: {lacks}\n")
     assert "# max_range_m: 50.0" in (tmp_path / "v.csv").read_text()
     again = lidarpool("sensors", "vlp16", "--out", "v.csv")
     assert (
         again.code == 2
-        and "v.csv already exists. Use another name, or pass --overwrite." in again.err
+        and "v.csv already exists. Use another name, or pass `--overwrite`." in again.err
     )
     outcome = lidarpool("sensors", "--calibration", "v.csv", "--out", "v.npz")
     assert outcome.code == 0 and (tmp_path / "v.npz").exists()

@@ -211,7 +211,7 @@ def test_a_data_set_that_is_given_by_another_name_keeps_its_files(parts, tmp_pat
     before = content(out)
     (tmp_path / "link").symlink_to(out)
     for given in (out, out / ".." / "ds", tmp_path / "link"):
-        with pytest.raises(LidarError, match="ds is one of the shards, which stays as it is"):
+        with pytest.raises(LidarError, match="ds is one of the shards, which must not be changed"):
             merge([*parts, given], out)
     assert content(out) == before
 
@@ -220,8 +220,8 @@ def test_a_shard_is_never_made_the_whole(parts):
     before = content(parts[0].parent)
     inside = parts[0] / "below/ds"
     around = parts[0].parent
-    for out, relation in ((parts[0], "is one of"), (inside, "lies in"), (around, "holds")):
-        with pytest.raises(LidarError, match=f"--out {out} {relation} the shard"):
+    for out, relation in ((parts[0], "is one of"), (inside, "is inside"), (around, "contains")):
+        with pytest.raises(LidarError, match=f"output folder {out} {relation} the shard"):
             merge(parts, out)
     with pytest.raises(LidarError, match="is one of the shards"):
         merge([parts[0].as_uri(), *parts[1:]], parts[0])
@@ -254,7 +254,7 @@ def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slot
     assert table.read_text() != whole
     merge(parts, out)  # whose rows are those of manifests
     assert content(out) == content(campaigns("folder") / "one")
-    with pytest.raises(LidarError, match=r"jobs\.csv is damaged.*--resume, which writes"):
+    with pytest.raises(LidarError, match=r"jobs\.csv is damaged.*--resume` to write"):
         sweeps(parts[1])
     with pytest.raises(LidarError, match=r"jobs\.csv is damaged"):
         verify(Storage.at(parts[1]))
@@ -278,7 +278,7 @@ def test_casting_times_that_are_lost_are_noted(parts, campaigns, tmp_path, edit)
     SECONDS_EDITS[edit](parts[1] / "report.csv")
     merge(parts, out)
     (note,) = json.loads((out / "report.json").read_text())["notes"]
-    assert "part-2/report.csv has no casting times of jobs: " in note
+    assert "part-2/report.csv: " in note
     one = content(campaigns("folder") / "one")
     made = content(out)
     del one["report.json"], made["report.json"]
@@ -291,18 +291,20 @@ def test_notes_of_a_damaged_report_are_lost_with_a_note(parts, tmp_path):
     (parts[1] / "report.json").write_text("[]")
     merge(parts, tmp_path / "ds")
     (note,) = json.loads((tmp_path / "ds" / "report.json").read_text())["notes"]
-    assert "part-2/report.json is damaged" in note and note.endswith("its notes are lost")
+    assert "part-2/report.json is damaged" in note and note.endswith("Its notes are lost")
 
 
 def test_a_manifest_of_another_job_is_refused(parts, tmp_path):
     shutil.copy(parts[0] / ".jobs/0003.json", parts[1] / ".jobs/0003.json")
-    with pytest.raises(LidarError, match=r"part-2/\.jobs/0003\.json is of job 3, which is not"):
+    with pytest.raises(
+        LidarError, match=r"part-2/\.jobs/0003\.json belongs to job 3, which is not"
+    ):
         merge(parts, tmp_path / "ds")
     (parts[1] / ".jobs/0003.json").rename(parts[1] / ".jobs/0004.json")
-    with pytest.raises(LidarError, match=r"damaged: .*part-2/\.jobs/0004\.json; run"):
+    with pytest.raises(LidarError, match=r"damaged: .*part-2/\.jobs/0004\.json\. Run"):
         merge(parts, tmp_path / "ds")
     (parts[1] / ".jobs/0004.json").unlink()
-    with pytest.raises(LidarError, match=r"damaged: the manifest of job 4 in .*part-2; run"):
+    with pytest.raises(LidarError, match=r"damaged: the manifest of job 4 in .*part-2\. Run"):
         merge(parts, tmp_path / "ds")
 
 
@@ -312,13 +314,13 @@ def test_a_damaged_record_of_a_campaign_is_named_and_made_again(parts, tmp_path,
     other_type = sealed(unsealed(whole) | {"files": 5})
     for data in (whole[:90] + b"x" + whole[91:], b"[]", other_type):
         path.write_bytes(data)
-        with pytest.raises(LidarError, match=r"campaign\.json is damaged or edited \(its .*\):"):
+        with pytest.raises(LidarError, match=r"campaign\.json is damaged or has been edited: its "):
             merge(parts, tmp_path / "ds")
     with Client(slots, set_as_default=False) as client:
         campaign = Campaign.load(parts[0].parent / "c.yaml")
         run = campaign.run(parts[1], client=client, resume=True, shard=(2, 3))
     assert (run.resumed, run.done) == (2, 2)
-    assert run.notes == ("campaign.json was damaged, and is made again",)
+    assert run.notes == ("campaign.json was damaged and has been created again",)
     merge(parts, tmp_path / "ds")
 
 
@@ -331,7 +333,9 @@ def test_a_manifest_that_names_files_elsewhere_is_damaged(parts, tmp_path):
     manifest["files"] = {"../stranger": 0} | manifest["files"]
     crc = zlib.crc32(json.dumps(manifest).encode())
     path.write_text(json.dumps(manifest | {"crc": crc}))
-    with pytest.raises(LidarError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
+    with pytest.raises(
+        LidarError, match=r"^These files are missing or damaged: .*part-2/\.jobs/0001\.json"
+    ):
         merge(parts, out)
     assert not (out.parent / "stranger").exists()
 
@@ -356,7 +360,9 @@ def test_a_manifest_with_other_entries_is_damaged(parts, tmp_path, edit):
     STRANGE_ENTRIES[edit](manifest)
     crc = zlib.crc32(json.dumps(manifest).encode())
     path.write_text(json.dumps(manifest | {"crc": crc}))
-    with pytest.raises(LidarError, match=r"^missing or damaged: .*part-2/\.jobs/0001\.json"):
+    with pytest.raises(
+        LidarError, match=r"^These files are missing or damaged: .*part-2/\.jobs/0001\.json"
+    ):
         merge(parts, tmp_path / "ds")
 
 
@@ -379,19 +385,22 @@ def unfinished(parts: list[Path]) -> list[Path]:
 
 
 WRONG = {
-    "missing": (lambda parts: parts[:2], "^missing: 1 shard, 3/3: give"),
-    "whole": (foreign('"2/3"', '"1/1"'), "part-2 is a whole run: give it alone, or"),
-    "twice": (doubled, "^shard 1/3 is in .*part-1 and in .*again: give one"),
-    "no shard": (lambda parts: [*parts, parts[0].parent], "shards holds no finished shard"),
-    "unfinished": (unfinished, "^.*part-3 holds no finished shard"),
+    "missing": (lambda parts: parts[:2], r"^These shards are missing: 3/3\."),
+    "whole": (foreign('"2/3"', '"1/1"'), r"part-2 is a complete run\. Specify it alone, or"),
+    "twice": (doubled, r"^Shard 1/3 is in both .*part-1 and .*again\. Specify only one"),
+    "no shard": (lambda parts: [*parts, parts[0].parent], "shards contains no finished shard"),
+    "unfinished": (unfinished, "^.*part-3 contains no finished shard"),
     "division": (foreign('"2/3"', '"2/4"'), "part-2 and .* differ in the number of shards"),
-    "campaign": (foreign('"vary": "', '"vary": "0'), "part-2 and .*part-1 differ in vary:"),
+    "campaign": (foreign('"vary": "', '"vary": "0'), r"part-2 and .*part-1 differ in vary\."),
     "file": (foreign('"files": []', '"files": [["a.glb", "1"]]'), ""),
-    "software": (foreign("(sources ", "(sources x"), "part-2 and .*part-1 differ in lidarpool:"),
-    "workers": (foreign('"numpy": "', '"numpy": "0'), "part-2 and .*part-1 differ in numpy of wo"),
+    "software": (foreign("(sources ", "(sources x"), r"part-2 and .*part-1 differ in lidarpool\."),
+    "workers": (
+        foreign('"numpy": "', '"numpy": "0'),
+        "part-2 and .*part-1 differ in the numpy of the wo",
+    ),
     "count": (
         foreign('"count": 7', '"count": 11'),
-        "^missing: 2 shards, 1/3, 3/3: .* larger count",
+        "^These shards are missing: 1/3, 3/3.* larger count",
     ),
 }
 
@@ -412,7 +421,7 @@ def test_shards_that_do_not_fit_together_are_named(parts, tmp_path, wrong, lidar
 def test_meshes_of_all_shards_are_the_same(parts, tmp_path):
     for part, digest in zip(parts, "112", strict=True):
         change_record(part, '"files": []', f'"files": [["a.glb", "{digest}"]]')
-    with pytest.raises(LidarError, match=r"part-3 and .*part-1 differ in the file a\.glb:"):
+    with pytest.raises(LidarError, match=r"part-3 and .*part-1 differ in the file a\.glb\."):
         merge(parts, tmp_path / "ds")
 
 
@@ -420,10 +429,12 @@ def test_merge_leaves_other_files_and_runs(parts, tmp_path):
     out = tmp_path / "ds"
     out.mkdir()
     (out / "thesis.txt").write_text("mine")
-    with pytest.raises(LidarError, match=r"holds thesis\.txt: a data set needs a folder"):
+    with pytest.raises(
+        LidarError, match=r"contains thesis\.txt, but a data set requires a separate folder"
+    ):
         merge(parts, out)
     assert [*out.iterdir()] == [out / "thesis.txt"]
-    for given, told in (([], "nothing to merge"), ([tmp_path / "none"], "none does not exist")):
+    for given, told in (([], "no shards to merge"), ([tmp_path / "none"], "none does not exist")):
         with pytest.raises(LidarError, match=told):
             merge(given, tmp_path / "new")
 
@@ -434,7 +445,7 @@ def test_merge_leaves_other_files_and_runs(parts, tmp_path):
 def test_shards_are_added_later(parts, campaigns, tmp_path):
     out = tmp_path / "ds"
     report = merge([parts[0], parts[2], tmp_path / "none"], out, partial=True)
-    assert report["notes"] == ["missing: 1 shard, 2/3"] and report["jobs"]["done"] == 5
+    assert report["notes"] == ["these shards are missing: 2/3"] and report["jobs"]["done"] == 5
     assert json.loads((out / "campaign.json").read_text())["shards"] == ["1/3", "3/3"]
     shutil.rmtree(parts[0])
     assert merge([parts[1]], out)["notes"] == []
@@ -531,7 +542,7 @@ def test_shards_fit_together_after_a_mesh_was_repaired(tmp_path, slots):
             assert len(run.failed) == failed
         (tmp_path / "b.stl").write_text(TRIANGLE)
         assert campaign.run(parts[1], client=client, shard=(2, 2), retry_failed=True).done == 1
-        with pytest.raises(LidarError, match=r"differ in the file b\.stl:"):
+        with pytest.raises(LidarError, match=r"differ in the file b\.stl\."):
             merge(parts, tmp_path / "ds")
         assert campaign.run(parts[0], client=client, shard=(1, 2), resume=True).done == 1
         assert merge(parts, tmp_path / "ds")["jobs"]["done"] == 2
@@ -629,7 +640,7 @@ def test_shards_of_a_survey_have_the_files_of_one_run(survey, lidarpool, slots, 
 def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
     with pytest.raises(LidarError, match=r"^missing: 1 shard, 1/3: give them"):
         merge(shards[:2], survey / "some")
-    with pytest.raises(LidarError, match="part-2 is one of the shards, which stays as it is"):
+    with pytest.raises(LidarError, match="part-2 is one of the shards, which must not be changed"):
         merge(shards, shards[0])
     with pytest.raises(LidarError, match="part-2 holds a shard of a survey: give another"):
         merge(shards[1:], shards[0])
@@ -646,7 +657,9 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
     for data in (whole[:-1], whole[:200] + bytes([whole[200] ^ 1]) + whole[201:]):
         part.unlink()
         part.write_bytes(data)
-        with pytest.raises(LidarError, match=f"^missing or damaged: .*{part.name}; run their"):
+        with pytest.raises(
+            LidarError, match=f"^These files are missing or damaged: .*{part.name}; run their"
+        ):
             merge(shards, survey / "repaired")
     part.unlink()
     part.write_bytes(whole)
@@ -658,9 +671,7 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
         merge(shards, survey / "moved")
     merge(shards, survey / "moved", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 25", "steps: 26")
-    with pytest.raises(
-        LidarError, match=r"than these shards, steps changed from 25 to 26: give --scen"
-    ):
+    with pytest.raises(LidarError, match=r"does not match these shards, .*steps .*--scen"):
         merge(shards, survey / "none", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 26", "steps: 25")
     (survey / "elsewhere/s.yaml").rename(survey / "s.yaml")
@@ -713,8 +724,8 @@ def test_a_folder_keeps_its_shard(parts, lidarpool, slots):
     run = ["run", parts[0].parent / "c.yaml", "-q", "--scheduler", slots, "--out", parts[1]]
     for shard in (["--shard", "3/3"], ["--shard", "2/4"], []):
         refused = lidarpool(*run, "--resume", *shard)
-        assert refused.code == 2 and "holds shard 2/3, and this is " in refused.err
-        assert "holds a finished data set" in lidarpool(*run, *shard).err
+        assert refused.code == 2 and "contains shard 2/3, but this run is " in refused.err
+        assert "contains a finished data set" in lidarpool(*run, *shard).err
     assert lidarpool(*run, "--shard", "2/3", "--resume").code == 0
     assert content(parts[1]) == before
 

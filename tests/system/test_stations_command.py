@@ -68,7 +68,7 @@ def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
 
     # The same again, as JSON, and in place of the first.
     again = lidarpool(*arguments, "--json")
-    assert again.code == 2 and "stations.yaml exists: give another folder" in again.err
+    assert again.code == 2 and "stations.yaml already exists. Use another folder" in again.err
     told = json.loads(lidarpool(*arguments, "--json", "--overwrite").out)
     stations = [tuple(one["position"]) for one in told["stations"]]
     assert [pose.position for pose in Scenario.load(folder / "stations.yaml").poses] == stations
@@ -84,7 +84,7 @@ def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lid
     arguments = ("--sensor", "velodyne/vlp16", "--count", "100", "--out", "a/b", "--spacing", "2")
     outcome = lidarpool("stations", "hall.glb", *arguments)
     assert outcome.code == 0, outcome.err
-    assert "of 100 stations already see all that can be seen" in outcome.out
+    assert "of 100 stations already cover everything" in outcome.out
     written = Scenario.load(hall / "a/b/stations.yaml")
     assert [entry.file for entry in written.scene.files] == ["../../hall.glb"]
     # The sensor of a scenario is the default.
@@ -99,10 +99,10 @@ def test_targets_are_in_all_that_is_written(hall, lidarpool):
     targets = ("--target", "Wall-*", "--target", "Column")
     outcome = lidarpool("stations", "hall.glb", *arguments, *targets)
     assert outcome.code == 0, outcome.err
-    assert " m² of Wall-* and Column\n" in outcome.out
+    assert " m² of Wall-* and Column are visible\n" in outcome.out
     assert "Floor" not in outcome.out and "Column " in outcome.out
     head = (hall / "hall-stations/stations.yaml").read_text()
-    assert "% of what\n# can be seen of Wall-* and Column." in head
+    assert "% of the\n# visible surface of Wall-* and Column." in head
     assert pixels_of_kind(hall / "hall-stations/stations.png", OTHER) > 10_000
 
 
@@ -114,7 +114,7 @@ def test_open_ground_that_decides_is_noted(tmp_path, lidarpool):
     (tmp_path / "site.glb").write_bytes(scene.export(file_type="glb"))
     arguments = ("site.glb", "--up-axis", "z", "--sensor", "riegl-vz400", "--spacing", "5")
     outcome = lidarpool("stations", *arguments, "--count", "1")
-    assert "note: Ground has " in outcome.out and "name them with --target" in outcome.out
+    assert "note: Ground has " in outcome.out and "select them with `--target`" in outcome.out
     outcome = lidarpool(
         "stations", *arguments, "--count", "1", "--target", "Hut", "--overwrite", "--json"
     )
@@ -126,8 +126,8 @@ def test_open_ground_that_decides_is_noted(tmp_path, lidarpool):
     ("arguments", "says"),
     [
         (["--sensor", "riegl-vz4000"], "Did you mean 'riegl-vz400'?"),
-        (["--sensor", "vlp16", "--coverage", "most"], "'most' is not 1% to 100%"),
-        (["--sensor", "mid70"], "Livox Mid-70 does not look all around"),
+        (["--sensor", "vlp16", "--coverage", "most"], "'most' is not a valid percentage"),
+        (["--sensor", "mid70"], "Livox Mid-70 does not scan the full circle"),
     ],
 )
 def test_what_cannot_be_planned_writes_nothing(arguments, says, hall, lidarpool):

@@ -123,9 +123,9 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         **settings: Any,
     ) -> None:
         if only and pictures:
-            raise click.UsageError("--only and --pictures cannot be combined.")
+            raise click.UsageError("`--only` and `--pictures` cannot be combined.")
         if settings.get("pace") and not settings.get("live"):
-            raise click.UsageError("--pace requires --live.")
+            raise click.UsageError("`--pace` requires `--live`.")
         settings["extent"] = "pictures" if pictures else only
         begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
         from ..base import timeline as steps
@@ -334,11 +334,11 @@ def run(
     from .run_command import run_campaign, run_job, run_scenario
 
     if options.fresh and (options.resume or options.verify):
-        raise click.UsageError("--fresh cannot be combined with --resume or --verify.")
+        raise click.UsageError("`--fresh` cannot be combined with `--resume` or `--verify`.")
     if number is not None and settings["shard"] is not None:
-        raise click.UsageError("--job and --shard cannot be combined.")
+        raise click.UsageError("`--job` and `--shard` cannot be combined.")
     if options.retry_failed and (options.fresh or number is not None):
-        raise click.UsageError("--retry-failed cannot be combined with --fresh or --job.")
+        raise click.UsageError("`--retry-failed` cannot be combined with `--fresh` or `--job`.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))
@@ -348,20 +348,20 @@ def run(
     is_several = len(paths) > 1
     if of_mesh and is_several:
         raise click.UsageError(
-            "--sensor, --pose and the other mesh options require a single mesh file. Run the "
-            "files one by one."
+            "`--sensor`, `--pose` and the other mesh options require a single mesh file. Run "
+            "the files one by one."
         )
     if is_several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if is_several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, terminal, options, backend, extent)
         elif extent is not None:
-            raise click.UsageError("--only and --pictures cannot be used with campaigns.")
+            raise click.UsageError("`--only` and `--pictures` cannot be used with campaigns.")
         else:
             run_campaign(campaign.of_shard(settings["shard"] or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError(
-            "--job, --retry-failed and --verify can only be used with campaigns."
+            "`--job`, `--retry-failed` and `--verify` can only be used with campaigns."
         )
     else:
         scenario = Scenario.load(paths[0], of_mesh)

@@ -31,10 +31,10 @@ READY = "ready"
 FREE = "free"
 # {port of this machine: what listens there}
 PORTS = {
-    80: "the interface of a sensor that is played",
+    80: "interface of a played sensor",
     8765: "Foxglove",
-    8786: "a scheduler of Dask",
-    8787: "the dashboard of a scheduler",
+    8786: "Dask scheduler",
+    8787: "Dask dashboard",
     9876: "Rerun",
 }
 _FOR_DEVELOPERS = ("bench", "dev", "docs", "lint")
@@ -111,7 +111,7 @@ def _port_state(port: int) -> str:
         try:
             probe.bind(("127.0.0.1", port))
         except OSError as error:
-            return "needs rights" if error.errno == errno.EACCES else "in use"
+            return "requires privileges" if error.errno == errno.EACCES else "in use"
     return FREE
 
 
@@ -128,20 +128,20 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
         yield figures["open3d"]
     if machine["available_memory_gib"] < _MIN_MEMORY_GIB:
         yield (
-            f"{machine['available_memory_gib']:.1f} GiB of memory are free, and a small run takes "
-            f"{_MIN_MEMORY_GIB:g}: end other programs"
+            f"Only {machine['available_memory_gib']:.1f} GiB of memory are available, but a "
+            f"small run needs about {_MIN_MEMORY_GIB:g} GiB. Close other programs"
         )
     for folder, free_gib in machine["disk_gib"].items():
         if free_gib < _MIN_DISK_GIB:
-            yield f"{folder} has {free_gib:.1f} GiB left: make room there"
+            yield f"Only {free_gib:.1f} GiB are free on the disk of {folder}. Free some space"
     if figures["gpus"] and backends["cuda"] != READY:
-        yield f"There is a GPU that is not used: {backends['cuda']}"
+        yield f"The GPU of this machine is not used: {backends['cuda']}"
     if backends["tiles"] != READY:
-        yield f"Rays are cast a hundred times slower without numba: {backends['tiles']}"
+        yield f"Without numba, ray casting is about a hundred times slower: {backends['tiles']}"
     elif not HAS_CACHE:
         yield (
-            "Each process compiles its loops for 20 s, as there is no folder to keep them: set "
-            "NUMBA_CACHE_DIR to a folder that can be written"
+            "Each process compiles its loops, which takes 20 s, because there is no writable "
+            "cache folder. Set NUMBA_CACHE_DIR to a writable folder"
         )
     if figures["second_copy"]:
         yield figures["second_copy"]
@@ -163,7 +163,7 @@ def in_words(figures: dict[str, Any]) -> list[str]:
         "writing clouds": figures["open3d"],
     }
     lines = [f"{name:<14} {value}" for name, value in rows.items()]
-    extras = f"{'extras':<14} added in {CHECKOUT}"
+    extras = f"{'extras':<14} installed from {CHECKOUT}"
     for title, states in (("backends", figures["backends"]), (extras, figures["extras"])):
         lines.append(title)
         lines += [f"  {name:<12} {state}" for name, state in states.items()]
@@ -177,4 +177,4 @@ def in_words(figures: dict[str, Any]) -> list[str]:
 def advice_in_words(figures: dict[str, Any]) -> str:
     """Return the last line of the report: the fault to fix first."""
     advice = figures["fix_first"]
-    return f"fix first: {advice}." if advice else "nothing needs to be fixed."
+    return f"fix first: {advice}." if advice else "No problems were found."

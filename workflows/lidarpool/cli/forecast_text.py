@@ -57,7 +57,7 @@ def forecast_scenario(
     """
     campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
     if campaign is None and number is not None:
-        raise LidarError(f"{path} is no campaign, and has no job {number}.")
+        raise LidarError(f"{path} is not a campaign, so it has no job {number}.")
 
     terminal = Terminal(quiet)
 
@@ -70,7 +70,7 @@ def forecast_scenario(
         with terminal.status("reading the scene", logged=False):
             built = build(scenario, plans=campaign is None)
             job = built.job()
-        with terminal.status("casting some rays"):
+        with terminal.status("casting sample rays"):
             figures = forecast(
                 job,
                 options.with_pool(scenario.pool, {"backend": backend}),
@@ -162,7 +162,7 @@ def _holds_files(folder: Path | Storage | None) -> bool:
 def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator[str]:
     """Yield the forecast of a campaign as lines of text."""
     data_set = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
-    yield f"campaign    {plural(campaign.count, 'job')}, seed {campaign.seed}, kept as {data_set}"
+    yield f"campaign    {plural(campaign.count, 'job')}, seed {campaign.seed}, stored as {data_set}"
     for name, words in campaign.choices.items():
         yield f"varied      {name}: {words}"
     if campaign.splits:
@@ -241,11 +241,11 @@ def _scene_lines(figures: dict[str, Any]) -> Iterator[str]:
 def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     """Yield scans, poses and rays of the survey."""
     sensor = job.survey.sensor
-    pattern = f"{sensor.channels:,} a firing"
+    pattern = f"{sensor.channels:,} per firing"
     if len(job.survey.carried) > 1:
         pattern = f"{len(job.survey.carried)} sensors"
     elif sensor.period is not None and sensor.cycle != "frame":
-        pattern = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
+        pattern = f"{sensor.period:,} x {sensor.channels:,} per {sensor.cycle}"
     path = f"from {plural(figures['poses'], 'pose')}"
     if figures["drive"]:
         path = "along a trajectory"
@@ -267,8 +267,11 @@ def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
     for sensor in drive["sensors"]:
         cycles = ""
         if sensor["turns"]:
-            cycles = f", {sensor['turns']:,.2f} {sensor['cycle']}s; in one the carrier moves "
-            cycles += f"{sensor['meters_a_turn']:,.3f} m{' on the flight lines' if lines else ''}"
+            cycles = f", {sensor['turns']:,.2f} {sensor['cycle']}s; the platform moves"
+            cycles += (
+                f" {sensor['meters_a_turn']:,.3f} m per "
+                f"{sensor['cycle']}{' on the flight lines' if lines else ''}"
+            )
         firings = plural(sensor["firings"], "firing")
         yield f"{sensor['name'] or 'sensor':<11} {sensor['model']}, {firings}{cycles}"
 
@@ -278,31 +281,31 @@ def _return_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
     survey = job.survey
     returns = survey.returns_each[0]
     if figures["drive"] or returns != type(returns)():
-        rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
+        rays = f", {returns.subrays} sub-rays per beam" if returns.subrays > 1 else ""
         yield f"returns     {returns.mode} of each pulse{rays}"
     if extinction := survey.extinction(survey.sensor):
-        light = f"{rounded(100 * math.exp(-100 * extinction))} % of the light from 50 m is left"
-        yield f"air         takes {rounded(1000 * extinction)}/km: {light}"
+        light = f"{rounded(100 * math.exp(-100 * extinction))} % of the light returns from 50 m"
+        yield f"air         extinction {rounded(1000 * extinction)}/km: {light}"
     if estimate := figures["estimate"]:
         without = survey.faults and 2 * estimate["rays"] < survey.ray_count
         yield (
-            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits, rounded to "
-            f"{survey.precision_m:g} m; an estimate from {estimate['rays']:,} rays cast here"
-            f"{', without faults' if without else ''}"
+            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits, rounded "
+            f"to {survey.precision_m:g} m; estimated from {estimate['rays']:,} sample "
+            f"rays{', without faults' if without else ''}"
         )
 
 
 def _need_lines(figures: dict[str, Any]) -> Iterator[str]:
     """Yield the workers, slots, memory and disk that the run needs."""
     backend = figures["backend"]
-    device = {None: "backend not known yet", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")
+    device = {None: "backend not yet known", "cuda": "GPU, cuda"}.get(backend, f"CPU, {backend}")
     yield f"cast by     {plural(figures['casters'], 'casting worker')} ({device})"
     for name, slots in figures["slots"].items():
         label = name
         partition = ""
         if name == GPU:  # the partition is called GPU, also where its workers have no GPU
             label = "casting"
-            partition = " of partition GPU"
+            partition = " in partition GPU"
         count = plural(slots["there"], "slot")
         yield f"{label:<10}  {count}{partition}, at least {slots['needed']:,} needed"
     available = figures["memory"]["there"]

@@ -107,7 +107,7 @@ def import_whole(
         If the folder exists, the survey cannot be written, or the scenario is refused.
     """
     if folder.exists():
-        raise LidarError(f"{folder} already exists. Pass another folder with --out.")
+        raise LidarError(f"{folder} already exists. Pass another folder with `--out`.")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:

@@ -69,7 +69,7 @@ _NOW_NS = 2_000_000_000  # time between reading the source and the first sweep o
     "--pose-rate-hz",
     type=click.FloatRange(0, 10_000, min_open=True),
     metavar="RATE",
-    help="ros2: poses per second on /tf.  [default: one for each sweep]",
+    help="For ros2, poses per second on /tf (default: one per sweep).",
 )
 @click.option(
     "--organized",
@@ -120,12 +120,12 @@ def play(
     kind = bridge_class(bridge_name)
     bridge_settings = {name: value for name, value in settings.items() if value not in (None, ())}
     if unknown := [name for name in bridge_settings if name not in kind.settings]:
-        raise click.UsageError(f"--{unknown[0]} cannot be used with --as {bridge_name}.")
+        raise click.UsageError(f"`--{unknown[0]}` cannot be used with `--as {bridge_name}`.")
     schedule = Schedule(rate)
     if bridge_name == _PACKETS and isinstance(source, Path) and source.suffix.lower() in ENDINGS:
         if now:
             raise click.UsageError(
-                "--now cannot be used with recorded packets, which contain their timestamps."
+                "`--now` cannot be used with recorded packets, which contain their timestamps."
             )
         options.refuse_mesh_options(of_mesh, source)
         _play_recording(source, to, schedule, bridge_settings, loop=loop)
@@ -143,7 +143,7 @@ def play(
         bridge = kind(sweeps, schedule, bridge_options, terminal.tell)
         with _summarized(lambda: bridge.summary), bridge:
             bridge.show_content(played.content)
-            click.echo(f"ready: {bridge.description}; Ctrl-C stops")
+            click.echo(f"ready: {bridge.description}. Press Ctrl-C to stop.")
             play_sweeps(played, bridge, schedule, terminal.tell, loop=loop, start_at_ns=start_at_ns)
 
 
@@ -162,7 +162,7 @@ def _play_recording(
     streams = recorded_streams(recording, to, settings.get("api", ()))
     transmitter = Transmitter(streams, terminal.tell, settings.get("lateness"))
     with _summarized(lambda: transmitter.summary), transmitter:
-        click.echo(f"ready: {transmitter.description}; Ctrl-C stops")
+        click.echo(f"ready: {transmitter.description}. Press Ctrl-C to stop.")
         play_recording(recording, transmitter, schedule, loop=loop)
 
 

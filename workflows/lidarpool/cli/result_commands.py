@@ -134,13 +134,16 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
 @click.option(
     "--compensated-actors",
     is_flag=True,
-    help="Points of actors where the actor was at the start of the sweep, in formats with sweeps.",
+    help=(
+        "Store points of actors where the actor was at the start of the sweep, in formats with "
+        "sweeps."
+    ),
 )
 @click.option(
     "--pose-rate-hz",
     type=click.FloatRange(0, 10_000, min_open=True),
     metavar="RATE",
-    help="Poses per second on /tf of mcap and rosbag2 (default: one for each sweep).",
+    help="Poses per second on /tf in mcap and rosbag2 (default: one per sweep).",
 )
 @click.option(
     "--organized",
@@ -186,8 +189,7 @@ def export(
             if not (source / name).exists():
                 raise LidarError(
                     f"{result} does not contain {name}. Pass the output folder of a finished "
-                    "run. To finish "
-                    "an interrupted run, use lidarpool run --resume."
+                    "run. To finish an interrupted run, use `lidarpool run --resume`."
                 )
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
@@ -212,7 +214,7 @@ def export(
                     click.echo(written[-1])
             except (LidarError, KeyboardInterrupt) as error:
                 if written:
-                    error.add_note(f"Written before: {', '.join(written)}.")
+                    error.add_note(f"These files have already been written: {', '.join(written)}.")
                 raise
 
 
@@ -220,8 +222,8 @@ def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
     """Raise LidarError if a storage holds a file that must not be overwritten."""
     if isinstance(target, Storage) and not overwrite and file in target.entries():
         raise LidarError(
-            f"{target.path(file)} already exists. Pass another folder with --out, or pass "
-            "--overwrite."
+            f"{target.path(file)} already exists. Pass another folder with `--out`, or pass "
+            "`--overwrite`."
         )
 
 
@@ -319,13 +321,12 @@ def view(
     from ..showing.pages.opened import growing_view, is_data_set, open_views
 
     if (film or export) and len(results) > 1:
-        raise LidarError("--film and --export require a single input.")
+        raise LidarError("`--film` and `--export` require a single input.")
     if data_sets := [result for result in results if is_data_set(result)]:
         if len(results) > 1 or film or export:
             raise LidarError(
                 f"{data_sets[0]} is a data set with several jobs. View it on its own, without "
-                "--film and "
-                "--export."
+                "`--film` and `--export`."
             )
         options.refuse_mesh_options(of_mesh, data_sets[0])
         from ..showing.pages.job_list import JobList, show_jobs

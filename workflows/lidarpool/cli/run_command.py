@@ -78,7 +78,10 @@ def run_scenario(
     points = len(result.points)
     lines = [*terminal.notes(result.notes)]
     words = shard_in_words(str(shard))
-    lines.append(f"{words} in {options.out}: {plural(points, 'point')}, for lidarpool merge")
+    lines.append(
+        f"{words} in {options.out}: {plural(points, 'point')}. To combine the shards, use "
+        "lidarpool merge"
+    )
     figures = {"folder": str(options.out), "shard": str(shard), "points": points}
     show(figures, lines, terminal.as_json)
 
@@ -119,7 +122,9 @@ def run_campaign(
     LidarError if the run or a job fails.
     """
     if options.pace is not None:
-        raise click.UsageError("--pace applies to a survey only. Remove it to run the campaign.")
+        raise click.UsageError(
+            "`--pace` can only be used with a single survey, not with a campaign."
+        )
     options = options.with_pool(campaign.pool, {"backend": backend})
     assert options.out is not None, "commands write"
     campaign.keep.of_jobs.check_installed()
@@ -136,7 +141,7 @@ def run_campaign(
             *terminal.notes(run.notes),
             f"{plural(run.done, 'job')}, {plural(run.rays, 'ray')}, "
             f"{plural(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
-            f"data set in {click.format_filename(str(options.out))}: see README.md there",
+            f"data set in {click.format_filename(str(options.out))}; see its README.md",
         ]
         show(figures, lines, terminal.as_json)
         timeline.mark(timeline.SUMMARY)
@@ -200,10 +205,10 @@ def run_job(
             return ""
         if Tally.from_cloud(result.points).sha256 not in hashes:
             raise LidarError(
-                f"job {name} has other points than those in {target}: files that it is "
-                "made of have changed, such as images of a mesh."
+                f"The points of job {name} differ from those in {target}. Files that the job "
+                "uses have changed, such as images of a mesh."
             )
-        return f"the points are those of job {name} in {target}, bit for bit"
+        return f"the points of job {name} are bit-identical to those in {target}"
 
     options = options.with_pool(scenario.pool, {"backend": backend})
     _run_survey(built, replace(job, number=0), options, terminal, extent, compare_with_dataset)
@@ -229,11 +234,11 @@ def _result_lines(
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if (plan := result.plan) is not None:
-        outcome = "no path free of collisions was found"
+        outcome = "no collision-free path was found"
         if plan.collision_free:
-            outcome = f"path of {plan.length:.2f} m, free of collisions"
-        possible = "no path is possible, the obstacles leave no way"
+            outcome = f"collision-free path of {plan.length:.2f} m"
+        possible = "no path is possible, because the obstacles block the way"
         if math.isfinite(plan.shortest_possible):
-            possible = f"the shortest possible is {plan.shortest_possible:.2f} m"
+            possible = f"the shortest possible path is {plan.shortest_possible:.2f} m"
         yield f"{outcome}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)"
     yield f"results in {click.format_filename(str(target))}: {', '.join(report['files'])}"

@@ -68,7 +68,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     )
 
     if not meshes and {"unit", "up_axis"} & of_mesh.keys():
-        raise click.UsageError("--unit and --up-axis require --mesh.")
+        raise click.UsageError("`--unit` and `--up-axis` require `--mesh`.")
     target = folder / SCENARIO_FILE
     data = mesh_data(meshes, folder, of_mesh)
     note = ""
@@ -241,7 +241,7 @@ def check(
     options.show(figures, lines, as_json)
     if figures["reasons"]:
         reasons = figures["reasons"]
-        start = "it cannot run:\n" if reasons[1:] else "it cannot run. "
+        start = "The scenario cannot be run:\n" if reasons[1:] else "The scenario cannot be run. "
         raise LidarError(start + "\n".join(reasons))
     if not as_json:
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
@@ -252,7 +252,7 @@ def check(
         for name, value in settings.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
-        click.echo(f"it can run: {shlex.join(words)}")
+        click.echo(f"The scenario can be run: {shlex.join(words)}")
     if strict and figures["warnings"]:
         sys.exit(WARNED)
 
@@ -424,7 +424,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
 
     check_target(file)
     if file.exists() and not overwrite:
-        raise LidarError(f"{file} already exists. Use another name, or pass --overwrite.")
+        raise LidarError(f"{file} already exists. Use another name, or pass `--overwrite`.")
     scene = make()
     if file.suffix.lower() == ".glb":  # other formats hold no colors
         scene = painted(scene) if paint else scene
@@ -522,10 +522,10 @@ def sensors(
     settings = {name: value for name, value in settings.items() if value is not None}
     writing = [file_format, seconds, revolutions, *settings]
     if out is None and any(value is not None for value in writing):
-        raise click.UsageError("These options require --out FILE.")
+        raise click.UsageError("These options require `--out FILE`.")
     if model is None and "calibration" not in settings:
         if out is not None:
-            raise click.UsageError("Specify the model to write, or pass --calibration FILE.")
+            raise click.UsageError("Specify the model to write, or pass `--calibration FILE`.")
         _list_models()
         return
     if model is not None:
@@ -541,7 +541,7 @@ def sensors(
         _write_sensor(sensor, out, overwrite, file_format, seconds, revolutions)
         return
     if seconds is not None or revolutions is not None:
-        raise click.UsageError("--seconds and --revolutions cannot be used with a .png file.")
+        raise click.UsageError("`--seconds` and `--revolutions` cannot be used with a .png file.")
     from lidarview.render.pattern_picture import (
         draw_pattern,  # imports Matplotlib, which figures do not need
     )
@@ -562,12 +562,12 @@ def _write_sensor(
     from lidarsim.sensor.export import export_sensor
 
     if out.exists() and not overwrite:
-        raise LidarError(f"{out} already exists. Use another name, or pass --overwrite.")
+        raise LidarError(f"{out} already exists. Use another name, or pass `--overwrite`.")
     file = export_sensor(sensor, out, format=file_format, seconds=seconds, revolutions=revolutions)
     size = plural(len(file.rays), "ray") if len(file.rays) else plural(sensor.channels, "channel")
     click.echo(f"{size}: {click.format_filename(out)}")
     if file.left_out:
-        click.echo(f"not in the file: {'; '.join(file.left_out)}")
+        click.echo(f"not stored in the file: {'; '.join(file.left_out)}")
 
 
 def _list_models() -> None:

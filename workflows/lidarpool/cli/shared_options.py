@@ -188,7 +188,8 @@ def refuse_mesh_options(of_mesh: Mapping[str, Any], path: Any) -> None:
     """Raise a LidarError for options of a mesh with a path that is none."""
     for name in of_mesh:
         raise LidarError(
-            f"--{name.replace('_', '-')} only applies to mesh files, and {path} is not a mesh file."
+            f"`--{name.replace('_', '-')}` only applies to mesh files, and {path} is not a "
+            "mesh file."
         )
 
 
@@ -245,22 +246,24 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
     from lidarsim.base.input_files import input_size
 
     if settings["scheduler"] is not None and file is not None:
-        raise click.UsageError("--scheduler and --scheduler-file cannot be combined.")
+        raise click.UsageError("`--scheduler` and `--scheduler-file` cannot be combined.")
     has_scheduler = settings["scheduler"] is not None or file is not None
     starts_cluster = settings.get("cluster") is not None
     if starts_cluster and has_scheduler:
         raise click.UsageError(
-            "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
+            "`--cluster` and `--scheduler` cannot be combined, because `--cluster` starts a "
+            "cluster and `--scheduler` connects to a running one."
         )
     if settings.get("tls") and (starts_cluster or has_scheduler):
         raise click.UsageError(
-            "--tls is for a cluster of this machine: that of --cluster is encrypted if its "
-            "file says so, that of --scheduler if its address begins with tls://."
+            "`--tls` can only be used with the local cluster. Clusters of `--cluster` are "
+            "encrypted if their file specifies it, and clusters of `--scheduler` if the "
+            "address begins with tls://."
         )
     if any(files) and not has_scheduler:
         raise click.UsageError(
-            "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
-            "address, tls://host:8786."
+            "`--tls-ca`, `--tls-cert` and `--tls-key` require `--scheduler` with the address "
+            "of an encrypted cluster, such as tls://host:8786."
         )
     for pem in filter(None, files):
         with explained(f"{pem} cannot be read"):
@@ -286,7 +289,7 @@ def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
         return
     system = "no EPSG code" if epsg is None else f"EPSG:{epsg}"
     added = ", ".join(f"{value:,.12g}" for value in origin)
-    moved = f"; ({added}) m is added to the scenario's coordinates" if any(origin) else ""
+    moved = f"; ({added}) m is added to the coordinates of the scenario" if any(origin) else ""
     yield f"world       {system}{moved}"
 
 

@@ -42,7 +42,9 @@ def _share(text: str) -> float:
     except ValueError:
         share = math.nan
     if not (0.01 <= share <= 1):
-        raise click.BadParameter(f"{text!r} is not 1% to 100%: give a percentage, such as 95%.")
+        raise click.BadParameter(
+            f"{text!r} is not a valid percentage. Expected a value from 1% to 100%, such as 95%."
+        )
     return share
 
 
@@ -61,47 +63,59 @@ def _share(text: str) -> float:
     "targets",
     metavar="NAME",
     multiple=True,
-    help="Object to cover, by its name or a pattern with * and ?; may be given several times. "
-    "Other objects only occlude.  [default: all]",
+    help=(
+        "Object to cover, as a name or a pattern with * and ?; can be repeated (default: all "
+        "objects). Other objects only occlude."
+    ),
 )
 @options.path(
     "--of",
     "cloud",
-    help="Choose no stations: compare what those of SCENARIO see with this result or cloud.",
+    help="Compare the stations in SCENARIO with this result or cloud; no stations are chosen.",
 )
 @click.option(
     "--within",
     "within_m",
     default=0.1,
     metavar="M",
-    help="With --of: surface this near to a point is covered.",
+    help="With --of, the distance from a point within which a surface is covered, in meters.",
 )
 @click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
 @click.option(
     "--coverage",
     type=_share,
     metavar="SHARE",
-    help="Choose until this share of what can be seen is covered, such as 95%; without --count "
-    "and --coverage, for as long as each station adds 1%.",
+    help=(
+        "Add stations until this share of the visible surface is covered, such as 95% (default: "
+        "without --count, as long as each station adds 1%)."
+    ),
 )
 @click.option(
-    "--height", "height_m", default=1.7, metavar="M", help="Of the instrument above the floor."
+    "--height",
+    "height_m",
+    default=1.7,
+    metavar="M",
+    help="Height of the instrument above the floor in meters.",
 )
 @click.option(
     "--spacing",
     "spacing_m",
     type=float,
     metavar="M",
-    help="Between the places that are tried.  [default: for about 600 places]",
+    help="Spacing of the candidate positions in meters (default: about 600 candidates).",
 )
 @click.option(
-    "--slant", "slant_deg", default=80.0, metavar="DEG", help="Largest angle of incidence."
+    "--slant",
+    "slant_deg",
+    default=80.0,
+    metavar="DEG",
+    help="Maximum angle of incidence in degrees.",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Folder for stations.yaml and stations.png.  [default: named after the scene]",
+    help="Output folder for stations.yaml and stations.png (default: named after the scene).",
 )
 @options.mesh_reading
 @overwrite
@@ -131,7 +145,7 @@ def stations(
       lidarpool stations hall-stations/stations.yaml --of hall-scan
     """  # noqa: D301 - click wants the character, not its name
     if settings["count"] is not None and settings["coverage"] is not None:
-        raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
+        raise click.UsageError("`--count` and `--coverage` cannot be combined.")
     begin("reading the scene", quiet=settings["as_json"])
     from ..scenario.scenario import Scenario
 
@@ -139,7 +153,7 @@ def stations(
     if cloud is not None:
         _refuse_beside_cloud(scene, settings | {"model": model})
         if not within_m > 0:
-            raise LidarError(f"--within is {within_m:g}; it must be greater than 0 m.")
+            raise LidarError(f"`--within` is {within_m:g}; it must be greater than 0.")
         scenario = Scenario.load(scene, of_mesh)
         sight = {key: settings[key] for key in ("slant_deg", "targets")}
         _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
@@ -147,13 +161,18 @@ def stations(
         scenario = Scenario.load(scene, of_mesh)
         model = model or scenario.sensor.model
         if not model:
-            raise click.UsageError(f"--sensor is required, because {scene} names no sensor model.")
+            raise click.UsageError(
+                f"`--sensor` is required, because {scene} does not specify a sensor model."
+            )
         out = settings.pop("out")
         overwrites = settings.pop("overwrite")
         folder = Path(f"{scene.stem}-stations") if out is None else out
         existing = [folder / name for name in (PLAN_FILE, PICTURE_FILE) if (folder / name).exists()]
         if existing and not overwrites:
-            raise LidarError(f"{existing[0]} exists: give another folder, --out, or --overwrite.")
+            raise LidarError(
+                f"{existing[0]} already exists. Use another folder with `--out`, or pass "
+                "`--overwrite`."
+            )
         _plan(scenario, model, folder, **settings)
 
 
@@ -170,7 +189,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     sensor = load_sensor(model)
     terminal = Terminal(quiet=as_json)
     built, notes = _built_with_notes(scenario, terminal)
-    with terminal.status("looking from all places"):
+    with terminal.status("computing the visibility from all candidates"):
         plan = plan_stations(built.scene, sensor, **settings)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
@@ -201,9 +220,10 @@ def _refuse_beside_cloud(scene: Path, settings: dict[str, Any]) -> None:
         "--coverage": settings["coverage"],
         "--spacing": settings["spacing_m"],
     }
-    if unused := [name for name, value in chosen.items() if value is not None]:
+    if unused := [f"`{name}`" for name, value in chosen.items() if value is not None]:
         raise click.UsageError(
-            f"{' and '.join(unused)}: not with --of, which takes stations and sensor of {scene}."
+            f"{joined(unused)} cannot be used with `--of`, which takes the stations and the "
+            f"sensor from {scene}."
         )
 
 
@@ -223,19 +243,22 @@ def _show_coverage(
 
     if scenario.poses is None:
         raise LidarError(
-            "--of compares the stations of a scenario, and it has no poses: give stations.yaml of "
-            "lidarpool stations, or list the poses of the scan."
+            "`--of` requires a scenario with stations, but the scenario has no poses. Use "
+            "the file stations.yaml from lidarpool stations, or set `poses` to the stations "
+            "of the scan."
         )
     recording = open_recording(cloud)
     terminal = Terminal(quiet=as_json)
     built, notes = _built_with_notes(scenario, terminal)
     if len(built.survey.carried) > 1:
-        raise LidarError("--of compares the scan of one sensor, and the scenario has several.")
+        raise LidarError(
+            "`--of` compares the scan of a single sensor, but the scenario has several sensors."
+        )
     positions = _station_positions(built)
     clouds = (
         recording.read_points(number, in_world=True).points for number in range(recording.count)
     )
-    with terminal.status("looking for points on what the stations see"):
+    with terminal.status("finding points near the visible surfaces"):
         coverage = survey_coverage(
             built.scene,
             built.survey.carried[0].sensor,
@@ -247,8 +270,8 @@ def _show_coverage(
         )
     if not coverage.seen_m2.any():
         raise LidarError(
-            f"The stations see no surface{_of_targets(targets)}: check their poses, and the unit "
-            "of the scene."
+            f"No surface{_of_targets(targets)} is visible from the stations. Check their "
+            "poses and the unit of the scene."
         )
     figures = _coverage_figures(coverage, built) | {
         "stations": len(positions),
@@ -256,9 +279,9 @@ def _show_coverage(
         "notes": [*notes, *recording.left_out_notes],
     }
     head = (
-        f"{plural(len(positions), 'station')} see {figures['seen_m2']:,.0f} m²"
-        f"{_of_targets(targets)}, and {figures['covered']:.1%} of it is within {within_m:g} m of "
-        "a point"
+        f"{figures['seen_m2']:,.0f} m²{_of_targets(targets)} are visible from "
+        f"{plural(len(positions), 'station')}, and {figures['covered']:.1%} of this area is "
+        f"within {within_m:g} m of a point"
     )
     table = _object_lines(built.scene.names, coverage.seen_m2, coverage.covered_m2, "seen")
     note_lines = map("note: {}".format, recording.left_out_notes)
@@ -322,9 +345,9 @@ def _target_notes(plan: StationPlan, built: Built) -> Iterator[str]:
     share = float(visible_m2[largest] / visible_m2.sum())
     if share > _MOST_OF_THE_AREA and (visible_m2 > 0).sum() > 1:
         yield (
-            f"{printable(built.scene.names[largest])} has {share:.0%} of the area that can be "
-            "seen, so that it decides where the stations are. If other objects matter, name them "
-            "with --target"
+            f"{printable(built.scene.names[largest])} has {share:.0%} of the visible area, so "
+            "it determines where the stations are. If other objects matter, select them with "
+            "`--target`"
         )
 
 
@@ -335,11 +358,15 @@ def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) ->
     reached = float(plan.coverage[-1])
     if coverage is not None and reached < coverage:
         yield (
-            f"{coverage:.0%} is not reached: {MAX_STATIONS} stations, which is the most, cover "
-            f"{reached:.1%}; try a greater --height, --slant or --spacing"
+            f"The coverage of {coverage:.0%} is not reached: {MAX_STATIONS} stations, which "
+            f"is the maximum, cover {reached:.1%}. Increase `--height`, `--slant` or "
+            "`--spacing`"
         )
     if count is not None and len(plan.stations) < count:
-        yield f"{len(plan.stations)} of {count} stations already see all that can be seen"
+        yield (
+            f"{len(plan.stations)} of {count} stations already cover everything that is visible "
+            "from the candidates"
+        )
 
 
 def _stations_scenario(
@@ -367,9 +394,9 @@ def _stations_scenario(
         "cloud": {"columns": ["range"]},
     }
     head = (
-        f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. They "
-        f"cover {plan.coverage[-1]:.1%} of what\n# can be seen{_of_targets(targets)}. Steps are of "
-        "10 degrees: one turn from each.\n"
+        f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. "
+        f"They cover {plan.coverage[-1]:.1%} of the\n# visible surface{_of_targets(targets)}. "
+        "The steps are 10 degrees wide, with one revolution from each station.\n"
     )
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
@@ -401,8 +428,9 @@ def _plan_lines(plan: StationPlan, built: Built, targets: Sequence[str]) -> Iter
     """Yield a plan as lines of text: stations, then objects, the largest uncovered area first."""
     names = built.scene.names
     yield (
-        f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
-        f"{plan.visible_m2.sum():,.0f} m²{_of_targets(targets)}"
+        f"{plural(len(plan.candidates), 'candidate position')} on a grid of "
+        f"{plan.spacing_m:g} m, from which {plan.visible_m2.sum():,.0f} "
+        f"m²{_of_targets(targets)} are visible"
     )
     yield "station        x          y          z   covered     added"
     previous_share = 0.0
@@ -411,10 +439,10 @@ def _plan_lines(plan: StationPlan, built: Built, targets: Sequence[str]) -> Iter
         gain = share - previous_share
         yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
         previous_share = share
-    yield from _object_lines(names, plan.visible_m2, plan.covered_m2, "can be seen")
+    yield from _object_lines(names, plan.visible_m2, plan.covered_m2, "visible")
     blind = int((plan.targets & (plan.visible_m2 == 0)).sum())
     if blind:
-        yield f"out of sight from all places: {plural(blind, 'object')}"
+        yield f"not visible from any candidate position: {plural(blind, 'object')}"
     yield from options.world_lines(built.survey.epsg, built.scenario.world.origin)
 
 

@@ -80,10 +80,10 @@ def twin(
     from ..run.cluster.connection import connected
 
     if resume and overwrite:
-        raise click.UsageError("--resume and --overwrite cannot be combined.")
+        raise click.UsageError("`--resume` and `--overwrite` cannot be combined.")
     if (out / SCENARIO_FILE).exists() and not overwrite:
         raise LidarError(
-            f"{out} already contains {SCENARIO_FILE}. Use another folder, or pass --overwrite."
+            f"{out} already contains {SCENARIO_FILE}. Use another folder, or pass `--overwrite`."
         )
     steps = out / STEPS_FOLDER
     if overwrite:

@@ -36,7 +36,7 @@ from .recording import Read, Recording, RecordingSource, SweepFiles
 from .well_known_text import wkt
 
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
-_THIN = "thin it first"
+_THIN = "downsample it first"
 _POINT_BYTES = 24  # least bytes of the coordinates of a point
 _COORDINATES = {
     "cartesian": ("cartesianX", "cartesianY", "cartesianZ"),
@@ -81,7 +81,7 @@ def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
             file.close()
         except libe57.E57Exception as error:
             del file.image_file  # closing it would fail again
-            raise OSError(f"{str(error).splitlines()[0]}; the disk may be full") from error
+            raise OSError(f"{str(error).splitlines()[0]}. The disk may be full") from error
 
 
 def _highest_intensity(cloud: CloudLike) -> float:
@@ -275,7 +275,7 @@ def read_points(path: Path) -> FilePoints:
     try:
         headers = [file.get_header(number) for number in range(file.scan_count)]
         if not headers:
-            raise ValueError("it has no scans")
+            raise ValueError("it contains no scans")
         point_count = sum(header.point_count for header in headers)
         check_count(point_count)
         Allowance(input_size(path), _THIN).take(_POINT_BYTES * point_count)
@@ -413,11 +413,14 @@ def _scale(headers: Sequence[Any]) -> _Scale:
         return _Scale([None] * len(headers))
     pairs = zip(headers, limits, strict=True)
     if any("intensity" in header.point_fields and limit is None for header, limit in pairs):
-        note = "has scans with and without intensityLimits: their intensities are used as stored"
+        note = "has scans with and without intensityLimits. Their intensities are used as stored"
         return _Scale([None] * len(headers), (note,))
     following = iter(scales)
     applied = [None if limit is None else next(following) for limit in limits]
-    note = "has intensities whose scale is stated by intensityLimits: they were brought to 0 to 1"
+    note = (
+        "states the scale of its intensities in intensityLimits. The intensities were scaled to "
+        "the range 0 to 1"
+    )
     return _Scale(applied, (note,))
 
 
@@ -470,12 +473,12 @@ def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
     )
     if not (np.isfinite(quaternion).all() and np.isfinite(position).all()):
         raise ValueError(
-            f"the pose of {name} has the quaternion {_listed(quaternion)} (x, y, z, w) and the "
-            f"position {_listed(position)}, which are not finite"
+            f"the pose of {name} is not finite: its quaternion is {_listed(quaternion)} (x, "
+            f"y, z, w) and its position is {_listed(position)}"
         )
     length = np.sqrt((quaternion**2).sum())
     if length < _MIN_QUATERNION:
-        note = f"has a zero quaternion in the pose of {name}, which is read as no rotation"
+        note = f"has a zero quaternion in the pose of {name}. The scan is not rotated"
         return affine(np.eye(3), position), (note,)
     (rotation,) = matrices(quaternion[None] / length)
     return affine(rotation, position), ()

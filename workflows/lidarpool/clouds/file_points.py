@@ -49,7 +49,9 @@ def from_columns(columns: Columns) -> FilePoints:
     Raises ValueError if an axis is missing.
     """
     if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise ValueError(f"its vertices have no {', '.join(missing)}")
+        raise ValueError(
+            f"the coordinates of its vertices are incomplete ({', '.join(missing)} missing)"
+        )
     positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return FilePoints(positions, columns)
 
@@ -156,5 +158,6 @@ def check_count(count: int) -> None:
     """Raise LidarError if points would exceed the memory."""
     if (size := count * POINT_BYTES) > memory():
         raise LidarError(
-            f"it has {count:,} points, which take {bytes_of(size)} of memory: thin it first."
+            f"it has {count:,} points, which require {bytes_of(size)} of memory. Downsample "
+            "it first."
         )

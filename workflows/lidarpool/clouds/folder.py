@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidarsim.base.errors import LidarError, MissingFileError, explained
+from lidarsim.base.errors import LidarError, MissingFileError, as_sentence, explained
 from lidarsim.base.storage import WRITING, Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
@@ -43,11 +43,11 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
         return
     folder = output
     if folder.exists() and not folder.is_dir():
-        raise LidarError(f"{folder} is a file: give a folder with --out.")
+        raise LidarError(f"{folder} is a file. Specify a folder with `--out`.")
     missing_folders = [
         path for path in (folder, *folder.parents) if not path.exists()
     ]  # innermost first
-    with explained(f"Cannot write to the folder {folder}", "give another with --out"):
+    with explained(f"Cannot write to the folder {folder}", "specify another folder with `--out`"):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
@@ -55,8 +55,8 @@ def result_folder(output: Path | Storage) -> Iterator[Path]:
             Storage.at(folder).tidy(deep=False)
         except BlockingIOError as error:
             raise LidarError(
-                f"Another run or export is using the folder {folder}: wait for it, or give another "
-                "with --out."
+                f"Another run or export is using the folder {folder}. Wait until it has "
+                "finished, or specify another folder with `--out`."
             ) from error
     try:
         yield folder
@@ -71,7 +71,7 @@ def refuse_missing(place: Path | Storage, advice: str) -> None:
     """Raise LidarError with advice if a path, of a folder or file, does not exist."""
     local = place if isinstance(place, Path) else Path(place.url) if place.is_local else None
     if local is not None and not local.exists():
-        raise MissingFileError(f"{place} does not exist: {advice}")
+        raise MissingFileError(f"{place} does not exist. {as_sentence(advice)}")
 
 
 @contextmanager
@@ -80,7 +80,7 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
 
     LidarError if the folder does not exist, the storage cannot be read, or has no complete result.
     """
-    refuse_missing(output, "give the folder of a finished run (its --out).")
+    refuse_missing(output, "specify the folder of a finished run, as passed to `--out`")
     with local_folder(output) as folder:
         if not isinstance(output, Storage):
             yield folder
@@ -89,9 +89,9 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
             sizes = output.sizes()
             if LAST_FILE not in sizes:
                 raise LidarError(
-                    f"{output.url} has no complete result, which has a {LAST_FILE}: give the URL "
-                    "of a finished run (its --out); lidarpool run --resume continues an unfinished "
-                    "one."
+                    f"{output.url} contains no complete result, because it has no "
+                    f"{LAST_FILE}. Specify the URL of a finished run. To complete an "
+                    "unfinished run, use `lidarpool run --resume`."
                 )
             for name in (*names, LAST_FILE):
                 if name in sizes:

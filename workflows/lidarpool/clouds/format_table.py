@@ -443,13 +443,13 @@ def _row_of_plugin(plugin: Plugin) -> FormatRow:
     row = plugin.load(FormatRow)
     if row.data_set:
         raise LidarError(
-            f"{plugin} has data sets, {row.data_set!r}, which plug-ins cannot have: leave out "
-            "data_set."
+            f"{plugin} defines the data set {row.data_set!r}, but plug-ins cannot define data "
+            "sets. Remove `data_set`."
         )
     if "/" in row.file or (row.write and row.file in _FILES):
         raise LidarError(
-            f"{plugin} writes {row.file!r}: name a file or folder that no other format has, and no "
-            "folder above it."
+            f"{plugin} writes {row.file!r}. Choose the name of a file or folder that no other "
+            "format writes, without parent folders."
         )
     return replace(row, plugin=plugin)
 
@@ -468,7 +468,9 @@ def row_of(name: str) -> FormatRow:
     """
     row = _TABLE[name]
     if not row.write:
-        raise LidarError(f"{name!r} is only read: write another format, such as ply.")
+        raise LidarError(
+            f"The format {name!r} can be read, but not written. Write another format, such as ply."
+        )
     return row
 
 
@@ -543,6 +545,6 @@ def check_whole(needs: Iterable[str], keep_every: int) -> None:
     """Raise LidarError if returns are thinned out for a format of all rays."""
     if "ray" in needs and keep_every > 1:
         raise LidarError(
-            f"Range images and organized clouds need every return, and keep_every is {keep_every}: "
-            "set cloud.keep_every to 1."
+            "Range images and organized clouds require all returns, but `keep_every` is "
+            f"{keep_every}. Set `cloud.keep_every: 1`."
         )

@@ -61,7 +61,10 @@ class Pieces(pieces.Pieces):
         for name, values in columns.items():
             for plane, image_of_return in enumerate(image.filled(values)):
                 if (key := _key(name, plane)) in arrays:
-                    raise LidarError(f"Two arrays of an image would be {key!r}: rename one.")
+                    raise LidarError(
+                        f"An image would contain two arrays named {key!r}. Rename one of the "
+                        "columns."
+                    )
                 arrays[key] = image_of_return
         boxes = Boxes.from_points(sweeps, number, points) if sweeps.actors and self.entry else None
         return {_file(sweeps, self.folders, number): packed(arrays)}, boxes

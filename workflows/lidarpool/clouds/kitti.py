@@ -63,7 +63,9 @@ class Pieces(pieces.Pieces):
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         if len(sweeps.objects) + len(sweeps.actors) > MAX_INSTANCES:
-            raise LidarError(f"KITTI labels hold {MAX_INSTANCES:,} objects at most.")
+            raise LidarError(
+                f"KITTI labels support at most {MAX_INSTANCES:,} objects. Write another format."
+            )
         super().__init__(cloud, sweeps, entry)
         self.names = _names(sweeps, entry)
         self.sequences = [f"sequences/{name}" for name in self.names]
@@ -266,9 +268,9 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
 
     def of_frames(rows: Floats, table: str) -> Floats:
         """Return the rows that belong to the files, and note those that belong to none."""
-        indices = rows_of_frames(files, len(rows), table, "files of points")
+        indices = rows_of_frames(files, len(rows), table, "point files")
         if surplus := frames_without_file(files, len(rows)):
-            notes.append(f"has no file of points for {frames_in_words(surplus)} of {table}")
+            notes.append(f"has no point file for {frames_in_words(surplus)} of {table}")
         return rows[indices]
 
     poses: Floats | None = None
@@ -276,11 +278,13 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
         rows = of_frames(_matrices(folder / "poses.txt"), "poses.txt")
         poses = lidar_poses(rows, calibration)
         if not calibration.exists():
-            notes.append(f"has no {CALIBRATION_FILE}, so its poses count as poses of the lidar")
+            notes.append(
+                f"has no {CALIBRATION_FILE}, so its poses are assumed to be poses of the lidar"
+            )
     times_ns: Floats | None = None
     if (folder / "times.txt").exists():
         seconds = np.loadtxt(folder / "times.txt", ndmin=1)
-        times_ns = 1e9 * seconds_of(seconds, None, advice="write seconds into times.txt")
+        times_ns = 1e9 * seconds_of(seconds, None, advice="write seconds to times.txt")
         times_ns = of_frames(times_ns, "times.txt")
 
     def read(number: int) -> Read:

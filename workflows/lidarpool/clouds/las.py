@@ -123,7 +123,7 @@ def _write(
             if packets is not None:
                 packets.append(file, packet_file)
     except lazrs.LazrsError as error:
-        raise OSError(f"{error}; the disk may be full") from error
+        raise OSError(f"{error}. The disk may be full") from error
 
 
 def _start_s(sweeps: Sweeps) -> float:
@@ -190,8 +190,9 @@ def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, nam
     header.offsets += np.where(np.abs(beside) > _ON_GRID * precision_m, beside, 0.0)
     if np.abs(np.stack([lower, upper]) - header.offsets).max() / precision_m > _MAX_STEPS:
         raise LidarError(
-            f"{name} holds 2^32 steps of {precision_m} m along an axis, "
-            f"and the cloud is {(upper - lower).max():.6g} m wide: use a coarser precision_m."
+            f"{name} stores positions in at most 2^32 steps of {precision_m} m per axis, but "
+            f"the cloud extends over {(upper - lower).max():.6g} m. Use a larger "
+            "`precision_m`."
         )
 
 
@@ -314,7 +315,7 @@ def open_file(source: RecordingSource) -> Recording:
         reader.seek(start)
         points = reader.read_points(length)
         if len(points) != length:
-            raise CutShortError(f"{count:,} points announced, and there are fewer")
+            raise CutShortError(f"its header declares {count:,} points, but it contains fewer")
         columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
         return np.stack([points.x, points.y, points.z], axis=1), columns, None
 

@@ -30,7 +30,7 @@ _MAX_RECORD = 1 << 20  # bytes of a record with a coordinate system
 _WKT_BIT = 16  # bit of the global encoding: the coordinate system is WKT
 _SIGNATURE = b"LASF"  # first bytes
 _EARLY_END = "failed to fill whole buffer"  # part of the error of lazrs at the end of a file
-_SMALLER = "write it as .las, or thin it first"
+_SMALLER = "write a .las file, or downsample it first"
 
 
 @contextmanager
@@ -54,14 +54,16 @@ def open_las(path: Path) -> Iterator[Any]:
             header = reader.header
             announced = header.point_count * header.point_format.size
             if not header.are_points_compressed and points_start + announced > size:
-                raise CutShortError(f"{header.point_count:,} points announced, and there are fewer")
+                raise CutShortError(
+                    f"its header declares {header.point_count:,} points, but it contains fewer"
+                )
             Allowance(size, _SMALLER).take(announced if header.are_points_compressed else 0)
             try:
                 yield reader
             except Exception as error:  # the text of the error of lazrs tells its kind
                 if _EARLY_END not in str(error):
                     raise
-                raise CutShortError("its packed points end too early") from error
+                raise CutShortError("its compressed points end too early") from error
 
 
 def noise_classes(header: Any) -> tuple[int, ...]:
@@ -118,14 +120,16 @@ def _layout(file: BinaryIO) -> tuple[int, int, int]:
     header_size, points_start, records = _unpacked(file, *_LAYOUT)
     file.seek(0)
     if file.read(len(_SIGNATURE)) != _SIGNATURE:
-        raise ValueError("its first bytes are not LASF, with which a .las or .laz begins")
+        raise ValueError("it does not start with LASF, the signature of .las and .laz files")
     size = os.fstat(file.fileno()).st_size
     if points_start > size:
-        raise CutShortError(f"its points begin at byte {points_start:,}, and it has {size:,}")
+        raise CutShortError(
+            f"its points start at byte {points_start:,}, but it has only {size:,} bytes"
+        )
     if header_size + _VLR.size * records > points_start:
         raise ValueError(
-            f"its header announces {records:,} variable-length records, which do not fit between "
-            f"its end and its points (bytes {header_size:,} to {points_start:,})"
+            f"its header declares {records:,} variable-length records, which do not fit "
+            f"between the header and the points (bytes {header_size:,} to {points_start:,})"
         )
     return header_size, points_start, records
 

@@ -184,8 +184,9 @@ def _labels_of_classes(classes: Collection[int]) -> Bytes:
     """
     if len(classes) > _MAX_CLASSES:
         raise LidarError(
-            f"{len(classes)} classes have names, but labels of nuScenes-lidarseg hold at most "
-            f"{_MAX_CLASSES}. Remove names from `classes`, or write another format, such as kitti."
+            f"nuScenes-lidarseg supports at most {_MAX_CLASSES} classes, but {len(classes)} "
+            "classes have names. Remove names from `classes`, or write another format, such "
+            "as kitti."
         )
     labels = np.zeros(1 << 16, np.uint8)
     labels[sorted(classes)] = np.arange(1, len(classes) + 1)
@@ -455,8 +456,8 @@ def open_folder(source: RecordingSource) -> Recording:
         if len(versions) > 1:
             names = ", ".join(version.name for version in versions)
             raise LidarError(
-                f"{source.name} has several versions of nuScenes: {names}. Give the folder of one "
-                f"of them, for example {source.name}/{versions[0].name}."
+                f"{source.name} contains several versions of nuScenes: {names}. Specify the "
+                f"folder of one version, for example {source.name}/{versions[0].name}."
             )
         (tables,) = versions
     with reading(source.name):

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from lidarsim.base.allowance import Allowance
 
-_ADVICE = "write a part of its points, or less in a group of rows"
+_ADVICE = "write fewer points, or smaller row groups"
 
 
 def number_columns(schema: pa.Schema) -> list[str]:

@@ -130,9 +130,9 @@ class GrowingPly:
         free = shutil.disk_usage(self._path.parent).free
         if free < size + piece:
             raise LidarError(
-                f"{self._path} could not be written: it takes {size:,} bytes, and {piece:,} beside "
-                f"it meanwhile; the disk has {free:,} bytes free. Make room, or write to another "
-                "folder."
+                f"{self._path} cannot be written: it requires {size:,} bytes and temporarily "
+                f"another {piece:,} bytes, but only {free:,} bytes are free on the disk. Free "
+                "some space, or write to another folder."
             )
 
     def append(self, count: int, columns: Iterable[tuple[str, AnyArray]]) -> None:
@@ -341,9 +341,11 @@ def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> 
         with quiet:
             written = o3d.t.io.write_point_cloud(str(path), points, write_ascii=False)
     except (RuntimeError, UnicodeError) as error:
-        raise LidarError(f"Open3D cannot write {path.parent}: {error}.") from error
+        raise LidarError(f"Open3D cannot write to {path.parent}: {error}.") from error
     if not written:
-        raise LidarError(f"Open3D cannot write to {path.parent}: check folder and disk.")
+        raise LidarError(
+            f"Open3D cannot write to {path.parent}. Check the folder and the free disk space."
+        )
 
 
 def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:
@@ -354,12 +356,12 @@ def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]
     try:
         start, stored_count, row = layout(piece)
         if stored_count != count:
-            raise ValueError(f"{stored_count:,} of {count:,} points")
+            raise ValueError(f"only {stored_count:,} of {count:,} points were written")
     except ValueError as error:
         free = shutil.disk_usage(path.parent).free
         raise LidarError(
-            f"{path} could not be written ({error}); the disk has {free:,} bytes free. "
-            "Make room, or write to another folder."
+            f"{path} cannot be written: {error}. The disk has {free:,} bytes of free space. "
+            "Free some space, or write to another folder."
         ) from error
     return start, row
 
@@ -420,8 +422,8 @@ def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
     except (OSError, ValueError, TypeError, LookupError, LidarError):
         keep_every = 1
     note = (
-        f"{source.name} keeps one of {keep_every} hits, so its gaps are no lost returns: run it "
-        "with keep_every 1 to compare these"
+        f"{source.name} keeps one of {keep_every} hits, so its gaps do not represent lost "
+        "returns. To compare lost returns, run the survey with `keep_every: 1`"
     )
     fields = {"notes": (note,), "thinned": True} if keep_every > 1 else {}
     load = partial(Sweeps.load, sweeps_path)

@@ -13,7 +13,7 @@ import numpy as np
 from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
-from lidarsim.base.words import did_you_mean
+from lidarsim.base.words import did_you_mean, joined
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
 from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
@@ -221,8 +221,8 @@ class Recording:
         if in_world and not self.is_cloud:
             if pose is None:
                 raise LidarError(
-                    f"{self.name} is in the axes of its sensor, and does not say where that was: "
-                    "compare it with a recording of sweeps."
+                    f"{self.name} is in sensor coordinates and does not contain the pose of "
+                    "the sensor. Compare it with a recording that consists of sweeps."
                 )
             positions = positions @ pose[:3, :3].T + pose[:3, 3] * self.meters
         rings = rings_of(columns)
@@ -239,8 +239,8 @@ class Recording:
         name = self.intensity_column
         if name is not None and name not in columns:
             raise LidarError(
-                f"it has no column {name!r} to compare as intensity."
-                + (did_you_mean(name, columns) or f" It has {', '.join(columns)}.")
+                f"it has no column {name!r} that could be used as intensity."
+                + (did_you_mean(name, columns) or f" Available columns: {', '.join(columns)}.")
             )
 
 
@@ -423,7 +423,9 @@ def positions_of(columns: Columns) -> Floats:
     Raises ValueError without these.
     """
     if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise ValueError(f"its points have no {', '.join(missing)}")
+        raise ValueError(
+            f"the coordinates of its points are incomplete ({', '.join(missing)} missing)"
+        )
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
 
 
@@ -438,16 +440,19 @@ def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> st
         return available[0]
     if chosen is not None and chosen in available:
         return chosen
-    listed = f"has the {kind} {', '.join(available)}" if available else f"has no {kind}"
+    contents = f"It contains the {kind} {joined(available)}." if available else ""
     if available == [""]:
-        listed = f"has no names of {kind}: give none"
-    if chosen is None and available:
-        advice = "choose one (--sensor-a, --sensor-b; of fit --sensor)"
-        raise SeveralSensorsError(f"{name} {listed}: {advice}.", available)
+        contents = f"Its {kind} have no names, so do not choose one."
+    if not available:
+        raise LidarError(f"{name} contains no {kind}. Record at least one.")
     if chosen is None:
-        raise LidarError(f"{name} {listed}: record one.")
+        raise SeveralSensorsError(
+            f"{name} contains the {kind} {joined(available)}. Choose one of them with "
+            "`--sensor`, or with `--sensor-a` and `--sensor-b` in a comparison.",
+            available,
+        )
     hint = did_you_mean(chosen, available)
-    raise LidarError(f"{name} does not have {chosen!r}.{hint} It {listed}.")
+    raise LidarError(f"{name} does not contain {chosen!r}.{hint} {contents}")
 
 
 def take_positions(columns: dict[str, AnyArray]) -> Floats:

@@ -97,10 +97,12 @@ class Reader:
         else:
             data = np.frombuffer(bytearray(self.storage.read(name)), np.uint8)
         if len(data) % row.itemsize:
-            raise ValueError(f"{len(data)} bytes are no whole rows of {row.itemsize}")
+            raise ValueError(
+                f"{len(data)} bytes are not a multiple of the row size ({row.itemsize} bytes)"
+            )
         rows = data.view(row)
         if count not in (None, len(rows)):
-            raise ValueError(f"it has {len(rows):,} points, and {points_file} {count:,}")
+            raise ValueError(f"it has {len(rows):,} points, but {points_file} has {count:,}")
         return rows  # PyTorch requires writable arrays
 
     def inside(self, sweep: int, cloud: Cloud) -> PointColumns:

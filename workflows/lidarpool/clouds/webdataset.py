@@ -50,7 +50,7 @@ class Pieces(pieces.Pieces):
         self.names = plain_names(name or "lidar" for name in sweeps.sensors)
         self.offsets = np.zeros((len(sweeps), 3), np.int64)
         if clash := [column.name for column in cloud.table if column.name in _RESERVED]:
-            raise LidarError(f"WebDataset has other {clash[0]!r}: rename the column.")
+            raise LidarError(f"WebDataset reserves the name {clash[0]!r}. Rename the column.")
 
     def spans(self, min_spans: int = 1) -> list[PieceRange]:
         """Divide all sweeps into ranges with separate tar files, wherever they are written."""
@@ -150,7 +150,9 @@ class Reader(sweep_reader.Reader):
         _, first, stop = self._offsets[sweep].tolist()
         sample = self.storage.read(self.files(sweep)[0], first, stop)
         if len(sample) < stop - first:
-            raise ValueError(f"it ends {stop - first - len(sample)} bytes before the sweep does")
+            raise ValueError(
+                f"it ends {stop - first - len(sample)} bytes before the end of the sweep"
+            )
         data = io.BytesIO(sample)
         arrays: dict[str, AnyArray] = {}
         with tarfile.open(fileobj=data, mode="r:") as tar:
@@ -210,8 +212,8 @@ def _sensors(files: list[Path]) -> dict[str, SweepFiles]:
             samples_of_sensor.setdefault(description.get("sensor", ""), []).append(sample)
     if not samples_of_sensor:
         raise LidarError(
-            f"{files[0].name} has no samples of points: a WebDataset of sweeps has files "
-            "KEY.points.npy."
+            f"{files[0].name} contains no point samples. A WebDataset of sweeps has files "
+            "named KEY.points.npy."
         )
 
     def sweeps_of(

@@ -45,14 +45,14 @@ def wkt(epsg: int) -> str:
         return _utm(epsg, zone, False, _ETRS89)
     if find_spec("rasterio") is None:
         raise LidarError(
-            f"EPSG:{epsg} is not a UTM zone of WGS 84 or ETRS89, and others need rasterio: "
-            f"{install_command('lidarpool[geo]')}."
+            f"EPSG:{epsg} is not a UTM zone of WGS 84 or ETRS89. Other coordinate systems "
+            f"require rasterio. Run {install_command('lidarpool[geo]')}."
         )
     crs = import_module("rasterio.crs")
     try:
         return str(crs.CRS.from_epsg(epsg).to_wkt(version="WKT1_GDAL"))
     except crs.CRSError as error:
-        raise LidarError(f"rasterio cannot write EPSG:{epsg} as WKT 1: {error}.") from error
+        raise LidarError(f"rasterio cannot convert EPSG:{epsg} to WKT 1: {error}.") from error
 
 
 def _utm(epsg: int, zone: int, south: bool, system: _Geodetic) -> str:

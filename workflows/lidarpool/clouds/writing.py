@@ -16,6 +16,7 @@ from lidarsim.base.errors import LidarError, MissingFileError, explained
 from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
+from lidarsim.base.words import alternatives, joined
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
@@ -42,29 +43,32 @@ class Format:
     In YAML, the format alone will do.
     """
 
-    format: Annotated[str, about(f"{_FILES}; or of a plug-in", json_schema_extra=_NAMES)]
+    format: Annotated[str, about(f"{_FILES}; or a format of a plug-in", json_schema_extra=_NAMES)]
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        about("layout of points in mcap and rosbag2"),
+        about("point layout in mcap and rosbag2"),
     ] = "velodyne"
     compensated: Annotated[
         bool,
         about(
-            "points of mcap, rosbag2 and pcd in the sensor's axes at the start of the sweep, "
-            "without times of points; by default as drivers publish them, each at its firing"
+            "whether points in mcap, rosbag2 and pcd are in the sensor frame at the start of "
+            "the sweep, without point times; by default, each point is in the sensor frame "
+            "at its firing, as drivers publish it"
         ),
     ] = False
     compensated_actors: Annotated[
         bool,
         about(
-            "points of actors where the actor was at the start of the sweep, so that they lie in "
-            "its box; by default where the actor was at their firing (formats of single sweeps)"
+            "whether points of actors are stored where the actor was at the start of the "
+            "sweep, so that they lie in its box (formats of single sweeps); by default, they "
+            "are stored where the actor was at their firing"
         ),
     ] = False
     pose_rate_hz: Annotated[
         float | None,
         about(
-            "poses per second on /tf of mcap and rosbag2 (default: one at the start of each sweep)",
+            "poses per second on /tf in mcap and rosbag2 (default: one pose at the start of "
+            "each sweep)",
             gt=0,
             le=10_000,
         ),
@@ -72,15 +76,16 @@ class Format:
     organized: Annotated[
         bool,
         about(
-            "clouds of mcap and rosbag2 have a point for each ray, NaN without a return, in lines "
-            "as the driver of the layout has them (velodyne, ouster, images, robosense)"
+            "whether clouds in mcap and rosbag2 contain a point for each ray, NaN without a "
+            "return, in rows as the driver of the layout publishes them (velodyne, ouster, "
+            "images, robosense)"
         ),
     ] = False
     intensity_full_scale: Annotated[
         float | None,
         about(
-            "intensity that las and laz store as 65,535 (default: chosen from the cloud, so that "
-            "at most 1 % of the points reach it)",
+            "intensity that las and laz store as 65,535 (default: chosen from the cloud, so "
+            "that at most 1 % of the points reach it)",
             gt=0,
             le=1e9,
         ),
@@ -91,26 +96,27 @@ class Format:
         if self.compensated and not row.raw_or_compensated:
             choices = [name for name, row in FORMATS.items() if row.raw_or_compensated]
             raise LidarError(
-                f"compensated is an option of {', '.join(choices)}, not of {self.format}: leave it "
-                "out."
+                f"{self.format} does not have the option `compensated`. It can be set for "
+                f"{joined(choices)} only."
             )
         if self.compensated_actors and not row.positions_of_sweeps:
             choices = [name for name, row in FORMATS.items() if row.positions_of_sweeps]
             raise LidarError(
-                f"{self.format} does not have the option `compensated_actors`. It can be set for "
-                f"formats that store the points of single sweeps: {', '.join(choices)}."
+                f"{self.format} does not have the option `compensated_actors`. It can only be "
+                "set for formats that store the points of single sweeps, which are "
+                f"{joined(choices)}."
             )
         if self.pose_rate_hz is not None and not row.layouts:
             choices = [name for name, row in FORMATS.items() if row.layouts]
             raise LidarError(
-                f"{self.format} does not have the option `pose_rate_hz`. It can be set for "
-                f"{' and '.join(choices)} only."
+                f"{self.format} does not have the option `pose_rate_hz`. It can only be set "
+                f"for {joined(choices)}."
             )
         if self.intensity_full_scale is not None and not row.integer_intensities:
             choices = [name for name, row in FORMATS.items() if row.integer_intensities]
             raise LidarError(
-                f"{self.format} does not have the option `intensity_full_scale`. It can be set for "
-                f"{' and '.join(choices)} only."
+                f"{self.format} does not have the option `intensity_full_scale`. It can only "
+                f"be set for {joined(choices)}."
             )
         if self.organized and self.layout not in row.organized_layouts:
             self._refuse_organized(row)
@@ -121,12 +127,13 @@ class Format:
         if not layouts:
             choices = [name for name, row in FORMATS.items() if row.organized_layouts]
             raise LidarError(
-                f"organized is an option of {', '.join(choices)}, not of {self.format}: leave it "
-                "out."
+                f"{self.format} does not have the option `organized`. It can only be set for "
+                f"{joined(choices)}."
             )
         raise LidarError(
-            f"organized is an option of the layouts {', '.join(layouts)}, not of {self.layout}, "
-            "whose driver publishes no organized clouds: leave it out, or take another layout."
+            f"The layout {self.layout} does not have the option `organized`, because its "
+            "driver does not publish organized clouds. Remove `organized`, or use one of the "
+            f"layouts {joined(layouts)}."
         )
 
     @classmethod
@@ -136,7 +143,8 @@ class Format:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
         except TypeError as error:
             raise LidarError(
-                f"{entry!r} names no format: give a name, or {{'format': name, 'layout': name}}."
+                f"{entry!r} does not specify a format. Use the name of a format, or "
+                "{'format': name, 'layout': name}."
             ) from error
 
     @property
@@ -182,10 +190,12 @@ class Format:
         left_out = self.left_out(cloud, sweeps)
         unnamed = [name for name in left_out if name in self.row.named]
         never_held = ", ".join(name for name in left_out if name not in unnamed)
-        notes = [f"{self.title} does not hold {never_held}"] if never_held else []
+        notes = [f"{self.title} cannot store {never_held}"] if never_held else []
         notes += [
-            f"{self.title} holds {name} only if classes have names: give classes: "
-            "{1: ground, …} (docs/how-to/labels.md)"
+            (
+                f"{self.title} can store {name} only if classes have names. Set `classes: {{1: "
+                "ground, …}`; see docs/how-to/labels.md"
+            )
             for name in unnamed
         ]
         return [*notes, *self.contradictions(sweeps.coordinates), *self.renamed(sweeps.sensors)]
@@ -197,9 +207,11 @@ class Format:
         if any(material.semantic_class for material in survey.materials):
             return []
         return [
-            f"{self.title} labels points by class, and all have class 0: give class: in "
-            "materials, copies, actors or traffic, and the names in classes: "
-            "(docs/how-to/labels.md)"
+            (
+                f"{self.title} labels points by class, but all points have class 0. Set `class` "
+                "in `materials`, `copies`, `actors` or `traffic`, and name the classes in "
+                "`classes`; see docs/how-to/labels.md"
+            )
         ]
 
     def renamed(self, sensors: Sequence[str]) -> list[str]:
@@ -207,10 +219,13 @@ class Format:
         expected = self.row.first_sensor
         if not expected or not sensors or sensors[0] in ("", expected):
             return []
-        note = f"the first sensor, {sensors[0]!r}, is {expected} in {self.title}"
+        note = (
+            f"{self.title} expects the name {expected!r} for the first sensor, so {sensors[0]!r} "
+            f"is renamed to {expected!r}"
+        )
         if expected in sensors[1:]:
-            note += f", and {expected!r} is {expected}_2"
-        return [f"{note}: its readers expect this name of the first"]
+            note += f" and {expected!r} to '{expected}_2'"
+        return [note]
 
     def contradictions(self, coordinates: str) -> list[str]:
         """Return a note if readers of the format expect different coordinates than the cloud's."""
@@ -218,13 +233,18 @@ class Format:
             return []
         if self.row.one_system:
             return [
-                f"readers of {self.format} expect points in one coordinate system, and with "
-                "cloud.coordinates sensor each is in the sensor's axes at its firing: use world"
+                (
+                    f"readers of {self.format} expect points in one coordinate system, but with "
+                    "`coordinates: sensor` each point is in the sensor frame at its firing. Set "
+                    "`cloud.coordinates: world`"
+                )
             ]
         if self.compensated or self.row.compensates:
             return [
-                f"{self.title} holds points compensated for motion, although cloud.coordinates is "
-                "sensor: they are brought to the start of the sweep"
+                (
+                    f"{self.title} stores points compensated for motion, so they are transformed "
+                    "to the start of the sweep although `cloud.coordinates` is sensor"
+                )
             ]
         return []
 
@@ -238,7 +258,7 @@ class Format:
         if missing := self.row.missing_packages:
             needs = [f"lidarpool[{self.row.extra}]"] if self.row.extra else missing
             command = install_command(*needs)
-            raise LidarError(f"The format {self.format} needs {' and '.join(missing)}: {command}.")
+            raise LidarError(f"The format {self.format} requires {joined(missing)}. Run {command}.")
         if self.row.plugin is not None:
             self.row.provides(self.row.write)
 
@@ -246,9 +266,9 @@ class Format:
         """Raise LidarError unless all requirements of `write` are met, before a file is written."""
         self.check_installed()
         if not path.parent.is_dir():
-            raise MissingFileError(f"The folder {path.parent} does not exist: make it first.")
+            raise MissingFileError(f"The folder {path.parent} does not exist. Create it first.")
         if path.exists() and not overwrite:
-            raise LidarError(f"{path} exists: give another place with --out, or --overwrite.")
+            raise LidarError(f"{path} already exists. Use another path, or pass `--overwrite`.")
         if path.name == self.row.file:
             refuse_strangers(Storage.at(path.parent), [self.row])
         self.check_columns(cloud)
@@ -257,12 +277,13 @@ class Format:
         """Raise LidarError if a cloud lacks columns that the format needs."""
         cloud_columns = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in cloud_columns]:
-            laid_out = f"with the layout {self.layout} " if self.row.layouts else ""
-            lacks = ", ".join(missing)
+            laid_out = f" with the layout {self.layout}" if self.row.layouts else ""
+            lacks = joined(missing)
+            columns = "column" if len(missing) == 1 else "columns"
             raise LidarError(
-                f"The format {self.format} {laid_out}needs {lacks}, which the cloud lacks: run the "
-                f"survey again with {self.format} in output.write, or with {lacks} among "
-                "cloud.columns."
+                f"The format {self.format}{laid_out} requires {lacks}, but the cloud has no "
+                f"such {columns}. Run the survey again with {self.format} in `output.write`, "
+                f"or add {lacks} to `cloud.columns`."
             )
 
     def write(
@@ -350,8 +371,8 @@ def refuse_strangers(storage: Storage, rows: Iterable[FormatRow]) -> None:
         for name in storage.tree(row.file):
             if not own_names.fullmatch(name):
                 raise LidarError(
-                    f"{storage.path(name)} is not a file of lidarpool, and {row.file} would be "
-                    "replaced: move it elsewhere, or give another folder with --out."
+                    f"{storage.path(name)} was not written by lidarpool, but {row.file} would "
+                    "be replaced. Move it elsewhere, or specify another folder with `--out`."
                 )
 
 
@@ -426,10 +447,11 @@ def save_cloud(
     name = format or _ENDINGS.get(path.suffix)
     if name is None:
         raise LidarError(
-            f"{path}: its ending has no format: use {', '.join(_ENDINGS)}, or give a format."
+            f"{path} has the extension {path.suffix!r}, which does not belong to a format. "
+            f"Use {alternatives([*_ENDINGS])}, or specify a format."
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
-        raise LidarError(f"precision_m is {precision_m}; it must be a length in meters.")
+        raise LidarError(f"`precision_m` is {precision_m}; it must be a positive length in meters.")
     file_format = Format(
         name,
         layout,
@@ -443,11 +465,11 @@ def save_cloud(
     sweeps = replace(sweeps, precision_m=precision_m or sweeps.precision_m)
     with explained(f"{path} cannot be written"):
         if path.is_dir():
-            raise LidarError(f"{path} is a folder: remove it, or give another path.")
+            raise LidarError(f"{path} is a folder. Remove it, or use another path.")
     if cloud.sweeps is None and "scan" in file_format.needs:
         raise LidarError(
-            f"{name} stores single sweeps, but this cloud has none: save the cloud of a "
-            "Result, or one that was read from the folder of a result."
+            f"{name} stores single sweeps, but the cloud has no sweeps. Save the cloud of a "
+            "`Result`, or a cloud that was read from the folder of a result."
         )
     file_format.write(path, cloud, sweeps, overwrite=True)
     return file_format.left_out(cloud, sweeps)

@@ -131,7 +131,7 @@ class _OpenPart:
             array.shape != (row_count,) or array.dtype != columns[name].dtype
             for name, array in self._arrays.items()
         ):
-            raise LidarError("it is damaged (its arrays do not fit together)")
+            raise LidarError("it is damaged (its arrays do not have matching shapes)")
         self._scans = None
         if SCAN.name in memory.starts:
             self._scans = self._read_scans(arrays, row_count)
@@ -145,7 +145,7 @@ class _OpenPart:
             raise LidarError(f"it is damaged ({error})") from error
         row_ends = np.cumsum(counts)
         if (counts < 0).any() or len(counts) != stop - first or row_ends[-1] != row_count:
-            raise LidarError("it is damaged (its arrays do not fit together)")
+            raise LidarError("it is damaged (its arrays do not have matching shapes)")
         return _Scans(first, row_ends)
 
     def _read_small(self, array: StoredArray) -> AnyArray:
@@ -154,7 +154,7 @@ class _OpenPart:
         data = values.reshape(-1).view(np.uint8).data
         self._fill(data, array.offset)
         if crc32(data, array.head_crc) != array.crc:
-            raise LidarError("it is damaged (its checksums differ)")
+            raise LidarError("it is damaged (its checksums do not match)")
         return values
 
     def read(self, first: int, stop: int) -> dict[str, AnyArray]:
@@ -181,4 +181,4 @@ class _OpenPart:
         while data and (count := self._file.readinto(data)):
             data = data[count:]
         if data:
-            raise LidarError("it is damaged (it is cut)")
+            raise LidarError("it is damaged (it is truncated)")

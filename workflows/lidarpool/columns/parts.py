@@ -35,7 +35,7 @@ from lidarsim.columns.waveforms import WAVEFORM
 # Files of a run in the folder of its parts: the mark of the run, then the kind of the file.
 _PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)
 _OTHER = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8})", re.ASCII)
-_AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans again."
+_AGAIN = "Resume the run with `--resume` (`resume=True` in Python) to cast its scans again."
 
 
 # A run deletes only files that it wrote: their names begin with its mark, 16 random digits, and a
@@ -126,7 +126,7 @@ def unpack(data: bytes) -> PartColumns:
             or part.samples.shape[:1] + part.samples.shape[2:] != (len(part.counts), 3)
             or any(array.shape != (len(part),) for array in part.columns.values())
         ):
-            raise ValueError("its arrays do not fit together")
+            raise ValueError("its arrays do not have matching shapes")
     except Exception as error:  # zipfile, zlib, lzma and NumPy raise a dozen kinds of errors
         raise LidarError(f"it is damaged ({error})") from error
     return part

@@ -41,7 +41,7 @@ B_COLOR = "#ee7733"
 ONLY_A = theme.rgb("#2ca25f")
 ONLY_B = theme.rgb("#101418")
 NO_RETURN = theme.rgb("#c8cbd0")  # within images, whatever the page's colors
-GAP_LABELS = ("only A has a return", "only B has a return", "no return")
+GAP_LABELS = ("return in A only", "return in B only", "no return")
 # color maps
 RESIDUAL_COLORS = "RdBu_r"
 DISTANCE_COLORS = "plasma"
@@ -86,7 +86,7 @@ class Comparison:
         path = Path(folder)
         with (
             result_folder(path),
-            explained(f"The comparison cannot be written to {path}", "make room"),
+            explained(f"The comparison cannot be written to {path}", "free some disk space"),
             staging(path) as staged,
         ):
             pages = {"distances": draw_distances(self), "above": draw_above(self)}
@@ -136,7 +136,7 @@ def draw_ranges(comparison: Comparison) -> Page:
     layout = _ImageLayout.for_rows(row_count)
     page = Page((WIDTH, layout.page_height))
     size = f"{plural(row_count, 'ring')}, {plural(column_count, 'column')}"
-    page.title("Range images", f"{size} of {images.step_deg:.4g}°")
+    page.title("Range images", f"{size}, {images.step_deg:.4g}° per column")
     range_scale = _range_scale(images)
     limit = _residual_limit(comparison)
     residual_scale = Normalize(-limit, limit)
@@ -225,7 +225,7 @@ def draw_rings(comparison: Comparison) -> Page:
         _draw_ring_gaps(page, axes, rings)
     frame = frames[2] if has_gaps else frames[1]
     axes = page.chart(
-        frame, xlabel="A − B, mm; more in the outer bins", ylabel="cells", yscale="log"
+        frame, xlabel="A − B, mm; larger values are in the outer bins", ylabel="cells", yscale="log"
     )
     _draw_residual_histogram(axes, comparison.residuals, limit)
     return page
@@ -284,7 +284,7 @@ def draw_distances(comparison: Comparison) -> Page:
     distances = comparison.figures["distances"]
     page.title(
         "Distances to the nearest neighbor",
-        f"medians: A to B {millimeters(distances['a_to_b']['median_m'])}, B to A "
+        f"median distances: A to B {millimeters(distances['a_to_b']['median_m'])}, B to A "
         f"{millimeters(distances['b_to_a']['median_m'])}",
     )
     intensity = comparison.figures["intensity"]
@@ -330,7 +330,7 @@ def _draw_intensities(page: Page, comparison: Comparison) -> None:
     axes.locator_params(nbins=6)  # labels of small numbers are long
     axes.grid(False)
     correlation = f"rank correlation {figures['rank_correlation']:.3f}"
-    page.heading(axes, f"{correlation} of {figures['pairs']:,} {figures['of']}")
+    page.heading(axes, f"{correlation}, {figures['pairs']:,} {figures['of']}")
 
 
 def draw_above(comparison: Comparison) -> Page:
@@ -339,7 +339,9 @@ def draw_above(comparison: Comparison) -> Page:
     page = Page((WIDTH, height))
     pictured = comparison.figures["pictured"]
     which = "" if pictured is None else f"sweep {pictured[0]} of A and sweep {pictured[1]} of B, "
-    page.title("From above", f"{which}colored by the distance to the nearest point of the other")
+    page.title(
+        "Top view", f"{which}colored by the distance to the nearest point of the other cloud"
+    )
     measured = comparison.measured_points
     lower = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points, _ in measured], axis=0)
     upper = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points, _ in measured], axis=0)

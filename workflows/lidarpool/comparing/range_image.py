@@ -331,7 +331,7 @@ def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _Co
     """
     numbers, notes = _ring_numbers(a, b)
     if (unmatched := len(np.setxor1d(numbers, b.rings))) > 0:
-        notes.append(f"only one of the two has returns of {plural(unmatched, 'ring')}")
+        notes.append(f"only one of the clouds has returns of {plural(unmatched, 'ring')}")
     rings, first = np.unique(np.append(b.rings, numbers), return_index=True)
     elevation = np.append(b.ring_elevation, a.ring_elevation)[first]
     _check_elevations(a, b, numbers, names)
@@ -373,7 +373,12 @@ def _ring_numbers(a: _PolarSweep, b: _PolarSweep) -> tuple[Ints, list[str]]:
     is_match = difference[index_a, index_b] <= _ring_tolerance(b)
     numbers = -1 - np.arange(len(a.rings))
     numbers[index_a[is_match]] = b.rings[index_b[is_match]]
-    return numbers, ["the rings are numbered in other orders, and matched by elevation"]
+    return numbers, [
+        (
+            "the rings of the two clouds are numbered in different orders, so they are matched by "
+            "elevation"
+        )
+    ]
 
 
 def _check_elevations(
@@ -387,8 +392,8 @@ def _check_elevations(
         range_a = f"{a.ring_elevation.min():.1f}° to {a.ring_elevation.max():.1f}°"
         range_b = f"{b.ring_elevation.min():.1f}° to {b.ring_elevation.max():.1f}°"
         raise LidarError(
-            f"the rings of {names[0]} look at {range_a} and the rings of {names[1]} at {range_b}, "
-            "at other angles: they are not of the same sensor"
+            f"the rings of {names[0]} have elevation angles of {range_a} and the rings of "
+            f"{names[1]} of {range_b}, so they come from different sensors"
         )
 
 

@@ -101,7 +101,9 @@ def compare(
         B have no quantity in common.
     """
     if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
-        raise LidarError(f"distances_m is {list(distances_m)}; it must be lengths in meters.")
+        raise LidarError(
+            f"`distances_m` is {list(distances_m)}; it must contain positive lengths in meters."
+        )
     first = open_recording(
         a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
     )
@@ -115,8 +117,8 @@ def compare(
             pairs = _choose_pairs(pairs, sweeps)
         elif len(pairs) < max(first.count, second.count):
             comparing.note(
-                f"A has {plural(first.count, 'sweep')}, B {second.count:,}: "
-                f"{plural(len(pairs), 'pair')} by {match}"
+                f"A has {plural(first.count, 'sweep')} and B has {second.count:,}. Matching "
+                f"by {match} results in {plural(len(pairs), 'pair')}"
             )
         comparing.pairs = pairs
         budget = MAX_VALUES // len(pairs)
@@ -126,10 +128,10 @@ def compare(
         return comparing.result()
     cloud = first if first.is_cloud else second
     if sweeps or match == "time":
-        raise LidarError(f"{cloud.name} has no sweeps: leave out --sweep and --match.")
+        raise LidarError(f"{cloud.name} has no sweeps. Omit `--sweep` and `--match`.")
     comparing.notes.append(
-        f"{cloud.name} has no sweeps: all points are compared at once in world coordinates, by "
-        "distances and intensities only"
+        f"{cloud.name} has no sweeps. All points are compared at once in world coordinates, "
+        "by distances and intensities only"
     )
     points_a = comparing.read_cloud(first, most_points)
     points_b = comparing.read_cloud(second, most_points)
@@ -147,7 +149,8 @@ def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[t
     for number in sweeps:
         if not 0 <= number < len(pairs):
             raise LidarError(
-                f"there is no sweep {number}: {plural(len(pairs), 'pair')} of sweeps, from 0."
+                f"There is no pair {number} of sweeps. Pairs are numbered from 0, and there are "
+                f"{len(pairs):,}."
             )
     return [pairs[number] for number in sorted({*sweeps})]
 
@@ -171,8 +174,8 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
             pairs = [(int(nearest_a[number]), int(number)) for number in close]
     if not pairs:
         raise LidarError(
-            f"{a.name} with {plural(a.count, 'sweep')} and {b.name} with {b.count:,} have none of "
-            f"the same {match}."
+            f"{a.name} has {plural(a.count, 'sweep')} and {b.name} has {b.count:,}, but no "
+            f"two of them have the same {match}."
         )
     return pairs
 
@@ -183,7 +186,7 @@ def _sweep_times(recording: Recording) -> Floats:
     LidarError if the recording has no times.
     """
     if recording.times is None:
-        raise LidarError(f"{recording.name} has no times of sweeps: leave out --match time.")
+        raise LidarError(f"{recording.name} has no sweep times. Omit `--match time`.")
     return np.fromiter(recording.times(), np.float64)
 
 
@@ -245,8 +248,9 @@ class _Comparing:
         if share == 1 or not parts:
             return RecordedPoints.joined(parts)
         self.note(
-            f"{recording.name} has {count:,} points; {100 * share:.3g} % are compared, "
-            "chosen evenly: distances to it are too long"
+            f"{recording.name} has {count:,} points, of which {100 * share:.3g} % are "
+            "compared, evenly chosen. Distances to this cloud are "
+            "overestimated"
         )
         return RecordedPoints.joined(parts)
 
@@ -255,12 +259,14 @@ class _Comparing:
     ) -> None:
         """Compare two sweeps in the sensor frame, at most `budget` cells and points of each."""
         if max(len(a), len(b)) > budget:
-            self.note(f"of each sweep, {budget:,} points and cells are compared, chosen evenly")
+            self.note(
+                f"in each sweep, {budget:,} points and cells are compared, which are evenly chosen"
+            )
         if len(a) and len(b):
             self.pictured = self.pictured or numbers
             self._add_ranges(a, b, budget)
         else:
-            self.note("pairs with an empty sweep are left out")
+            self.note("pairs with an empty sweep are skipped")
         self.add_points(a, b, budget)
 
     def add_points(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
@@ -359,10 +365,10 @@ class _Comparing:
             if not count:
                 listed = "".join(f" {note}." for note in recording.left_out_notes)
                 raise LidarError(
-                    f"{recording.name} has no points: there is nothing to compare.{listed}"
+                    f"{recording.name} contains no points, so there is nothing to compare.{listed}"
                 )
         if not self.measured_points:
-            raise LidarError("No pair of sweeps has points in both: choose others.")
+            raise LidarError("None of the pairs has points in both sweeps. Choose other sweeps.")
         from_a, from_b = (
             _NearestPairs(*map(np.concatenate, zip(*pairs, strict=True))) for pairs in self.nearest
         )

@@ -42,11 +42,12 @@ def read_seconds(storage: Storage) -> Mapping[int, float]:
     try:
         header, *rows = csv.reader(io.StringIO(storage.read(SECONDS_FILE).decode()), strict=True)
         if header != _HEADER:
-            raise ValueError("it has another header")
+            raise ValueError("its header is not the expected one")
         return {int(number): float(seconds) for number, seconds in rows}
     except (OSError, ValueError, csv.Error) as error:
         raise LidarError(
-            f"{storage.path(SECONDS_FILE)} has no casting times of jobs: {message_of(error)}"
+            f"The casting times of the jobs cannot be read from {storage.path(SECONDS_FILE)}: "
+            f"{message_of(error)}"
         ) from error
 
 

@@ -27,18 +27,18 @@ from typing import IO, Any
 
 import numpy as np
 
-from lidarsim.base.errors import LidarError, explained
+from lidarsim.base.errors import LidarError, as_sentence, explained
 from lidarsim.base.input_files import open_input
 from lidarsim.base.named_files import is_plain
 from lidarsim.base.storage import Storage
-from lidarsim.base.words import printable
+from lidarsim.base.words import joined, printable
 from lidarsim.columns.cloud import Cloud, CloudLike
 
 Value = bool | int | float | str
 
 TABLE_FILE = "jobs.csv"
 PARQUET_FILE = "jobs.parquet"
-WRITE_AGAIN = "run the campaign again with --resume, which writes it anew"
+WRITE_AGAIN = "run the campaign again with `--resume` to write the table again"
 ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
 MAX_JOBS = 100_000_000  # limit for a campaign: a larger number is not a job's
 MAX_ERROR_LETTERS = 4_000  # limit for an error in the table: csv.reader refuses cells of 131,072
@@ -118,7 +118,7 @@ class JobRow:
         not a plain file name.
         """
         if differing := data.keys() ^ {entry.name for entry in fields(cls)}:
-            raise ValueError(f"a row of a job has other entries: {min(differing)}")
+            raise ValueError(f"the entries of a job row are wrong, for example {min(differing)!r}")
         kinds = {**_HEAD, **_TAIL, "seconds": int | float, "values": dict, "classes": dict}
         for name, kind in kinds.items():
             if not isinstance(data[name], kind):
@@ -173,8 +173,8 @@ class Tally:
             self._columns = {name: hashlib.sha256() for name in arrays}
         if self._columns.keys() != arrays.keys():
             raise LidarError(
-                f"Points of one job have the columns {', '.join(self._columns)} and then "
-                f"{', '.join(arrays)}: give all the same."
+                "The points of one job must have the same columns, but they have "
+                f"{', '.join(self._columns)} first and {', '.join(arrays)} later."
             )
         for name, array in arrays.items():
             self._columns[name].update(np.ascontiguousarray(array))
@@ -224,7 +224,8 @@ def write_table(
         If a row has a value that is not in `names`, or the table cannot be written.
     """
     with explained(
-        f"The table of jobs cannot be written to {storage}", "make room or see to rights"
+        f"The job table cannot be written to {storage}",
+        "free some disk space, or check the permissions of the folder",
     ):
         classes, kinds = _columns(names, jobs())
         header = [*_HEAD, *map(_column_of, names), *_TAIL, *(f"class_{n}" for n in classes)]
@@ -259,8 +260,8 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
                 storage.get(TABLE_FILE, path)
             if checksum is not None and Storage(str(path.parent)).checksum(path.name) != checksum:
                 raise LidarError(
-                    f"{storage.path(TABLE_FILE)} is damaged or edited, its checksum is not that of "
-                    f"the data set: {WRITE_AGAIN}."
+                    f"{storage.path(TABLE_FILE)} is damaged or has been edited, because its "
+                    f"checksum differs from that in the data set. {as_sentence(WRITE_AGAIN)}"
                 )
             file = TextIOWrapper(open_input(path), encoding="utf-8", newline="")
             stack.enter_context(file)
@@ -271,12 +272,12 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
             last = header.index("error")
             tail = header[last : last + len(_TAIL)]
             if header[:first] != [*_HEAD] or tail != [*_TAIL]:
-                raise ValueError("it is not a table of jobs")
+                raise ValueError("it is not a job table")
             counted = header[last + len(_TAIL) :]
             if unknown := next((name for name in counted if not _CLASS.fullmatch(name)), None):
-                raise ValueError(f"its column {unknown!r} is not known")
+                raise ValueError(f"it has the unknown column {unknown!r}")
             if len(set(header)) < len(header):
-                raise ValueError("it has a column twice")
+                raise ValueError("it has two columns with the same name")
             names = [name.removeprefix(_VARIED) for name in header[first:last]]
             last_number = -1
             for cells in reader:
@@ -287,8 +288,8 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
                 yield row
         except (ValueError, csv.Error) as error:
             raise LidarError(
-                f"{storage.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
-                f"{WRITE_AGAIN}."
+                f"{storage.path(TABLE_FILE)} is damaged near line {reader.line_num}: {error}. "
+                f"{as_sentence(WRITE_AGAIN)}"
             ) from error
 
 
@@ -307,8 +308,8 @@ def _columns(
     for row in jobs:
         if unknown := [name for name in row.values if name not in kinds]:
             raise LidarError(
-                f"Job {row.name} has a value {unknown[0]!r}, which is not among those that vary: "
-                f"{', '.join(names) or 'none'}."
+                f"Job {row.name} has a value for {unknown[0]!r}, which is not a varied "
+                f"quantity. The varied quantities are {joined(names) or 'none'}."
             )
         classes.update(row.classes)
         for name, value in row.values.items():
@@ -338,7 +339,7 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
     Raises ValueError for an invalid row.
     """
     if len(cells) != len(header):
-        raise ValueError(f"{len(cells)} cells in {len(header)} columns")
+        raise ValueError(f"it has {len(cells)} cells in {len(header)} columns")
     first = len(_HEAD)
     stop = len(_HEAD) + len(names)
     fixed = dict(zip(header[:first], cells, strict=False))
@@ -383,7 +384,8 @@ def _kind(value: Any) -> type:
         return str
     if kind not in (bool, int, float, str):
         raise LidarError(
-            f"A varied value is {value!r}, a {kind.__name__}: give a number, text, true or false."
+            f"A varied value is {value!r} ({kind.__name__}); it must be a number, a string, "
+            "true or false."
         )
     return kind
 

@@ -21,11 +21,11 @@ import numpy as np
 from pydantic import Field
 
 from lidarsim.base.archives import open_archive
-from lidarsim.base.errors import LidarError
+from lidarsim.base.errors import LidarError, as_sentence
 from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
-from lidarsim.base.words import did_you_mean
+from lidarsim.base.words import did_you_mean, joined
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import unsealed
@@ -131,7 +131,9 @@ class SavedSweeps:
         position = operator.index(index)
         position += len(self) if position < 0 else 0
         if not 0 <= position < len(self):
-            raise IndexError(f"there is no sweep {index} of {len(self)}")
+            raise IndexError(
+                f"there is no sweep {index}, because the data set has {len(self)} sweeps"
+            )
         if self._order is not None:
             position = int(self._order[position])
         run_index = bisect_right(self._run_stops, position)
@@ -164,7 +166,7 @@ class SavedSweeps:
             If torch is not installed.
         """
         if find_spec("torch") is None:
-            raise LidarError(f"This needs PyTorch: {install_command('torch')}.")
+            raise LidarError(f"This method requires PyTorch. Run {install_command('torch')}.")
         from .torch_sweeps import TorchSweeps
 
         return TorchSweeps(self, transform, even)
@@ -275,7 +277,10 @@ def sweeps(
     table = read_table(storage, head["table"])
     rows = [job for job in table if job.number in sweep_counts]
     if len(rows) < len(sweep_counts):
-        raise LidarError(f"{storage.path(TABLE_FILE)} lacks jobs that are done: {WRITE_AGAIN}.")
+        raise LidarError(
+            f"{storage.path(TABLE_FILE)} does not contain all jobs that are done. "
+            f"{as_sentence(WRITE_AGAIN)}"
+        )
     rows = _chosen(rows, split, jobs, storage)
     sensor_names = list(dict.fromkeys(name for job in rows for name in sweep_counts[job.number]))
     if sensors is not None:
@@ -297,32 +302,33 @@ def read_index(storage: Storage) -> dict[str, Any]:
 
     Raises LidarError if the set is unfinished.
     """
-    refuse_missing(storage, "give the folder of a data set, the --out of a campaign.")
+    refuse_missing(storage, "specify the folder of a data set, as passed to `--out` of a campaign")
     try:
         head = unsealed(storage.read(INDEX_FILE))
         if head["version"] != VERSION:
-            raise ValueError(f"it is of version {head['version']}, not {VERSION}")
+            raise ValueError(f"its version is {head['version']} instead of {VERSION}")
         if head["format"] not in DATA_SETS:
             raise ValueError(f"its format is {head['format']!r}")
         if "table" not in head:
-            raise ValueError(f"it has no checksum of {TABLE_FILE}")
+            raise ValueError(f"it contains no checksum of {TABLE_FILE}")
         head["jobs"] = {row["number"]: dict(row["sensors"]) for row in head["jobs"]}
     except FileNotFoundError as error:
         if ".jobs" in storage.entries():
             raise LidarError(
-                f"{storage} is an unfinished data set: lidarpool run CAMPAIGN --out {storage} "
-                "--resume continues it."
+                f"{storage} contains an unfinished data set. Complete it with `lidarpool run "
+                f"CAMPAIGN --out {storage} --resume`."
             ) from error
         raise LidarError(
-            f"{storage} is no data set of lidarpool, which has a {INDEX_FILE}: give the --out of a "
-            "campaign."
+            f"{storage} is not a data set of lidarpool, because it contains no {INDEX_FILE}. "
+            "Specify the folder that was passed to `--out` of a campaign."
         ) from error
     except OSError as error:
         raise _unreadable(storage.path(INDEX_FILE), error) from error
     except (ValueError, LookupError, TypeError, AttributeError) as error:
         raise LidarError(
-            f"{storage.path(INDEX_FILE)} is damaged or of another version of lidarpool ({error}): "
-            "run the campaign again with --resume, or merge its shards again."
+            f"{storage.path(INDEX_FILE)} is damaged or was written by another version of "
+            f"lidarpool ({error}). Run the campaign again with `--resume`, or merge its "
+            "shards again."
         ) from error
     return head
 
@@ -343,9 +349,9 @@ def _chosen(
         available = {row.number for row in rows} | {row.name for row in rows}
         if missing := [job for job in jobs if job not in available]:
             raise LidarError(
-                f"{storage} has no job {missing[0]!r}"
+                f"{storage} contains no completed job {missing[0]!r}"
                 + ("" if split is None else f" in split {split!r}")
-                + " that is done: jobs.csv lists all, with their splits and errors."
+                + ". All jobs are listed in jobs.csv, with their splits and errors."
             )
         rows = [row for row in rows if row.number in requested or row.name in requested]
     return rows
@@ -356,7 +362,11 @@ def _check_known(label: str, requested: Sequence[str], available: Any, storage: 
     names = [name for name in available if name]
     for name in requested:
         if name not in available:
-            hint = f" It has {', '.join(names)}." if names else f" It names no {label}s."
+            hint = (
+                f" The {label}s are {joined(names)}."
+                if names
+                else f" None of its {label}s has a name."
+            )
             raise LidarError(
                 f"{storage} has no {label} {name!r}.{did_you_mean(name, names) or hint}"
             )
@@ -370,6 +380,6 @@ def _unreadable(file: str, error: Exception) -> LidarError:
         return LidarError(f"{file} cannot be read: {error.strerror or error}.")
     reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")[:120]
     return LidarError(
-        f"{file} is missing or damaged ({reason}): get it again, or remove its job from the data "
-        "set and run the campaign with --resume."
+        f"{file} is missing or damaged: {reason}. Download it again, or remove its job from "
+        "the data set and run the campaign with `--resume`."
     )

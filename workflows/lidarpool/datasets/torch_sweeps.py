@@ -81,8 +81,8 @@ class TorchStream(torch.utils.data.IterableDataset):
     def __iter__(self) -> Iterator[Any]:
         if torch.utils.data.get_worker_info() is not None:
             raise LidarError(
-                "A stream is read by the process that trains, since the cluster works ahead: give "
-                "the DataLoader num_workers=0."
+                "A stream can only be read in the training process, because the cluster "
+                "prefetches sweeps. Set num_workers=0 for the DataLoader."
             )
         rank, ranks = _ranks()
         jobs = self.stream.numbers

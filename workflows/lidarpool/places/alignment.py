@@ -292,8 +292,9 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
         best = candidates[0]
     if poses.are_given and trial(best, (1, -1, 1)) < _MAX_SHARE_OF_VOXELS * filled[best]:
         raise LidarError(
-            f"{name}: its points fit their poses better with y turned to -y: they are mirrored, or "
-            "the poses are of other axes. Give points and poses in axes of the same hand."
+            f"The points of {name} fit its poses better with y inverted. Either the points "
+            "are mirrored, or the poses refer to different axes. Use points and poses in "
+            "coordinate systems of the same handedness."
         )
     return best
 
@@ -380,7 +381,8 @@ def _planes(
     planes = VoxelPlanes.of_points(name, np.concatenate(parts), alignment.voxel_m)
     if planes is None:
         raise LidarError(
-            f"{name} shows no planes, such as a floor or walls: a place is rebuilt of surfaces."
+            f"{name} contains no planar surfaces, such as a floor or walls, which the "
+            "reconstruction requires."
         )
     return planes
 

@@ -130,7 +130,7 @@ class Twin:
         path = Path(folder)
         with (
             result_folder(path),
-            explained(f"The twin cannot be written to {path}", "make room"),
+            explained(f"The reconstruction cannot be written to {path}", "free some disk space"),
             staging(path) as staged,
         ):
             write_scene(staged / SCENE_FILE, self.scene)
@@ -186,8 +186,9 @@ class Twin:
         columns = ["time", "intensity", *(["class"] if classes else [])]
         scenario["cloud"] = {"columns": columns}
         head = (
-            f"# The place of {self.figures['name']}, rebuilt by lidarpool {__version__}.\n"
-            "# Another sensor on the same drive: lidarpool run scenario.yaml --sensor MODEL\n"
+            f"# Reconstruction of {self.figures['name']}, created by lidarpool "
+            f"{__version__}.\n# To simulate another sensor on the same drive: lidarpool run "
+            "scenario.yaml --sensor MODEL\n"
         )
         return head + yaml.safe_dump(scenario, sort_keys=False, default_flow_style=None)
 
@@ -254,15 +255,15 @@ def twin(
         and `model` is not set; if an extra is missing; or if the folder contains the steps of a
         different twin.
     """
-    need("scipy", "twin", "Places are rebuilt")
+    need("scipy", "twin", "Recordings are reconstructed")
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.of_choice(RecordingChoice(Path(recording), sensor, intensity))
     else:
         if client is not None:
             raise LidarError(
-                "A recording in memory is rebuilt in this process: give the path of a recording "
-                "for a cluster, or leave out the client."
+                "A recording in memory can only be reconstructed in this process. Pass the "
+                "path of a recording to use a cluster, or omit the client."
             )
         if not isinstance(recording, Recording):
             recording = open_recording(recording, sensor, intensity, name="the recording")
@@ -270,7 +271,7 @@ def twin(
     _check(recorded)
     if base is None and not len(recorded.elevation_rad):
         reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
-        raise LidarError(f"{reason} Name its sensor, for example --model livox/mid360.")
+        raise LidarError(f"{reason} Specify its sensor, for example `--model livox/mid360`.")
     track = None if trajectory is None else Path(trajectory)
     tell = tell or (lambda line: None)
     with ExitStack() as stack:
@@ -290,8 +291,9 @@ def _check(recorded: RecordedSweeps) -> None:
         raise LidarError(f"{recording.notes[0]}.")
     if recorded.count < MIN_SWEEPS:
         raise LidarError(
-            f"{recording.name} has {plural(recorded.count, 'sweep')}, and a twin needs at least "
-            f"{MIN_SWEEPS}: a place shows what stands by sweeps that agree."
+            f"{recording.name} has {plural(recorded.count, 'sweep')}, but a reconstruction "
+            f"requires at least {MIN_SWEEPS}, because sweeps that agree identify stationary "
+            "surfaces."
         )
 
 
@@ -329,9 +331,9 @@ class _Building:
     def twin(self, trajectory: Path | None) -> Twin:
         """Build the twin."""
         recorded = self.recorded
-        self.tell(f"{plural(recorded.count, 'sweep')}: finding poses")
+        self.tell(f"estimating the poses of {plural(recorded.count, 'sweep')}")
         poses = self._poses(trajectory)
-        self.tell(f"poses {poses.source}; finding how points were stored")
+        self.tell(f"poses {poses.source}; determining the motion compensation of the points")
         first = first_alignment(recorded, poses)
         stretches = divide(first.poses[:, :3, 3])
         counting = np.concatenate([stretch.own_numbers for stretch in stretches])
@@ -367,7 +369,7 @@ class _Building:
 
     def _aligned(self, run: Map, task: BuildTask, stretches: Sequence[Stretch]) -> Alignment:
         """Align all sweeps."""
-        self.tell(f"aligning the sweeps of {plural(len(stretches), 'stretch', 'stretches')}")
+        self.tell(f"aligning the sweeps in {plural(len(stretches), 'submap')}")
         tasks = [
             StretchTask(task.recorded, task.alignment, stretch, task.mapped)
             for stretch in stretches
@@ -383,7 +385,7 @@ class _Building:
         tasks = [replace(task, stretch=one, drawn_share=share) for one in stretches]
         parts = []
         for number, part in enumerate(self.steps.each(_BUILD, run, build_stretch, tasks), 1):
-            self.tell(f"built {number} of {plural(len(stretches), 'stretch', 'stretches')}")
+            self.tell(f"built {number} of {plural(len(stretches), 'submap')}")
             surfels, _, *others = part
             parts.append(_BuiltStretch(surfels, *others))
         return _Built(parts, stretches)
@@ -397,7 +399,7 @@ class _Building:
         """Fit the response and the noise of the sensor, and make the twin."""
         recorded = self.recorded
         alignment = sweeps.alignment
-        self.tell("fitting the sensor")
+        self.tell("fitting the sensor model")
         some = even_indices(len(built.parts), _RESPONSE_STRETCHES).tolist()
         response = fit_response(
             [self._seen(index) for index in some],
@@ -520,7 +522,10 @@ class _Built:
         """Return the images of a held-out sweep in the middle, or raise LidarError without one."""
         images = [part.images for part in self.parts if part.images is not None]
         if not images:
-            raise LidarError("The sweeps to compare with have no points: give a whole recording.")
+            raise LidarError(
+                "The sweeps that were held out for the comparison contain no points. Use a "
+                "complete recording."
+            )
         return images[len(images) // 2]
 
 
@@ -553,7 +558,7 @@ def fit_sensor(
     """
     if not len(sweeps.recorded.elevation_rad):
         assert base is not None
-        return base, ["without rings, the noise of the sensor is that of its model"]
+        return base, ["without rings, the sensor noise is that of the sensor model"]
     # A sweep with few points, as with lost packets, looks like one of another sensor.
     counts = np.array([*sizes.values()])
     whole = np.array([*sizes])[counts >= np.median(counts) / 2]
@@ -575,7 +580,7 @@ def fit_sensor(
         fitted = fit(aligned, scene=scene, pose=poses, white=white).model
     except LidarError as error:  # the place is there, and a scan of it needs no noise
         sensor = base or _without_noise(sweeps, chosen[0])
-        return sensor, [f"the noise of the sensor is unknown: {error}"]
+        return sensor, [f"the sensor noise is unknown: {error}"]
     if base is None or fitted.performance is None:
         return base or fitted, []
     source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"
@@ -591,7 +596,7 @@ def _without_noise(sweeps: AlignedSweeps, number: int) -> SensorModel:
     elevation_deg = np.degrees(np.sort(sweeps.recorded.elevation_rad)).round(3)
     return SensorModel(
         name="Recorded sensor",
-        sources={"angles": "medians of the recorded points"},
+        sources={"angles": "median angles of the recorded points"},
         firings_per_turn=firings_per_turn(sweeps.recorded.read(number)),
         range_m=(0.0, float(np.ceil(1.1 * sweeps.answering.max_range_m))),
         beams={"elevation_deg": elevation_deg.tolist()},
@@ -602,7 +607,12 @@ def _drive_notes(alignment: Alignment) -> list[str]:
     """Return a note on a sensor that stood."""
     if np.ptp(alignment.poses[:, :3, 3], axis=0).max() > _MIN_DRIVE_M:
         return []
-    return ["the sensor stood: the place is what it saw from there, and has holes behind things"]
+    return [
+        (
+            "the sensor was stationary, so the reconstruction contains only surfaces that are "
+            "visible from its position, with holes behind objects"
+        )
+    ]
 
 
 def _median(values: Floats) -> float | None:

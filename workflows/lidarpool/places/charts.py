@@ -76,16 +76,18 @@ class SweepImages(NamedTuple):
         near_m, far_m = np.nanquantile(self.range_m, (0.01, 0.98)).tolist()
         ranges = LogNorm(max(near_m, 0.1), max(far_m, 1.0))
         differences = Normalize(-_DIFFERENCE_M, _DIFFERENCE_M)
-        words = f"difference, red where the twin is farther, to {1000 * _DIFFERENCE_M:.0f} mm"
+        words = f"difference up to {1000 * _DIFFERENCE_M:.0f} mm (red: reconstruction is farther)"
         images = [
             _Image("range, recorded", self.range_m, ranges, theme.RANGE_COLORS),
-            _Image("range, in the twin", self.simulated_m, ranges, theme.RANGE_COLORS),
+            _Image("range, reconstructed", self.simulated_m, ranges, theme.RANGE_COLORS),
             _Image(words, self.simulated_m - self.range_m, differences, "RdBu_r"),
         ]
         if self.intensity is not None and self.simulated_intensity is not None:
             scale = Normalize(0, max(float(np.nanquantile(self.intensity, 0.98)), 1e-9))
             images.append(_Image("intensity, recorded", self.intensity, scale, "gray"))
-            images.append(_Image("intensity, in the twin", self.simulated_intensity, scale, "gray"))
+            images.append(
+                _Image("intensity, reconstructed", self.simulated_intensity, scale, "gray")
+            )
         return images
 
 
@@ -117,7 +119,7 @@ def draw_sweep(sweep: SweepImages) -> Page:
     images = sweep.pictures()
     height = _TOP + len(images) * _IMAGE_HEIGHT + (len(images) - 1) * _GAP + _BOTTOM
     page = Page((_WIDTH, height))
-    page.title(f"Sweep {int(sweep.number[0])}", "which was held out when the place was made")
+    page.title(f"Sweep {int(sweep.number[0])}", "held out from the reconstruction")
     for index, one in enumerate(images):
         bottom = height - _TOP - (index + 1) * _IMAGE_HEIGHT - index * _GAP
         frame = (_LEFT, bottom / height, _CHART_WIDTH, _IMAGE_HEIGHT / height)
@@ -161,7 +163,9 @@ def _image(values: Floats, cells: tuple[Ints, tuple[int, int]]) -> Floats32:
 def draw_above(parts: Sequence[Above], path: Floats) -> Page:
     """Draw from above what stands and what moved, and the positions (s, 3) of the drive."""
     page = Page((_WIDTH, _ABOVE_HEIGHT))
-    page.title("From above", "gray: what stands; red: left out, because rays passed it")
+    page.title(
+        "Top view", "gray: stationary points; red: points removed because rays passed through them"
+    )
     near = np.concatenate([part.still for part in parts])
     moved = np.concatenate([part.moved for part in parts])
     low, high = np.quantile(near, (0.01, 0.99), axis=0)
@@ -183,7 +187,7 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
 def draw_errors(figures: Mapping[str, Any]) -> Page:
     """Draw the differences of ranges along the drive, and by range."""
     page = Page((_WIDTH, 560))
-    page.title("Differences of ranges", "of held-out sweeps; dots: half, bars: 90 % are smaller")
+    page.title("Range differences", "in held-out sweeps; dots: medians; bars: 90th percentiles")
     rows = (
         (figures["held_out"]["by_sweep"], "sweep", "sweep"),
         (figures["held_out"]["by_range"], "from_m", "range from, m"),

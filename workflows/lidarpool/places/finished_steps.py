@@ -50,16 +50,17 @@ class FinishedSteps:
         if file.exists():
             if not resume:
                 raise LidarError(
-                    f"{folder.parent} holds an unfinished twin: continue it with --resume, or "
-                    "start again with --overwrite."
+                    f"{folder.parent} contains an unfinished reconstruction. Continue it with "
+                    "`--resume`, or start again with `--overwrite`."
                 )
             if json.loads(file.read_text(encoding="utf-8")) != own:
                 raise LidarError(
-                    f"{folder.parent} holds an unfinished twin of another recording, of other "
-                    "options, or by another version: start again with --overwrite."
+                    f"{folder.parent} contains an unfinished reconstruction of another "
+                    "recording, or one with other options or from another version of "
+                    "lidarpool. Start again with `--overwrite`."
                 )
             return cls(folder)
-        with explained(f"Cannot write to {folder.parent}", "give another folder"):
+        with explained(f"Cannot write to {folder.parent}", "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
             _replace(file, lambda path: path.write_text(json.dumps(own), encoding="utf-8"))
         return cls(folder)
@@ -113,7 +114,7 @@ class FinishedSteps:
             with path.open("wb") as file:
                 np.savez(file, **arrays)
 
-        with explained(f"Cannot write to {self.folder}", "make room"):
+        with explained(f"Cannot write to {self.folder}", "free some disk space"):
             _replace(self._file(step, index), write)
 
 

@@ -22,8 +22,8 @@ class Motion(StrEnum):
     """How the points of a recording were stored."""
 
     COMPENSATED = "compensated"
-    TIMED = "as fired, at the times of the points"
-    COUNTERCLOCKWISE = "as fired, counter-clockwise"
+    TIMED = "as fired, with point times"
+    COUNTERCLOCKWISE = "as fired, counterclockwise"
     CLOCKWISE = "as fired, clockwise"
 
     def times_s(self, sweep: RecordedSweep, sweep_s: float) -> Floats | None:

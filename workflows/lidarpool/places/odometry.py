@@ -85,13 +85,13 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         times_s = period_s * np.arange(sweeps.count, dtype=np.float64)
     if trajectory is not None:
         poses, times_s = _of_file(sweeps, trajectory, times_s)
-        return RecordedPoses.in_world(poses, times_s, f"of {trajectory.name}")
+        return RecordedPoses.in_world(poses, times_s, f"from {trajectory.name}")
     recorded = sweeps.recording.poses(range(sweeps.count))
     if recorded is not None and not np.isfinite(recorded).all():
         number = int(np.flatnonzero(~np.isfinite(recorded).all(axis=(1, 2)))[0])
         raise LidarError(
-            f"{sweeps.recording.name} has a pose of sweep {number} that is not a number: give the "
-            "poses by --trajectory."
+            f"{sweeps.recording.name} contains an invalid pose for sweep {number}. Pass the "
+            "poses with `--trajectory`."
         )
     share = 0.0
     first_s = 0.0
@@ -99,18 +99,18 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     is_known = sweeps.recording.fired is not None  # of a result, which may stand
     if recorded is not None and (is_known or np.ptp(recorded, axis=0).any()):
         poses = recorded
-        source = "of the recording"
+        source = "from the recording"
     else:
         poses = _registered(sweeps)
-        source = "by registration"
+        source = "from registration"
         share = 0.5
         first_s = 0.0 if sweeps.times is None else sweeps.times.first_s
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         if len(steps_m) and steps_m.max() > _MAX_STEP_M:
             number = int(steps_m.argmax()) + 1
             raise LidarError(
-                f"Registration moves {steps_m.max():.1f} m from sweep {number - 1} to sweep "
-                f"{number} of {sweeps.recording.name}, which is a failure: give --trajectory."
+                f"Registration failed: it moves sweep {number} of {sweeps.recording.name} by "
+                f"{steps_m.max():.1f} m from sweep {number - 1}. Pass `--trajectory`."
             )
     located = RecordedPoses.in_world(poses, times_s, source)
     return located._replace(share=share, first_s=first_s)
@@ -131,15 +131,17 @@ def _of_file(sweeps: RecordedSweeps, trajectory: Path, times_s: Floats) -> tuple
     if sweeps.stamps_s is None:
         if len(track.times_s) != sweeps.count:
             raise LidarError(
-                f"{trajectory} has {plural(len(track.times_s), 'pose')}, and {name} has "
-                f"{plural(sweeps.count, 'sweep')} without times. Give one pose for each sweep."
+                f"{trajectory} contains {plural(len(track.times_s), 'pose')}, but {name} has "
+                f"{plural(sweeps.count, 'sweep')} without times. Provide one pose for each "
+                "sweep."
             )
         times_s = np.asarray(track.times_s, np.float64)
     elif times_s[0] < first_s - _MAX_ROUNDING_S or times_s[-1] > last_s + _MAX_ROUNDING_S:
         raise LidarError(
-            f"{trajectory} covers {first_s:.3f} to {last_s:.3f} s, and the sweeps of {name} are "
-            f"stamped {times_s[0]:.3f} to {times_s[-1]:.3f} s. Give a trajectory of the same "
-            "drive in the same clock, or rows of KITTI, one for each sweep."
+            f"{trajectory} covers {first_s:.3f} to {last_s:.3f} s, but the sweeps of {name} "
+            f"have timestamps from {times_s[0]:.3f} to {times_s[-1]:.3f} s. Use a trajectory "
+            "of the same drive with the same clock, or KITTI poses with one row for each "
+            "sweep."
         )
     positions, rotations = track.poses(0, 1e9 * (times_s.clip(first_s, last_s) - first_s))
     poses = np.tile(np.eye(4), (sweeps.count, 1, 1))
@@ -157,9 +159,9 @@ def _of_rows(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
     name = sweeps.recording.name
     if len(rows) != sweeps.count:
         raise LidarError(
-            f"{trajectory} has {plural(len(rows), 'row')} without times, and {name} has "
-            f"{plural(sweeps.count, 'sweep')}. Give one row for each sweep, or poses with times, "
-            "such as TUM."
+            f"{trajectory} contains {plural(len(rows), 'row')} without times, but {name} has "
+            f"{plural(sweeps.count, 'sweep')}. Provide one row for each sweep, or poses with "
+            "times, such as a TUM file."
         )
     of_recording = sweeps.recording.calibration
     is_calibrated = of_recording is not None and of_recording.exists()
@@ -172,9 +174,9 @@ def _of_rows(sweeps: RecordedSweeps, trajectory: Path, rows: Floats) -> Floats:
     upward_m = float(np.abs(steps[:, 2]).sum())
     if length_m > _MIN_CAMERA_M and upward_m > _CAMERA_SHARE * length_m:
         raise LidarError(
-            f"{trajectory} moves the sensor along its z axis, so these are probably poses of a "
-            f"camera. Put KITTI's {CALIBRATION_FILE} beside the file, or give poses of the sensor "
-            "with times, such as TUM."
+            f"{trajectory} moves the sensor along its z axis, so its poses are probably "
+            f"camera poses. Put KITTI's {CALIBRATION_FILE} next to the file, or use sensor "
+            "poses with times, such as a TUM file."
         )
     return poses
 

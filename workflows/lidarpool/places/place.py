@@ -154,7 +154,9 @@ class Place:
         shifts_m = _shifts(np.concatenate(surfel), np.concatenate(offset_m), count)
         supported = votes >= self.surfels.dark  # a dark surfel needs a pulse that is lost
         if not supported.any():
-            raise LidarError(f"{sweeps.name}: its sweeps contradict each other.")
+            raise LidarError(
+                f"The sweeps of {sweeps.name} contradict each other. Check their poses."
+            )
         return self.surfels.moved(shifts_m).part(supported)
 
     def observations(self, sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> Observations:
@@ -183,7 +185,9 @@ def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: f
     """Build the place of the points that stand, or raise LidarError if too few stand."""
     points = _standing(sweeps, standing)
     if not len(points):
-        raise LidarError(f"{sweeps.name} has no points that stand: nothing is left.")
+        raise LidarError(
+            f"{sweeps.name} contains no stationary points, so the reconstruction is empty."
+        )
     name = Path(sweeps.name).name
     gap_rad = sweeps.recorded.gap_rad
     surfels = Surfels.of_points(name, points, voxel_m, gap_rad)

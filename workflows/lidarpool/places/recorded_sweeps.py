@@ -257,12 +257,16 @@ class RecordedSweeps:
     def of_recording(cls, recording: Recording) -> RecordedSweeps:
         """Find the rings of a recording, or raise LidarError if no sweep can be read."""
         if recording.is_cloud or not recording.count:
-            raise LidarError(f"{recording.name} has no sweeps: give a recording of sweeps.")
+            raise LidarError(
+                f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
+            )
         numbers = even_indices(recording.count, _REFERENCE_SWEEPS).tolist()
         returns = {number: _returns(recording, number) for number in numbers}
         references = {number: found for number, found in returns.items() if len(found[0])}
         if not references:
-            raise LidarError(f"{recording.name} has no points: there is no place to rebuild.")
+            raise LidarError(
+                f"{recording.name} contains no points, so there is nothing to reconstruct."
+            )
         stamps_s = _stamps_s(recording)
         times = PointTimes.of_sweeps(
             [columns for _, columns in references.values()],
@@ -286,7 +290,10 @@ class RecordedSweeps:
             if len(numbers) < MIN_RINGS:
                 return cls(recording, np.empty(0), None, ())
             if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
-                note = f"The rings of {recording.name} are no cones: its rays are not calibrated."
+                note = (
+                    f"The rings of {recording.name} do not form cones, so its rays are not "
+                    "calibrated."
+                )
                 return cls(recording, np.empty(0), None, (note,))
             return cls(recording, medians, numbers, ())
         found = [_runs_in_order(points) for points, _ in references]
@@ -295,20 +302,20 @@ class RecordedSweeps:
             clusters = _clusters(np.concatenate([points for points, _ in references]))
             if clusters is not None:
                 note = (
-                    f"{recording.name} has no column of rings: the elevations of its points show "
-                    f"{len(clusters)} rings."
+                    f"{recording.name} has no ring column. Its {len(clusters)} rings were "
+                    "determined from the elevation angles of the points."
                 )
                 return cls(recording, clusters, None, (note,), are_cones=True)
             note = (
-                f"{recording.name} has no column of rings, the order of its points shows none, and "
-                "their elevations are not those of a few cones: its points are compensated for the "
-                "motion, or its rays are not calibrated."
+                f"{recording.name} has no ring column, and its rings cannot be determined "
+                "from the order or the elevation angles of its points. Either its points are "
+                "compensated for motion, or its rays are not calibrated."
             )
             return cls(recording, np.empty(0), None, (note,))
         medians = max(runs, key=len)
         note = (
-            f"{recording.name} has no column of rings: the order of its points shows "
-            f"{len(medians)} rings."
+            f"{recording.name} has no ring column. Its {len(medians)} rings were determined "
+            "from the order of the points."
         )
         return cls(recording, np.sort(medians)[::-1], None, (note,))
 
@@ -378,8 +385,8 @@ class RecordedSweeps:
             rings = rings_of(columns)
             if rings is None:
                 raise LidarError(
-                    f"{self.recording.name} has sweeps with a column of rings, and others without: "
-                    "give the sweeps of one sensor."
+                    f"Some sweeps of {self.recording.name} have a ring column, and others do "
+                    "not. Use the sweeps of a single sensor."
                 )
             numbers = rings.astype(np.int64)
             order = np.argsort(self.ring_numbers)
@@ -417,16 +424,17 @@ def _stamps_s(recording: Recording) -> Floats | None:
         stamps_s = 1e-9 * np.fromiter(recording.times(), np.float64)
     if len(stamps_s) != recording.count:
         raise LidarError(
-            f"{recording.name} has {plural(recording.count, 'sweep')}, of which {len(stamps_s):,} "
-            "can be read. Repair the file, or record it again."
+            f"{recording.name} has {plural(recording.count, 'sweep')}, but only "
+            f"{len(stamps_s):,} can be read. Repair the file, or record it again."
         )
     backward = np.flatnonzero(np.diff(stamps_s) <= 0)
     if len(backward):
         number = int(backward[0])
         raise LidarError(
-            f"{recording.name} has stamps that do not ascend: sweep {number + 1:,} is at "
-            f"{stamps_s[number + 1]:.6f} s, and sweep {number:,} at {stamps_s[number]:.6f} s. "
-            "Remove repeated sweeps, and sort the others by their stamps."
+            f"The timestamps of {recording.name} do not increase: sweep {number:,} is at "
+            f"{stamps_s[number]:.6f} s, and sweep {number + 1:,} is at "
+            f"{stamps_s[number + 1]:.6f} s. Remove repeated sweeps, and sort the others by "
+            "timestamp."
         )
     return stamps_s
 
@@ -436,8 +444,8 @@ def _clock_notes(name: str, times: PointTimes | None) -> tuple[str, ...]:
     if times is None or times.clock is not Clock.OTHER:
         return ()
     return (
-        f"The times of points in {name} come from another clock than the stamps of its sweeps. The "
-        "first point of each sweep is taken as fired at the stamp.",
+        f"The point times in {name} are from a different clock than the timestamps of its "
+        "sweeps. The first point of each sweep is assumed to be fired at the timestamp.",
     )
 
 

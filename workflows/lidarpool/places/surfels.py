@@ -113,14 +113,14 @@ class Surfels:
         count = len(voxels.counts)
         if count * POINT_BYTES > memory() // 2:
             raise LidarError(
-                f"{name} makes {count:,} surfels, which take {bytes_of(count * POINT_BYTES)} of "
-                f"memory, of at most {bytes_of(memory() // 2)}: give a larger voxel_m than "
-                f"{voxel_m:.3g}."
+                f"{name} results in {count:,} surfels, which require "
+                f"{bytes_of(count * POINT_BYTES)} of memory, but the limit is "
+                f"{bytes_of(memory() // 2)}. Set `voxel_m` to more than {voxel_m:.3g}."
             )
         if count < _NEIGHBORS[-1]:
             raise LidarError(
-                f"{name} has {count} points that stand in different voxels of {voxel_m:.3g} m, and "
-                f"at least {_NEIGHBORS[-1]} are needed."
+                f"{name} has stationary points in {count} voxels of {voxel_m:.3g} m, but at "
+                f"least {_NEIGHBORS[-1]} are required."
             )
         means = voxels.means(points.positions)
         outward = voxels.means(points.outward)

@@ -26,13 +26,15 @@ class Search:
     waypoints, and the swarms converge more slowly.
     """
 
-    trials: Annotated[int, about("particle swarms, each with its own seed", ge=1, le=10**6)] = 100
-    particles: Annotated[int, about("of each swarm", ge=1, le=10_000_000)] = 1000
-    iterations: Annotated[int, about("of each swarm", ge=1, le=1_000_000)] = 300
+    trials: Annotated[
+        int, about("number of particle swarms, each with its own seed", ge=1, le=10**6)
+    ] = 100
+    particles: Annotated[int, about("number of particles in a swarm", ge=1, le=10_000_000)] = 1000
+    iterations: Annotated[int, about("number of iterations of a swarm", ge=1, le=1_000_000)] = 300
     waypoints: Annotated[
-        int, about("corners of the path between start and target", ge=1, le=100)
+        int, about("number of corners of the path between start and target", ge=1, le=100)
     ] = 5
-    seed: Annotated[Seed, about("the same seed gives the same path")] = 0
+    seed: Annotated[Seed, about("random seed; the same seed results in the same path")] = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,20 +77,19 @@ class Planning(Search):
         start, target = ((float(x), float(y)) for x, y in (self.start, self.target))
         if start == target:
             raise LidarError(
-                f"start and target of the path are both {start}: there is nothing to plan. "
-                "Move one of them."
+                f"The start and the target of the path are both {start}. Move one of them."
             )
         centers = _checked(
             "centers",
             self.centers,
             lambda n: n.size == 0 or (n.ndim == 2 and n.shape[1] == 2),
-            "finite numbers of shape (m, 2)",
+            "finite numbers with the shape (m, 2)",
         ).reshape(-1, 2)
         radii = _checked(
             "radii",
             self.radii,
             lambda n: n.shape in ((), (len(centers),)) and bool((n > 0).all()),
-            "finite numbers above 0, one for each disc or one for all",
+            "positive finite numbers, one for each disc or one for all discs",
         )
         radii = np.broadcast_to(radii, len(centers)).copy()
         for array in (centers, radii):
@@ -112,7 +113,7 @@ def _checked(
     except (TypeError, ValueError):
         numbers = np.array(np.nan)
     if not (np.isfinite(numbers).all() and fits(numbers)):
-        raise LidarError(f"planning: {name} is {reprlib.repr(value)}; it must be {requirement}.")
+        raise LidarError(f"`planning.{name}` is {reprlib.repr(value)}; it must be {requirement}.")
     return numbers
 
 
@@ -127,6 +128,7 @@ def _check_outside(
             disc = int(within[0])
             x, y = centers[disc]
             raise LidarError(
-                f"The path's {name} ({end[0]:g}, {end[1]:g}) lies within disc {disc} of radius "
-                f"{radii[disc]:g} at ({x:g}, {y:g}): move the {name} out of it."
+                f"The {name} of the path ({end[0]:g}, {end[1]:g}) lies within disc {disc}, "
+                f"which has the center ({x:g}, {y:g}) and the radius {radii[disc]:g}. Move "
+                f"the {name} out of the disc."
             )

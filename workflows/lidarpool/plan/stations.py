@@ -62,8 +62,8 @@ class Sight:
         sectors = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
         if len(np.unique(sectors)) < min(_SECTORS, revolution):
             raise LidarError(
-                f"{sensor.model} does not look all around, as it has to on a station: give "
-                "another sensor, such as terrestrial/riegl-vz400."
+                f"{sensor.model} does not scan the full circle, which is required at a scan "
+                "station. Use another sensor, such as terrestrial/riegl-vz400."
             )
         self._lowest = float(z.min()) - 1e-9
         self._highest = float(z.max()) + 1e-9
@@ -174,7 +174,7 @@ def plan_stations(
     (1, [180.0])
     """
     if count is not None and coverage is not None:
-        raise LidarError("count and coverage both say when to stop: give one of them.")
+        raise LidarError("`count` and `coverage` cannot be combined.")
     scene = replace(SimplifiedScene.from_scene(scene).scene, actors=())
     is_target = _target_mask(scene.names, targets)
     sight = Sight(scene, sensor, slant_deg)
@@ -184,8 +184,9 @@ def plan_stations(
     visibility = _visibility(_sample_surfaces(scene, is_target), sight, positions)
     if not len(visibility.area_m2):
         raise LidarError(
-            f"{'No target' if targets else 'Nothing'} is visible from {len(positions):,} places at "
-            f"{height_m:g} m: check the unit of the scene, the range of the sensor, and the slant."
+            f"{'No target' if targets else 'Nothing'} is visible from the {len(positions):,} "
+            f"candidate positions at a height of {height_m:g} m. Check the unit of the scene, "
+            "the range of the sensor and the slant."
         )
     min_gain = MIN_GAIN if count is None and coverage is None else 0.0
     choice = _choose_rows(visibility, count or MAX_STATIONS, coverage or 1.0, min_gain)
@@ -279,7 +280,9 @@ def _target_mask(names: Sequence[str], targets: Sequence[str]) -> Bools:
     for pattern in targets:
         rows = rows_named(pattern, names)
         if not len(rows):
-            raise LidarError(f"The target {pattern!r} fits no object.{name_hint(pattern, names)}")
+            raise LidarError(
+                f"The target {pattern!r} does not match any object.{name_hint(pattern, names)}"
+            )
         mask[rows] = True
     return mask
 
@@ -372,10 +375,11 @@ def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: floa
     positions[:, 2] = floor[rows] + height_m
     positions = positions[_free_positions(scene, caster, positions)]
     if not len(positions):
-        fault = "The scene has no floor" if not walkable.any() else "There is no room on the floor"
+        fault = "The scene has no floor" if not walkable.any() else "The floor has no space"
         raise LidarError(
-            f"{fault} for an instrument at {height_m:g} m, on a grid of {spacing_m:g} m: check the "
-            "scene's unit and up axis, give another height or spacing, or add scene.ground."
+            f"{fault} for an instrument at a height of {height_m:g} m on a grid of "
+            f"{spacing_m:g} m. Check the unit and the up axis of the scene, use another "
+            "height or spacing, or set `scene.ground`."
         )
     return positions
 
@@ -386,8 +390,8 @@ def _grid_positions(scene: Scene, spacing_m: float) -> tuple[Floats, tuple[int, 
     columns, rows = np.maximum((upper - lower)[:2] / spacing_m, 1).astype(int).tolist()
     if columns * rows > _MAX_CANDIDATES:
         raise LidarError(
-            f"A grid of {spacing_m:g} m has {columns * rows:,} places, more than "
-            f"{_MAX_CANDIDATES:,}: give a larger spacing."
+            f"A grid of {spacing_m:g} m has {columns * rows:,} positions, but the limit is "
+            f"{_MAX_CANDIDATES:,}. Use a larger spacing."
         )
     x, y = np.meshgrid(
         (np.arange(columns) - (columns - 1) / 2) * spacing_m,

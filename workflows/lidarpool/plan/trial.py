@@ -142,7 +142,7 @@ def best(trials: Iterable[Trial], planning: Planning) -> Plan:
         clearance_m = clearance(path, planning.centers, planning.radii)
         ranked.append((max(0.0, -clearance_m), path_length(path), trial.trial, clearance_m, path))
     if not ranked:
-        raise LidarError("No planning trial was finished, so there is no best path.")
+        raise LidarError("No planning trial was completed, so there is no best path.")
     _, length, number, clearance_m, path = min(ranked, key=lambda candidate: candidate[:3])
     return Plan(
         path=path,

@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from lidarsim.base.errors import LidarError, MissingFileError
+from lidarsim.base.words import joined
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 
@@ -18,25 +19,25 @@ from ..datasets.loader import sweeps
 
 KINDS = (
     "the folder of a result or data set, a .ply, .pcd, .las, .laz, .e57, .parquet, .xyz, .txt, "
-    ".asc, .csv, .pts, .ptx, .npy, .bin of KITTI or nuScenes, .pcap or .pcapng of Velodyne or "
-    "Ouster, .osf, a bag of ROS 2, or a folder of KITTI, nuScenes, WebDataset or range images"
+    ".asc, .csv, .pts, .ptx, .npy, .bin (KITTI, nuScenes), .pcap, .pcapng (Velodyne, Ouster) or "
+    ".osf file, a ROS 2 bag, or a folder in KITTI, nuScenes, WebDataset or range image format"
 )
 _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
-    ".bag": "it is a bag of ROS 1, convert it (rosbags-convert --src IN.bag --dst OUT)",
-    ".db3": "it is a part of a bag of ROS 2, give the folder that it is in",
-    ".rrd": "it is a recording of Rerun, open it with the command rerun",
-    ".osi": "it is a trace of OSI, name it as the traffic of a scenario",
-    **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "it is a mesh, run a survey of it first"),
+    ".bag": "It is a ROS 1 bag. Convert it with rosbags-convert --src IN.bag --dst OUT.",
+    ".db3": "It is part of a ROS 2 bag. Specify the folder that contains it.",
+    ".rrd": "It is a Rerun recording. Open it with the command rerun.",
+    ".osi": "It is an OSI trace. Use it as the traffic of a scenario.",
+    **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "It is a mesh. Run a survey of it first."),
 }
 # Endings of clouds that may have another unit.
 _UNIT_SUFFIXES = (".las", ".laz", ".ply", *(ending for ending in SCAN_READERS if ending != ".bin"))
 
 
 class UnknownFormatError(LidarError):
-    """The format of a file or folder is not read, with `advice`, a clause or no text."""
+    """The format of a file or folder is not supported, with `advice`: sentences, or no text."""
 
     def __init__(self, name: str, advice: str) -> None:
-        super().__init__(f"{name} is not read: {advice}give {KINDS}.")
+        super().__init__(f"The format of {name} is not supported. {advice or f'Specify {KINDS}.'}")
         self.advice = advice
 
 
@@ -57,7 +58,7 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
     sequences = list(dict.fromkeys(recording.sequence for recording in recordings.values()))
     if len(sequences) == 1:
         return recordings
-    note = f"The first of {len(sequences):,} sequences is shown, {sequences[0]}."
+    note = f"Only the first of {len(sequences):,} sequences is shown, {sequences[0]}."
     return {
         name: replace(recording, notes=(note,))
         for name, recording in recordings.items()
@@ -85,14 +86,14 @@ def open_recording(
     """
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:
-            raise LidarError(f"{name} is in meters: leave out its unit, {unit!r}.")
+            raise LidarError(f"The unit of {name} is the meter. Remove the unit {unit!r}.")
         return open_cloud(name, source, source.sweeps, sensor, intensity)
     path = Path(source)
     name = str(source)
     if unit is not None and path.suffix.lower() not in _UNIT_SUFFIXES:
         raise LidarError(
-            f"{name} is in meters: leave out its unit, {unit!r}, which is for a file "
-            f"{' '.join(_UNIT_SUFFIXES)}."
+            f"The unit of {name} is the meter. Remove the unit {unit!r}, which can only be "
+            f"set for {joined(_UNIT_SUFFIXES)} files."
         )
     recording = _open_path(RecordingSource(path, name, sensor, intensity, unit))
     noise_filter = recording.noise_filter
@@ -105,17 +106,16 @@ def _open_path(source: RecordingSource) -> Recording:
     """Open a file or folder."""
     path = source.path
     if not path.exists():
-        raise MissingFileError(f"{source.name} does not exist: give {KINDS}.")
+        raise MissingFileError(f"{source.name} does not exist. Specify {KINDS}.")
     if path.is_file() and not path.stat().st_size:
-        raise LidarError(f"{source.name} is empty (0 bytes): give {KINDS}.")
+        raise LidarError(f"{source.name} is empty (0 bytes). Specify {KINDS}.")
     if (path / INDEX_FILE).exists():
         return _open_data_set(source)
     if (open_source := reader_of(path, source.name)) is not None:
         recording: Recording = open_source(source)
         return recording
     suffix = path.suffix.lower()
-    advice = f"{_CONVERSIONS[suffix]}, or " if suffix in _CONVERSIONS else ""
-    raise UnknownFormatError(source.name, advice)
+    raise UnknownFormatError(source.name, _CONVERSIONS.get(suffix, ""))
 
 
 def _open_data_set(source: RecordingSource) -> Recording:

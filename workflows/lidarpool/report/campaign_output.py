@@ -97,8 +97,9 @@ class DataSetOutput(Output[CampaignRun]):
         if not run.resume and (starts_anew or not unfinished):
             if INDEX_FILE in entries and not options.overwrite:
                 raise LidarError(
-                    f"{storage} holds a finished data set, and one needs a folder of its own: give "
-                    "another with --out, or replace it with --overwrite (in Python overwrite=True)."
+                    f"{storage} contains a finished data set, but each data set requires a "
+                    "separate folder. Specify another folder with `--out`, or replace the "
+                    "data set with `--overwrite` (`overwrite=True` in Python)."
                 )
             if starts_anew:
                 _remove_dataset(storage, run_folder)
@@ -107,7 +108,7 @@ class DataSetOutput(Output[CampaignRun]):
         try:
             self._record = check_same(storage, self.campaign)
         except DamagedRecordError:  # the manifests name the campaign of the jobs
-            self._lost_record = f"{CAMPAIGN_FILE} was damaged, and is made again"
+            self._lost_record = f"{CAMPAIGN_FILE} was damaged and has been created again"
             return None
         self._check_shards(self._record["shards"])
         if not self._is_complete(self._record, verify=options.verify):
@@ -122,10 +123,11 @@ class DataSetOutput(Output[CampaignRun]):
     def _check_shards(self, shards: Sequence[str]) -> None:
         """Raise LidarError unless a finished data set has the shards of this run."""
         if shards != [str(self.campaign.shard)]:
-            held = listed([*map(shard_in_words, shards)]) or "no shard"
+            held = listed([*map(shard_in_words, shards)]) or "no shards"
             raise LidarError(
-                f"{self.dataset.storage} holds {held}, and this is "
-                f"{shard_in_words(str(self.campaign.shard))}: give another folder with --out."
+                f"{self.dataset.storage} contains {held}, but this run is "
+                f"{shard_in_words(str(self.campaign.shard))}. Specify another folder with "
+                "`--out`."
             )
 
     def _is_complete(self, record: Mapping[str, Any], *, verify: bool) -> bool:
@@ -150,7 +152,7 @@ class DataSetOutput(Output[CampaignRun]):
 
     def _finished(self, run: Run[CampaignRun]) -> CampaignRun:
         """Show that a data set is complete, and return its sums."""
-        run.screen.tell(f"{self.dataset.storage} is complete: nothing is left to do")
+        run.screen.tell(f"{self.dataset.storage} is already complete")
         for row in self._rows:
             run.page.ended(row)
         notes = tuple(run.warn_of_empty_jobs(self._rows))
@@ -180,7 +182,7 @@ class DataSetOutput(Output[CampaignRun]):
         retried = store.db.failed() if options.retry_failed else ()
         store.forget([*self._wrong, *retried])
         if self._wrong:
-            store.notes.append(f"made again: {listed([*self._wrong.values()])}")
+            store.notes.append(f"jobs run again: {listed([*self._wrong.values()])}")
         for row in store.rows():
             run.page.ended(row)
 
@@ -247,22 +249,23 @@ def read_record(storage: Storage) -> dict[str, Any]:
 
     DamagedRecordError if the file is damaged or edited; LidarError if there is none.
     """
-    refuse_missing(storage, "give the folder of a data set, the --out of a campaign.")
+    refuse_missing(storage, "specify the folder of a data set, as passed to `--out` of a campaign")
     try:
         record = unsealed(storage.read(CAMPAIGN_FILE))
         for name, kind in _RECORDED.items():
             if not isinstance(record.get(name), kind):
-                raise ValueError(f"its entry {name} is missing or of another type")
+                raise ValueError(f"its entry {name} is missing or has the wrong type")
         for shard in record["shards"]:
             Shard.parse(str(shard))
     except OSError as error:
         raise LidarError(
-            f"{storage} holds no finished data set, which has a {CAMPAIGN_FILE}: {error}."
+            f"{storage} contains no finished data set, which would have a valid "
+            f"{CAMPAIGN_FILE}: {error}."
         ) from error
     except (ValueError, LidarError) as error:
         raise DamagedRecordError(
-            f"{storage.path(CAMPAIGN_FILE)} is damaged or edited ({error}): run the campaign again "
-            "with --resume, which writes it anew."
+            f"{storage.path(CAMPAIGN_FILE)} is damaged or has been edited: {error}. Run the "
+            "campaign again with `--resume` to write the file again."
         ) from error
     return record
 
@@ -284,10 +287,10 @@ def read_notes(storage: Storage) -> list[str]:
         notes = json.loads(storage.read(LAST_FILE))["notes"]
         if isinstance(notes, list):
             return [*map(str, notes)]
-        reason = "its entry notes is no list"
+        reason = "its entry notes is not a list"
     except (OSError, ValueError, LookupError, TypeError) as error:
         reason = message_of(error).rstrip(".")
-    return [f"{storage.path(LAST_FILE)} is damaged ({reason}): its notes are lost"]
+    return [f"{storage.path(LAST_FILE)} is damaged: {reason}. Its notes are lost"]
 
 
 def write_shared(
@@ -351,11 +354,15 @@ def _check_jobs(
         for row, (manifest, difference) in dataset.look(rows, contents=contents):
             if campaign is not None and row.number not in campaign.numbers:
                 share = (
-                    "" if campaign.shard == ALL else f", of which this is shard {campaign.shard}"
+                    ""
+                    if campaign.shard == ALL
+                    else f" in total, of which this run is shard {campaign.shard}"
                 )
                 raise LidarError(
-                    f"{dataset.storage} has job {row.name}, and count is {campaign.count:,}"
-                    f"{share}: a campaign can only grow. Give another folder with --out."
+                    f"{dataset.storage} contains job {row.name}, which is not part of this "
+                    f"run, because the campaign has {plural(campaign.count, 'job')}{share}. "
+                    "The number of jobs can only be increased. Specify another folder with "
+                    "`--out`."
                 )
             if difference:
                 wrong[row.number] = f"job {row.name} ({difference})"
@@ -367,8 +374,9 @@ def _check_jobs(
     for (name, digest), jobs in jobs_of_file.items():
         if (name, digest) not in current_files and name in dict(current_files):
             raise LidarError(
-                f"Jobs of {dataset.storage} were made of another {name} than there is now: "
-                f"{listed(jobs)}. Bring that back, or give another folder with --out."
+                f"These jobs in {dataset.storage} were created from a different version of "
+                f"{name}: {listed(jobs)}. Restore that version, or specify another folder "
+                "with `--out`."
             )
     return intact_count, wrong
 
@@ -390,16 +398,16 @@ def verify(storage: Storage, number: int | None = None) -> str:
     rows = [row for row in read_table(storage, index["table"]) if row.done]
     is_complete = {row.number for row in rows} == index["jobs"].keys()
     rows = [row for row in rows if number in (None, row.number)]
-    wrong = {} if is_complete else {-1: f"{TABLE_FILE} has other jobs than {INDEX_FILE}"}
+    wrong = {} if is_complete else {-1: f"{TABLE_FILE} and {INDEX_FILE} list different jobs"}
     if number is None and CAMPAIGN_FILE in storage.sizes():
         read_record(storage)
     wrong |= _check_jobs(dataset, rows, True)[1]
     if wrong:
         raise LidarError(
-            f"{storage} is damaged: {listed([*wrong.values()])}. With the campaign, --verify makes "
-            "these jobs again."
+            f"{storage} is damaged: {listed([*wrong.values()])}. To run these jobs again, "
+            "pass the campaign with `--verify`."
         )
-    return f"{storage} is whole: {plural(len(rows), 'job')}"
+    return f"{storage} is intact, with {plural(len(rows), 'job')}"
 
 
 def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
@@ -412,15 +420,16 @@ def check_same(storage: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     recorded = record["casting"] or {"lidarpool": record["identity"]["lidarpool"]}
     if differs := difference(recorded, {name: installed.get(name, "none") for name in recorded}):
         raise LidarError(
-            f"{storage} was made with {differs}: the bits of its jobs are the same only with that. "
-            "Install it, or make the job in a folder of its own with --out."
+            f"{storage} was created with {differs}. Only that version reproduces its jobs bit "
+            "for bit. Install it, or run the job in a separate folder with `--out`."
         )
     for name, value in campaign.identity.items():
         if record["identity"].get(name) != value:
             changed = differences(record["fields"], campaign.fields)
             raise LidarError(
-                f"{storage} is of another campaign: {changed or f'its {name} differs'}. Make the "
-                "job in a folder of its own with --out."
+                f"{storage} belongs to a different campaign "
+                f"({changed or f'its {name} differs'}). Run the job in a separate folder with "
+                "`--out`."
             )
     return record
 
@@ -435,8 +444,8 @@ def dataset_files(storage: Storage, *, begun: bool) -> list[str]:
     for name in sorted(files):
         if not begun or not allowed.fullmatch(name):
             raise LidarError(
-                f"{storage} holds {name}: a data set needs a folder of its own, move that "
-                "elsewhere, or give another with --out."
+                f"{storage} contains {name}, but a data set requires a separate folder. Move "
+                "this file elsewhere, or specify another folder with `--out`."
             )
     return files
 
@@ -457,12 +466,12 @@ def _remove_dataset(storage: Storage, run_folder: Storage) -> None:
 
 def failures(sums: CampaignRun, max_errors: int = 5) -> str:
     """Describe the different errors of jobs that have failed, with the values of the jobs."""
-    head = f"{plural(len(sums.failed), 'job')} failed, the other {sums.done:,} are done:"
+    head = f"{plural(len(sums.failed), 'job')} failed and {sums.done:,} succeeded:"
     errors = []
     for row in sums.failed:
         values = ", ".join(f"{name} {value}" for name, value in row.values.items())
         errors.append((f"{row.name}{f' ({values})' if values else ''}", row.error))
     lines = lines_of_errors(errors, max_jobs=3)
     if (hidden := len(lines) - max_errors) > 0:
-        lines[max_errors:] = [f"and {plural(hidden, 'more error')}, see jobs.csv"]
-    return "\n".join([head, *lines, "--retry-failed does these jobs again."])
+        lines[max_errors:] = [f"{plural(hidden, 'more error')}, listed in jobs.csv"]
+    return "\n".join([head, *lines, "To run the failed jobs again, use `--retry-failed`."])

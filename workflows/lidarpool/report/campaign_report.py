@@ -28,12 +28,18 @@ PICTURES = "pictures"
 SPLITS = "splits"
 VALUES_SHOWN = 12  # shown values of a quantity with labels
 _CAPTIONS = {
-    "job": "One of the jobs.",
-    "varied": "What was varied: jobs by value, and the points of each job against it.",
-    "results": "What came of it: jobs by points, and share of rays that hit.",
+    "job": "A sweep from one of the jobs.",
+    "varied": (
+        "Varied quantities: the number of jobs by value, and the number of points per job as a "
+        "function of the value."
+    ),
+    "results": "Results: the number of jobs by number of points, and by share of rays that hit.",
 }
 # Of the page alone: the card and the files of pictures are the same in every run.
-_PAGE_CAPTIONS = {**_CAPTIONS, "times": "Jobs by casting time, the sum of all tasks of a job."}
+_PAGE_CAPTIONS = {
+    **_CAPTIONS,
+    "times": "The number of jobs by casting time, which is the sum over all tasks of a job.",
+}
 
 
 def write_card(
@@ -72,7 +78,9 @@ def write_card(
     LidarError
         If a file cannot be written, or a split cannot be the name of a file.
     """
-    with explained(f"The data set's card cannot be written to {storage}", "make room"):
+    with explained(
+        f"The card of the data set cannot be written to {storage}", "free some disk space"
+    ):
         storage.remove([LAST_FILE])
         rows = writing_seconds(storage, _with_splits(storage, jobs))
         figures = Figures(campaign["names"], rows)
@@ -116,7 +124,8 @@ def _with_splits(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
                 if row.split not in files:
                     if not re.fullmatch(r"\w[\w.-]*", row.split):
                         raise LidarError(
-                            f"A split cannot be called {row.split!r}: use letters and digits."
+                            f"{row.split!r} is not a valid name for a split. Use only letters "
+                            "and digits."
                         )
                     name = f"{SPLITS}/{row.split}.txt"
                     files[row.split] = stack.enter_context(storage.writing(name))

@@ -79,9 +79,9 @@ def draw_varied(figures: Figures) -> Page | None:
         lower.set_ylim(limits)
         layout.label_charts(page, number, scale, upper, lower)
     page.title(
-        "What was varied, and the points that came of it",
-        "Above, the jobs by value. Below, a dot for each job; the median of jobs with near values, "
-        "and the range of their middle 80%.",
+        "Varied quantities and resulting points",
+        "Top: the number of jobs by value. Bottom: a dot for each job, with the median of "
+        "jobs with similar values and the range of their central 80 %.",
         _remarks(figures, informative, len(drawable) - len(scales)),
     )
     return page
@@ -124,7 +124,7 @@ class _Layout(NamedTuple):
     ) -> None:
         """Label the axes of the charts of a quantity, and write its name above."""
         is_first = number % self.column_count == 0
-        for axes, quantity in ((upper, "jobs"), (lower, "points of a job")):
+        for axes, quantity in ((upper, "jobs"), (lower, "points per job")):
             _set_labels(page, axes, scale, self.width)
             if is_first:
                 axes.set_ylabel(quantity)
@@ -161,7 +161,7 @@ def _remarks(figures: Figures, informative: Varied | None, hidden: int) -> str:
     if failed := int(figures.failures.sum()):
         remarks.append(f"red: {plural(failed, 'failed job')}")
     if figures.done > MAX_DOTS:
-        remarks.append(f"{MAX_DOTS:,} of {figures.done:,} jobs have dots")
+        remarks.append(f"dots are shown for {MAX_DOTS:,} of {figures.done:,} jobs")
     if hidden:
         remarks.append(f"{plural(hidden, 'more quantity', 'more quantities')} in jobs.csv")
     text = "; ".join(remarks)
@@ -186,17 +186,17 @@ def draw_results(figures: Figures) -> Page | None:
     points, rays, hits = (figures.per_job(name)[is_done] for name in ("points", "rays", "hits"))
     with np.errstate(invalid="ignore"):
         quantities = (
-            Varied("points of a job", points),
-            Varied("rays that hit, per cent", 100 * hits / rays),
+            Varied("points per job", points),
+            Varied("rays that hit, %", 100 * hits / rays),
         )
-    return _draw_distributions(quantities, "What came of it", "Jobs by points and hits")
+    return _draw_distributions(quantities, "Results", "Number of jobs by points and by hits")
 
 
 def draw_times(figures: Figures) -> Page | None:
     """Draw how casting times are distributed over jobs, or None if no job is done."""
     seconds = figures.per_job("seconds")[~figures.failures]
-    quantity = Varied("casting a job, all its tasks, s", seconds)
-    return _draw_distributions((quantity,), "What it took", "Jobs by casting time")
+    quantity = Varied("casting time per job, all tasks, s", seconds)
+    return _draw_distributions((quantity,), "Casting time", "Number of jobs by casting time")
 
 
 def _draw_distributions(quantities: Sequence[Varied], title: str, caption: str) -> Page | None:
@@ -217,7 +217,7 @@ def _draw_distributions(quantities: Sequence[Varied], title: str, caption: str) 
                 float(np.median(quantity.known_values)), color=theme.INK, lw=1.1 * page.unit
             )
     page.figure.axes[0].set_ylabel("jobs")
-    page.title(title, f"{caption}; the line is the median.")
+    page.title(title, f"{caption}; the line marks the median.")
     return page
 
 
@@ -392,7 +392,7 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     ]
     page.title(
         f"A sweep of job {sweep.job}",
-        f"{plural(len(sweep), 'point')} from above, meters in the sensor's axes",
+        f"{plural(len(sweep), 'point')}, seen from above, in meters in the sensor frame",
         ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:

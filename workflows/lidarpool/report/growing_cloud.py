@@ -250,8 +250,9 @@ class CloudWriter:
             first.counts.merge(part_writer.counts)
         if first.counts.point_count != self.file.count:
             raise LidarError(
-                f"{first.counts.point_count:,} of {self.file.count:,} points are on objects of the "
-                "scene or on none: the parts are of another scene."
+                f"only {first.counts.point_count:,} of {self.file.count:,} points lie on "
+                "objects of the scene or on no object, so the parts belong to a different "
+                "scene."
             )
         return first.counts
 

@@ -14,10 +14,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, explained
+from lidarsim.base.errors import LidarError, MissingFileError, Mistakes, as_sentence, explained
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
-from lidarsim.base.words import listed, plural
+from lidarsim.base.words import listed
 
 from ..base.field_words import differences
 from ..base.fingerprint import fingerprint
@@ -54,8 +54,7 @@ from .campaign_output import (
 from .output import SurveyOutput
 
 MAX_NAMED = 20  # shards or files in a message
-_MISSING = "missing: "  # begins a note
-_AGAIN = "run their shards again with --resume (of a campaign --verify), and merge again"
+_MISSING = "these shards are missing: "  # begins a note
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,9 @@ class _ShardFolder:
         properties = {"kind": [*record["identity"]]} | record["identity"]
         properties |= {f"the file {name}": digest for name, digest in record["files"]}
         if record["casting"]:  # empty if the shard has cast no rays
-            properties |= {f"{name} of workers": value for name, value in record["casting"].items()}
+            properties |= {
+                f"the {name} of the workers": value for name, value in record["casting"].items()
+            }
         return properties | ({"the number of shards": self.shards[0].total} if self.shards else {})
 
 
@@ -148,11 +149,13 @@ def merge(
         with mistakes.noted():
             shard_folders.append(_read_folder(storage))
     mistakes.lines += (
-        [] if shard_storages else ["there is nothing to merge: give the folders of shards."]
+        []
+        if shard_storages
+        else ["There are no shards to merge. Specify the folders of the shards."]
     )
     with suppress(LidarError):  # the result would have the place of the shard's points
         if "made_of" in _read_folder(Storage.at(target)).record:
-            message = f"{target} holds a shard of a survey: give another folder with --out."
+            message = f"{target} contains a shard of a survey. Specify another folder with `--out`."
             shard_folders = []
             mistakes.lines = [message]
     if not (partial and shard_folders):
@@ -179,13 +182,13 @@ def _check_apart(target: Storage, shard_storages: Mapping[str, Storage]) -> None
         if path == real:
             relation = "is one of the shards"
         elif f"{path}/".startswith(f"{real.rstrip('/')}/"):
-            relation = f"lies in the shard {storage}"
+            relation = f"is inside the shard {storage}"
         elif f"{real}/".startswith(f"{path.rstrip('/')}/"):
-            relation = f"holds the shard {storage}"
+            relation = f"contains the shard {storage}"
         if relation:
             raise LidarError(
-                f"--out {target} {relation}, which stays as it is: give another folder with --out, "
-                "or name the shards without that one."
+                f"The output folder {target} {relation}, which must not be changed. Specify "
+                "another folder with `--out`, or omit that shard."
             )
 
 
@@ -194,7 +197,9 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
     Raises LidarError if damaged or unfinished.
     """
-    refuse_missing(storage, "give the folder of a shard, the --out of lidarpool run --shard.")
+    refuse_missing(
+        storage, "specify the folder of a shard, as passed to `--out` of `lidarpool run --shard`"
+    )
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
         run = storage.below(RUN_FOLDER)
@@ -204,8 +209,8 @@ def _read_folder(storage: Storage) -> _ShardFolder:
             with suppress(LookupError):
                 return _read_survey(storage, run)
     raise LidarError(
-        f"{storage} holds no finished shard: give a folder of lidarpool run --shard; --resume "
-        "finishes an unfinished one."
+        f"{storage} contains no finished shard. Specify the output folder of `lidarpool run "
+        "--shard`, and finish an unfinished shard with `--resume`."
     )
 
 
@@ -257,8 +262,8 @@ def _read_survey(storage: Storage, run: Storage) -> _ShardFolder:
                 )
         except DamagedError as error:
             raise LidarError(
-                f"{run.path(FILE)} is damaged: run its shard again with --resume, which makes it "
-                "anew from the points, and merge again."
+                f"{run.path(FILE)} is damaged. Run its shard again with `--resume`, which "
+                "recreates the file from the points, and merge again."
             ) from error
 
 
@@ -273,7 +278,7 @@ def _check(
     """
     mistakes = Mistakes()
     expected = software()
-    first = "the software here"
+    first = "the installed software"
     first_fields: Mapping[str, str] = {}
     folders_by_shard = dict[int, _ShardFolder]()
     for shard_folder in sorted(
@@ -286,7 +291,7 @@ def _check(
             and len(shard_folders) > 1 + bool(earlier)
         ):
             mistakes.lines.append(
-                f"{shard_folder.storage} is a whole run: give it alone, or leave it out."
+                f"{shard_folder.storage} is a complete run. Specify it alone, or omit it."
             )
             continue
         if differs := [
@@ -297,7 +302,9 @@ def _check(
             )
             message = f"{shard_folder.storage} and {first} differ in {differs[0]}"
             message += f" ({changed})" * bool(changed)
-            mistakes.lines.append(f"{message}: merge shards of one run and of the same software.")
+            mistakes.lines.append(
+                f"{message}. Merge shards of a single run with the same software."
+            )
         elif len(common) > len(expected):
             expected = common
             first = str(shard_folder.storage)
@@ -308,22 +315,36 @@ def _check(
             if (
                 first_folder := folders_by_shard.setdefault(shard.number, shard_folder)
             ) is not shard_folder:
-                twice = f"shard {shard} is in {first_folder.storage} and in {shard_folder.storage}"
-                mistakes.lines.append(f"{twice}: give one of them.")
+                twice = (
+                    f"Shard {shard} is in both {first_folder.storage} and {shard_folder.storage}."
+                )
+                mistakes.lines.append(f"{twice} Specify only one of these folders.")
     mistakes.tell()
     notes = [*dict.fromkeys(note for shard_folder in shard_folders for note in shard_folder.notes)]
     if not (missing := _missing(shard_folders)):
         return notes
-    message = (
-        f"{_MISSING}{plural(len(missing), 'shard')}, {listed([*map(str, missing)], MAX_NAMED)}"
-    )
+    message = f"{_MISSING}{listed([*map(str, missing)], MAX_NAMED)}"
     if not partial:
         grown = any(
             shard in shard_folder.shards for shard_folder in shard_folders for shard in missing
         )
-        give = f"give them, too{', run again with the larger count and --resume' * grown}"
-        raise LidarError(f"{message}: {give}, or merge what there is with --partial.")
+        advice = (
+            "Run them again with the larger count and `--resume`"
+            if grown
+            else "Specify their folders as well"
+        )
+        raise LidarError(
+            f"{as_sentence(message)} {advice}, or merge only the existing shards with `--partial`."
+        )
     return [*notes, message]
+
+
+def _missing_or_damaged(names: Sequence[str]) -> str:
+    """Return the message about files of shards that cannot be merged."""
+    return (
+        f"These files are missing or damaged: {listed(names, MAX_NAMED)}. Run their shards "
+        "again with `--resume`, or campaigns with `--verify`, and merge again."
+    )
 
 
 def _missing(shard_folders: Sequence[_ShardFolder]) -> list[Shard]:
@@ -373,7 +394,7 @@ def _merge_dataset(
         if not damaged:
             damaged += _lacking(all_folders, _merged(files))
         if damaged:
-            raise LidarError(f"missing or damaged: {listed(damaged, MAX_NAMED)}; {_AGAIN}.")
+            raise LidarError(_missing_or_damaged(damaged))
         lacking = _missing(all_folders)
         shards = {shard for shard_folder in all_folders for shard in shard_folder.shards}
         record["shards"] = [*map(str, sorted(shards.difference(lacking)) if lacking else [ALL])]
@@ -424,14 +445,15 @@ class _RowFile:
                 number = row.number
                 if not any(number in numbers for numbers in ranges):
                     raise LidarError(
-                        f"{path} is of job {number}, which is not in shard "
-                        f"{listed([*map(str, shard_folder.shards)])} of {shard_folder.run_size:,} "
-                        "jobs: move it elsewhere, and merge again."
+                        f"{path} belongs to job {number}, which is not in shard "
+                        f"{listed([*map(str, shard_folder.shards)])} of "
+                        f"{shard_folder.run_size:,} jobs. Move the file elsewhere, and merge "
+                        "again."
                     )
                 if number in self._offsets:
                     raise LidarError(
-                        f"{path} is of job {number}, of which there is another manifest: move one "
-                        "of them elsewhere, and merge again."
+                        f"{path} belongs to job {number}, which has another manifest. Move "
+                        "one of the manifests elsewhere, and merge again."
                     )
                 row = replace(row, seconds=seconds.get(number, 0.0))
                 self._offsets[number] = file.tell()
@@ -520,7 +542,8 @@ def _merge_survey(
     path = Path(scenario or made_of["path"])
     if not path.exists():
         raise MissingFileError(
-            f"{path}, of which these shards are, does not exist: give --scenario."
+            f"{path}, the scenario of these shards, does not exist. Specify its new path with "
+            "`--scenario`."
         )
     with screen.status("reading the scene"):
         built = build(Scenario.load(path, made_of["options"]))
@@ -530,8 +553,9 @@ def _merge_survey(
     if differs := [name for name in identity if identity[name] != record["identity"][name]]:
         changed = differences(record["fields"], jobs.fields)
         raise LidarError(
-            f"{path} has another {differs[0]} than these shards{f', {changed}' * bool(changed)}: "
-            "give --scenario."
+            f"{path} does not match these shards, because its {differs[0]} is "
+            f"different{f' ({changed})' * bool(changed)}. Specify the scenario of the shards "
+            "with `--scenario`."
         )
     fields: dict[str, Any] = {
         "scenario": built.scenario,
@@ -566,7 +590,7 @@ class _Merged(SurveyOutput):
             """Take a file and return its receipt, or None if the file is missing or damaged."""
             name = part_name(mark, 0, part_file.first, part_file.stop)
             with (
-                explained(f"{source.path(part_file.name)} cannot be taken"),
+                explained(f"{source.path(part_file.name)} cannot be copied"),
                 suppress(FileNotFoundError),
             ):
                 store.storage.take(source, part_file.name, name)
@@ -594,7 +618,7 @@ class _Merged(SurveyOutput):
                 if receipt is None or not store.db.commit([(only, receipt)]):
                     damaged.append(source.path(expected.name))
         if damaged:
-            raise LidarError(f"missing or damaged: {listed(damaged, MAX_NAMED)}; {_AGAIN}.")
+            raise LidarError(_missing_or_damaged(damaged))
         if not only.trials:  # the first shard, which plans, is missing
             only.job = replace(only.job, planning=None)
         only.frames = only.scans.stop

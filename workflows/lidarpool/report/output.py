@@ -111,8 +111,10 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         """
         target = self.target
         storage = Storage.at(target)
-        advice = "give another folder with --out, or replace it with --overwrite (in Python "
-        advice += "overwrite=True)."
+        advice = (
+            "Specify another folder with `--out`, or replace the result with `--overwrite` "
+            "(`overwrite=True` in Python)."
+        )
         with explained(f"{target} cannot be read"):
             try:
                 entries = set(storage.entries())
@@ -124,14 +126,16 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             if earlier != {name: expected[name] for name in _SURVEY}:
                 changed = differences(earlier_fields, fields()) if earlier_fields else ""
                 raise LidarError(
-                    f"{target} holds the result of another survey{f', {changed}' * bool(changed)}: "
-                    f"{advice}"
+                    f"{target} contains the result of a different "
+                    f"survey{f' ({changed})' * bool(changed)}. {advice}"
                 )
         further = _further_files(self.survey, self.formats)
         foreign = [name for name in (*FILES, *further) if name in entries and name not in listed]
         if foreign and not overwrite:
-            lists = f"{target} holds {foreign[0]}, which no result there lists"
-            raise LidarError(f"{lists}: {advice}")
+            lists = (
+                f"{target} contains {foreign[0]}, which does not belong to a result in this folder."
+            )
+            raise LidarError(f"{lists} {advice}")
         refuse_strangers(storage, _rows({*further, *listed}))
 
     def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
@@ -208,7 +212,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         with (
             explained(
                 f"The result cannot be written to {self.target}",
-                "make room or give another folder with --out",
+                "free some disk space, or specify another folder with `--out`",
             ),
             staging(folder, self.target) as staged,
         ):

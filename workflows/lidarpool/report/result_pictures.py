@@ -20,7 +20,7 @@ from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.vocabulary import PICTURES
-from lidarsim.base.words import did_you_mean, plural
+from lidarsim.base.words import alternatives, did_you_mean, plural
 from lidarsim.base.writing_progress import WritingProgress
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
@@ -72,22 +72,23 @@ def draw_pictures(
     longer = max(size)
     if shorter < MIN_SIDE or longer > MAX_SIDE or longer > MAX_RATIO * shorter:
         raise LidarError(
-            f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
-            f"{MIN_SIDE} to {MAX_SIDE} each, one at most twice the other, such as 1600 x 1000."
+            f"A picture cannot have {size[0]} x {size[1]} pixels. Its width and height must "
+            f"be from {MIN_SIDE} to {MAX_SIDE} pixels, and neither may be more than twice the "
+            "other. For example, use 1600 x 1000."
         )
     makers = _picture_makers(shown, cloud, size, color)
     for name in only:
         if name not in PICTURES:
-            advice = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
+            advice = did_you_mean(name, PICTURES) or f" Available pictures: {', '.join(PICTURES)}."
             raise LidarError(f"There is no picture {name!r}.{advice}")
         if name not in makers:
-            why = f"the cloud has no column {' or '.join(_LIGHT)}"
+            why = f"the cloud has no column {alternatives(_LIGHT)}"
             if name == "path":
-                why = "its run planned no path"
+                why = "no path was planned in its run"
             elif shown.coordinates == "sensor":
-                why = "points are in the axes of their sensors"
-            raise LidarError(f"There is no picture {name!r}: {why}.")
-    with explained(f"The folder {folder} cannot be made", "give another"):
+                why = "its points are in sensor coordinates"
+            raise LidarError(f"The picture {name!r} cannot be drawn, because {why}.")
+    with explained(f"The folder {folder} cannot be created", "specify another folder"):
         Path(folder).mkdir(parents=True, exist_ok=True)
     names = only or [*makers]
     for number, name in enumerate(names):
@@ -145,7 +146,10 @@ def _picture_makers(
             available = list(dict.fromkeys(c.name for c in columns_by_name.values()))
             raise LidarError(
                 f"{cloud} has no column {color!r}."
-                + (did_you_mean(color, columns_by_name) or f" There are {', '.join(available)}.")
+                + (
+                    did_you_mean(color, columns_by_name)
+                    or f" Available columns: {', '.join(available)}."
+                )
             )
         column = columns_by_name[color]
         return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
@@ -252,15 +256,15 @@ def _path_legend(unit: float, trial_count: int, obstacle_count: int) -> list[Lin
 
 def _verdict(best: PlannedPath, trials: Sequence[Floats]) -> str:
     """Return the caption: length, shortest possible length, collisions, and the longest trial."""
-    shortest = "discs cut the target off"
+    shortest = "the discs block every path to the target"
     if math.isfinite(best.shortest_m) and best.shortest_m > 0:
-        shortest = f"shortest possible {best.shortest_m:.2f} m ({best.excess:+.2%})"
+        shortest = f"shortest possible length {best.shortest_m:.2f} m ({best.excess:+.2%})"
     length = f"length {best.length_m:.2f} m · {shortest}"
     state = "collision-free" if best.clearance_m >= 0 else "enters a disc"
     best_of = f"best of {plural(len(trials), 'trial')}"
     if len(trials) > 1:  # equal paths are hidden by the best path
         longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in trials)
-        best_of += f", the longest {longest:.2f} m"
+        best_of += f", of which the longest is {longest:.2f} m"
     return f"{length.replace('-', '−')} · {state} · {best_of}"
 
 
@@ -318,13 +322,13 @@ def draw_stations(plan: StationPlan) -> Page:
     page = Page(SIZE)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLORS, 0.6))
     page.numbers(axes, shot)
-    names = ["covered", "not covered", "out of sight"] + ["not a target"] * (not plan.targets.all())
+    names = ["covered", "not covered", "not visible"] + ["not a target"] * (not plan.targets.all())
     page.legend([*zip(names, COLORS, strict=False)], "station")
     candidates = plural(len(plan.candidates), "place")
     targets = "" if plan.targets.all() else f" of {plural(int(plan.targets.sum()), 'object')}"
     page.title(
         plural(len(plan.stations), "station").capitalize(),
-        f"{plan.coverage[-1]:.1%} covered of what can be seen{targets} from {candidates}",
+        f"{plan.coverage[-1]:.1%} of the visible surface{targets} covered from {candidates}",
         plan.sight.sensor.model,
     )
     return page

@@ -23,14 +23,14 @@ _INDENT = "  "
 
 
 class LidarError(Exception):
-    """An error that the user can correct: bad input, a missing partition, a full disk.
+    """An error that the user can correct, such as invalid input or a full disk.
 
-    The message says in one or two lines what was given, what was expected and what to do. The
-    command prints the message without a traceback and exits with code 2. A line is cut in its
-    middle if it quotes a file at length. A long list of names has separate lines.
+    The message states in one or two lines what is wrong, what was expected, and what to do. The
+    command line prints the message without a traceback and exits with code 2. Very long lines are
+    shortened in the middle, and long lists of names are wrapped.
 
-    If a file does not exist, the error is also a FileNotFoundError. If an argument does not fit the
-    annotation of its parameter, it is also a ValueError.
+    If a file does not exist, the error is also a FileNotFoundError. If an argument does not match
+    the annotation of its parameter, it is also a ValueError.
     """
 
     def __init__(self, message: object = "") -> None:

@@ -38,7 +38,7 @@ class CloudLike(Protocol):
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """The columns beside the positions, in the order of files."""
+        """The columns apart from the positions, in the order in which files store them."""
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the points in order, from row `first` on, in clouds of at most `points`."""
@@ -71,28 +71,29 @@ class CloudDisplay:
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_fields
 class Cloud(CloudDisplay):
-    """Points of a survey, ordered by scan and ray.
+    """Point cloud of a survey, ordered by scan and ray.
 
-    Read a column as ``cloud["channel"]``, or as ``cloud.scan`` unless an attribute has its name.
-    Select points as ``cloud[:100]``, ``cloud[mask]`` or ``cloud[indices]``; ``np.asarray(cloud)``
-    is their positions, float64 (n, 3).
+    Read a column with ``cloud["channel"]``, or with ``cloud.scan`` if there is no attribute of that
+    name. Select points with ``cloud[:100]``, ``cloud[mask]`` or ``cloud[indices]``.
+    ``np.asarray(cloud)`` returns the positions as float64 (n, 3).
 
     Parameters
     ----------
     positions
-        float32 or float64 (n, 3), meters, world coordinates.
+        float32 or float64 (n, 3): world coordinates in meters.
     columns
-        {name: (n,)}: the other columns, of `lidarsim.columns.table` or custom ones.
+        {name: (n,)}: the other columns, from `lidarsim.columns.table` or custom.
     custom_columns
-        Descriptions of the columns that are not in the table.
+        Descriptions of the columns that are not in `lidarsim.columns.table`.
     sweeps
-        Function that returns the sweeps of the survey, for `save_cloud`; clouds of a `Result` have
-        such a function.
+        Function that returns the sweeps of the survey, which `save_cloud` requires for some
+        formats. The clouds of a `Result` have such a function.
 
     Raises
     ------
     LidarError
-        If the lengths differ, a position is not finite, or a value does not fit its column.
+        If the lengths differ, a position is not finite, or a value does not fit the type of its
+        column.
     """
 
     positions: AnyFloats
@@ -165,7 +166,7 @@ class Cloud(CloudDisplay):
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """The columns beside the positions, in the order of files."""
+        """The columns apart from the positions, in the order in which files store them."""
         known_columns = TABLE | {column.name: column for column in self.custom_columns}
         return tuple(
             known_columns.get(name) or Column(name, array.dtype.str, "", "")
@@ -188,7 +189,7 @@ class Cloud(CloudDisplay):
     def waveforms(self) -> Waveforms:
         """Recorded waveforms of the points.
 
-        LidarError if the survey, without `waveform_samples`, has recorded no waveforms.
+        Raises LidarError if the survey recorded no waveforms (see `waveform_samples`).
         """
         if not self.has_waveforms:
             raise LidarError(
@@ -199,14 +200,14 @@ class Cloud(CloudDisplay):
 
     @property
     def bounds(self) -> AnyFloats:
-        """Lowest and highest coordinates, (2, 3), meters, or zeros for an empty cloud."""
+        """Minimum and maximum coordinates in meters, or zeros for an empty cloud. Shape (2, 3)."""
         if not len(self):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
 
     @checked
     def to_dataframe(self, library: Literal["pandas", "polars"] = "pandas") -> Any:
-        """Return a DataFrame of pandas or polars with all columns.
+        """Return a pandas or polars DataFrame with all columns.
 
         Raises
         ------
@@ -217,7 +218,7 @@ class Cloud(CloudDisplay):
         return import_module(library).DataFrame(self.by_name)
 
     def head(self, points: int = SHOWN_POINTS) -> Cloud:
-        """Return the first points, or the whole of a smaller cloud."""
+        """Return the first points, or the entire cloud if it is smaller."""
         return self[:points]
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:

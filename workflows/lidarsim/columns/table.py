@@ -35,38 +35,37 @@ _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 @dataclass(frozen=True)
 @checked_fields
 class Column:
-    """A quantity of every point of a cloud.
+    """A column of a point cloud, with one value per point.
 
     Parameters
     ----------
     name
-        A Python identifier; also used in files, unless there is a `file_name`.
+        A Python identifier. Files use it as well, unless `file_name` is set.
     dtype
-        NumPy's name of the type of a value.
+        NumPy dtype of the values, for example "float32".
     unit
-        Unit of the values; "" for none.
+        Unit of the values; "" if they have no unit.
     meaning
-        Description in a few words without a full stop.
+        Description in a few words, without a period.
     source
-        Name of an attribute of the returns of a batch
-        (`lidarsim.simulator.points.batch_points.BatchPoints`), or a function that computes the
-        column from the returns: an array (n,), a value for each point. The function runs on the
-        worker that casts the rays. By default the attribute with the name of the column.
+        Name of an attribute of `lidarsim.simulator.points.batch_points.BatchPoints`, the returns in
+        a batch, or a function that computes the column from this object as an array of shape
+        (n,). The function runs on the worker that casts the rays. By default, the attribute with
+        the name of the column is used.
     coordinates
-        Coordinate system of the values: "world", "sensor", or "" for none.
+        Coordinate system of the values: "world", "sensor", or "" if the values are not coordinates.
     kind
-        Display of the values: "number" on a color scale, "label" with a color for each value.
+        How the values are displayed: "number" uses a color scale, and "label" one color per value.
     file_name
         Usual name of the column in files.
     scale
-        Color scale of numbers. "linear", for positions, angles, times and numbers of things; or
-        "logarithmic", for energies and the like: where the values differ by large factors, equal
-        factors have equal distances on the scale.
+        Color scale for numbers: "linear" for positions, angles, times and counts, or "logarithmic"
+        for quantities that vary by large factors, such as energies.
 
     Raises
     ------
     LidarError
-        If the name is not an identifier or NumPy has no such type.
+        If the name is not an identifier, or if NumPy does not support the dtype.
     """
 
     name: str

@@ -90,21 +90,22 @@ def reflectances() -> dict[str, Measured]:
 @dataclass(frozen=True)
 @checked_fields
 class Material:
-    """Optical properties and class of surfaces.
+    """Optical properties and semantic class of surfaces.
 
-    Of several entries for a face, the first counts.
+    If several entries apply to a face, the first one is used.
 
-    An entry applies to objects by their names, to faces by the names of their materials in the
-    scene's files, or to faces by both.
+    An entry selects objects by name, faces by the name of their material in the scene file, or
+    faces by both.
 
-    Reflectance is at the sensor's wavelength, equal in all directions but for a gloss. Of light
-    that is not scattered, a share is mirrored; the rest passes, or is lost with "none".
+    The reflectance is the diffuse reflectance at the wavelength of the sensor. A share of the light
+    that is not scattered is reflected specularly. The rest is transmitted, or absorbed if
+    `transparent` is "none".
 
     Raises
     ------
     LidarError
-        If the entry has neither objects nor material, a value is outside its range, the table of
-        reflectances has no such spectrum, or two values contradict each other.
+        If neither `objects` nor `material` is set, a value is out of range, the spectrum is
+        unknown, or two values contradict each other.
     """
 
     objects: Annotated[

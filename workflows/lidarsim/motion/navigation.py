@@ -59,16 +59,17 @@ Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 @dataclass(frozen=True)
 @checked_fields
 class Imu:
-    """An inertial measurement unit on the carrier.
+    """An inertial measurement unit on the platform.
 
-    Without arguments, the unit is ideal.
+    Without arguments, the unit has no errors.
 
-    `mount` is its pose in the carrier frame. Noise is named and measured as in kalibr's `imu.yaml`.
+    `mount` is its pose in the platform frame. The noise parameters have the names and units of
+    `imu.yaml` in kalibr.
 
     Raises
     ------
     LidarError
-        If a number is outside its range.
+        If a number is out of range.
     """
 
     rate_hz: Annotated[
@@ -104,16 +105,16 @@ class Imu:
 @dataclass(frozen=True)
 @checked_fields
 class Gnss:
-    """A GNSS receiver on the carrier.
+    """A GNSS receiver on the platform.
 
-    Without arguments, the receiver is ideal.
+    Without arguments, the receiver has no errors.
 
-    `mount` is the pose of its antenna in the carrier frame.
+    `mount` is the pose of its antenna in the platform frame.
 
     Raises
     ------
     LidarError
-        If a number is outside its range.
+        If a number is out of range.
     """
 
     rate_hz: Annotated[float, about("positions a second", ge=0.0001, le=1000)] = 10.0
@@ -152,7 +153,9 @@ class Gnss:
 @dataclass(frozen=True)
 @checked_fields
 class Navigation:
-    """Instruments that measure the carrier's motion, whose samples are written beside the cloud.
+    """Instruments that measure the motion of the platform.
+
+    Their samples are written next to the cloud.
 
     Parameters
     ----------
@@ -162,7 +165,7 @@ class Navigation:
     Raises
     ------
     LidarError
-        If a number is outside its range.
+        If a number is out of range.
     """
 
     imu: Annotated[

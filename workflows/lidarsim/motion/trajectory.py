@@ -53,9 +53,10 @@ Beyond = Literal["refuse", "hold", "absent"]
 @dataclass(frozen=True)
 @checked_fields
 class Pose:
-    """Position and rotation of a sensor, in scene coordinates.
+    """Position and rotation of a sensor in scene coordinates.
 
-    Angles are in degrees, in aerospace order.
+    The position is in meters. The angles are yaw, pitch and roll in degrees, applied in the
+    aerospace order.
     """
 
     position: Annotated[tuple[float, float, float], written_as(Triple), about("x, y and z, meters")]
@@ -68,7 +69,7 @@ class Pose:
 
     @property
     def rotation(self) -> Floats | None:
-        """Rotation from the sensor frame to the scene frame, (3, 3), or None without rotation."""
+        """Rotation (3, 3) from the sensor frame to the scene frame, or None without rotation."""
         if not (self.yaw_deg or self.pitch_deg or self.roll_deg):
             return None
         return rotations_of(np.array([self.yaw_deg, self.pitch_deg, self.roll_deg]))
@@ -79,7 +80,7 @@ class Pose:
         return np.eye(3) if self.rotation is None else self.rotation
 
     def compose(self, mount: Pose) -> Pose:
-        """Return the scene pose of an instrument whose pose in this pose's frame is `mount`."""
+        """Return the scene pose of an instrument that is mounted at `mount` in this pose."""
         if mount == CENTER:
             return self
         rotation = self.rotation_matrix
@@ -291,43 +292,45 @@ class StaticPose:
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Track:
-    """Poses at times, with a straight or smooth path in between: a single station.
+    """Timed poses with a linear or smooth path between them.
+
+    A track is a trajectory with a single station.
 
     Parameters
     ----------
     times_s
-        float64 (k,): times of the poses, seconds, ascending; by any clock.
+        float64 (k,): times of the poses in seconds, ascending, with an arbitrary zero.
     positions
-        float64 (k, 3): meters, in scene coordinates.
+        float64 (k, 3): positions in scene coordinates, in meters.
     quaternions
-        float64 (k, 4): x, y, z, w of the rotations from the carrier frame to the scene frame, of
-        unit length within 1e-3. None for a level carrier that faces its direction of travel, the
-        tangent of its path. On straight lines it turns at corners, within 1 m before and after
-        them, or from the middle of one line to the middle of the next if they are shorter than
-        2 m. A carrier that stands still, or moves vertically, keeps its heading and turns to the
-        next one in the last second.
+        float64 (k, 4): rotations from the platform frame to the scene frame, as x, y, z, w of
+        quaternions whose length is 1 within 1e-3. If None, the platform is level and faces its
+        direction of travel, which is the tangent of its path. On a linear path, it turns within
+        1 m before and after each corner, or from the center of one segment to the center of the
+        next if they are shorter than 2 m. A platform that is stationary or moves vertically keeps
+        its heading and turns to the next heading in the last second.
     smooth
-        Positions and quaternions follow cubic splines, whose accelerations do not jump, and stand
-        still between equal poses. Otherwise positions follow straight lines, and the carrier
-        rotates evenly about one axis from each pose to the next (Shoemake, 1985).
+        If True, positions and quaternions follow cubic splines with continuous accelerations, and
+        they are constant between equal poses. Otherwise, positions follow straight lines, and the
+        platform rotates at a constant rate about one axis between two poses (Shoemake, 1985).
     start_s
-        Start of the station, by the clock of `times_s`; by default the first time.
+        Start of the station on the time scale of `times_s`; by default the first time.
     duration_s
-        Duration of the station; by default until the last time.
+        Duration of the station in seconds; by default until the last time.
     beyond
-        Before the first and after the last time "refuse" raises an error. An actor stays at its
-        first or last pose with "hold", and is not in the scene with "absent".
+        Behavior before the first and after the last time: "refuse" raises an error, "hold" keeps an
+        actor at its first or last pose, and "absent" removes an actor from the scene.
     yaw_deg, pitch_deg, roll_deg
-        Angles of the poses in place of `quaternions`, as in `Pose`: (k,), or one angle for all
-        poses, degrees. Pitch and roll need yaw; they are zero by default. The track keeps them as
-        `quaternions`.
+        Angles of the poses in degrees, as in `Pose` and as an alternative to `quaternions`: (k,),
+        or one angle for all poses. Pitch and roll are zero by default and require yaw. The track
+        stores the angles as `quaternions`.
 
     Raises
     ------
     LidarError
-        If there are fewer than two poses, a number is not finite, times do not ascend, a
-        quaternion is invalid, or the station is not within the times. If there are both
-        quaternions and angles, or pitch or roll without yaw.
+        If there are fewer than two poses, a number is not finite, the times do not increase, a
+        quaternion is invalid, the station is outside the times, both quaternions and angles are
+        passed, or pitch or roll are passed without yaw.
 
     Examples
     --------
@@ -368,23 +371,25 @@ class Track:
     def from_matrices(
         cls, times_s: Floats, matrices: Floats, beyond: Literal["refuse", "hold"] = "refuse"
     ) -> Sequence[Track]:
-        """Return the straight tracks of k bodies, whose poses are computed all at once.
+        """Return linear tracks of k bodies from matrices.
 
-        Time 0 of the tracks is 0 by the clock of `times_s`, even if that is outside the times.
+        The poses of all tracks are computed together.
+
+        Time 0 of the tracks is 0 on the time scale of `times_s`, even if this is outside the times.
 
         Parameters
         ----------
         times_s
-            (s,): times of the poses of all tracks, seconds, ascending; at least two.
+            (s,): times of the poses of all tracks in seconds, ascending; at least two.
         matrices
-            (k, s, 4, 4): rigid transforms, which are not checked.
+            (k, s, 4, 4): rigid transforms, which are not validated.
         beyond
-            As of `Track`.
+            As in `Track`.
 
         Raises
         ------
         LidarError
-            If the times are too few, or do not ascend.
+            If there are fewer than two times, or if the times do not increase.
         """
         times = np.asarray(times_s, np.float64)
         if len(times) < 2:
@@ -466,7 +471,7 @@ class Track:
 
     @property
     def duration_ns(self) -> float:
-        """Duration of the station, nanoseconds."""
+        """Duration of the station in nanoseconds."""
         assert self.duration_s is not None  # set above
         return self.duration_s * 1e9
 
@@ -485,7 +490,7 @@ class Track:
         return _FIRING_S if self.beyond == "refuse" else np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
-        """Return the pose at a time since the start of the station, nanoseconds."""
+        """Return the pose at a time in nanoseconds since the start of the station."""
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
         return Pose.from_rotation(positions[0], rotations[0])
 

@@ -79,55 +79,56 @@ def load_trajectory(
     duration_s: Duration | None = None,
     beyond: Beyond = "refuse",
 ) -> Track:
-    """Read the trajectory of a carrier.
+    """Read the trajectory of a platform from a file.
 
     Parameters
     ----------
     path
-        TUM (rows of time, x, y, z, qx, qy, qz, qw); KITTI (rows of a 3 x 4 matrix); a table with
-        a header, separated by commas, semicolons, tabs or spaces, as EuRoC's data.csv; a folder
-        «oxts» of KITTI; or a bag of ROS 2 (.mcap, .db3 or its folder), which needs
-        the extra ``ros``. A table has time_s (or time_ns), x, y, z, and qx, qy, qz, qw, or
-        yaw_deg (or heading_deg, clockwise from y) with pitch_deg and roll_deg; without rotations
-        the carrier faces its direction of travel.
+        A TUM file (rows of time, x, y, z, qx, qy, qz, qw); a KITTI file (rows of a 3 x 4 matrix); a
+        table with a header, separated by commas, semicolons, tabs or spaces, such as data.csv of
+        EuRoC; an oxts folder of KITTI; or a ROS 2 bag (.mcap, .db3 or its folder), which requires
+        the extra ``ros``. A table contains time_s (or time_ns), x, y, z, and optionally qx, qy,
+        qz, qw, or yaw_deg (or heading_deg, clockwise from y) with pitch_deg and roll_deg. Without
+        rotations, the platform faces its direction of travel.
     format
-        "tum", "kitti", "csv", "oxts" or "bag"; by default by the content.
+        "tum", "kitti", "csv", "oxts" or "bag"; by default determined from the content.
     times
-        For a KITTI file, or a file of rows of oxts: the file with the seconds of its rows, or with
-        their dates, as KITTI's timestamps.txt.
+        For a KITTI file or a file with oxts rows, the file with the times of its rows, in seconds
+        or as dates, such as timestamps.txt of KITTI.
     time_unit
-        Unit of the times in the file, "s", "ms", "us" or "ns", if it is not the unit that the
-        header or the format states. Without `time_unit`, times of 1e11 s and more, and times that
-        span more than a year, are refused.
+        Unit of the times in the file, "s", "ms", "us" or "ns", if it differs from the unit in the
+        header or of the format. Without `time_unit`, times of 1e11 s or more, and times that span
+        more than a year, raise an error.
     columns
-        For a table, {name as above: name in the file}, if the names differ.
+        For a table with other column names, a mapping {name as above: name in the file}.
     ignore
-        For a table, names of columns to leave out, with * and ?; a column that is neither used nor
-        named here is an error.
+        For a table, names of columns to skip; * and ? are wildcards. Any other unused column raises
+        an error.
     topic
-        For a bag with several: a topic of Odometry, PoseStamped, PoseWithCovarianceStamped,
-        TransformStamped or NavSatFix; "/tf:FRAME" for a frame; or two topics, of NavSatFix and of
-        the Imu with its orientation, separated by a space.
+        For a bag with several topics, a topic with Odometry, PoseStamped,
+        PoseWithCovarianceStamped, TransformStamped or NavSatFix messages; "/tf:FRAME" for a frame;
+        or a NavSatFix topic and an Imu topic with orientations, separated by a space.
     origin
-        For latitudes and longitudes: latitude and longitude of the world's zero, degrees, and its
-        height, meters. By default the first position.
+        For geographic coordinates, latitude and longitude of the world origin in degrees, and its
+        height in meters. By default, the first position.
     camera_axes
-        Whether to convert poses from a camera frame (z ahead, y down) to a carrier frame (x ahead,
-        z up); by default for KITTI.
+        Whether to convert poses from a camera frame (z forward, y down) to a platform frame (x
+        forward, z up). By default, KITTI poses are converted.
     offset_s
-        Added to all times.
+        Offset in seconds that is added to all times.
     smooth
-        Whether the carrier follows smooth curves (`Track`).
+        Whether the platform follows smooth curves, as in `Track`.
     start_s, duration_s
-        Start and duration of the survey within the times of the file; by default all of them.
+        Start and duration of the survey in seconds, within the times of the file; by default, the
+        entire trajectory is used.
     beyond
-        Use of the trajectory before its first and after its last time (`Track`).
+        Behavior before the first and after the last time, as in `Track`.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, has content that is not understood, or is invalid; the message
-        names the file.
+        If the file cannot be read, is invalid, or contains unsupported data. The message contains
+        the name of the file.
     """
     path = Path(path)
     timing = TimeOptions(times, time_unit)

@@ -20,28 +20,29 @@ from .shots import Shots, check_columns
 
 
 class Packets:
-    """The datagrams that a sensor sends, sweep by sweep, of clouds from `Scanner.sweep`.
+    """Encoder of clouds from `Scanner.sweep` as the datagrams that a sensor sends.
 
-    The poses are the caller's, and may jump: packets hold ranges and angles, not poses. Shots that
-    fill no packet are sent with the next sweep. All sweeps are encoded in the order of their
-    numbers.
+    Poses do not have to be continuous, because packets contain ranges and angles but no poses.
+    Shots that do not fill a packet are sent with the next sweep. Sweeps must be encoded in the
+    order of their numbers.
 
     Parameters
     ----------
     sensor
-        The lidar, or the lidar `Mounted` on a carrier.
+        The lidar, or a `Mounted` lidar on a platform.
     name
-        Name of the sensor, the source of its serial number. A `Mounted` has a name already.
+        Name of the sensor, from which its serial number is derived. A `Mounted` sensor already has
+        a name.
     returns
-        Sub-rays of a beam, and the choice of its reported returns, as of the scanner.
+        Sub-rays and reported returns, as for the scanner.
     start
-        Date and time of time 0 of the scanner, as in `Survey`; then stamps are of a clock that a
-        receiver sets, or that follows PTP.
+        Date and time at time 0 of the scanner, as in `Survey`. If it is set, the timestamps are
+        those of a clock that is synchronized by a GNSS receiver or PTP.
 
     Raises
     ------
     LidarError
-        If the sensor has no packets, or the packets cannot hold its returns.
+        If the sensor has no packet format, or if the format cannot store its returns.
 
     Examples
     --------
@@ -82,7 +83,7 @@ class Packets:
 
     @classmethod
     def of_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
-        """Return the packets of a scanner's sensor, with `start` as above."""
+        """Return an encoder for the sensor of a scanner, with `start` as above."""
         carried = scanner.survey.carried[0]
         return cls(carried, returns=scanner.survey.returns_each[0], start=start)
 
@@ -108,30 +109,29 @@ class Packets:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns that the scanner's clouds must have."""
+        """Columns that the clouds of the scanner must contain."""
         return ("ray", "range", *self.encoder.columns)
 
     @checked
     def encode(
         self, sweep: Cloud, *, number: SweepNumber | None = None, start_s: StartSeconds = None
     ) -> list[Datagrams]:
-        """Return the datagrams that a sweep fills, a group for each port.
+        """Return the datagrams of a sweep, with one group per port.
 
         Parameters
         ----------
         sweep
-            The cloud that `Scanner.sweep` has returned for this number and start.
+            Cloud that `Scanner.sweep` returned for this number and start.
         number
-            Number of the revolution, or frame; by default one more than the number of the last
-            sweep, or
-            0. `Scanner.sweep` needs the same.
+            Number of the revolution or frame, which must be the same as in `Scanner.sweep`. By
+            default, it is the number after that of the last sweep, starting at 0.
         start_s
-            Start of the revolution, as in `Scanner.sweep`.
+            Start of the revolution in seconds, as in `Scanner.sweep`.
 
         Raises
         ------
         LidarError
-            If the cloud lacks a column, or is of another sweep.
+            If the cloud lacks a column, or if it belongs to another sweep.
         """
         number = self._next_number if number is None else number
         steps = self._sensor.steps_of_revolution(number)
@@ -151,9 +151,9 @@ class Packets:
         return datagrams
 
     def finish(self) -> list[Datagrams]:
-        """Return the datagrams of the shots that are left after the last sweep."""
+        """Return the datagrams of the remaining shots after the last sweep."""
         return self.encoder.finish()
 
     def files(self) -> Mapping[str, bytes]:
-        """Return the files that readers need beside the packets, {suffix: content}."""
+        """Return the files that readers require in addition to the packets, {suffix: content}."""
         return self.encoder.files()

@@ -53,20 +53,22 @@ class Actor:
     Parameters
     ----------
     mesh
-        Triangles in the frame of the actor (x ahead, z up), and the name of the actor.
+        Mesh in the frame of the actor (x forward, z up). Its name is the name of the actor.
     trajectory
-        Poses of the actor's frame, in the scene's local coordinates; the only station starts with
-        the survey. By default the actor is static at zero, until `Scanner.move` moves it.
+        Poses of the actor in local scene coordinates. The trajectory has a single station, which
+        starts with the survey. By default, the actor stays at the origin until it is moved by
+        `Scanner.move`.
     offset_s
-        Time in the mesh's animation at the start of the survey, or, if the animation is played by
-        speed, at the start of the trajectory, seconds.
+        Time in the animation of the mesh at the start of the survey, in seconds. If the speed of
+        the actor controls the animation, it is the time at the start of the trajectory.
     spray
-        Whether the actor raises spray while it moves, if the weather has spray.
+        Whether the actor raises spray while it moves. It has an effect only if the weather includes
+        spray.
 
     Raises
     ------
     LidarError
-        If the mesh has voxels, or the first rotation of the trajectory mirrors or deforms.
+        If the mesh contains voxels, or if the first rotation of the trajectory mirrors or deforms.
     """
 
     mesh: SceneMesh
@@ -94,7 +96,7 @@ class Actor:
             check_rotations(np.asarray(rotations, np.float64))
 
     def following(self, trajectory: Trajectory) -> Actor:
-        """Return the actor on another trajectory.
+        """Return a copy of the actor with another trajectory.
 
         Raises
         ------
@@ -115,7 +117,7 @@ class Actor:
 
     @property
     def bounds(self) -> Floats:
-        """Corners of the actor's box in its frame, (2, 3), meters, in all poses if it deforms."""
+        """Corners of the bounding box of all poses in the frame of the actor, in meters, (2, 3)."""
         return (self.mesh.animation or self.mesh).bounds
 
     def placed(self, time_ns: float) -> SceneMesh:
@@ -292,14 +294,14 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
 
 @checked
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
-    """Return the mesh of a box, with its origin in the middle of its underside.
+    """Return the mesh of a box whose origin is the center of its bottom face.
 
     Parameters
     ----------
     name
         Name of the object.
     size_m
-        Length along x, width along y and height along z, meters.
+        Length along x, width along y and height along z, in meters.
 
     Examples
     --------

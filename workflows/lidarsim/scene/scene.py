@@ -44,46 +44,49 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Scene:
-    """Triangles to scan, and the object of each triangle.
+    """A scene of triangles that belong to named objects.
 
-    Coordinates are local: world = `vertices` + `origin`. The origin is zero unless the scene
-    lies farther than 10 km from zero (georeferenced data); then the origin is a point of whole
-    meters in the scene's middle, so that single precision is enough for the local coordinates.
+    Coordinates are local, so world coordinates are `vertices` + `origin`. The origin is zero unless
+    the scene is more than 10 km away from zero, as in georeferenced data. In that case, the origin
+    is near the center of the scene, in integer meters, so that single precision is sufficient for
+    local coordinates.
 
     Parameters
     ----------
     vertices
-        float64 (v, 3), meters, Z-up, local.
+        float64 (v, 3): local coordinates in meters, with z pointing up.
     faces
-        int32 (f, 3), indices into `vertices`; f >= 1 unless there are instances.
+        int32 (f, 3): indices into `vertices`. At least one face is required, unless there are
+        instances.
     face_object
-        int32 (f,), for each triangle the index of its object in `names`.
+        int32 (f,): index of the object of each triangle in `names`.
     names
-        Names of the static objects, without duplicates; an object's number is its index.
-        `object_names` has the actors, too.
+        Names of the static objects, without duplicates. The number of an object is its index.
+        `object_names` also contains the actors.
     origin
-        float64 (3,), whole meters, plus `world_origin`.
+        float64 (3,): origin in integer meters, plus `world_origin`.
     world_origin
-        float64 (3,), meters: what `georeferenced` has added to `origin`. Without it, world
-        coordinates are as in the scene's files.
+        float64 (3,): offset in meters that `georeferenced` added to `origin`. Without it, world
+        coordinates are the coordinates in the scene files.
     actors
-        Moving objects, numbered after the static objects; their meshes are not in `faces`.
+        Moving objects, numbered after the static objects. `faces` does not contain their meshes.
     instances
         Static triangles that are not in `faces`: parts of meshes that are stored once and placed
-        any number of times, or that have a mask (transparent pixels) or voxels (leaves). The
-        triangles are numbered after `faces`, instance by instance; the triangles of actors follow.
+        any number of times, or parts with a mask (transparent pixels) or voxels (leaves). The
+        triangles are numbered after `faces`, instance by instance, followed by the triangles of
+        actors.
     colors
-        Colors of `faces`, or None; parts of instances and meshes of actors have their own.
+        Colors of `faces`, or None. Instances and actors have their own colors.
     materials
-        Names of the materials of the static objects' faces in the scene's files, or None.
+        Names of the materials of static faces in the scene files, or None.
     epsg
-        EPSG code of the coordinate system of the world coordinates, if the scene's file states it.
-        Pass it to `Survey` to have it written.
+        EPSG code of the world coordinates, if the scene file states it. Pass it to `Survey` to
+        write it to the results.
 
     Raises
     ------
     LidarError
-        If there is no triangle, or the arrays do not fit together.
+        If there are no triangles, or if the arrays are inconsistent.
     """
 
     vertices: Floats
@@ -151,7 +154,7 @@ class Scene:
 
     @classmethod
     def seed(cls) -> Scene:
-        """Return the scene of the demo: six surfaces of revolution, 76,800 triangles.
+        """Return the demo scene: six surfaces of revolution with 76,800 triangles.
 
         Examples
         --------
@@ -169,55 +172,56 @@ class Scene:
         same_names: SameNames = "number",
         **options: Any,
     ) -> Scene:
-        """Read a scene file, such as .glb, .obj, .usd, CityJSON, .xodr, .ifc, or a raster (.tif).
+        """Read a scene from a file, such as .glb, .obj, .usd, CityJSON, .xodr, .ifc or .tif.
 
         Parameters
         ----------
         path
-            The file; its objects keep their names.
+            Path of the scene file. Objects keep their names.
         same_names
-            With "number", objects of the same name get a number: Wall, Wall.2. With "join", all
-            objects of a name are one object.
+            How to treat objects with the same name: "number" appends numbers (Wall, Wall.2), and
+            "join" merges them into one object.
         **options
-            Options of all formats, see below, and options that the format of the file alone has, by
-            the names of `scene.files` in scenarios: `storeys` of a building (.ifc), `step_m` of a
-            raster. `epsg`, the code of the coordinate system of a transformed raster, is
-            `world.epsg` there.
+            Options for all formats, which are listed below, and options for specific formats, with
+            the names of `scene.files` in scenarios, such as `storeys` for buildings (.ifc) and
+            `step_m` for rasters. The option `epsg`, the coordinate system to which a raster is
+            transformed, is called `world.epsg` in scenarios.
 
         Other Parameters
         ----------------
         unit
-            Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes the unit
-            that the file states (.dae, .3mf, .usd, .glb and .gltf), else meters.
+            Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. The default is the
+            unit that the file states (.dae, .3mf, .usd, .glb and .gltf), otherwise meters.
         up_axis
-            Axis of the file that points up: x, y or z. None takes the axis that the file (.dae,
-            .usd) or its format states (y of .glb and .gltf), else z.
+            Axis that points up in the file: x, y or z. The default is the axis that the file (.dae,
+            .usd) or its format (y for .glb and .gltf) specifies, otherwise z.
         transform
-            Placement of the mesh in the world, in meters, after unit and up axis: a
-            `lidarsim.scene.transform.Transform`.
+            Placement of the mesh in the world in meters, as a `lidarsim.scene.transform.Transform`
+            that is applied after `unit` and `up_axis`.
         opacity
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
-            .obj, .usd). With "ignore", triangles are solid, and no image is read.
+            .obj, .usd). With "ignore", all triangles are opaque, and no images are read.
         colors
             Whether to read base colors and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON,
-            .xodr and .ifc without images), and colors of vertices (.glb, .gltf, .obj, .ply, .off,
+            .xodr and .ifc without images), and vertex colors (.glb, .gltf, .obj, .ply, .off,
             .usd).
         materials
-            Whether faces keep the names of their materials (.glb, .gltf, .obj, .dae, .3mf, .usd,
-            CityJSON, .xodr, .ifc), so that `Material` may choose them.
+            Whether to store the material names of faces (.glb, .gltf, .obj, .dae, .3mf, .usd,
+            CityJSON, .xodr, .ifc), so that `Material` can select them.
         assets
-            A folder: further files that the scene file names are read from this folder and from
-            the folder of the scene file, and from the folders below. Of a world of Gazebo, models
-            are looked for in it first.
+            Folder with further files to which the scene file refers. Files are read from this
+            folder, from the folder of the scene file, and from their subfolders. The models of a
+            Gazebo world are searched in this folder first.
 
         Returns
         -------
-        The scene. Objects of .usd that move are actors of the scene, if it has static objects.
+        The scene. Moving objects in a .usd file become actors if the scene has static objects.
 
         Raises
         ------
         LidarError
-            If the file cannot be read completely, has no triangles, or lacks an option.
+            If the file cannot be read completely, contains no triangles, or requires an option that
+            is not set.
         """
         if options.get("animation") is not None:
             raise LidarError(
@@ -254,18 +258,18 @@ class Scene:
     @classmethod
     @checked
     def from_meshes(cls, meshes: Iterable[SceneMesh | SceneInstance]) -> Scene:
-        """Make a scene of meshes, with an object for each mesh.
+        """Create a scene with one object per mesh.
 
         Parameters
         ----------
         meshes
-            Meshes in world coordinates, or instances of meshes, whose triangles are stored once.
-            Duplicate names are numbered: Shelf, Shelf.2.
+            Meshes in world coordinates, or instances of meshes, which store their triangles only
+            once. Duplicate names are numbered (Shelf, Shelf.2).
 
         Raises
         ------
         LidarError
-            If there are no meshes, or more vertices or triangles than 32 bits can count.
+            If there are no meshes, or if the number of vertices or triangles exceeds 32 bits.
         """
         objects = list(meshes)
         _check_objects(objects)
@@ -302,12 +306,14 @@ class Scene:
         )
 
     def with_actors(self, actors: Iterable[Actor]) -> Scene:
-        """Return a scene of the same triangles, which are not copied, with new actors.
+        """Return a scene with the same triangles and new actors.
+
+        The triangles are not copied.
 
         Raises
         ------
         LidarError
-            If `actors` holds anything but actors.
+            If `actors` contains anything other than actors.
         """
         actors = tuple(actors)
         for actor in actors:
@@ -320,10 +326,11 @@ class Scene:
         return scene
 
     def georeferenced(self, world_origin: ArrayLike) -> Scene:
-        """Return the same scene at another place of the world.
+        """Return the same scene at another location in the world.
 
-        Local coordinates stay, and so do the poses of surveys; points that are written have
-        `world_origin` (3,), meters, added to the coordinates of the scene's files. Zero undoes it.
+        Local coordinates and the poses of surveys do not change. The offset `world_origin` (3,), in
+        meters, is added to the coordinates in the scene files when points are written. An offset
+        of zero restores the original location.
 
         Examples
         --------
@@ -352,9 +359,9 @@ class Scene:
 
     @property
     def object_names(self) -> tuple[str, ...]:
-        """Names of all objects, first the static objects, then the actors.
+        """Names of all objects, static objects first, followed by actors.
 
-        The column `object` holds indices into these names.
+        The column `object` contains indices into these names.
         """
         if not self.actors:
             return self.names
@@ -389,7 +396,7 @@ class Scene:
     def material_names(self) -> tuple[str, ...]:
         """Distinct names of all materials of faces.
 
-        The column `material` holds indices into these names.
+        The column `material` contains indices into these names.
         """
         return tuple(name for name in dict.fromkeys(self.surface_kinds.material) if name)
 

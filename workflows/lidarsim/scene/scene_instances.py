@@ -31,23 +31,25 @@ BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class SceneInstance:
-    """A mesh placed in the world, where any number of instances share a mesh.
+    """A mesh that is placed in the world.
+
+    Any number of instances can share a mesh.
 
     Parameters
     ----------
     mesh
-        The mesh, in its own frame.
+        The mesh in its own frame.
     transform
-        Pose of the mesh's frame in world coordinates. Or a matrix (4, 4) from the mesh's
-        coordinates to the world's, meters: it may rotate, move, mirror and scale, also unevenly.
-        Or a `lidarsim.scene.transform.Transform`.
+        Pose of the mesh frame in world coordinates; or a matrix (4, 4) from mesh to world
+        coordinates in meters, which may rotate, translate, mirror and scale, also non-uniformly;
+        or a `lidarsim.scene.transform.Transform`.
     name
         Name of the object; by default the name of the mesh.
 
     Raises
     ------
     LidarError
-        If the transform is not affine or finite, or flattens the mesh.
+        If the transform is not affine, not finite, or not invertible.
     """
 
     mesh: SceneMesh
@@ -66,12 +68,14 @@ class SceneInstance:
 
     @classmethod
     def from_matrices(cls, mesh: SceneMesh, transforms: Floats, name: str) -> list[SceneInstance]:
-        """Return instances of a mesh at matrices (n, 4, 4), which are checked all at once.
+        """Return instances of a mesh at matrices (n, 4, 4).
+
+        The matrices are validated together.
 
         Raises
         ------
         LidarError
-            If `SceneInstance` refuses one of the matrices.
+            If a matrix is not valid for a `SceneInstance`.
         """
         linear = transforms[:, :3, :3]
         offsets = transforms[:, :3, 3]

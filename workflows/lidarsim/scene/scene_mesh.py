@@ -65,26 +65,25 @@ class Voxels:
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class SceneMesh:
-    """Triangles of an object, in world coordinates.
+    """Triangle mesh of an object in world coordinates.
 
     Parameters
     ----------
     name
         Name of the object.
     vertices
-        float64 (v, 3), meters, Z-up, finite.
+        float64 (v, 3): finite coordinates in meters, with z pointing up.
     faces
-        int64 (f, 3), indices into `vertices`, at least one face.
+        int64 (f, 3): indices into `vertices`; at least one face.
     cutouts
-        Cutouts of the last faces, cutout by cutout.
+        Cutouts of the last faces, in the order of these faces.
     colors
         Colors of the faces (`lidarsim.scene.colors.Colors`), or None.
     voxels
-        Densities of leaves within the surface of the mesh, which is closed then and has no
-        cutouts.
+        Leaf densities within the surface of the mesh, which must be closed and have no cutouts.
     animation
-        Motion of the vertices if an actor has the mesh; elsewhere the mesh is static, as
-        `vertices`.
+        Motion of the vertices, which applies if the mesh belongs to an actor. Otherwise, the mesh
+        is static and has the shape given by `vertices`.
     materials
         Names of the materials of the faces (`lidarsim.scene.face_materials.FaceMaterials`), or
         None.
@@ -92,8 +91,8 @@ class SceneMesh:
     Raises
     ------
     LidarError
-        If there is no triangle, a shape is wrong, a coordinate is NaN or infinite, or a face
-        refers to a vertex that does not exist.
+        If there are no triangles, a shape is wrong, a coordinate is not finite, or a face refers to
+        a vertex that does not exist.
     """
 
     name: str
@@ -142,7 +141,7 @@ class SceneMesh:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of the vertices, meters, (2, 3)."""
+        """Lower and upper corner of the bounding box in meters. Shape (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property

@@ -23,26 +23,26 @@ MAX_CHANNELS = 65_535  # limit of the type of the column
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """The beams of a sensor, which a firing fires all once.
+    """Beams of a sensor, each of which is fired once per firing.
 
-    Channel 0 is the first beam, usually the lowest.
+    Channel 0 is the first beam, which is usually the lowest.
 
     Parameters
     ----------
     elevation
-        float64 (c,): angle above the sensor's xy plane, radians.
+        float64 (c,): angle above the xy plane of the sensor, in radians.
     azimuth
-        float64 (c,): offset from the head's azimuth, radians; 0 by default.
+        float64 (c,): offset from the azimuth of the head, in radians; 0 by default.
     time_ns
-        float64 (c,): time of a beam within a firing, nanoseconds; 0 by default.
+        float64 (c,): time of a beam within a firing, in nanoseconds; 0 by default.
     origin
-        float64 (c, 3): start of a beam with the head at azimuth 0, meters, in the sensor frame; the
-        sensor's center by default.
+        float64 (c, 3): start of a beam in the sensor frame with the head at azimuth 0, in meters;
+        the sensor origin by default.
 
     Raises
     ------
     LidarError
-        If the lengths differ, a value is not finite, or beams are missing or too many.
+        If the lengths differ, a value is not finite, or there are no beams or too many beams.
     """
 
     __signature__ = ReadableSignature()
@@ -76,7 +76,7 @@ class Beams:
     def even(cls, layers: int, vertical_fov_deg: float) -> Beams:
         """Return beams evenly spaced over a vertical field of view, both ends included.
 
-        Half of the field of view is below the horizon; a single beam looks straight ahead.
+        Half of the field of view is below the horizon. A single beam points straight forward.
         """
         half = np.radians(vertical_fov_deg) / 2
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
@@ -126,25 +126,26 @@ Duty = Annotated[float, Field(gt=0, le=1)]
 @dataclass(frozen=True)
 @checked_fields
 class Spin:
-    """A head that spins.
+    """A rotating head.
 
     Parameters
     ----------
     firings_per_turn
-        Firings in one revolution: firing rate over revolution rate, not always a whole number.
+        Number of firings per revolution, which is the firing rate divided by the revolution rate.
+        It does not have to be an integer.
     step_deg
-        Rotation in one time step, in (0, 360].
+        Rotation per time step in degrees, in (0, 360].
     rate_hz
-        Revolutions a second.
+        Revolutions per second.
     clockwise
-        Direction of rotation, seen from above.
+        Whether the head rotates clockwise as seen from above.
     zero_deg
-        Azimuth at firing 0: counter-clockwise from the sensor's +x axis.
+        Azimuth at firing 0 in degrees, counterclockwise from the +x axis of the sensor.
 
     Raises
     ------
     LidarError
-        If a value is out of its range, or a time step holds no firing at all.
+        If a value is out of range, or if a time step contains no firings.
 
     Examples
     --------

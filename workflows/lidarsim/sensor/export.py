@@ -55,32 +55,32 @@ def export_sensor(
     seconds: Seconds | None = None,
     revolutions: Revolutions | None = None,
 ) -> SensorFile:
-    """Write the rays of a sensor, or its optics, to a file of another program.
+    """Export the rays or the optics of a sensor to a file for another program.
 
     Parameters
     ----------
     sensor
-        A `Sensor`, as `load_sensor` and `Sensor.grid` return.
+        A `Sensor`, for example from `load_sensor` or `Sensor.grid`.
     path
-        The file; its ending chooses the format, unless `format` does. An existing file is
-        replaced.
+        Path of the file. The format follows from its extension, unless `format` is set. An existing
+        file is replaced.
     format
         Name of the format, such as "livox"; see docs/how-to/other-simulators.md.
     seconds
-        Duration of the pattern in the file.
+        Duration of the pattern in seconds.
     revolutions
-        Revolutions or frames in the file instead; by default one.
+        Number of revolutions or frames, as an alternative to `seconds`; by default one.
 
     Returns
     -------
     SensorFile
-        The format, the rays, and what the format does not hold of the sensor.
+        The format, the rays, and the properties of the sensor that the format cannot store.
 
     Raises
     ------
     LidarError
-        If the format is unknown, the format cannot hold the sensor, the rays are too many, a
-        package is missing, or the file cannot be written.
+        If the format is unknown or cannot store the sensor, there are too many rays, a package is
+        missing, or the file cannot be written.
 
     Examples
     --------

@@ -423,36 +423,37 @@ def load_sensor(
     max_range_m: MaxRange | None = None,
     performance: Sheet | None = None,
 ) -> Sensor:
-    """Return a sensor of a model, or of the calibration of a unit.
+    """Load a sensor from a sensor model or from the calibration of a unit.
 
     Parameters
     ----------
     model
-        Name, such as "velodyne/vlp16", or the path of a data file (.yaml). By default, the model
-        whose beams are nearest to the calibration.
+        Name of the model, such as "velodyne/vlp16", or path of a sensor file (.yaml). By default,
+        the model whose beams are closest to the calibration.
     calibration
-        File of the unit: Velodyne YAML, Ouster metadata, Hesai angle corrections, RoboSense
-        angle.csv, Livox list of rays, a table of beams, or rays of a sensor that `export_sensor`
-        wrote (`read_calibration`).
+        Calibration file of a unit: Velodyne YAML, Ouster metadata, Hesai angle corrections,
+        RoboSense angle.csv, Livox ray list, a beam table, or rays that were written by
+        `export_sensor`.
     columns
-        Firings in a revolution, if the model, or a table of beams, leaves a choice.
+        Number of firings per revolution, if the model or the beam table offers a choice.
     rate_hz
-        Revolutions, lines or frames a second.
+        Revolutions, lines or frames per second.
     step_deg
-        Part of a revolution that is one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
-        OS1-128: a scan then costs little by itself, because batches join consecutive scans, and
-        several workers can share a revolution.
+        Rotation per scan in degrees. Ten degrees correspond to 800 rays of a VLP-16 and 3,600 rays
+        of an OS1-128. The overhead per scan is then low, because batches combine consecutive
+        scans, and several workers can share a revolution.
     min_range_m, max_range_m
-        Instead of the model's.
+        Minimum and maximum range in meters; by default those of the model.
     performance
-        "datasheet": with noise and returns of the data sheet, for surveys that give none. By
-        default "ideal" for a model by name, and for a file that states no performance.
+        With "datasheet", the sensor has the noise and returns of its data sheet, unless a survey
+        sets others. The default is "ideal" for a named model, and for a file that does not
+        specify the performance.
 
     Raises
     ------
     LidarError
-        If the model does not exist, a file cannot be used, or model and calibration do not fit
-        together.
+        If the model does not exist, a file cannot be used, or the model and the calibration do not
+        match.
 
     Examples
     --------

@@ -29,19 +29,19 @@ AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise of ranges and angles, lost returns and false alarms.
+    """Noise of ranges and angles, lost returns, and false alarms.
 
-    Without arguments, there is none of these.
+    Without arguments, the sensor is ideal.
 
-    The standard deviation of a range of r meters is ``range_m + range_per_m * r``, and
-    `range_at_threshold_m` times the threshold of detection over the return's energy is added in
-    squares. Rays are cast in directions with noise, and reported with angles without noise. Stated
-    detection ranges are for surfaces at right angles in clear air.
+    The standard deviation of a range of r meters is ``range_m + range_per_m * r``. The term
+    `range_at_threshold_m`, multiplied by the ratio of the detection threshold to the energy of the
+    return, is added in quadrature. Rays are cast in noisy directions but reported with noise-free
+    angles. Detection ranges refer to perpendicular surfaces in clear air.
 
     Raises
     ------
     LidarError
-        If a number is outside its range, or needs a detection range that is not given.
+        If a number is out of range, or requires a detection range that is not set.
     """
 
     range_m: Annotated[Meters, about("standard deviation of ranges, meters", 0.02)] = 0.0

@@ -45,7 +45,7 @@ Precision = Annotated[float, Field(ge=1e-6, le=1000)]
 @dataclass(frozen=True)
 @checked_fields
 class Optics:
-    """Light and resolution of a sensor."""
+    """Optical parameters and range resolution of a sensor."""
 
     wavelength_nm: Annotated[
         float, about("wavelength of the laser; 905 if no source states it", ge=200, le=20_000)
@@ -77,15 +77,15 @@ class Optics:
 @dataclass(frozen=True)
 @checked_fields
 class Returns:
-    """Sub-rays of a beam, and the returns of a pulse that the sensor reports.
+    """Sub-rays of a beam, and the returns that the sensor reports for a pulse.
 
-    "dual" reports the strongest and the last return, or the two strongest if the last return is
-    the strongest. "two_strongest" reports the two strongest returns.
+    The mode "dual" reports the strongest and the last return, or the two strongest returns if the
+    last return is the strongest. The mode "two_strongest" reports the two strongest returns.
 
     Raises
     ------
     LidarError
-        If the mode does not exist, or a number is outside its range.
+        If the mode is unknown, or if a number is out of range.
     """
 
     mode: Annotated[

@@ -43,37 +43,40 @@ MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Sensor:
-    """Beams that a head moves. Each firing fires all beams once.
+    """A lidar sensor, which consists of beams and a head that moves them.
 
-    Another kind of sensor has its own beams or head, or is a subclass with other `directions`,
-    `origins` or `begins_ns`; no other code changes. A sensor is identified by its fields (see
-    `lidarpool.base.fingerprint`), so keep everything that its rays depend on in fields.
+    Each firing fires all beams once.
+
+    To define another kind of sensor, use other beams or another head, or write a subclass that
+    overrides `directions`, `origins` or `begins_ns`. No other code has to be changed. A sensor is
+    identified by its fields (see `lidarpool.base.fingerprint`), so store everything on which its
+    rays depend in fields.
 
     Parameters
     ----------
     beams
-        The beams of a firing.
+        The beams, all of which are fired in each firing.
     head
         The mechanism that moves the beams.
     min_range_m, max_range_m
-        Returns nearer or farther than these, in meters, are ignored. A ray passes through nearer
-        surfaces.
+        Minimum and maximum range in meters. Other returns are ignored, and rays pass through
+        surfaces at shorter range.
     name
-        Name of the model, for reports; by default the name of the class.
+        Name of the sensor model for reports; by default the name of the class.
     optics
-        Light and resolution.
+        Optical parameters and range resolution.
     start_ns
-        Start of the head, nanoseconds after the start of the survey or station.
+        Start of the head in nanoseconds after the start of the survey or station.
     noise, returns
-        Defaults for surveys with this sensor; not part of its fingerprint.
+        Defaults for surveys with this sensor. They are not part of its fingerprint.
     packets
-        Packets of the maker that recordings of this sensor are written in; not part of its
-        fingerprint either.
+        Packet format of the manufacturer for recordings of this sensor. It is not part of its
+        fingerprint.
 
     Raises
     ------
     LidarError
-        If a range or the start is out of bounds.
+        If a range or the start is out of range.
 
     Examples
     --------
@@ -177,35 +180,35 @@ class Sensor:
     ) -> Sensor:
         """Return a spinning sensor with evenly spaced azimuths and elevations.
 
-        Azimuth 0 is the sensor's +x axis and grows counter-clockwise seen from above; channel 0
-        is the lowest.
+        Azimuth 0 is the +x axis of the sensor, and azimuths increase counterclockwise as seen from
+        above. Channel 0 is the lowest.
 
         Parameters
         ----------
         rays_per_revolution
-            Firings in one revolution.
+            Number of firings per revolution.
         layers
-            Channels, evenly spaced over the vertical field of view, both ends included; one
-            channel looks straight ahead.
+            Number of channels, evenly spaced over the vertical field of view, both ends included. A
+            single channel points straight forward.
         vertical_fov_deg
-            Vertical field of view in degrees, half of it below the horizon, in [0, 180]. 0 is for
-            one layer, the plane of a 2D scanner.
+            Vertical field of view in degrees, in [0, 180], half of it below the horizon. A value of
+            0 is only possible for a single layer, as in a 2D scanner.
         step_deg
-            Rotation in one time step, degrees, in (0, 360].
+            Rotation per time step in degrees, in (0, 360].
         min_range_m, max_range_m
-            Returns nearer or farther than these, in meters, are ignored.
+            Minimum and maximum range in meters. Other returns are ignored.
         rate_hz
-            Revolutions a second.
+            Revolutions per second.
         horizontal_fov_deg
-            Horizontal field of view in degrees, in (0, 360]. Below 360 the azimuths of a
-            revolution, and its time steps, sweep this sector only, from right to left, with +x in
-            its middle.
+            Horizontal field of view in degrees, in (0, 360]. If it is less than 360, the firings
+            and time steps of a revolution cover only this sector, from right to left, centered on
+            the +x axis.
 
         Raises
         ------
         LidarError
-            If a value is outside its range, several layers have no field of view, or a time step
-            holds no firing at all.
+            If a value is out of range, several layers have a field of view of 0, or a time step
+            contains no firings.
         """
         if layers > 1 and vertical_fov_deg == 0:
             raise LidarError(

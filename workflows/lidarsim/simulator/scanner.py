@@ -46,25 +46,27 @@ StartSeconds = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
 
 
 class Scanner:
-    """A sensor in a scene that scans in this process, without a cluster or files.
+    """A simulated sensor in a scene, which runs in this process without a cluster or files.
 
-    A scanner returns the bytes of a survey of the same scans: sweep `number` is the revolution (or
-    frame) with this number of a survey along the same trajectory, with the same random numbers if
-    the sensor is the first of the survey. Scanners with the same name and seed of noise have the
-    same random numbers. Threads may share a scanner. A pickled copy returns the same bytes, as in a
-    task of Dask: the copy builds its trees, and continues with the numbers of the scanner.
+    The results are bit-identical to those of a survey: sweep `number` is the revolution (or frame)
+    with this number in a survey along the same trajectory. It has the same random numbers if the
+    sensor is the first sensor of the survey. Scanners with the same name and the same noise seed
+    have the same random numbers. Threads can share a scanner. A pickled copy, for example in a Dask
+    task, returns the same results. It builds its own acceleration structures and continues with
+    the sweep numbers of the scanner.
 
     Parameters
     ----------
     scene
-        The scanned scene.
+        The scene to scan.
     sensor
-        The lidar, or the lidar `Mounted` on a carrier: then poses are poses of the carrier.
+        The lidar, or a `Mounted` lidar on a platform. For a `Mounted` lidar, poses are poses of the
+        platform.
     name
-        Name of the sensor, which is part of all random numbers: give the sensors of a robot
-        different names. A `Mounted` has a name already.
+        Name of the sensor, on which all of its random numbers depend. Use different names for the
+        sensors of a robot. A `Mounted` lidar already has a name.
     unseen
-        Names of objects that the sensor does not see, with * and ?, as in `Mounted`.
+        Names of objects that are invisible to the sensor, as in `Mounted`; * and ? are wildcards.
     columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
     fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3, wet, \
     spray_g_m3
@@ -72,14 +74,14 @@ class Scanner:
     backend
         "cuda", "tiles", "numpy", or "auto" for the first of the three that can be used.
     threads
-        CPU threads to cast with; None for all cores.
+        Number of CPU threads for ray casting; None for all cores.
     device
-        Number of the CUDA device; None for the current one.
+        Index of the CUDA device; None for the current device.
 
     Raises
     ------
     LidarError
-        If an argument does not fit, or the backend cannot be used here.
+        If an argument is invalid, or if the backend cannot be used on this machine.
 
     Examples
     --------
@@ -189,24 +191,24 @@ class Scanner:
 
     @property
     def survey(self) -> Survey:
-        """Survey of a step, with the sensor, columns, returns and noise of the scanner."""
+        """Survey of one time step with the sensor, columns, returns and noise of the scanner."""
         return self._rig.survey
 
     @property
     def origin(self) -> Floats:
-        """World coordinates of the scene's local origin, meters: (3,)."""
+        """Local origin of the scene in world coordinates, in meters. Shape (3,)."""
         return self._rig.scene.origin
 
     @property
     def scene(self) -> Scene:
-        """The scene, with actors and instances where they were moved."""
+        """The scene, with actors and instances at their current poses."""
         return self._rig.scene
 
     @checked
     def span_s(
         self, number: SweepNumber = 0, *, start_s: StartSeconds = None
     ) -> tuple[float, float]:
-        """Return the times at which the first and the last beam of a sweep are fired, seconds.
+        """Return the firing times of the first and the last beam of a sweep, in seconds.
 
         `number` and `start_s` are as in `sweep`.
         """
@@ -224,21 +226,23 @@ class Scanner:
         number: SweepNumber | None = None,
         start_s: StartSeconds = None,
     ) -> Cloud:
-        """Scan a sweep: a revolution of the head, or a frame.
+        """Simulate a sweep, which is one revolution of the head or one frame.
 
         Parameters
         ----------
         pose
-            Pose of a static sensor, or trajectory of a moving sensor: each beam is fired from the
-            pose at the time of the beam. In the scene's local coordinates.
+            Pose of a stationary sensor, or trajectory of a moving sensor, in local scene
+            coordinates. Along a trajectory, each beam is fired from the pose at the time of the
+            beam.
         number
-            Number of the revolution, or frame, from 0. The number selects the random numbers and
-            the firings, since a revolution starts at the azimuth where the last revolution has
-            stopped. By default, firings and times belong to revolution 0, and each call has new
-            random numbers.
+            Number of the revolution or frame, starting at 0. It determines the random numbers and
+            the firings, because a revolution starts at the azimuth where the previous one ended.
+            By default, each call uses the firings and times of revolution 0 with new random
+            numbers.
         start_s
-            Start of the revolution, seconds since the start of the trajectories of the sensor and
-            the actors. By default as in a survey: `number` times the duration of a revolution.
+            Start of the revolution in seconds since the start of the trajectories of the sensor and
+            the actors. The default is `number` times the duration of a revolution, as in a
+            survey.
 
         Returns
         -------
@@ -248,7 +252,7 @@ class Scanner:
         Raises
         ------
         LidarError
-            If the trajectory of the sensor or an actor is shorter than the sweep.
+            If the trajectory of the sensor or of an actor does not cover the sweep.
         """
         path = _trajectory_of(pose)
         with self._casting() as rig:
@@ -286,31 +290,33 @@ class Scanner:
         number: SweepNumber | None = None,
         start_s: StartSeconds = None,
     ) -> Floats32:
-        """Return images of the ranges that the sensor measures from several poses.
+        """Return the range images that the sensor measures from several poses.
 
-        This is the fastest way to scan: no points are computed.
+        This is the fastest method, because no points are computed.
 
         Parameters
         ----------
         poses
-            A pose or a list of poses; positions (k, 3), meters; or matrices (k, 4, 4) from the
-            frame of the sensor, or of its carrier, to the scene frame. The sensor is static.
+            A pose or a list of poses; positions (k, 3) in meters; or matrices (k, 4, 4) from the
+            frame of the sensor, or of its platform, to the scene frame. The sensor is stationary
+            at each pose.
         number
-            Number of the revolution, as in `sweep`. The image of pose i has the random numbers of
+            Number of the revolution, as in `sweep`. The image at pose i has the random numbers of
             revolution ``number + i``.
         start_s
-            Start of the revolution, for actors, as in `sweep`.
+            Start of the revolution in seconds, which determines the poses of actors, as in
+            `sweep`.
 
         Returns
         -------
         float32 (k, firings, channels)
-            Range of the nearest reported return of each ray, meters; inf without a return.
+            Range of the nearest reported return of each ray in meters; inf without a return.
 
         Raises
         ------
         LidarError
-            If the poses are neither such a list nor array, a number is not finite, or a matrix
-            mirrors or deforms.
+            If the poses have none of these forms, a number is not finite, or a matrix mirrors or
+            deforms.
         """
         positions, rotations = _poses_of(poses)
         with self._casting() as rig:
@@ -333,31 +339,33 @@ class Scanner:
         *,
         times_s: ArrayLike | None = None,
     ) -> None:
-        """Move actors and instances, while sweeps under way still see the earlier poses.
+        """Move actors and instances for all subsequent sweeps.
 
-        Bodies that move in one call give the same bytes as bodies that move one by one, which takes
-        longer. If a body cannot move, none does.
+        Sweeps in progress use the earlier poses.
+
+        Moving several bodies in a single call is faster than moving them one by one, with the same
+        result. If a body cannot be moved, none of them is moved.
 
         Parameters
         ----------
         name
             Name of an actor, or of an object that is a `SceneInstance` in the scene, such as a copy
-            of a scenario; or k names.
+            in a scenario; or a list of k names.
         pose
-            New pose of the mesh's frame, in the scene's local coordinates: a `Pose`, a position, or
-            a matrix (4, 4). An instance keeps its scale. An actor may also get a trajectory, which
-            it follows from time 0 on. For k names a list of these, positions (k, 3), or matrices
-            (k, 4, 4); arrays are faster.
+            New pose of the mesh frame in local scene coordinates: a `Pose`, a position, or a matrix
+            (4, 4). Instances keep their scale. For an actor, it can also be a trajectory, which
+            the actor follows from time 0. For k names, pass a list of these, positions (k, 3), or
+            matrices (k, 4, 4). Arrays are faster than lists.
         times_s
-            (samples,): times of poses within a sweep, seconds by the clock of `start_s`, ascending.
-            Then `pose` is matrices (samples, 4, 4), or (k, samples, 4, 4) for k names, and each
-            beam meets the actors where they are when the beam is fired. From each pose to the next,
-            actors move straight and rotate evenly.
+            (samples,): times of poses within a sweep in seconds, ascending, on the time scale of
+            `start_s`. If it is set, `pose` contains matrices (samples, 4, 4), or
+            (k, samples, 4, 4) for k names, and each beam uses the poses of the actors at the time
+            of the beam. Between two poses, actors move at constant velocity and angular velocity.
 
         Raises
         ------
         LidarError
-            If the actor or instance does not exist, a name is given twice, an instance would move
+            If the actor or instance does not exist, a name occurs twice, an instance would move
             during a sweep, or a rotation mirrors or deforms.
 
         Examples
@@ -369,7 +377,7 @@ class Scanner:
         >>> names = [car.name for car in cars]
         >>> scanner.move(names, [(4, 0, 0), (8, 4, 0), (8, -4, 0)])
         >>> matrices = np.tile(np.eye(4), (3, 2, 1, 1))
-        >>> matrices[:, 1, 0, 3] = 1.5  # a meter and a half in a tenth of a second
+        >>> matrices[:, 1, 0, 3] = 1.5  # 1.5 m in 0.1 s
         >>> scanner.move(names, matrices, times_s=[0, 0.1])
         """
         names = [name] if isinstance(name, str) else list(name)

@@ -38,14 +38,14 @@ _KIND_FIELDS: dict[str, tuple[str, ...]] = {
 @dataclass(frozen=True)
 @checked_fields
 class Fault:
-    """A fault of a sensor, for a time.
+    """A fault of a sensor during an interval of time.
 
-    Labels keep the truth, and list the faults.
+    The labels describe the true scene and list the active faults.
 
     Raises
     ------
     LidarError
-        If a number is outside its range, or its fields do not fit together.
+        If a number is out of range, or if the fields cannot be combined.
     """
 
     kind: Annotated[FaultKind, about("kind of fault")]

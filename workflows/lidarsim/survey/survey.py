@@ -63,23 +63,24 @@ def nanoseconds(moment: datetime) -> int:
 @dataclass(frozen=True)
 @checked_fields
 class Mounted:
-    """A sensor on a carrier.
+    """A sensor mounted on a platform.
 
     Parameters
     ----------
     sensor
         The lidar.
     mount
-        Pose in the carrier frame.
+        Pose of the sensor in the platform frame.
     name
-        Name, needed with several sensors; part of all random numbers of the sensor.
+        Name of the sensor, required if there are several sensors. All random numbers of the sensor
+        depend on it.
     steps
-        Time steps from each station; by default the survey's.
+        Number of time steps at each station; by default that of the survey.
     returns, noise
-        Instead of the survey's, which by default are the sensor's.
+        Returns and noise of this sensor; by default those of the survey, or else of the sensor.
     unseen
-        Names of objects that the sensor does not see, with * and ?: its rays pass through these
-        objects, such as the sensor's own housing.
+        Names of objects that are invisible to the sensor, such as its own housing; * and ? are
+        wildcards. Rays pass through these objects.
     """
 
     sensor: Sensor
@@ -97,26 +98,28 @@ class Mounted:
 
 @dataclass(frozen=True)
 class ScanSpec:
-    """The firings of a sensor's time step: the unit of ordering and exactly-once delivery.
+    """The firings of a sensor in one time step.
+
+    A scan is the unit of ordering and of exactly-once delivery.
 
     Parameters
     ----------
     scan
-        Number in the survey.
+        Index of the scan in the survey.
     station
-        Station of the trajectory (`Trajectory`).
+        Index of the station in the `Trajectory`.
     firings
-        Half-open range of firings, counted from the start of the station.
+        Half-open range of firing indices, counted from the start of the station.
     start_ns
-        Start of the station, nanoseconds since the survey's start.
+        Start of the station in nanoseconds since the start of the survey.
     sensor
-        Number of the sensor.
+        Index of the sensor.
     channels
-        Number of the sensor's channels.
+        Number of channels of the sensor.
     ahead
-        Number of scans that its random numbers are ahead of its number.
+        Offset between the index that selects the random numbers and the index of the scan.
     repeats
-        For a scan of a frozen sensor: the first scan of the sweep that is sent again, and the first
+        For a scan of a frozen sensor, the first scan of the sweep that is repeated, and the first
         scan of the sweep that it replaces.
     """
 
@@ -214,52 +217,53 @@ class SensorSweeps(NamedTuple):
 @dataclass(frozen=True)
 @checked_fields
 class Survey(CloudOptions, Weather):
-    """All scans of a carrier's sensors.
+    """All scans of the sensors on a platform.
 
-    Scans of a sensor are in time order, and all scans of a sensor come before the scans of the next
-    sensor, so that a batch is one cast, and each part belongs to one sensor or two. The column
-    `time` shows which points are simultaneous.
+    The scans of a sensor are in time order, and all scans of a sensor come before the scans of the
+    next sensor. Use the column `time` to find simultaneous points.
 
-    Several sensors always have the column `sensor`. Without materials, all objects scatter half of
-    the light.
+    With several sensors, the cloud always contains the column `sensor`. Without materials, all
+    objects scatter half of the light.
 
     Parameters
     ----------
     sensor
-        The lidar of a survey with one sensor, without a mount.
+        The lidar, if there is a single sensor without a mount.
     poses
-        Poses, one after the other: `Pose`, or x, y, z.
+        Poses of the sensor or platform, one after the other, each as a `Pose` or as x, y, z.
     steps
-        Time steps from each pose, 36 by default; along a `Track` by default all that it lasts for.
+        Number of time steps at each pose; 36 by default. Along a `Track`, the default covers its
+        entire duration.
     trajectory
-        Instead of `poses`, if the carrier moves.
+        Trajectory of a moving platform, as an alternative to `poses`.
     sensors
-        Instead of `sensor`: `Mounted`, several with a name each.
+        `Mounted` sensors, as an alternative to `sensor`. Several sensors must have different names.
     materials
-        Materials of objects, and of faces by the names of their materials; the first entry for a
-        face counts.
+        Materials of objects, or of faces by the names of their materials. If several entries apply
+        to a face, the first one is used.
     returns
-        Sub-rays of a beam, and the returns of a pulse that are reported; by default the sensor's.
+        Sub-rays of a beam, and the returns that are reported for a pulse; by default those of the
+        sensor.
     noise
-        Noise of ranges and angles, and lost returns; by default the sensor's.
+        Noise of ranges and angles, and lost returns; by default those of the sensor.
     navigation
-        IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
+        IMU and GNSS receiver of the platform, whose samples are written next to the cloud.
     faults
-        Faults of sensors, such as dirt or lost packets.
+        Sensor faults, such as dirt or lost packets.
     classes
-        Names of semantic classes, {number: name}, for reports and files; with them the cloud has
-        the column `class`.
+        Names of the semantic classes, {number: name}, for reports and files. If set, the cloud
+        contains the column `class`.
     epsg
-        EPSG code of the world's coordinate system, which files that can hold one state;
-        `Scene.georeferenced` places a scene with local coordinates in it.
+        EPSG code of the world coordinates, which is written to files that support it. To place a
+        scene with local coordinates in the world, use `Scene.georeferenced`.
     **options
-        The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
+        Fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
     Raises
     ------
     LidarError
-        If a number is out of range, poses are missing, a column is unknown, or the trajectory does
-        not last long enough.
+        If a number is out of range, poses are missing, a column is unknown, or the trajectory is
+        too short.
 
     Examples
     --------

@@ -36,29 +36,29 @@ class _Step(NamedTuple):
 
 
 class Follower:
-    """A lidar that follows the bodies of another program.
+    """A lidar in a world that is controlled by another program.
 
-    `sweep` and `ranges` scan a world that stands still, which is fastest: bodies are instances of
-    their meshes. `step` collects the steps of a world that moves, and scans each sweep once its
-    last beam is fired: each beam leaves from the pose of the sensor, and meets bodies at their
-    poses, at the time of the beam.
+    `sweep` and `ranges` scan the world as if it were stationary, which is the fastest method.
+    `step` collects the time steps of a moving world and simulates each sweep once its last beam has
+    been fired. Each beam then uses the poses of the sensor and of the bodies at the time of the
+    beam.
 
     Parameters
     ----------
     bodies
-        Meshes of the k bodies that move, in their own frames. Bodies with the same arrays share a
-        tree.
+        Meshes of the k moving bodies, in their own frames. Bodies with the same arrays share an
+        acceleration structure.
     sensor
-        The lidar, or the lidar `Mounted` on a carrier.
+        The lidar, or a `Mounted` lidar on a platform.
     static
-        Meshes and instances that stand, in world coordinates; `step` needs at least one.
+        Stationary meshes and instances in world coordinates. `step` requires at least one.
     options
         Options of `Scanner`, such as columns, noise, threads, and the names of `unseen` bodies.
 
     Raises
     ------
     LidarError
-        If meshes are missing, or `Scanner` refuses an option.
+        If there are no meshes, or if an option of `Scanner` is invalid.
 
     Examples
     --------
@@ -131,26 +131,27 @@ class Follower:
     def sweep(
         self, pose: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
     ) -> Cloud:
-        """Scan a sweep of the world as it stands.
+        """Simulate a sweep of the world in its current state.
 
         Parameters
         ----------
         pose
-            (4, 4): matrix from the frame of the sensor, or of its carrier, to the world.
+            (4, 4): matrix from the frame of the sensor, or of its platform, to the world.
         matrices
-            (k, 4, 4): matrices from the frames of the bodies to the world, meters.
+            (k, 4, 4): matrices from the frames of the bodies to the world, in meters.
         number
-            Number of the sweep, as of `Scanner.sweep`; by default each call has new noise.
+            Number of the sweep, as in `Scanner.sweep`. By default, each call has new noise.
 
         Returns
         -------
         Cloud
-            The returns. The column `object` holds indices into `names`.
+            The returns. The column `object` contains indices into `names`.
 
         Raises
         ------
         LidarError
-            If there are not as many matrices as bodies, or a matrix mirrors or deforms.
+            If the number of matrices differs from the number of bodies, or if a matrix mirrors or
+            deforms.
         """
         sensor_pose = _matrices(pose, 1)
         self._place(_matrices(matrices, len(self._bodies)))
@@ -162,54 +163,55 @@ class Follower:
     def ranges(
         self, poses: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
     ) -> Floats32:
-        """Return the ranges that sensors measure in the world as it stands.
+        """Return the ranges that sensors measure in the current state of the world.
 
         Parameters
         ----------
         poses
-            (s, 4, 4): matrices from the frame of the sensor at s poses to the world.
+            (s, 4, 4): matrices from the sensor frame to the world, for s poses of the sensor.
         matrices, number
-            As of `sweep`.
+            As in `sweep`.
 
         Returns
         -------
         float32 (s, firings, channels)
-            Meters; inf without a return (`Scanner.ranges`).
+            Ranges in meters; inf without a return (see `Scanner.ranges`).
 
         Raises
         ------
         LidarError
-            As `sweep`.
+            As in `sweep`.
         """
         sensor_poses = _matrices(poses, None)
         self._place(_matrices(matrices, len(self._bodies)))
         return self._frozen.ranges(_local(sensor_poses, self._frozen.origin), number=number)
 
     def step(self, time_s: float, pose: ArrayLike, matrices: ArrayLike = ()) -> list[Cloud]:
-        """Take note of a step of the world, and return the sweeps that ended since the last step.
+        """Record a time step of the world, and return the sweeps completed since the last step.
 
-        The first sweep begins at the first step, and sweeps follow each other. A time before the
-        last step's time, as of a world that was reset, begins anew.
+        The first sweep starts at the first step, and each further sweep starts where the previous
+        one ends. If the time is before the last step, for example after the world was reset, a
+        new first sweep starts.
 
         Parameters
         ----------
         time_s
-            Time of the world, seconds.
+            Time of the world in seconds.
         pose
-            (4, 4): matrix from the frame of the sensor, or of its carrier, to the world.
+            (4, 4): matrix from the frame of the sensor, or of its platform, to the world.
         matrices
-            (k, 4, 4): matrices from the frames of the bodies to the world, meters. Between two
-            steps, bodies move straight and rotate evenly.
+            (k, 4, 4): matrices from the frames of the bodies to the world, in meters. Between two
+            steps, bodies move at constant velocity and angular velocity.
 
         Returns
         -------
-        The sweeps, mostly none or one.
+        The completed sweeps; usually none or one.
 
         Raises
         ------
         LidarError
-            If there are not as many matrices as bodies, a matrix mirrors or deforms, or nothing
-            stands in the world.
+            If the number of matrices differs from the number of bodies, a matrix mirrors or
+            deforms, or the world contains nothing stationary.
         """
         if self._start_s is None or (
             self._steps and time_s < self._start_s + self._steps[-1].time_s
@@ -227,7 +229,7 @@ class Follower:
         return list(self._ended_sweeps())
 
     def reset(self) -> None:
-        """Forget all steps, so that the next step begins the first sweep."""
+        """Discard all steps, so that the next step starts the first sweep."""
         self._steps.clear()
         self._start_s = None
         self._number = 0

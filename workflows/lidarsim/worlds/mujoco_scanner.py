@@ -22,36 +22,38 @@ _log = logging.getLogger(__name__)
 
 
 class MujocoScanner:
-    """A lidar that scans a world of MuJoCo.
+    """A lidar in a MuJoCo world.
 
-    The body that carries the lidar is not seen, as with MuJoCo's rangefinders. Arrays of the model
-    and the data are read; MuJoCo 3.2 or later is not imported.
+    The body on which the lidar is mounted is invisible to it, as for MuJoCo rangefinders. The class
+    only reads the arrays of the model and the data, from MuJoCo 3.2 or later, and does not import
+    MuJoCo.
 
     Parameters
     ----------
     model
-        An `mjModel`. Changes of its geoms after this call are not seen.
+        An `mjModel`. Later changes of its geoms have no effect.
     sensor
-        The lidar, or the lidar `Mounted` on the body or site.
+        The lidar, or a `Mounted` lidar on the body or site.
     body, site
-        Name or number of the body or site whose frame the lidar has: x ahead, z up. Several names
-        are several lidars of the same kind, for `ranges`.
+        Name or ID of the body or site whose frame is the frame of the lidar (x forward, z up). A
+        list defines several lidars of the same model, for `ranges`.
     groups
-        Groups of the geoms that the lidar sees; group 3 has mostly doubles for collisions.
+        Groups of geoms that are visible to the lidar. Group 3 usually contains duplicates for
+        collision detection.
     exclude
-        Names of bodies and geoms, or numbers of bodies, that the lidar does not see.
+        Names of bodies and geoms, or IDs of bodies, that are invisible to the lidar.
     objects
-        What the column `object` tells apart: bodies, or geoms, which takes longer.
+        Whether the column `object` distinguishes bodies or geoms. Geoms take longer.
     sag_m
-        Largest distance of the triangles of cylinders and capsules from the surface, meters; of
-        balls and ellipsoids twice that.
+        Maximum distance in meters between the triangles and the surface of cylinders and capsules.
+        For spheres and ellipsoids, it is twice as large.
     options
         Options of `Scanner`, such as columns, materials, noise and threads.
 
     Raises
     ------
     LidarError
-        If the model has no such body, site or geom, or nothing is left to see.
+        If the model does not contain a body, site or geom, or if no geoms are visible.
 
     Examples
     --------
@@ -118,18 +120,18 @@ class MujocoScanner:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the objects, by the numbers of the column `object`."""
+        """Names of the objects, in the order of the values in the column `object`."""
         return self.follower.names
 
     def sweep(self, data: Any, *, number: int | None = None) -> Cloud:
-        """Scan a sweep of the world as it stands in an `mjData`.
+        """Simulate a sweep of the world in the state of an `mjData`.
 
         Parameters
         ----------
         data
-            After `mj_forward` or `mj_step`.
+            State after `mj_forward` or `mj_step`.
         number
-            Number of the sweep, as of `Scanner.sweep`; by default each call has new noise.
+            Number of the sweep, as in `Scanner.sweep`. By default, each call has new noise.
 
         Raises
         ------
@@ -139,27 +141,28 @@ class MujocoScanner:
         return self.follower.sweep(self._pose(data), self._matrices(data), number=number)
 
     def ranges(self, data: Any, *, number: int | None = None) -> Floats32:
-        """Return the ranges that the lidars measure in the world as it stands in an `mjData`.
+        """Return the ranges that the lidars measure in the state of an `mjData`.
 
         Returns
         -------
         float32 (firings, channels), or (lidars, firings, channels)
-            Meters; inf without a return. With the lidars' axis if `body` or `site` is a list.
+            Ranges in meters; inf without a return. The first axis exists if `body` or `site` is a
+            list.
         """
         poses = self._poses(data)
         images = self.follower.ranges(poses, self._matrices(data), number=number)
         return images[0] if self._is_single else images
 
     def step(self, data: Any) -> list[Cloud]:
-        """Take note of a step of the simulation, and return the sweeps that ended since the last.
+        """Record a simulation step, and return the sweeps completed since the last step.
 
-        Call `step` after each `mj_step`: each beam leaves from the pose of the lidar, and meets
-        bodies at their poses, at the time of the beam. A time before the last begins anew.
+        Call `step` after each `mj_step`. Each beam uses the poses of the lidar and of the bodies at
+        the time of the beam. If the time is before the last step, a new first sweep starts.
 
         Raises
         ------
         LidarError
-            If there are several lidars, or nothing in the model stands.
+            If there are several lidars, or if the model contains nothing stationary.
         """
         return self.follower.step(float(data.time), self._pose(data), self._matrices(data))
 

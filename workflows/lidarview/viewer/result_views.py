@@ -34,7 +34,7 @@ def result_page(
     """Serve the page of a result while the body runs, and announce its address."""
     count = view.total if isinstance(view, GrowingView) else len(view.points)
     shows = f"shows {plural(count, 'point')}"
-    shows += "" if cell_display() else "; Ctrl-C ends it"
+    shows += "" if cell_display() else ". Press Ctrl-C to stop."
     with (
         page_server(view.answer, port) as page,
         announced(page, f"{page.url} {shows}", browser, on_stdout=True),

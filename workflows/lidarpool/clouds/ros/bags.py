@@ -56,7 +56,7 @@ _LATCHED = Qos(
     liveliness_lease_duration=QosTime(0, 0),
     avoid_ros_namespace_conventions=False,
 )
-_UNSTAMPED = "has no stamps, so its sweeps have the times at which they were recorded"
+_UNSTAMPED = "has no timestamps, so its sweeps have the times at which they were recorded"
 _MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
 
 
@@ -185,7 +185,7 @@ class Reader(sweep_reader.Reader):
             records = self._bag.messages(connections)
             record = next((candidate for candidate in records if candidate[1] == time_ns), None)
         if record is None:
-            raise ValueError(f"it has no message on {topic} at {time_ns} ns")
+            raise ValueError(f"it contains no message on {topic} at {time_ns} ns")
         connection, _, data = record
         return message_types().deserialize_cdr(data, connection.msgtype)
 
@@ -225,7 +225,7 @@ def open_file(source: RecordingSource) -> Recording:
         if connection.msgtype in LIVOX_CLOUDS
     }
     topics = livox_clouds if source.sensor in livox_clouds else clouds or livox_clouds
-    connection = topics[source.choose("topics of PointCloud2", topics)]
+    connection = topics[source.choose("PointCloud2 topics", topics)]
     messages = partial(bag.messages, [connection])
     columns_of = livox_columns if topics is livox_clouds else point_columns
 

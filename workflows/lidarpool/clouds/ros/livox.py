@@ -35,8 +35,8 @@ def check_lines(channels: int) -> None:
     """Raise LidarError if a sensor has more channels than a point of Livox has lines."""
     if channels > _MAX_LINES:
         raise LidarError(
-            f"The layout livox counts lines in a byte, and a sensor has {channels:,} channels: use "
-            "another layout."
+            f"The layout livox stores line numbers in one byte, but a sensor has {channels:,} "
+            "channels. Use another layout."
         )
 
 

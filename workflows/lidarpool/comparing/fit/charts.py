@@ -25,14 +25,14 @@ class _Chart(NamedTuple):
 # {curve, or column of channels: chart}, three charts a row
 _CHARTS = {
     "noise_by_range": _Chart("range, m", "noise, mm", 1000),
-    "noise_by_light": _Chart("intensity, or energy", "noise, mm", 1000),
-    "noise_by_tilt": _Chart("incidence, °", "noise with noise of directions, mm", 1000),
-    "returned_by_light": _Chart("intensity, or energy", "pulses that return, %", 100),
-    "lost_by_range": _Chart("range of the scene, m", "pulses lost, %", 100),
+    "noise_by_light": _Chart("intensity or energy", "noise, mm", 1000),
+    "noise_by_tilt": _Chart("incidence angle, °", "noise including angle noise, mm", 1000),
+    "returned_by_light": _Chart("intensity or energy", "pulses that return, %", 100),
+    "lost_by_range": _Chart("range in the scene, m", "pulses lost, %", 100),
     "light_by_range": _Chart("range, m", "mean intensity", 1),
     "noise_m": _Chart("elevation, °", "noise, mm", 1000),
     "bias_m": _Chart("elevation, °", "bias, mm", 1000),
-    "uneven_deg": _Chart("elevation, °", "spread of azimuths, 0.001°", 1000),
+    "uneven_deg": _Chart("elevation, °", "azimuth spread, 0.001°", 1000),
 }
 
 
@@ -49,7 +49,7 @@ def draw_charts(figures: Mapping[str, Any]) -> Page:
     names = [name for name in _CHARTS if curves.get(name)]
     height = 140 + 500 * -(-len(names) // 3)  # pixels
     page = Page((1600, height))
-    page.title(figures["model"], f"fitted to {figures['name']}; bars are intervals of 95 %")
+    page.title(figures["model"], f"fitted to {figures['name']}; bars show 95 % intervals")
     for number, name in enumerate(names):
         row, column = divmod(number, 3)
         bottom = 1 - (530 + 500 * row) / height

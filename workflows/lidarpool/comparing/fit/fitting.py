@@ -66,14 +66,17 @@ class Fit:
         """
         model_path = Path(file)
         if model_path.suffix not in MODEL_FILES:
-            raise LidarError(f"{model_path} is no sensor file: give a name such as mine.yaml.")
+            raise LidarError(
+                f"{model_path} is not a sensor file. Use a file name with the extension .yaml, "
+                "such as mine.yaml."
+            )
         model = self.model.model_dump(mode="json", exclude_defaults=True)
         text = "".join(f"# {line}\n" for line in repr(self).splitlines())
         text += yaml.safe_dump(model, sort_keys=False, allow_unicode=True, default_flow_style=None)
         pictures = {"fit": draw_charts(self.figures).svg()}
         page = rendered("fit.html", report=self.figures, pictures=pictures)
         contents = {model_path: text, model_path.with_suffix(".html"): page}
-        advice = "choose a folder that exists and has room"
+        advice = "choose an existing folder with enough free space"
         with explained(f"{model_path} cannot be written", advice):
             for path, content in contents.items():
                 Storage.at(path.parent, durable=False).write(path.name, content.encode())
@@ -129,7 +132,7 @@ def fit(
         If the recording cannot be read, has no sweeps or rings, or contains several sensors; if the
         sensor moves, but the scene or the poses are unknown; or if scipy is missing.
     """
-    need("scipy", "fit", "Figures are fitted")
+    need("scipy", "fit", "Sensor models are fitted")
     named = None if model is None else read_model(model)  # before the recording, which takes long
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
@@ -140,7 +143,9 @@ def fit(
     if poses is None or speed is None:
         measured = measure_standing(recording, white, loaded, poses)
     elif loaded is None:
-        raise LidarError(moving_message(recording.name, speed, "the --scene of its poses"))
+        raise LidarError(
+            moving_message(recording.name, speed, "Pass the scene of its poses with `--scene`")
+        )
     else:
         measured = measure_moving(recording, white, loaded, poses)
     base = recorded_sensor(measured.stack) if named is None else named
@@ -155,7 +160,7 @@ def _fit_of(recording: Recording, measured: Measured, base: SensorModel) -> Fit:
     estimates = measured.estimates
     notes = list(stack.notes)
     if not _has_rings(base, stack):
-        notes.append(f"the recorded rings are not the rings of {base.name}: check --model")
+        notes.append(f"the recorded rings do not match the rings of {base.name}. Check `--model`")
     figures = {
         "versions": {"lidarpool": __version__},
         "name": name,
@@ -208,7 +213,7 @@ def recorded_sensor(stack: SweepStack) -> SensorModel:
     """Return a sensor with the beams of a recording."""
     return SensorModel(
         name="Recorded sensor",
-        sources={"angles": "medians of the recorded points"},
+        sources={"angles": "median angles of the recorded points"},
         firings_per_turn=stack.ranges.shape[2],
         range_m=(0.0, float(np.ceil(1.1 * np.nanmax(stack.ranges)))),
         beams={"elevation_deg": np.sort(stack.elevation_deg).round(3).tolist()},

@@ -52,7 +52,10 @@ class KnownPoses:
         if pose is not None:
             matrices = _given_matrices(pose, recording)
             if scene is None and len(matrices) == 1:
-                raise LidarError("pose is the sensor's in a scene: give scene, or leave out pose.")
+                raise LidarError(
+                    "`pose` requires `scene`, because it is the pose of the sensor in that "
+                    "scene. Set `scene`, or omit `pose`."
+                )
             return cls(np.arange(len(matrices)), matrices, True, origin)
         numbers = even_indices(recording.count, _MAX_SWEEPS)
         recorded = recording.poses(numbers.tolist())
@@ -107,7 +110,9 @@ class KnownPoses:
         if not self.are_given:
             recorded = recording.poses(range(recording.count))
             if recorded is None:
-                raise LidarError(f"{recording.name} lacks poses of some sweeps: give --pose.")
+                raise LidarError(
+                    f"{recording.name} does not contain a pose for every sweep. Pass `--pose`."
+                )
             matrices = recorded
             matrices[:, :3, 3] -= self.origin
 
@@ -129,7 +134,7 @@ def _given_matrices(pose: Any, recording: Recording) -> Floats:
         matrices = pose.astype(np.float64).reshape(-1, 4, 4)
         check_rotations(matrices[:, :3, :3])
         if not np.isfinite(matrices).all():
-            raise LidarError("pose has positions that are not finite.")
+            raise LidarError("`pose` contains positions that are not finite.")
     else:
         is_single = isinstance(pose, Pose) or isinstance(next(iter(pose), 0), Real)
         poses = [pose_of("pose", single) for single in ([pose] if is_single else pose)]
@@ -138,8 +143,8 @@ def _given_matrices(pose: Any, recording: Recording) -> Floats:
         )
     if len(matrices) not in (1, recording.count):
         raise LidarError(
-            f"pose has {plural(len(matrices), 'pose')}, and {recording.name} has "
-            f"{plural(recording.count, 'sweep')}: give one pose, or one for each sweep."
+            f"`pose` contains {plural(len(matrices), 'pose')}, but {recording.name} has "
+            f"{plural(recording.count, 'sweep')}. Pass one pose, or one pose for each sweep."
         )
     return matrices
 

@@ -164,8 +164,8 @@ def _check_rays(count: int, name: str) -> None:
     """Raise LidarError for too few rays on smooth surfaces."""
     if count < MIN_RAYS:
         raise LidarError(
-            f"{name} has {count} rays on smooth surfaces, not {MIN_RAYS}: record walls or a floor, "
-            "in the sensor's axes."
+            f"{name} has only {count} rays on smooth surfaces, but at least {MIN_RAYS} are "
+            "required. Record walls or a floor, with points in the sensor frame."
         )
 
 
@@ -184,8 +184,12 @@ def _scene_ranges(stack: SweepStack, scene: Scene, poses: KnownPoses | None) -> 
 def _check_pose(near_share: float, name: str) -> None:
     """Raise LidarError unless half of the ranges are near the ranges of the scene."""
     if not near_share > _MIN_SCENE_SHARE:
-        message = f"less than half of {name} is within {SCENE_TOLERANCE_M} m of the scene"
-        raise LidarError(f"{message}: give the sensor's --pose in it, or no scene.")
+        message = (
+            f"Less than half of the points in {name} are within {SCENE_TOLERANCE_M} m of the scene."
+        )
+        raise LidarError(
+            f"{message} Pass the pose of the sensor in the scene with `--pose`, or omit the scene."
+        )
 
 
 def _lost_by_range(stack: SweepStack, expected: Floats) -> Curve:

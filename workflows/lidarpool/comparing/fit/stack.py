@@ -72,7 +72,8 @@ class SweepStack:
         cells = _CommonCells.read(recording)
         if len(cells.numbers) < recording.count:
             notes.append(
-                f"{len(cells.numbers):,} of {recording.count:,} sweeps are used, evenly chosen"
+                f"{len(cells.numbers):,} of {recording.count:,} sweeps are used, which are "
+                "evenly distributed"
             )
         for index in range(len(cells.numbers)):
             cells.read_sweep(recording, index)
@@ -81,8 +82,8 @@ class SweepStack:
         has_return = np.isfinite(values[0]).any(axis=0)
         if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
             notes.append(
-                f"{rounded(100 * gaps, 2)} % of the sweeps are gaps, of lost packets or sweeps cut "
-                "short, and count as no lost pulses"
+                f"{rounded(100 * gaps, 2)} % of the sweeps consists of gaps, caused by lost "
+                "packets or truncated sweeps. Gaps are not counted as lost pulses"
             )
         directions, azimuth_offsets = _mean_directions(values, elevation_deg, cells.step_deg)
         return cls(
@@ -104,7 +105,9 @@ def check_sweeps(recording: Recording) -> None:
     if recording.thinned:
         raise LidarError(f"{recording.notes[0]}.")
     if recording.is_cloud or not recording.count:
-        raise LidarError(f"{recording.name} has no sweeps: give a recording of sweeps.")
+        raise LidarError(
+            f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
+        )
 
 
 @dataclass(eq=False)
@@ -127,7 +130,7 @@ class _CommonCells:
         sweeps = (recording.read_points(k) for k in range(min(3, recording.count)))
         reference = max(sweeps, key=len)
         if not len(reference):
-            raise LidarError(f"{recording.name} has no points: there is nothing to fit.")
+            raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
         with prefixed(recording.name):
             images = range_images(reference, reference, ("a sweep", "a sweep"))
         shape = len(images.rings), round(360 / images.step_deg)
@@ -159,7 +162,10 @@ class _CommonCells:
             is_foreign = foreign > _MAX_FOREIGN_SHARE * returned.sum()
             # With other steps of azimuth, more points lie behind others of their cell.
             if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
-                raise LidarError(f"sweep {number} is of another sensor, or another mode.")
+                raise LidarError(
+                    f"sweep {number} comes from a different sensor, or was recorded in a "
+                    "different mode."
+                )
         self._add_rings(sweep)
         _, sweep_rows, row_indices = np.intersect1d(sweep.rings, self.rings, return_indices=True)
         first_column = round(sweep.start_deg / sweep.step_deg)

@@ -46,14 +46,18 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
     name = recording.name
     speed = None if stands else find_motion(stack, sweep_period_ns(recording, stack.numbers))
     if speed is not None:
-        raise LidarError(moving_message(name, speed, "a --pose for each sweep in its --scene"))
+        raise LidarError(
+            moving_message(
+                name, speed, "Pass its scene with `--scene` and one `--pose` for each sweep"
+            )
+        )
     _check_drift(stack, name)
     changes = np.abs(np.diff(stack.ranges, axis=0))
     if (change := finite_median(changes, (0, 1, 2))) > _MAX_CHANGE_M:
         raise LidarError(
-            f"{name} has ranges that change by {rounded(change, 2)} m from sweep to sweep, in the "
-            "median, and no motion of the sensor explains that: give points in meters, of a place "
-            "that stands still."
+            f"{name} has ranges that change by a median of {rounded(change, 2)} m between "
+            "sweeps, which no motion of the sensor explains. Use points in meters, recorded "
+            "in a stationary environment."
         )
     return stack
 
@@ -80,8 +84,9 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
     if speed.turn_deg > 0:
         amounts.append(f"{rounded(speed.turn_deg, 2)}°")
     return (
-        f"{name} is of a sensor that moves, by {' and '.join(amounts)} from sweep to sweep: give "
-        f"{advice}, sweeps of a sensor that stands, or one sweep for the bias of its rings."
+        f"{name} was recorded by a moving sensor, which moves by {' and '.join(amounts)} "
+        f"between sweeps. {advice}, use sweeps of a stationary sensor, or use a single sweep "
+        "to fit the bias of its rings."
     )
 
 
@@ -133,7 +138,8 @@ def _check_drift(stack: SweepStack, name: str) -> None:
     drift_m = range_scatter(stack, lag)
     if drift_m > _DRIFT_FACTOR * step_m + _DRIFT_M:
         raise LidarError(
-            f"{name} has ranges that drift: smooth surfaces change by {rounded(step_m, 2)} m from "
-            f"sweep to sweep, but by {rounded(drift_m, 2)} m in {lag} sweeps, so the sensor or the "
-            "place moves, or the sensor warms up: give sweeps of a warm sensor that stands."
+            f"{name} has ranges that drift: smooth surfaces change by {rounded(step_m, 2)} m "
+            f"between consecutive sweeps, but by {rounded(drift_m, 2)} m over {lag} sweeps. "
+            "Either the sensor or its environment moves, or the sensor warms up. Use sweeps "
+            "of a warm, stationary sensor."
         )

@@ -289,7 +289,7 @@ def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
         detail = f"{plural(stage.tasks, 'task')}, {work}"
         overview.append(axis.row(STAGES[stage.stage], stage.stage, detail, stage.busy))
     groups: list[dict[str, Any]] = [
-        {"title": "Stages", "detail": "while at least one task ran", "rows": overview},
+        {"title": "Stages", "detail": "periods in which at least one task ran", "rows": overview},
         *_partition_groups(stages, axis),
     ]
     marks = np.arange(0, seconds, nice_step(seconds / 6))
@@ -337,9 +337,9 @@ def _partition_groups(stages: Sequence[StageTotals], axis: _TimeAxis) -> list[di
         total = max(task_counts[partition], count)
         detail = f"{plural(len(workers), 'worker')}, {plural(total, 'task')}"
         if total > count:  # else gaps would look like idle time
-            detail += f", of which {count:,} are drawn: gaps are not all idle time"
+            detail += f", of which {count:,} are drawn, so gaps are not always idle time"
         if len(tasks) > MAX_ROWS:
-            detail += f"; the busiest {MAX_ROWS} of {len(tasks):,} rows"
+            detail += f"; only the {MAX_ROWS} busiest of {len(tasks):,} rows are shown"
         groups.append({"title": partition, "detail": detail, "rows": _worker_rows(tasks, axis)})
     return groups
 

@@ -73,7 +73,7 @@ class JobList:
         return {
             "title": self.title,
             "names": self._names,
-            "state": f"data set in the format {data_set_title(self._index['format'])}",
+            "state": f"data set in {data_set_title(self._index['format'])} format",
             "over": True,
             "still": True,
             "count": len(self.rows),
@@ -143,7 +143,7 @@ def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
     """Show the list of jobs in the browser until Ctrl-C."""
     stopped = threading.Event()
     with page_server(jobs.answer, port, stopped.set, index="jobs.html") as page:
-        words = f"{page.url} shows {plural(len(jobs.rows), 'job')}; Ctrl-C ends it"
+        words = f"{page.url} shows {plural(len(jobs.rows), 'job')}. Press Ctrl-C to stop."
         with announced(page, words, browser, on_stdout=True):
             wait_for_interrupt(stopped)
 

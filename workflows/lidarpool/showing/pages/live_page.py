@@ -65,14 +65,16 @@ class LivePage(RunPage):
         if job.committed_in_words:
             self._status.progress = job.progress()
         self._views.jobs = {0: LiveJob(job)}
-        self._status.state = "starting: workers, each with its own Python"
+        self._status.state = "starting the worker processes"
 
     def follow(self, partitions: Mapping[str, Partition], dataset: DataSet | None = None) -> None:
         """Show the jobs under way, the busy slots of partitions, and jobs that were written."""
         self._loads.partitions = partitions
         if dataset is not None:
             self._views.follow(dataset)
-        self._status.state = "starting: workers read the scene and make their trees"
+        self._status.state = (
+            "workers are reading the scene and building its acceleration structures"
+        )
 
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
         """Record parts of the only job."""
@@ -95,7 +97,7 @@ class LivePage(RunPage):
         all_done = 0 < progress.jobs == progress.jobs_done
         self._listed.update(under_way, is_last=all_done)
         if all_done:
-            self._status.state = "writing the table and the card"
+            self._status.state = "writing the job table and the data set card"
         elif progress.cast or any(job["stored"] for job in self._listed.under_way):
             self._status.state = "running"
         self._loads.ask()
@@ -127,7 +129,9 @@ class LivePage(RunPage):
         """
         if cloud is not None:
             self._views.jobs[0].show_file(cloud)
-        click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
+        click.echo(
+            f"The live page remains available at {self.page.url}. Press Ctrl-C to stop.", err=True
+        )
         wait_for_interrupt(self.stopped)
 
     # -- the page's side -----------------------------------------------------------------

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # recordings are imported when one is opened
     from .recorded import OnPart
 
 _TRAJECTORIES = (".csv", ".tum", ".txt")  # suffixes of files that may be trajectories
-_TRAJECTORY_ADVICE = "name it in a scenario, as trajectory: FILE"
+_TRAJECTORY_ADVICE = "set `trajectory: FILE` in a scenario"
 _HEADER_BYTES = 1 << 16  # bytes of a .ply that name its elements
 
 
@@ -70,15 +70,15 @@ def open_view(
     """
     if not path.exists():
         raise MissingFileError(
-            f"{path} does not exist: give a result, a cloud, a mesh or a scenario."
+            f"{path} does not exist. Specify a result, a cloud, a mesh or a scenario."
         )
     title = f"{path.resolve().name} - lidarpool"
     if _is_previewed(path):
         return _preview(path, of_mesh, tell)
     if of_mesh:
         raise LidarError(
-            f"{path} is not a mesh, and --{next(iter(of_mesh)).replace('_', '-')} says how a mesh "
-            "is read: leave it out."
+            f"{path} is not a mesh. Remove `--{next(iter(of_mesh)).replace('_', '-')}`, which "
+            "can only be used with meshes."
         )
     if path.is_dir():
         if (path / CLOUD).exists():
@@ -92,7 +92,7 @@ def open_view(
         except LidarError:  # text, or of another program
             return _recorded(path, title, keep_noise, on_part)
         if not len(view.points):
-            raise LidarError(f"{path} has no points.")
+            raise LidarError(f"{path} contains no points.")
         return view
     return _recorded(path, title, keep_noise, on_part)
 
@@ -130,10 +130,13 @@ def _recorded(path: Path, title: str, keep_noise: bool, on_part: OnPart) -> View
         sensors = open_sensors(path, keep_noise=keep_noise)
         return recorded_view(sensors, title, downloads(), on_part)
     except UnknownFormatError as error:
-        advice = f"{_TRAJECTORY_ADVICE}, or " if may_be_trajectory else error.advice
+        advice = f"{error.advice} " if error.advice else ""
+        if may_be_trajectory:
+            advice = f"If it is a trajectory, {_TRAJECTORY_ADVICE}. "
         raise LidarError(
-            f"{path} is not read: {advice}give a result, data set, cloud, recording, "
-            "scenario or mesh of a format that lidarpool view --help names."
+            f"The format of {path} is not supported. {advice}Specify a result, data set, "
+            "cloud, recording, scenario or mesh in a format that `lidarpool view --help` "
+            "lists."
         ) from error
     except LidarError as error:
         if not may_be_trajectory:
@@ -182,6 +185,6 @@ def refuse_unfinished(path: Path) -> None:
 
     if not (path / CLOUD).exists() and (path / RUN_FOLDER / FILE).exists():
         raise LidarError(
-            f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
-            "--live shows its points."
+            f"{path} contains an unfinished run. Continue it with `lidarpool run --resume`, "
+            "and use `--live` to show its points."
         )

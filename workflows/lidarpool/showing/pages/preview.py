@@ -27,7 +27,7 @@ from ...scenario.campaign_sections import is_campaign
 from ...scenario.scenario import Scenario
 
 MATERIAL = TABLE["material"]
-_PREVIEW = "Preview before a run, with the points of the first sweep of each sensor."
+_PREVIEW = "This is a preview before the run, with the points of the first sweep of each sensor."
 
 
 def scenario_view(
@@ -46,7 +46,7 @@ def scenario_view(
     if not is_mesh and not of_mesh and is_campaign(path):
         campaign = CampaignSpec.load(path)
         job = campaign.job(0)
-        note = f"Job {job.name} of {campaign.count:,} of the campaign. {_PREVIEW}"
+        note = f"This is job {job.name} of {campaign.count:,} in the campaign. {_PREVIEW}"
     else:
         built = build(_with_materials(Scenario.load(path, of_mesh)))
         for line in advice(built):
@@ -78,7 +78,7 @@ def first_sweeps(job: Job) -> Iterator[Cloud]:
     sweeps = job.sweeps
     survey = job.survey
     if not len(sweeps):
-        raise LidarError("The survey has no sweeps: give poses, or a longer trajectory.")
+        raise LidarError("The survey has no sweeps. Set `poses`, or a longer trajectory.")
     rig = Rig(job.scene, survey)
     table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
     origin = job.scene.origin if survey.coordinates == "world" else np.zeros(3)

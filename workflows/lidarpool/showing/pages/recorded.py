@@ -149,7 +149,7 @@ def recorded_view(
         notes += further_notes
     if not len(cloud):
         left_out = "".join(f" {note}." for note in first.left_out_notes)
-        raise LidarError(f"{first.name} has no points.{left_out}")
+        raise LidarError(f"{first.name} contains no points.{left_out}")
     names: dict[str, Sequence[str]] = {}
     if first.name.lower().endswith((".las", ".laz")):
         names["class"] = ASPRS_CLASSES
@@ -278,10 +278,10 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
             break
     notes = []
     if len(poses) < len(ordered):
-        notes.append(f"The first {len(poses):,} of {plural(len(ordered), 'sweep')} are shown.")
+        notes.append(f"Only the first {len(poses):,} of {plural(len(ordered), 'sweep')} are shown.")
     are_stations = all(recording.stations for recording in recordings)
     if not is_timed and len(ordered) > 1 and not are_stations:
-        notes.append("The recording has no times: ten sweeps a second are assumed.")
+        notes.append("The recording contains no times. A rate of 10 sweeps per second is assumed.")
     counts = [len(positions) for positions in pieces.positions]
     cloud = pieces.cloud(scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
     sweeps = recorded_sweeps(ordered[: len(poses)], poses, [*sensors])

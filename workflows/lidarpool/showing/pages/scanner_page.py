@@ -102,8 +102,9 @@ class ScannerPage(ScannerView):
         names = [_name(scanner) for scanner in scanners]
         if not names or len({*names}) < len(names):
             raise LidarError(
-                f"Scanners of one page need different names, such as Scanner(…, name='front'); "
-                f"given: {', '.join(map(repr, names)) or 'none'}."
+                "The scanners on a page must have different names, such as Scanner(…, "
+                "name='front'), but their names are "
+                f"{', '.join(map(repr, names)) or 'missing'}."
             )
         super().__init__(scanners[0])
         address = Address.choose(to, PORT)
@@ -122,7 +123,7 @@ class ScannerPage(ScannerView):
     @property
     def description(self) -> str:
         """Line for users with the address to open."""
-        return f"page: open {self.url}"
+        return f"The page is available at {self.url}"
 
     @property
     def url(self) -> str:
@@ -132,7 +133,7 @@ class ScannerPage(ScannerView):
     def _repr_html_(self) -> str:
         """Return the page in a frame, for the cell of a notebook."""
         if self._is_closed:
-            return "<p>This page is closed.</p>"
+            return "<p>This page has been closed.</p>"
         return frame_of(self._page, f"sweeps of {self._scanner.survey.sensor.model}")
 
     def _send(self, scanner: Scanner, cloud: Cloud, pose: Any, time_ns: float) -> None:
@@ -203,7 +204,8 @@ class SweepFeed:
         names = [_name(sensor.scanner) for sensor in self._sensors]
         if name not in names:
             raise LidarError(
-                f"The page does not show the scanner {name!r}: give show() all scanners, as a list."
+                f"The page does not show the scanner {name!r}. Pass all scanners to show() as "
+                "a list."
             )
         sensor = self._sensors[names.index(name)]
         placed = pose_at(pose, time_ns).compose(scanner.survey.carried[0].mount)

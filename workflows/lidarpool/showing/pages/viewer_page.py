@@ -108,7 +108,7 @@ class ViewerPage(RunPage):
 
     def stay(self, cloud: Path | None = None) -> None:
         """Keep the viewer until Ctrl-C."""
-        click.echo(f"{self._viewer.description}; Ctrl-C ends it", err=True)
+        click.echo(f"{self._viewer.description}. Press Ctrl-C to stop.", err=True)
         wait_for_interrupt()
 
 
@@ -116,7 +116,7 @@ class ViewerPage(RunPage):
 def viewer_page(name: str, title: str) -> Iterator[ViewerPage]:
     """Show a run in a viewer while the body runs, and print how to open the viewer."""
     with open_viewer(name, title=title) as viewer:
-        click.echo(f"live: {viewer.description}", err=True)
+        click.echo(viewer.description, err=True)
         page = ViewerPage(viewer)
         try:
             yield page

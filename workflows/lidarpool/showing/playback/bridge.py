@@ -132,7 +132,7 @@ def bridge_class(name: str) -> type[Bridge]:
     """
     if name not in BRIDGES:
         names = ", ".join(BRIDGES)
-        raise LidarError(f"{name!r} is no bridge.{did_you_mean(name, BRIDGES)} Use {names}.")
+        raise LidarError(f"{name!r} is not a bridge.{did_you_mean(name, BRIDGES)} Use {names}.")
     entry = BRIDGES[name]
     module, _, attribute = entry.target.partition(":")
     try:
@@ -141,7 +141,8 @@ def bridge_class(name: str) -> type[Bridge]:
         if not entry.extra or (error.name or "").startswith("lidar"):
             raise
         raise LidarError(
-            f"--as {name} needs {error.name}: {install_command(f'lidarpool[{entry.extra}]')}."
+            f"`--as {name}` requires {error.name}. Run "
+            f"{install_command(f'lidarpool[{entry.extra}]')}."
         ) from error
     bridge.check_installed()
     return bridge

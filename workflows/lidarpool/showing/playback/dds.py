@@ -22,7 +22,7 @@ from rosbags.interfaces import Nodetype
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.ports import port_number
-from lidarsim.base.words import shortened
+from lidarsim.base.words import joined, shortened
 
 from ...clouds.ros.messages import LATCHED_TOPICS, RosMessage, message_store
 
@@ -81,14 +81,15 @@ class Network:
         interfaces = {_interface_to(peer) for peer in peers} or {LOOPBACK}
         if len(interfaces) > 1:
             raise LidarError(
-                f"--to {' and '.join(hosts)} are reached through several interfaces, "
-                f"{', '.join(sorted(interfaces))}: give addresses of one network."
+                f"The addresses {joined(hosts)} of `--to` are reached through different "
+                f"network interfaces ({', '.join(sorted(interfaces))}). Specify addresses in "
+                "a single network."
             )
         text = environment.get(DOMAIN_VARIABLE) or "0"
         domain = port_number(text)
         if domain is None or domain > _MAX_DOMAIN:
             raise LidarError(
-                f"{DOMAIN_VARIABLE} is {shortened(text)!r}: set it to a number from 0 to "
+                f"{DOMAIN_VARIABLE} is {shortened(text)!r}; it must be a number from 0 to "
                 f"{_MAX_DOMAIN}."
             )
         return cls(interfaces.pop(), peers, domain)
@@ -111,14 +112,14 @@ def _ipv4_address(host: str) -> str:
 
     Raises LidarError for an unknown host, and without IPv4.
     """
-    advice = "give a host or an IPv4 address, without a port"
+    advice = "Specify a host name or an IPv4 address, without a port."
     try:
         infos = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        raise LidarError(f"--to {host}: no such host: {advice}.") from error
+        raise LidarError(f"The host {host} of `--to` does not exist. {advice}") from error
     address = str(infos[0][4][0])
     if ipaddress.ip_address(address).is_multicast:
-        raise LidarError(f"--to {host} is a multicast address: {advice}.")
+        raise LidarError(f"The address {host} of `--to` is a multicast address. {advice}")
     return address
 
 
@@ -128,7 +129,9 @@ def _interface_to(address: str) -> str:
         try:
             probe.connect((address, 9))  # sends nothing
         except OSError as error:
-            raise LidarError(f"--to {address} cannot be reached: {error.strerror}.") from error
+            raise LidarError(
+                f"The address {address} of `--to` cannot be reached: {error.strerror}."
+            ) from error
         return str(probe.getsockname()[0])
 
 
@@ -147,9 +150,9 @@ class RosPublisher:
             self._participant = DomainParticipant(network.domain)
         except DDSException as error:
             raise LidarError(
-                f"ROS 2 cannot be reached in domain {network.domain} on {network.address}: its "
-                f"ports are taken, or the interface is down; set {DOMAIN_VARIABLE} to another "
-                "number, or give another address with --to."
+                f"ROS 2 cannot be reached in domain {network.domain} on {network.address}. "
+                "Its ports are in use, or the network interface is down. Set "
+                f"{DOMAIN_VARIABLE} to another number, or specify another address with `--to`."
             ) from error
 
     def __enter__(self) -> RosPublisher:

@@ -12,6 +12,7 @@ from pydantic import Field
 from lidarsim.base.arrays import Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
+from lidarsim.base.words import joined
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.trajectory import Pose, Trajectory
 from lidarsim.packets.encoders import Datagrams
@@ -93,9 +94,10 @@ def play(
     packets = Packets.of_scanner(scanner, start)
     names = {column.name for column in scanner.survey.stored_columns}
     if missing := [name for name in packets.columns if name not in names]:
+        columns = "column" if len(missing) == 1 else "columns"
         raise LidarError(
-            f"The scanner lacks the columns {', '.join(missing)}, which packets hold: make it with "
-            "columns=Packets(sensor).columns."
+            f"Packets require the {columns} {joined(missing)}, which the scanner does not compute. "
+            "Create the scanner with columns=Packets(sensor).columns."
         )
     streams = sensor_streams([packets.encoder], [to], [api] if api else [])
     sweeps = _sweeps(scanner, trajectory, duration_s)

@@ -57,7 +57,8 @@ def play_sweeps(
             bridge.send(sweep, points, shift_ns)
         bridge.finish()
     if late_sweeps:
-        note(f"{plural(late_sweeps, 'sweep')} left late.")
+        verb = "was" if late_sweeps == 1 else "were"
+        note(f"{plural(late_sweeps, 'sweep')} {verb} sent late.")
 
 
 def _laps(played: Played, *, loop: bool) -> Iterator[Callable[[], _ShiftedSweep]]:

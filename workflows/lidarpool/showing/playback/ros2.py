@@ -9,7 +9,7 @@ from heapq import merge
 from itertools import count
 from typing import Any, ClassVar, Self
 
-from lidarsim.base.words import plural
+from lidarsim.base.words import joined, plural
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -65,8 +65,8 @@ class Ros2Bridge(Bridge):
     def description(self) -> str:
         """Domain and interface of the topics."""
         network = self._publisher.network
-        peers = f", told to {', '.join(network.peers)}" if network.peers else ""
-        return f"topics of ROS 2 in domain {network.domain} on {network.address}{peers}"
+        peers = f", with the peers {joined(network.peers)}" if network.peers else ""
+        return f"ROS 2 topics in domain {network.domain} on {network.address}{peers}"
 
     def prepare(self, sweep: int, points: Cloud) -> None:
         """Publish static messages.
@@ -96,7 +96,10 @@ class Ros2Bridge(Bridge):
     def summary(self) -> str:
         """How many messages readers were too slow for."""
         dropped = self._publisher.dropped
-        return f"{plural(dropped, 'message')} dropped: a reader was too slow" if dropped else ""
+        if not dropped:
+            return ""
+        verb = "was" if dropped == 1 else "were"
+        return f"{plural(dropped, 'message')} {verb} dropped, because a subscriber was too slow"
 
     def __enter__(self) -> Self:
         self._publisher.__enter__()

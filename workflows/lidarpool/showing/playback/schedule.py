@@ -19,8 +19,8 @@ _CHECK_S = 0.1
 BEHIND_S = 0.005
 _MAX_THREADS = 8  # sweeps in memory are bounded as well
 BEHIND = (
-    "casting falls behind: sweeps leave late. Use fewer rays, sub-rays or actors, or play slower "
-    "(--rate)."
+    "The simulation is slower than the sensor, so sweeps are sent late. Use fewer rays, "
+    "sub-rays or actors, or reduce the rate (`--rate`)."
 )
 
 

@@ -53,7 +53,7 @@ class Played:
 
     def __post_init__(self) -> None:
         if not len(self.sweeps):
-            raise LidarError("There are no sweeps to play: give poses, or a longer trajectory.")
+            raise LidarError("There are no sweeps to play. Set `poses`, or a longer trajectory.")
 
     def __iter__(self) -> Iterator[tuple[int, Cloud]]:
         for sweep in self.order:
@@ -97,21 +97,21 @@ def open_source(
     """
     if isinstance(source, Path) and not source.exists():
         raise MissingFileError(
-            f"{source} does not exist: give a result, a scenario or a recording."
+            f"{source} does not exist. Specify a result, a scenario or a recording."
         )
     with ExitStack() as stack:
         if isinstance(source, Path) and source.is_file():
             if source.suffix.lower() in CAPTURE_ENDINGS:
                 raise LidarError(
-                    f"{source} holds packets: play it with --as packets, or give a result or "
-                    "scenario."
+                    f"{source} contains packets. Play it with `--as packets`, or specify a "
+                    "result or a scenario."
                 )
             yield _cast(scenario_job(source, needs, of_mesh, tell), stack)
             return
         if of_mesh:
             raise LidarError(
-                f"unit and up_axis say how a mesh file is read, and {source} is a result: leave "
-                "them out."
+                f"`unit` and `up_axis` can only be used with mesh files, but {source} is a "
+                "result. Omit them."
             )
         files = (CLOUD, SWEEPS_FILE, PICTURE_FILE, *INSTRUMENT_FILES)
         folder = stack.enter_context(local_result(source, files))
@@ -126,8 +126,8 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
     for name in (CLOUD, SWEEPS_FILE):
         if not (folder / name).exists():
             raise LidarError(
-                f"{source} holds no {name}: give a scenario, or the folder of a finished run "
-                "(its --out)."
+                f"{source} contains no {name}. Specify a scenario, or the folder of a "
+                "finished run, as passed to `--out`."
             )
     sweeps = Sweeps.load(folder / SWEEPS_FILE)
     cloud = CloudFile(folder / CLOUD)
@@ -158,7 +158,10 @@ def scenario_job(
         campaign = CampaignSpec.load(path)
         scenario = campaign.scenario(0)
         if scenario is None:
-            raise LidarError(f"{path}: its jobs are made by a function: give a scenario.")
+            raise LidarError(
+                f"The jobs of {path} are created by a function, so they cannot be played. Specify "
+                "a scenario."
+            )
     else:
         scenario = Scenario.load(path, of_mesh)
     output = OutputSection(write=() if needs is None else (needs,))

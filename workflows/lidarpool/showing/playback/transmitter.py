@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Self
 
 from lidarsim.base.errors import LidarError, explained
-from lidarsim.base.words import did_you_mean
+from lidarsim.base.words import did_you_mean, joined
 from lidarsim.packets.encoders import PacketEncoder
 from lidarsim.packets.send import LOOPBACK, Address, Sender, check_reachable
 from lidarsim.packets.service import Destination, Service
@@ -60,15 +60,16 @@ class Stream:
         """
         if receiver.port is not None and not self.kinds:
             raise LidarError(
-                f"--to {receiver}: the ports of {self.model} are not known: leave the port out."
+                f"The ports of {self.model}, to which `--to {receiver}` refers, are unknown. "
+                "Remove the port."
             )
         first = next(iter(self.kinds.values()), 0)
         shift = 0 if receiver.port is None else receiver.port - first
         numbers = {port: port + shift for port in self.kinds.values()}
         if beyond := [port for port in numbers.values() if not 0 < port < 1 << 16]:
             raise LidarError(
-                f"--to {receiver}: other packets of {self.name} would go to port {beyond[0]}: give "
-                f"a port nearer to {first}."
+                f"With `--to {receiver}`, other packets of {self.name} would be sent to port "
+                f"{beyond[0]}, which is out of range. Use a port closer to {first}."
             )
         check_reachable(Address(receiver.host, numbers.get(first)))
         return replace(self, destination=Destination(receiver.host, numbers))
@@ -132,8 +133,8 @@ def _by_sensor(texts: Sequence[str], names: Sequence[str], option: str) -> dict[
         name, separator, address = text.rpartition("=")
         if separator and name not in names:
             raise LidarError(
-                f"{option} {text}: there is no sensor {name!r}.{did_you_mean(name, names)} There "
-                f"are {', '.join(names)}."
+                f"{option} {text} refers to the sensor {name!r}, which does not "
+                f"exist.{did_you_mean(name, names)} The sensors are {joined(names)}."
             )
         parsed = Address.parse(address)
         for sensor in [name] if separator else names:
@@ -151,8 +152,9 @@ def _check_apart(stream: Stream, other: Stream) -> None:
         return
     port = min(stream.ports[0], 60_000)
     raise LidarError(
-        f"{stream.name} and {other.name} both send to {host}:{min(shared)}: give each a port, as "
-        f"in --to {stream.name}={host}:{port} --to {other.name}={host}:{port + 100}."
+        f"{stream.name} and {other.name} would both send to {host}:{min(shared)}. Specify a "
+        f"port for each of them, such as `--to {stream.name}={host}:{port} --to "
+        f"{other.name}={host}:{port + 100}`."
     )
 
 
@@ -194,7 +196,8 @@ class Transmitter:
                     self._services.append(service.description)
                 elif stream.api_given:
                     raise LidarError(
-                        f"--api: {stream.model} has no interface that listens: leave it out."
+                        f"`--api` cannot be used with {stream.model}, because it has no "
+                        "interface that listens. Remove `--api`."
                     )
                 self.sender.redirect(number, stream.destination, stream.source_address)
             self._stack = stack.pop_all()

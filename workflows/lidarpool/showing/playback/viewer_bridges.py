@@ -31,7 +31,8 @@ class ViewerBridge(Bridge):
         super().__init__(sweeps, schedule, options, note)
         if len(options.to) > 1:
             raise LidarError(
-                f"--to is given {len(options.to)} times: {self.name} listens on one address."
+                f"`--to` was passed {len(options.to)} times, but {self.name} listens on a "
+                "single address."
             )
         self._sequence = SweepSequence(sweeps)
         self._viewer = self._open(*options.to)

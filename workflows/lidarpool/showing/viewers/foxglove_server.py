@@ -80,8 +80,8 @@ class FoxgloveServer(Viewer):
         address = Address.choose(to, PORT)
         if not address.is_loopback:
             raise LidarError(
-                f"Foxglove's server asks for no password, so it listens on this machine only, not "
-                f"at {address}: give 127.0.0.1, and forward the port: ssh -L "
+                "The Foxglove server has no password, so it can only listen on this machine "
+                f"and not on {address}. Use 127.0.0.1 and forward the port: ssh -L "
                 f"{address.port}:{LOOPBACK}:{address.port} user@machine."
             )
         # The server logs malformed requests of clients as warnings.
@@ -103,9 +103,9 @@ class FoxgloveServer(Viewer):
                 message_backlog_size=BACKLOG,
             )
         except RuntimeError as error:
-            raise LidarError(f"Foxglove's server cannot listen on {address}: {error}") from error
+            raise LidarError(f"The Foxglove server cannot listen on {address}: {error}") from error
         self.address = Address(address.host, self._server.port)
-        self.description = f"Foxglove: open {self.link} or {self.desktop_link}"
+        self.description = f"Foxglove is available at {self.link} or {self.desktop_link}"
 
     @property
     def link(self) -> str:

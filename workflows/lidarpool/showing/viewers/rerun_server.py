@@ -59,7 +59,9 @@ class RerunServer(Viewer):
             raise
         self._recording.send_recording_name(title)
         self._log = RerunLog(self._recording)
-        self.description = f"Rerun: open http://{page}/?url={source} or run rerun {source}"
+        self.description = (
+            f"Rerun is available at http://{page}/?url={source} or with the command rerun {source}"
+        )
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
         """Show scene, trajectories and path in place of earlier surroundings."""

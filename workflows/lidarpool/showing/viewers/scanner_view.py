@@ -85,7 +85,7 @@ class ScannerView(ABC):
             If the view is closed.
         """
         if self._is_closed:
-            raise LidarError("This view is closed and shows no more sweeps: open another.")
+            raise LidarError("This view is closed and cannot show further sweeps. Open a new view.")
         self._send(scanner or self._scanner, cloud, pose, start_s * 1e9)
 
     def close(self) -> None:

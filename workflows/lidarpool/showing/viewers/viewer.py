@@ -84,7 +84,7 @@ def check_installed(name: str) -> None:
     row = VIEWERS[name]
     if find_spec(row.package) is None:
         command = install_command(f"lidarpool[{row.extra}]")
-        raise LidarError(f"{name} needs {row.distribution}: {command}.")
+        raise LidarError(f"{name} requires {row.distribution}. Run {command}.")
 
 
 class Address(NamedTuple):
@@ -115,7 +115,7 @@ class Address(NamedTuple):
             with suppress(LidarError):
                 cls(LOOPBACK, candidate)._check_free(count)
                 return cls(LOOPBACK, candidate)
-        raise LidarError(f"All ports from {port} on are in use: give an address and a port.")
+        raise LidarError(f"All ports from {port} on are in use. Specify an address and a port.")
 
     @classmethod
     def _parse(cls, text: str, port: int) -> Address:
@@ -125,7 +125,8 @@ class Address(NamedTuple):
         if number is None:
             shown = shortened(text, _SHOWN_LETTERS)
             raise LidarError(
-                f"{shown!r} is not an address: give ADDRESS:PORT, such as {LOOPBACK}:{port}."
+                f"{shown!r} is not a valid address. Expected ADDRESS:PORT, such as "
+                f"{LOOPBACK}:{port}."
             )
         return cls(host.strip("[]") or LOOPBACK, number)
 
@@ -148,8 +149,8 @@ class Address(NamedTuple):
             except (OSError, OverflowError) as error:
                 reason = getattr(error, "strerror", None) or str(error)
                 raise LidarError(
-                    f"{Address(self.host, port)} cannot be used: {reason}. Give another address "
-                    "and port."
+                    f"The address {Address(self.host, port)} cannot be used: {reason}. "
+                    "Specify another address and port."
                 ) from error
 
     def wait_until_open(self, timeout_s: float, is_alive: Callable[[], bool]) -> None:
@@ -162,4 +163,4 @@ class Address(NamedTuple):
             with suppress(OSError), socket.create_connection(self, timeout=1):
                 return
             time.sleep(0.05)
-        raise LidarError(f"The server on {self} does not start.")
+        raise LidarError(f"The server on {self} did not start.")
