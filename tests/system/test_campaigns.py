@@ -444,7 +444,7 @@ def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool
         assert f"damaged: job 0002 ({name} is missing or damaged). " in found.err
         assert "bit for bit" not in found.out and found.err.count("\n") == 1
     again = lidarpool(*run, "--verify" if harm == "flipped" else "--resume")
-    assert again.code == 0 and "note: made again: job 0002 (" in again.out
+    assert again.code == 0 and "note: jobs run again: job 0002 (" in again.out
     assert bytes_of(files / "ds") == whole
     assert not (files / "ds" / "run").exists()
 
@@ -549,7 +549,7 @@ def test_other_content_or_software_is_refused(files, finished, lidarpool, slots)
     (files / "c.yaml").write_text(CAMPAIGN.replace("seed: 3", "seed: 4"))
     for more in (["--resume"], ["--job", 1]):
         other = lidarpool(*run, *more)
-        assert other.code == 2 and "campaign: seed changed from 3 to 4" in other.err
+        assert other.code == 2 and "a different campaign (seed changed from 3 to 4)" in other.err
     (files / "c.yaml").write_text(CAMPAIGN)
     record = files / "ds" / "campaign.json"
     made = unsealed(record.read_bytes())
