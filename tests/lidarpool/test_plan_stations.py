@@ -239,3 +239,33 @@ def test_a_scan_that_cannot_be_compared(tmp_path, monkeypatch, options, says):
     outcome = CliRunner().invoke(cli, ["stations", *options])
     assert outcome.exit_code != 0
     assert says in outcome.output + str(outcome.exception)
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--sensor", "livox/mid70"], "Livox Mid-70 does not scan the full circle"),
+        (["--sensor", "riegl-vz400", "--slant", "91"], "91.0 is not in the range 0<x<=90"),
+        (["--sensor", "riegl-vz400", "--height", "0"], "0.0 is not in the range x>0"),
+        (["--sensor", "riegl-vz400", "--spacing", "-1"], "-1.0 is not in the range x>0"),
+    ],
+)
+def test_options_are_checked_before_the_scene_is_read(tmp_path, options, says):
+    (tmp_path / "damaged.obj").write_text("v 1 2\n")
+    outcome = CliRunner().invoke(cli, ["stations", str(tmp_path / "damaged.obj"), *options])
+    assert outcome.exit_code != 0
+    assert says in outcome.output + str(outcome.exception)
+
+
+def test_the_table_has_the_names_that_targets_match(tmp_path):
+    parts = [SceneMesh(f"site_{mesh.name}", mesh.vertices, mesh.faces) for mesh in rooms()]
+    write_scene(tmp_path / "hall.glb", Scene.from_meshes(parts))
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("scene: hall.glb\nposes: [[3, 0, 1.7]]\nsensor: ouster/os0-128\n")
+    np.save(tmp_path / "scan.npy", np.array([[3.0, 1.0, 0.0]]))
+    command = ["stations", str(plan), "--of", str(tmp_path / "scan.npy"), "--target"]
+    outcome = CliRunner().invoke(cli, [*command, "site_*"])
+    shown = re.findall(r"^(site_\w+) +[\d,.]+ m²", outcome.output, re.M)
+    assert {*shown} == {f"site_{mesh.name}" for mesh in rooms()}
+    refused = CliRunner().invoke(cli, [*command, "nor*"])
+    assert str(refused.exception).endswith(" Similar names: site_North.")

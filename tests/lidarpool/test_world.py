@@ -204,8 +204,11 @@ def test_an_origin_that_is_added_twice_is_told_wherever_it_ends(epsg):
 @pytest.mark.parametrize("command", ["check", "run", "stations"])
 def test_commands_warn_of_the_place(tmp_path, command):
     scenario = tmp_path / "room.yaml"
-    copies = [{"name": "Room", "box": [8, 6, 3], "at": [[*ORIGIN, 0]]}]
-    scene = {"copies": copies, "ground": {"height_m": 0, "margin_m": 3}}
+    copies = [
+        {"name": "Room", "box": [8, 6, 3], "at": [[*ORIGIN, 0]]},
+        {"name": "Chimney", "box": [1, 1, 1], "at": [[*ORIGIN, 3]]},
+    ]
+    scene = {"copies": copies, "ground": {"height_m": -0.1, "margin_m": 3}}
     world = {"epsg": 25832, "origin": ORIGIN}
     data = {**PLAN, "scene": scene, "poses": [[*ORIGIN, 1]], "world": world}
     scenario.write_text(yaml.safe_dump(data))
@@ -216,7 +219,23 @@ def test_commands_warn_of_the_place(tmp_path, command):
     }
     outcome = CliRunner().invoke(cli, [command, str(scenario), *options[command]])
     assert outcome.exit_code == 0, outcome.output
-    assert outcome.output.count("The scene is at x 1,000,000, y 10,800,000, outside the") == 1
+    problem = "The scene is at x 1,000,000, y 10,800,000, outside the"
+    assert outcome.output.count(problem) == 1
+    if command == "run":
+        [note] = json.loads((tmp_path / "out/report.json").read_text())["notes"]
+        assert note.startswith(problem)
+        assert "points in the cloud on 1 of 3 objects" in outcome.output  # all in the room
+    if command == "stations":  # the scenario has the same origin, and the warning as a comment
+        planned = (tmp_path / "plan/stations.yaml").read_text()
+        assert f"# Warning: {problem}" in planned
+        assert yaml.safe_load(planned)["world"] == {"epsg": 25832, "origin": [*ORIGIN, 0]}
+
+
+def test_results_of_python_note_the_place():
+    """Whoever makes a job, its result has the warning among its notes."""
+    job = job_of(world={"epsg": 25832, "origin": [0, 0]})
+    assert job.place_problem.startswith("The scene is at x 0, y 0, outside the area of use")
+    assert job_of(world={"epsg": 25832, "origin": ORIGIN}).place_problem == ""
 
 
 @pytest.mark.slow
@@ -227,7 +246,7 @@ def test_stations_and_check_name_the_system(tmp_path):
     scenario.write_text(yaml.safe_dump(data))
     shown = CliRunner().invoke(cli, ["check", str(scenario)]).output
     assert "world       EPSG:25832; (500,000, 5,400,000, 0) m is added to the scenario's" in shown
-    assert "x 499,993.00 to 500,007.00" in shown
+    assert "x -7.00 to 7.00, y -6.00 to 6.00, z 0.00 to 3.00" in shown
     options = ["--sensor", "riegl-vz400", "--count", "1", "--out", f"{tmp_path}/plan", "--json"]
     outcome = CliRunner().invoke(cli, ["stations", str(scenario), *options])
     assert outcome.exit_code == 0, outcome.exception

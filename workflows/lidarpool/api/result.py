@@ -196,8 +196,8 @@ class Result(RunResult):
         yield (
             "survey",
             f"{scans_in_words(self.survey.scan_count, self.survey.sweep_count)}, "
-            f"{self.rays:,} rays, {self.hit_count:,} hits on "
-            f"{plural(len(self.objects), 'object')} ({self.backend}, "
+            f"{self.rays:,} rays, {self.hit_count:,} hits, "
+            f"{plural(len(self.objects), 'object')} in the scene ({self.backend}, "
             f"{self.survey_seconds:.1f} s)",
         )
         names = ", ".join(("x", "y", "z", *(column.name for column in self.points.table)))

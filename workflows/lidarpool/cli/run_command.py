@@ -15,6 +15,7 @@ import click
 from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import plural, scans_in_words
+from lidarsim.columns.table import NO_SURFACE
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 
 from ..base import timeline
@@ -223,15 +224,13 @@ def _result_lines(
 ) -> Iterator[str]:
     """Yield the outcome of a survey as lines of text."""
     yield from terminal.notes(report["notes"])
-    surface_hits = report["hits_on_surfaces"]
-    hits_on_none = result.hit_count - surface_hits
+    hits_elsewhere = result.hit_count - report["hits_on_surfaces"]
     yield (
         f"{scans_in_words(job.survey.scan_count, job.survey.sweep_count)}, "
-        f"{plural(result.rays, 'ray')}, "
-        f"{plural(surface_hits, 'hit')} on {plural(len(job.scene.object_names), 'object')}"
-        f"{f' and {hits_on_none:,} on none' if hits_on_none > 0 else ''}, "
-        f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "
-        f"({result.backend}, {result.survey_seconds:.1f} s)"
+        f"{plural(result.rays, 'ray')}, {plural(result.hit_count, 'hit')}"
+        f"{f' ({hits_elsewhere:,} not on a surface)' if hits_elsewhere > 0 else ''}, "
+        f"{plural(len(result.points), 'point')} in the cloud{_objects_with_points(report)}"
+        f"{result.thinned} ({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if (plan := result.plan) is not None:
         outcome = "no collision-free path was found"
@@ -242,3 +241,12 @@ def _result_lines(
             possible = f"the shortest possible path is {plan.shortest_possible:.2f} m"
         yield f"{outcome}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)"
     yield f"results in {click.format_filename(str(target))}: {', '.join(report['files'])}"
+
+
+def _objects_with_points(report: dict[str, Any]) -> str:
+    """Return a clause with the number of objects that have points, or an empty string."""
+    counts = [n for name, n in report["points_by_object"].items() if name != NO_SURFACE]
+    hit = sum(count > 0 for count in counts)
+    if not hit:
+        return ""
+    return f" on {f'{hit:,} of ' * (hit < len(counts))}{plural(len(counts), 'object')}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.words import joined, plural, printable, without_common_prefix
+from lidarsim.base.words import joined, plural, printable
 
 from . import completion
 from . import shared_options as options
@@ -93,6 +94,7 @@ def _share(text: str) -> float:
 @click.option(
     "--height",
     "height_m",
+    type=click.FloatRange(0, min_open=True),
     default=1.7,
     metavar="M",
     help="Height of the instrument above the floor in meters.",
@@ -100,13 +102,14 @@ def _share(text: str) -> float:
 @click.option(
     "--spacing",
     "spacing_m",
-    type=float,
+    type=click.FloatRange(0, min_open=True),
     metavar="M",
     help="Spacing of the candidate positions in meters (default: about 600 candidates).",
 )
 @click.option(
     "--slant",
     "slant_deg",
+    type=click.FloatRange(0, 90, min_open=True),
     default=80.0,
     metavar="DEG",
     help="Maximum angle of incidence in degrees.",
@@ -181,12 +184,13 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     from lidarsim.base.model_names import full_name
     from lidarsim.sensor.models import load_sensor
 
-    from ..plan.stations import plan_stations
+    from ..plan.stations import plan_stations, sensor_elevations
     from ..report.result_pictures import draw_stations
     from .terminal import Terminal
 
     model = full_name(model)
     sensor = load_sensor(model)
+    sensor_elevations(sensor)  # an unsuitable sensor is reported before the scene is read
     terminal = Terminal(quiet=as_json)
     built, notes = _built_with_notes(scenario, terminal)
     with terminal.status("computing the visibility from all candidates"):
@@ -194,7 +198,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
     file.write_text(
-        _stations_scenario(scenario, folder, model, plan, settings["targets"]),
+        _stations_scenario(scenario, folder, model, plan, settings["targets"], terminal.warnings),
         "utf-8",
         newline="\n",
     )
@@ -370,9 +374,14 @@ def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) ->
 
 
 def _stations_scenario(
-    scenario: Scenario, folder: Path, model: str, plan: StationPlan, targets: Sequence[str]
+    scenario: Scenario,
+    folder: Path,
+    model: str,
+    plan: StationPlan,
+    targets: Sequence[str],
+    warnings: Sequence[str],
 ) -> str:
-    """Return the text of a scenario whose poses are the stations."""
+    """Return the text of a scenario whose poses are the stations, with warnings as comments."""
     import yaml
 
     def relative(file: Path) -> str:
@@ -398,6 +407,9 @@ def _stations_scenario(
         f"They cover {plan.coverage[-1]:.1%} of the\n# visible surface{_of_targets(targets)}. "
         "The steps are 10 degrees wide, with one revolution from each station.\n"
     )
+    for warning in warnings:
+        lines = textwrap.wrap(f"Warning: {warning}", 96, break_on_hyphens=False)
+        head += "".join(f"# {line}\n" for line in lines)
     return head + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=100)
 
 
@@ -453,7 +465,7 @@ def _object_lines(
     uncovered_m2 = visible_m2 - covered_m2
     order = [k for k in (-uncovered_m2).argsort(kind="stable").tolist() if visible_m2[k] > 0]
     shown = order[:_SHOWN_OBJECTS]
-    labels = without_common_prefix(names)
+    labels = [printable(name) for name in names]  # in full, as --target expects them
     groups = [(labels[k], [k]) for k in shown]
     if further := order[_SHOWN_OBJECTS:]:
         groups.append((f"{len(further):,} others", further))

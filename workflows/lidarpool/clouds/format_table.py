@@ -32,8 +32,9 @@ class FormatRow:
     file
         File or folder in the folder of a result; an ending chooses the format.
     module
-        Dotted name of the module that writes it. A class `Reader` there (`clouds/reading.py`) reads
-        single sweeps of data sets.
+        Dotted name of the module that writes the format. If the module has a class `Reader`, which
+        derives from `Reader` in `clouds/sweep_reader.py`, this class reads single sweeps of data
+        sets.
     title
         Proper name in sentences, such as KITTI; by default the name of the format.
     write

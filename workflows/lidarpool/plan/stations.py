@@ -53,20 +53,9 @@ class Sight:
         self.caster = RayCaster(scene.vertices, scene.faces)
         # Single precision of ray casters, and of points in pictures.
         self._slack = max(2e-3, 2e-5 * float(np.linalg.norm(np.ptp(scene.bounds, axis=0))))
-        head = sensor.head
-        revolution = math.ceil(head.firings_per_turn) if isinstance(head, Spin) else sensor.period
-        revolution = revolution or 20_000  # firings of a head that never repeats
-        count = min(revolution, max(4 * _SECTORS, 20_000 // sensor.channels))
-        firings = np.linspace(0, revolution, count, endpoint=False).astype(np.int64)
-        x, y, z = sensor.directions(firings).reshape(-1, 3).T
-        sectors = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
-        if len(np.unique(sectors)) < min(_SECTORS, revolution):
-            raise LidarError(
-                f"{sensor.model} does not scan the full circle, which is required at a scan "
-                "station. Use another sensor, such as terrestrial/riegl-vz400."
-            )
-        self._lowest = float(z.min()) - 1e-9
-        self._highest = float(z.max()) + 1e-9
+        lowest, highest = sensor_elevations(sensor)
+        self._lowest = lowest - 1e-9
+        self._highest = highest + 1e-9
 
     def sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
         """Return the visible sides of surfaces at points (n, 3) from a station (3,): int8 (n,).
@@ -89,6 +78,29 @@ class Sight:
         sides = np.zeros(len(points), np.int8)
         sides[facing_points] = np.sign(facing[facing_points])
         return sides
+
+
+def sensor_elevations(sensor: Sensor) -> tuple[float, float]:
+    """Return the sines of the lowest and the highest elevation of a sensor's rays.
+
+    Raises
+    ------
+    LidarError
+        If the sensor does not scan the full circle.
+    """
+    head = sensor.head
+    revolution = math.ceil(head.firings_per_turn) if isinstance(head, Spin) else sensor.period
+    revolution = revolution or 20_000  # firings of a head that never repeats
+    count = min(revolution, max(4 * _SECTORS, 20_000 // sensor.channels))
+    firings = np.linspace(0, revolution, count, endpoint=False).astype(np.int64)
+    x, y, z = sensor.directions(firings).reshape(-1, 3).T
+    sectors = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(int) % _SECTORS
+    if len(np.unique(sectors)) < min(_SECTORS, revolution):
+        raise LidarError(
+            f"{sensor.model} does not scan the full circle, which is required at a scan "
+            "station. Use another sensor, such as terrestrial/riegl-vz400."
+        )
+    return float(z.min()), float(z.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,8 +187,8 @@ def plan_stations(
     """
     if count is not None and coverage is not None:
         raise LidarError("`count` and `coverage` cannot be combined.")
+    is_target = _target_mask(scene.names, targets)  # a wrong name is reported at once
     scene = replace(SimplifiedScene.from_scene(scene).scene, actors=())
-    is_target = _target_mask(scene.names, targets)
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _default_spacing_m(scene)
@@ -252,8 +264,8 @@ def survey_coverage(
     >>> found.seen_m2.round().tolist(), bool(48 <= found.covered_m2[0] < 54)
     ([180.0], True)
     """
-    scene = SimplifiedScene.from_scene(scene).scene
     is_target = _target_mask(scene.names, targets)
+    scene = SimplifiedScene.from_scene(scene).scene
     sight = Sight(scene, sensor, slant_deg)
     samples = _sample_surfaces(scene, is_target)
     has_point = np.zeros(len(samples.points), np.bool_)

@@ -209,7 +209,7 @@ class DataSetOutput(Output[CampaignRun]):
         seconds = time.monotonic() - run.started
         fields: dict[str, Any] = {
             "stages": loop.stages if loop else (),
-            "notes": tuple(store.notes),
+            "notes": run.notes(),
         }
         warnings = run.warn_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note

@@ -15,9 +15,11 @@ from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
+from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import CHUNK_POINTS
+from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.casting.visibility import unseen_objects
@@ -127,7 +129,7 @@ def forecast(
         "triangles": job.scene.triangles,
         "masked": list(job.scene.masked),
         "unseen": _unseen(job),  # {name of a sensor: names of the objects that it does not see}
-        "bounds": (job.scene.bounds + job.scene.origin).tolist(),
+        "bounds": _bounds_in_scenario(job.scene).tolist(),
         "epsg": job.survey.epsg,
         "world_origin": job.scene.world_origin.tolist(),
         "poses": job.survey.path.stations,
@@ -144,6 +146,15 @@ def forecast(
         "memory": {"needed": required_bytes, "there": cluster.memory or None},
         "disk": disk,
     }
+
+
+def _bounds_in_scenario(scene: Scene) -> Floats:
+    """Return the bounds of a scene in the coordinates of its scenario, (2, 3), in meters.
+
+    World coordinates are these plus `world.origin`.
+    """
+    bounds: Floats = scene.bounds + (scene.origin - scene.world_origin)
+    return bounds
 
 
 class _Cluster(NamedTuple):

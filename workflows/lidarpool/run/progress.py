@@ -173,18 +173,28 @@ class Screen:
     """Reports to a caller of Python: notes go to the log, and bars to a terminal or notebook.
 
     `on_progress` is called in place of bars.
+
+    Attributes
+    ----------
+    warnings
+        Warnings that were reported, without duplicates.
     """
+
+    warnings: list[str]
 
     def __init__(self, on_progress: Callable[[Progress], None] | None = None) -> None:
         self._on_progress = on_progress
+        self.warnings = []
 
     def tell(self, words: str) -> None:
         """Log a note for the user."""
         logger.info(words)
 
     def warn(self, words: str) -> None:
-        """Log a warning about a probable mistake."""
-        logger.warning(words)
+        """Log a warning about a probable mistake once, and append it to `warnings`."""
+        if words not in self.warnings:
+            self.warnings.append(words)
+            logger.warning(words)
 
     def status(self, words: str) -> AbstractContextManager[None]:
         """Return a context that shows the current activity."""

@@ -120,6 +120,7 @@ class Run(Generic[R]):
         self.screen = screen
         self.page = page
         self._on_frame = on_frame
+        self._warnings = tuple(screen.warnings)  # about the scenario, before the run
         self._pacer = None if options.pace is None else Pacer(options.pace)
         self._unshown: list[Receipt] = []  # parts whose frames wait for their time
         self.started = time.monotonic()
@@ -262,6 +263,13 @@ class Run(Generic[R]):
 
     # -- for outputs -------------------------------------------------------------------------
 
+    def notes(self, job: Job | None = None) -> tuple[str, ...]:
+        """Return the notes of the run, after the warnings about its scenario."""
+        warnings = [*self._warnings]
+        if job is not None and job.place_problem:
+            warnings.append(job.place_problem)
+        return tuple(dict.fromkeys([*warnings, *self.store.notes]))
+
     def result(self) -> RunResult:
         """Return the result of the only job, which is committed."""
         only_job = self.store.only_job
@@ -285,7 +293,7 @@ class Run(Generic[R]):
             hit_count=only_job.parts.hit_count,
             stages=loop.stages if loop else (),
             resumed=only_job.resumed,
-            notes=tuple(self.store.notes),
+            notes=self.notes(job),
             identity=self.store.identity,
             _hit_counts=only_job.hit_counts,
             sample_rays=only_job.sample_rays(),

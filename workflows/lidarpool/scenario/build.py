@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -44,7 +45,7 @@ from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
 from .default_poses import Placing, place_sensor
-from .georeference import check_epsg, warn_of_place
+from .georeference import check_epsg, place_problem
 from .ground import StandingSurfaces
 from .osi_traffic import OSI_SUFFIXES, read_osi
 from .scenario import Scenario
@@ -59,6 +60,8 @@ from .traffic import (
     carrier_of,
     read_fcd,
 )
+
+_log = logging.getLogger(__name__)
 
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
@@ -137,9 +140,15 @@ class Job:
             )
         if survey.epsg is not None:
             check_epsg(survey.epsg, scene)
-        warn_of_place(scene, survey.epsg)
+        if self.place_problem:
+            _log.warning("%s", self.place_problem)
         warn_of_gray(scene, survey)
         warn_of_reach(scene, survey)
+
+    @cached_property
+    def place_problem(self) -> str:
+        """Warning that the scene is probably in the wrong place, or an empty string."""
+        return place_problem(self.scene, self.survey.epsg)
 
     @property
     def trials(self) -> int:

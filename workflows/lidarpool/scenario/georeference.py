@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,8 +10,6 @@ from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.files.coordinate_systems import outside_system, target_problem, zone_in_area
 from lidarsim.scene.scene import Scene
-
-_log = logging.getLogger(__name__)
 
 # Coordinates of the files and `world.origin` are the same place, given twice, if both are this far
 # from zero, and differ by less than this share. Local coordinates are near zero.
@@ -37,12 +34,6 @@ def check_epsg(epsg: int, scene: Scene) -> None:
         raise LidarError(place_problem(scene, epsg))
     if problem:
         raise LidarError(f"`world.epsg` (`epsg` in Python) is {problem}.")
-
-
-def warn_of_place(scene: Scene, epsg: int | None) -> None:
-    """Log a warning if a scene is not where a coordinate system is used."""
-    if problem := place_problem(scene, epsg):
-        _log.warning("%s", problem)
 
 
 def place_problem(scene: Scene, epsg: int | None) -> str:

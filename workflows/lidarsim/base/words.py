@@ -65,18 +65,19 @@ def most_similar(word: str, candidates: Iterable[str]) -> str | None:
 
 
 def name_hint(pattern: str, names: Sequence[str]) -> str:
-    """Return the most similar name.
+    """Return a sentence with the names that are similar to a name or pattern.
 
-    Without one, or for a pattern with * or ?, returns the first names.
-
-    Names that differ in their last number are listed as a pattern, with their number.
+    Without similar names, the sentence lists the first names. Names that differ only in their last
+    number are listed as a pattern, with their number.
 
     Examples
     --------
     >>> name_hint("Hose", ["House", "Tree"])
     " Did you mean 'House'?"
-    >>> name_hint("Street*", ["House", "Tree", "Tree.2", "Tree.3"])
+    >>> name_hint("Lamp*", ["House", "Tree", "Tree.2", "Tree.3"])
     ' Available names: House, Tree* (3).'
+    >>> name_hint("hous*", ["Ground", "Site_House_1", "Site_House_2", "Site_House_3"])
+    ' Similar names: Site_House* (3).'
     """
     is_pattern = any(sign in pattern for sign in "*?[")
     if similar := "" if is_pattern else did_you_mean(pattern, names):
@@ -85,8 +86,17 @@ def name_hint(pattern: str, names: Sequence[str]) -> str:
     for name in names:
         groups.setdefault(_LAST_NUMBER.sub("", name), []).append(name)
     entries: list[str] = []
+    similar_entries: list[str] = []
+    word = max(re.split(r"[*?\[\]]", pattern), key=len).casefold()
+    close = {*difflib.get_close_matches(word, map(str.casefold, groups), n=8)}
     for stem, group in groups.items():
-        entries += [f"{stem}* ({len(group):,})"] if stem and len(group) > 2 else group
+        listed_group = [f"{stem}* ({len(group):,})"] if stem and len(group) > 2 else group
+        entries += listed_group
+        folded = stem.casefold()
+        if folded in close or (len(word) > 1 and word in folded):
+            similar_entries += listed_group
+    if similar_entries:
+        return f" Similar names: {listed(similar_entries, 8)}."
     return f" Available names: {listed(entries, 8) or 'none'}."
 
 
