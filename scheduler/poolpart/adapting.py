@@ -64,11 +64,12 @@ class Bounds:
         PoolError
             If a number is not possible.
         """
-        check_count(f"The minimum of partition {name!r}", minimum, minimum=0)
-        check_count(f"The maximum of partition {name!r}", maximum, minimum=max(1, minimum))
+        check_count(f"the minimum of partition {name!r}", minimum, minimum=0)
+        check_count(f"the maximum of partition {name!r}", maximum, minimum=max(1, minimum))
         if not isinstance(idle_s, int | float) or not 0 <= idle_s < math.inf:
             raise PoolError(
-                f"idle_s of partition {name!r} is {idle_s!r}; give seconds, such as 60."
+                f"Invalid value {idle_s!r} for `idle_s` of partition {name!r}. Expected a number "
+                "of seconds, for example 60."
             )
         return cls(minimum, maximum, float(idle_s))
 

@@ -24,24 +24,28 @@ _own: dict[str, int | None] = {}  # {address of a worker of this process: its de
 
 @telling_departure()
 def own_device() -> int | None:
-    """CUDA device that this task's worker should use, by the worker's own numbering, or None.
+    """Return the CUDA device that the worker of this task should use, or None if it has no device.
 
-    Workers spread over the devices that they see: each takes the first device in its list that
-    the fewest others use, in its partition first, then in the cluster. dask-cuda rotates
-    `CUDA_VISIBLE_DEVICES` from worker to worker so that number 0 is another device in each,
-    whereas workers of a plain `dask worker` all list the same devices in the same order.
-    A worker keeps its device until it ends: the answer is the same for all of its tasks, and takes
-    no time from the second one on.
+    The number refers to the devices that are visible to the worker. The workers are distributed
+    over the devices: each worker takes the first device in its list that the fewest other workers
+    use, first in its partition and then in the cluster. A worker keeps its device until it ends, so
+    all of its tasks receive the same number, and only the first call takes time.
 
     Raises
     ------
     WorkerLeft
         If the worker is leaving.
     ValueError
-        Outside of a task.
+        If the function is called outside of a task.
     PoolError
-        If the scheduler lacks this package; in the first call on a worker, if it is in a
-        coroutine: call it in a thread.
+        If poolpart is not installed in the environment of the scheduler, or if the first call on a
+        worker is made in a coroutine. In the latter case, call the function in a thread.
+
+    Notes
+    -----
+    dask-cuda rotates `CUDA_VISIBLE_DEVICES` from worker to worker, so that device 0 differs between
+    workers. Workers of a plain `dask worker` list the same devices in the same order. This function
+    supports both cases.
 
     Examples
     --------
@@ -55,17 +59,27 @@ def own_device() -> int | None:
         if gpus := probe.visible_gpus():
             device = on_scheduler(own_client(), assign_device, address=address, gpus=gpus)
             if device is None:
-                raise WorkerLeft(f"the scheduler has given up the worker at {address}")
+                raise WorkerLeft(f"The scheduler has removed the worker at {address}.")
         _own[address] = device
     return _own[address]
 
 
 @telling_departure()
 def own_device_share() -> float:
-    """Share of its device's memory that this task's worker may take: 1 if no other uses the device.
+    """Return the share of the device memory that the worker of this task may use, between 0 and 1.
 
-    The workers of a partition and host that see as many devices share these evenly. They count as
-    soon as they have joined. The errors of `own_device` are raised here, too.
+    The share is 1 if no other worker uses the device. Workers of the same partition and host that
+    see the same number of devices share the devices evenly. Workers count as soon as they have
+    joined.
+
+    Raises
+    ------
+    WorkerLeft, ValueError, PoolError
+        In the same cases as `own_device`.
+
+    Examples
+    --------
+    >>> limit = int(own_device_share() * 8e9)                          # doctest: +SKIP
     """
     if own_device() is None:
         return 1.0

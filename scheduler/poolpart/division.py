@@ -30,7 +30,7 @@ PATIENCE_S = 60.0  # seconds that a worker has to answer
 _RETURN_S = 10.0  # minimum time for workers to declare their former resources
 _STAY_S = 1.0  # time until workers that could not be moved are members again
 _LOOK_EVERY_S = 0.05  # between looks for tasks that have not ended
-_MOVES = "The number of workers to move"
+_MOVES = "the number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
@@ -68,7 +68,6 @@ async def _answer(
 async def declare(
     steward: Steward,
     rules: Mapping[str, Rule],
-    initial_rules: Mapping[str, Rule],
     pool: Mapping[str, WorkerInfo],
     known_partitions: Collection[str],
     own_partitions: Collection[str],
@@ -80,9 +79,7 @@ async def declare(
     steward
         The scheduler's steward.
     rules
-        {partition: rule for workers that join later}.
-    initial_rules
-        {partition: rule that chooses the first workers}.
+        {partition: its rule}.
     pool
         {name of a worker to choose from: the worker as the client saw it, with its GPUs}.
     known_partitions
@@ -111,19 +108,22 @@ async def declare(
     ]
     # By name: a restarted worker has another address.
     candidates = [w.with_gpus(pool[w.name].gpus) for w in present if w.name in pool]
-    chosen, notes = divide(initial_rules, candidates)
+    chosen, notes = divide(rules, candidates)
     as_seen = [
         worker
         if worker.partitions & {*own_partitions}
         else replace(worker, resources=pool[worker.name].resources)
         for worker in candidates
     ]
-    notes = {**shortfalls(initial_rules, candidates, as_seen), **notes}
+    notes = {**shortfalls(rules, candidates, as_seen), **notes}
     other = steward.remainder()
     for name in rules:
         if isinstance(rules[name], rest) and other not in (None, *rules):
-            note = f"workers that join later go to partition {other!r}, which has the rest already"
-            notes[name] = "; ".join(filter(None, (notes.get(name), note)))
+            note = (
+                f"Workers that join later are assigned to partition {other!r}, which already has "
+                "the rule `rest()`."
+            )
+            notes[name] = " ".join(filter(None, (notes.get(name), note)))
     for name in rules:
         # Workers that may be in the partition already: it is made again.
         permitted = {worker.address for worker in chosen[name]} if name in known_partitions else ()
@@ -145,32 +145,34 @@ async def declare(
     await features_settled()  # before the members get tasks, which lend slots
     members = [seats[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
-    notes_of_all = {name: "; ".join(filter(None, (notes.get(name), common_note))) for name in rules}
+    notes_of_all = {name: " ".join(filter(None, (notes.get(name), common_note))) for name in rules}
     return notes_of_all, [worker for worker in candidates if seats[worker.address] not in members]
 
 
 def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
-    """Say that workers which a rule does not take have its partition, and what to do."""
+    """Return the message for workers that have a partition and are not chosen by its rule."""
     if name in steward.rules:
         return (
-            f"Partition {name!r} exists already, with {names_of(members)}, "
-            "which this call did not see, or does not choose: use "
-            f"Pool.partitions()[{name!r}] of a new pool, or give another name."
+            f"Partition {name!r} already exists, and this call does not select all of its workers. "
+            f"Its workers are {names_of(members)}. To use the existing partition, call "
+            f"`Pool.from_client(client)[{name!r}]`. To create another partition, choose a "
+            "different name."
         )
-    use = f"use Pool.partitions()[{name!r}] as it is"
+    use = f"Use the existing partition with `Pool.from_client(client)[{name!r}]`"
     for seat in members:
         names = [resource for resource, slots in seat.original.items() if slots]
         if len(names) > 1:
             return (
-                f"Worker {seat.info.name} was started with the resources {', '.join(names)}, and "
-                f"a worker belongs to one partition: {use}, or start the worker with --resources "
-                f'"{name}=1" alone.'
+                f"Worker {seat.info.name} was started with the resources {', '.join(names)}, but "
+                f"a worker can belong to only one partition. {use}, or start the worker with only "
+                f'`--resources "{name}=1"`.'
             )
     return (
-        f"Workers were started with the resource {name!r}, and the rule does not take all of them "
-        f"({names_of(members)} would be left): {use}, or give a rule that takes all, such as "
-        "rest(), or another name. A partition of another name, with minimum=0, takes workers from "
-        f"{name!r} by resize(1, source={name!r})."
+        f"Workers were started with the resource {name!r}, and the rule does not select all of "
+        f"them. Workers that are not selected: {names_of(members)}. {use}, pass a rule that "
+        "selects all of these workers, such as `rest()`, or choose another name. A partition with "
+        f"another name and `minimum=0` can take workers from {name!r}, for example with "
+        f"`partition.resize(1, source={name!r})`."
     )
 
 
@@ -182,9 +184,9 @@ async def _expect_arrival(steward: Steward, members: Sequence[Seat]) -> None:
     late = await steward.arrive(members, PATIENCE_S)
     if absent := [seat for seat in members if seat in late or seat.removed]:
         raise PoolError(
-            f"{names_of(absent)} left, or did not answer, when assigned to partition "
-            f"{' and '.join(sorted({str(seat.partition) for seat in absent}))}; the other workers "
-            "were assigned. Make a new pool to divide it again."
+            "Some workers left or did not respond while they were assigned to "
+            f"{_in_words(sorted({str(seat.partition) for seat in absent}))}: {names_of(absent)}. "
+            "The other workers were assigned. Create a new pool to divide it again."
         )
 
 
@@ -240,13 +242,13 @@ async def resize(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
     """Give a partition a number of workers, and return the names of the workers that moved."""
-    check_count(f"The number of workers of partition {name!r}", count, minimum=0)
+    check_count(f"the number of workers of partition {name!r}", count, minimum=0)
     steward.adopt(name)
     rule = steward.rules[name]
     if count < rule.minimum:
         raise PoolError(
-            f"Partition {name!r} cannot have {count} workers, because its rule has the minimum "
-            f"{rule.minimum}."
+            f"Partition {name!r} cannot be resized to {workers_in_words(count)}, because its "
+            f"minimum is {rule.minimum}."
         )
     size = len(steward.members(name))  # includes members that are starting again
     moving: list[Seat] = []
@@ -277,7 +279,10 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
     Raises PoolError if there are fewer than `count`.
     """
     if source == name:
-        raise PoolError(f"Partition {name!r} cannot take workers from itself.")
+        raise PoolError(
+            f"Partition {name!r} cannot take workers from itself. Pass another partition as "
+            "`source`."
+        )
     if source is not None:
         steward.adopt(source)
     donor = source or steward.remainder()
@@ -286,11 +291,16 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
         members = _settled_members(steward, donor)
         spare += members[: max(0, len(members) - steward.rules[donor].minimum)]
     if len(spare) < count:
-        donor_text = f"partition {donor!r}, beyond its minimum," if source else "the remainder"
+        available = f"only {workers_in_words(len(spare))}" if spare else "no workers"
+        if source:
+            reason = f"partition {source!r} has {available} to spare beyond its minimum"
+            advice = "pass another partition as `source`"
+        else:
+            reason = f"the remainder of the pool has {available} to spare"
+            advice = "pass the partition that should provide them as `source`"
         raise PoolError(
-            f"Partition {name!r} cannot grow by {count}: {donor_text} has "
-            f"{workers_in_words(len(spare), 'spare')}. Start more, or shrink another partition "
-            "first."
+            f"Partition {name!r} cannot grow by {workers_in_words(count)}, because {reason}. "
+            f"Start more workers, or {advice}."
         )
     return _by_load(steward, spare)[:count]
 
@@ -304,8 +314,8 @@ def _leaving(steward: Steward, name: str, count: int) -> list[Seat]:
     minimum = steward.rules[name].minimum
     if len(members) - count < minimum:
         raise PoolError(
-            f"Partition {name!r} cannot shrink by {count}: it has "
-            f"{workers_in_words(len(members))} and needs at least {minimum}."
+            f"Partition {name!r} cannot shrink by {workers_in_words(count)}, because it has "
+            f"{workers_in_words(len(members))} and its minimum is {minimum}."
         )
     return members[:count]
 
@@ -339,9 +349,10 @@ async def _move(
     if late:
         await steward.arrive(late, _STAY_S)  # so that they can be moved again at once
         raise PoolError(
-            f"{len(late)} of {len(seats)} workers could not be moved within "
-            f"{timeout_s:g} s, because their tasks have not ended, or they do not answer: "
-            f"{names_of(late)} stay."
+            f"{len(late)} of {workers_in_words(len(seats))} could not be moved within "
+            f"{timeout_s:g} s. A worker is not moved while it runs tasks or does not respond. "
+            f"These workers stay in their partition: {names_of(late)}. Wait for their tasks, or "
+            "pass a longer `timeout_s`."
         )
     return [seat.info.name for seat in seats if not seat.removed]
 
@@ -411,10 +422,17 @@ async def dissolve(
     present = [seat for seat in seats if not seat.away]
     if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
-            f"{names_of(late)} did not answer while {' and '.join(dissolved)} were dissolved; they "
-            "are restored when they answer."
+            f"Some workers did not respond while {_in_words(dissolved)} "
+            f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {names_of(late)}. They are "
+            "restored as soon as they respond."
         )
     return dissolved
+
+
+def _in_words(partitions: Sequence[str]) -> str:
+    """Return partitions for a message, such as "partitions 'A' and 'B'"."""
+    plural = "s" if len(partitions) > 1 else ""
+    return f"partition{plural} {' and '.join(map(repr, partitions))}"
 
 
 def _existing(steward: Steward, names: Collection[str] | None) -> list[str]:
@@ -444,10 +462,12 @@ async def _wait_for_tasks(
     await asyncio.sleep(_LOOK_EVERY_S)
     while tasks := _unfinished(steward.scheduler, _existing(steward, names)):
         if time.monotonic() >= deadline:
+            one = len(tasks) == 1
             raise PoolError(
-                f"After {timeout_s:g} s {len(tasks)} tasks of "
-                f"{' and '.join(_existing(steward, names))} had not ended, such as "
-                f"{tasks[0].key}: wait or cancel, then dissolve."
+                f"{len(tasks)} {'task' if one else 'tasks'} of "
+                f"{_in_words(_existing(steward, names))} {'has' if one else 'have'} not finished "
+                f"after {timeout_s:g} s, for example {tasks[0].key!r}. Wait for the tasks or "
+                "cancel them, and dissolve again."
             )
         await asyncio.sleep(_LOOK_EVERY_S)
 

@@ -2,12 +2,12 @@
 
 
 class PoolError(RuntimeError):
-    """A pool cannot be divided as requested, or lacks workers or slots that a job needs."""
+    """The pool or a partition cannot be used as requested."""
 
 
 class PipeClosed(Exception):  # noqa: N818 - like StopIteration: an end, not an error
-    """A pipe is closed and, for a consumer, empty."""
+    """The pipe is closed and, for a consumer, also empty."""
 
 
 class PipeFailed(RuntimeError):  # noqa: N818 - reads as what happened to the pipe
-    """A pipe was failed with `Pipe.fail`, whose reason is the message."""
+    """The pipe has failed. The message contains the reason."""

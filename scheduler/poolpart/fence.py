@@ -155,9 +155,9 @@ class Fences(SchedulerPlugin):
         self._warned_at = time.monotonic()
         fences = ", ".join(sorted(self.names))
         message = (
-            f"Tasks wait, such as {key!r}: all workers that could take them are kept for "
-            f"exclusive partitions ({fences}). Start more workers, submit to a partition, or "
-            "make a partition that is not exclusive."
+            f"Tasks such as {key!r} are waiting, because all workers that could run them belong "
+            f"to exclusive partitions ({fences}). Start more workers, submit the tasks to a "
+            "partition, or create a partition that is not exclusive."
         )
         logger.warning(message)
         self.scheduler.log_event("warn", {"message": pickle.dumps(message)})

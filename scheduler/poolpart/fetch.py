@@ -25,33 +25,32 @@ _held: dict[str, Any] = {}  # {name: bytes that this process holds}
 def fetch_available(
     client: Client, keys: Collection[str], patience_s: float = 2.0, *, holder: str | None = None
 ) -> dict[str, Any]:
-    """Fetch the results that are available now.
+    """Fetch the results that are currently available.
 
-    A later call fetches further results.
-
-    `Client.gather` is the wrong tool for a long-running consumer. When a worker dies, a
-    connection to it is tried for half a minute, and nothing else is delivered meanwhile; and
-    a future for a released key makes the scheduler wait for ever for a task that nobody
-    submits. This function asks where the keys are, fetches them from there, and gives up on a
-    worker that is silent for `patience_s`: the next call asks again, and finds recomputed results
-    elsewhere. The submitter must hold references to the keys.
+    Later calls fetch further results. `Client.gather` is not suitable for a long-running consumer.
+    If a worker dies, it tries to connect to it for half a minute, and does not deliver other
+    results in the meantime. If a key was released, its future lets the scheduler wait forever for a
+    task that nobody submits. This function asks the scheduler which workers hold the results,
+    fetches them, and gives up on a worker that is silent for `patience_s` seconds. The next call
+    asks again, and finds recomputed results on other workers. The submitter must hold references to
+    the keys.
 
     Parameters
     ----------
     client
-        A client; on a worker, the worker's own.
+        Client of the cluster. In a task, the client of its worker.
     keys
-        Keys of tasks, finished or not.
+        Keys of finished or unfinished tasks.
     patience_s
-        Longest time to wait for an answer of the scheduler, and then for a sign of life of each
-        worker, in seconds. A transfer may take longer.
+        Maximum time in seconds to wait for a response of the scheduler, and then for a response of
+        each worker. A transfer may take longer.
     holder
-        Address of a worker that has all keys; then the scheduler is not asked where they are.
+        Address of a worker that holds all results. If given, the scheduler is not asked.
 
     Returns
     -------
     dict
-        Results by key, possibly none.
+        Results by key, possibly empty.
     """
     require(FETCHING)
 

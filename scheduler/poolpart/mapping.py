@@ -123,7 +123,7 @@ def run_chunk(
             if results and not return_exceptions:
                 break
             shown = ", ".join(reprlib.repr(argument) for argument in call)
-            error.add_note(f"{NOTE}this was item {number} of a map: {shown}")
+            error.add_note(f"{NOTE}The error occurred for item {number} of a map: {shown}")
             if not return_exceptions:
                 raise
             results.append(_sendable(error))
@@ -227,7 +227,10 @@ class Stage:
         for name, minimum in (("window", 1), ("chunk", 1), ("retries", 0)):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or value < minimum):
-                raise ValueError(f"{name} is {value!r}; give a whole number, {minimum} or more.")
+                raise ValueError(
+                    f"Invalid value {value!r} for `{name}`. Expected an integer of at least "
+                    f"{minimum}."
+                )
         check_wait(self.empty_s)
 
     def prospects(self) -> Prospects:
@@ -259,7 +262,8 @@ class Stage:
             # arguments share one key on the cluster if they are large.
             [self.keywords] * len(firsts),
             *([previous_tasks] if previous_tasks else []),
-            key=f"map-{funcname(self.function)}",
+            # Dask takes the first word, and further words of letters only, as the prefix.
+            key=f"{funcname(self.function)}-map",
             pure=False,
             priority=self.priority,
             retries=self.retries or None,
@@ -269,11 +273,16 @@ class Stage:
 
 
 class Results(Iterator[Any]):
-    """Results of a function for many items, an iterator from `Partition.map`.
+    """Iterator of the results of a function for many items, as returned by `Partition.map`.
 
-    The first tasks start at once; further items are taken, sent and fetched while results are
-    read. Close or delete it to stop early. It has a length if all iterables have one; `done` is the
-    number of results that were read.
+    The first tasks start immediately. Further items are taken, sent and fetched while results are
+    read. Close or delete the iterator to stop early. It has a length if all iterables have one.
+    `done` is the number of results that have been read.
+
+    Examples
+    --------
+    >>> with contextlib.closing(io.map(load, paths)) as results:         # doctest: +SKIP
+    ...     first = next(results)
     """
 
     def __init__(self, stage: Stage, iterables: Sequence[Iterable[Any]]) -> None:
@@ -341,18 +350,21 @@ class Results(Iterator[Any]):
 
     def __len__(self) -> int:
         if self._length == math.inf:
-            raise TypeError("The length of a map is that of its iterables; one of them has none.")
+            raise TypeError(
+                "The length of a map is unknown, because one of its iterables has no length."
+            )
         return int(self._length)
 
     def __bool__(self) -> bool:
         # Dask's `as_completed` asks first; it would take the results for futures.
         raise TypeError(
-            "Partition.map gives results, not futures: loop over them, with ordered=False as they "
-            "complete, or list(partition.map(…)). Partition.submit gives a future for as_completed."
+            "`Partition.map` returns an iterator of results, not futures. Iterate over it, with "
+            "`ordered=False` to receive results as they complete. To obtain futures for "
+            "`as_completed`, use `Partition.submit`."
         )
 
     def __repr__(self) -> str:
-        state = "closed" if self._closed else f"{len(self._running)} tasks under way"
+        state = "closed" if self._closed else f"{len(self._running)} tasks in flight"
         last = self._stages[-1]
         return (
             f"<Results of {funcname(last.function)} on {last.partition!r}: "
@@ -360,7 +372,7 @@ class Results(Iterator[Any]):
         )
 
     def close(self) -> None:
-        """Stop: waiting tasks are cancelled, results that were not read are dropped."""
+        """Cancel waiting tasks and discard results that have not been read."""
         self._closed = True
         self._failed = None
         for held in (self._ready, self._undelivered, self._unfinished):
@@ -404,7 +416,8 @@ class Results(Iterator[Any]):
         self._slots = [of_stage.running for of_stage in prospects]
         for wait, of_stage in zip(self._waits, prospects, strict=True):
             wait.check(of_stage)
-        self._next_look = time.monotonic() + LOOK_S
+        until_next = min(wait.until_next_check(LOOK_S) for wait in self._waits)
+        self._next_look = time.monotonic() + until_next
 
     def _submit(self) -> None:
         """Send chunks up to the window, in as few messages as possible."""
@@ -504,7 +517,7 @@ class Results(Iterator[Any]):
         """Raise if the client was closed, and count the partition's slots from time to time."""
         if self._stages[-1].client.status in ("closing", "closed"):
             raise CancelledError(
-                f"The client of partition {self._stages[-1].partition!r} was closed."
+                f"The client that partition {self._stages[-1].partition!r} uses was closed."
             )
         # Not while there are results: results of a dissolved partition are read first.
         if self._ended.empty() and time.monotonic() > self._next_look:
@@ -564,15 +577,15 @@ class Results(Iterator[Any]):
             if not (_of_item(error) or future.cancelled() or isinstance(error, PoolError)):
                 last = chunk.first + len(chunk.rows) - 1
                 error.add_note(
-                    f"{NOTE}the task was for items {chunk.first} to {last} of a map; unless "
-                    "window=1, a task beside it may have killed the worker"
+                    f"{NOTE}The task processed items {chunk.first} to {last} of a map. Unless "
+                    "`window=1`, another task on the same worker may have killed the worker."
                 )
             raise
         raise AssertionError("the task has not failed")
 
 
 def _wait_of(stage: Stage) -> WorkerWait:
-    return WorkerWait(stage.partition, "a map", stage.empty_s)
+    return WorkerWait(stage.partition, "A map", stage.empty_s)
 
 
 def _of_item(error: BaseException | None) -> bool:

@@ -27,7 +27,7 @@ from typing import Any
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .adapting import expects_workers, max_running_tasks, slots_of_new_worker
+from .adapting import adaptive_names, expects_workers, max_running_tasks, slots_of_new_worker
 from .errors import PoolError
 from .features import begin_features, end_features, features_settled, names_with_features
 from .internals.method_rules import Rules, rule_for_arriving_graphs
@@ -38,7 +38,7 @@ from .registration import is_registered, note_registration
 from .stats import NAME as STATISTICS
 from .stats import forget_statistics, statistics_of
 from .steward import NAME as STEWARD
-from .steward import Steward
+from .steward import Steward, names_with_rule
 from .workers import on_scheduler
 
 logger = logging.getLogger(__name__)
@@ -75,7 +75,7 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
     if is_registered(client, name):
         return by_rule
     connection = client.scheduler_comm
-    has_or_had_rule, objection = on_scheduler(
+    has_or_had_rule, objection, others = on_scheduler(
         client,
         _register,
         name=name,
@@ -86,6 +86,15 @@ def register(client: Client, name: str, slots: int, by_rule: bool) -> bool:
     )
     if objection:
         raise PoolError(objection)
+    if others is not None:
+        existing = ", ".join(map(repr, others)) or "none"
+        logger.warning(
+            "Partition %r has no workers. Its tasks wait until a worker with the resource %r joins "
+            "the cluster. Existing partitions: %s.",
+            name,
+            name,
+            existing,
+        )
     note_registration(client, name, connection)
     return bool(has_or_had_rule)
 
@@ -126,7 +135,9 @@ class Registrations(SchedulerPlugin):
             require(REFUSING)
             rule_for_arriving_graphs(self._rules, scheduler, self._check)
         except PoolError as error:  # partitions are of use without
-            logger.warning("Partitions: tasks that could never run are not refused: %s", error)
+            logger.warning(
+                "Partitions: Tasks that can never run wait instead of failing. %s", error
+            )
         scheduler.add_plugin(self)
 
     # -- clients -----------------------------------------------------------------------
@@ -197,10 +208,11 @@ async def _register(
     client_id: str,
     in_task: bool,
     dask_scheduler: Any = None,
-) -> tuple[bool, str]:
+) -> tuple[bool, str, list[str] | None]:
     """Register a client, unless its task could never run.
 
-    Returns whether the partition has or had a rule, and why the task cannot run, or "".
+    Returns whether the partition has or had a rule, why the task cannot run, or "", and, if no
+    worker of the partition exists or is expected, the names of the partitions that exist.
     """
     registrations: Registrations | None = dask_scheduler.plugins.get(NAME)
     ruled = has_rule(dask_scheduler, name)
@@ -218,16 +230,40 @@ async def _register(
         if not ruled:  # or the division of the pool has begun it
             begin_features(dask_scheduler, [name])
         await features_settled()
-    return has_or_had_rule, objection
+    others = None
+    if not expects_any_worker(dask_scheduler, name, slots):
+        others = partition_names(dask_scheduler)
+    return has_or_had_rule, objection, others
+
+
+def partition_names(dask_scheduler: Any = None) -> list[str]:
+    """Return the names of all partitions, including divided and adaptive ones without workers.
+
+    Runs on the scheduler.
+    """
+    declared = {
+        name
+        for worker in dask_scheduler.workers.values()
+        for name, slots in worker.resources.items()
+        if slots
+    }
+    return sorted(declared | adaptive_names(dask_scheduler) | names_with_rule(dask_scheduler))
+
+
+def expects_any_worker(scheduler: Any, name: str, slots: float) -> bool:
+    """Return whether a partition has a worker, or a worker is starting or may be started."""
+    steward: Steward | None = scheduler.plugins.get(STEWARD)
+    return bool(
+        has_worker_for(scheduler, name, slots)
+        or (steward is not None and steward.members(name))
+        or expects_workers(scheduler, name)
+    )
 
 
 def _prospects(name: str, slots: int, by_rule: bool, dask_scheduler: Any = None) -> Prospects:
-    steward: Steward | None = dask_scheduler.plugins.get(STEWARD)
-    seats = steward.members(name) if steward is not None else []
-    has_workers = has_worker_for(dask_scheduler, name, slots)
     return Prospects(
         max_running_tasks(dask_scheduler, name, slots),
-        has_workers or bool(seats) or expects_workers(dask_scheduler, name),
+        expects_any_worker(dask_scheduler, name, slots),
         objection_to(dask_scheduler, name, slots, by_rule),
     )
 
@@ -277,7 +313,7 @@ def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool)
         return ""
     members = [worker for worker in workers_declaring(scheduler, name) if worker.resources[name]]
     if has_or_had_rule and not members and not has_rule(scheduler, name):
-        return f"Partition {name!r} was dissolved: divide the pool again, or use another partition."
+        return f"Partition {name!r} was dissolved. Divide the pool again, or use another partition."
     steward: Steward | None = scheduler.plugins.get(STEWARD)
     seats = steward.members(name) if steward is not None else []
     max_slots = max(
@@ -289,9 +325,9 @@ def objection_to(scheduler: Any, name: str, slots: float, has_or_had_rule: bool)
     if not max_slots or slots <= max_slots:
         return ""
     return (
-        f"A task asks for {slots:g} slots of one worker, and workers of partition {name!r} have "
-        f"{max_slots:g} at most: ask for fewer, or give them more, by slots={slots:g} in "
-        f'its rule or by --resources "{name}={slots:g}".'
+        f"A task requests {slots:g} slots on one worker, but workers of partition {name!r} have "
+        f"at most {max_slots:g}. Request fewer slots, or increase the slots per worker with "
+        f'`slots={slots:g}` in the rule or with `--resources "{name}={slots:g}"`.'
     )
 
 
@@ -314,10 +350,10 @@ def addresses_of(scheduler: Any, name: str, workers: Sequence[str]) -> list[str]
     for worker in map(str, workers):
         matches = [address for address, member in members.items() if worker in (address, member)]
         if not matches and ("://" not in worker or worker in scheduler.workers):
-            present = ", ".join(sorted(members.values())[:9]) or "none at the moment"
+            present = ", ".join(sorted(members.values())[:9]) or "none"
             raise PoolError(
-                f"Worker {worker!r} does not belong to partition {name!r}: give names or "
-                f"addresses of its members ({present})."
+                f"Worker {worker!r} does not belong to partition {name!r}. Pass names or "
+                f"addresses of its current members: {present}."
             )
         addresses += matches or [worker]
     return addresses

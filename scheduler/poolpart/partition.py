@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import concurrent.futures
 import inspect
 import re
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, nullcontext, suppress
+from contextlib import ExitStack, nullcontext
 from contextvars import ContextVar
 from typing import Any, Literal, Self, overload
 
@@ -34,43 +33,52 @@ from .stats import size_of, stats_of, tasks_of
 from .task_context import own_client
 from .task_table import TaskTable, moment
 from .worker_wait import WAIT_S
-from .workers import WorkerInfo, all_workers, on_scheduler
+from .workers import WorkerInfo, all_workers, ask_for_repr, on_scheduler
 
-_REPR_S = 2.0  # longest wait of `repr` for the scheduler, seconds
 # Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 
 
 class Partition:
-    """The workers of a cluster that declare the resource `name`.
+    """Workers of a cluster that declare the resource `name`, and an interface to run tasks on them.
 
-    Every task of a partition takes a slot of the resource, and so runs on these workers only. The
-    members are the workers that declare the resource now, including restarted workers and workers
-    that joined with the resource.
+    Each task of a partition takes a slot of the resource, and therefore only runs on these
+    workers. The members are the workers that declare the resource at the moment. This includes
+    restarted workers and workers that have joined with the resource.
 
     Parameters
     ----------
     name
         Name of the partition and of the resource.
     client
-        Client of the cluster. By default, in a task, the client of its worker.
+        Client of the cluster. By default, a task uses the client of its worker.
     note
-        A remark for users, such as that there were no GPUs. The division that makes the
-        partition logs the note as a warning, once.
+        Remark about the partition, for example that the pool has no GPUs. The division that
+        creates the partition logs the note as a warning.
     by_rule
-        Whether a division of the pool made it, so that it can be dissolved.
+        Whether a division of the pool created the partition, so that it can be dissolved.
 
     Notes
     -----
-    Functions of a script are sent with each task, and global variables of the script are new each
-    time: keep a value that is expensive to build in a module, or as an attribute of
-    ``distributed.get_worker()``.
+    If no worker declares the resource and none is expected, the first task logs a warning that
+    lists the existing partitions. The task waits until a worker with the resource joins.
 
-    A partition can be an argument of a task, which then submits with the client of its worker.
-    Tasks that a task of a partition submits to a `Client` belong to the same partition and take a
-    slot each; the submitting task lends its own slot while it waits for results. Release a
-    `threading.Lock` before such a wait: a task that borrows the slot may wait for the lock, and
-    then neither task goes on. A `distributed.Lock` may be held.
+    Dask sends the functions of a script with each task and creates the global variables of the
+    script anew each time. Store values that are expensive to build in a module, or as an attribute
+    of ``distributed.get_worker()``.
+
+    A partition can be an argument of a task. In the task, it uses the client of the worker.
+
+    If a task of a partition submits tasks with a `Client`, these tasks belong to the same
+    partition, and each of them takes a slot. The submitting task lends its own slot while it waits
+    for results. Release a `threading.Lock` before such a wait. Otherwise, a task that borrows the
+    slot may wait for the lock, which causes a deadlock. A `distributed.Lock` may be held.
+
+    Examples
+    --------
+    >>> gpu = Partition("GPU", client)                               # doctest: +SKIP
+    >>> gpu.submit(pow, 2, 10).result()                              # doctest: +SKIP
+    1024
     """
 
     def __init__(
@@ -86,7 +94,7 @@ class Partition:
 
     @property
     def client(self) -> Client:
-        """The client that is used."""
+        """The client that the partition uses."""
         # Not when unpickled: that happens in the event loops of scheduler and worker.
         if self._client is None:
             self._client = own_client()
@@ -94,13 +102,13 @@ class Partition:
 
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:
-        """The members now, by name."""
+        """Current members, sorted by name."""
         members = (w for w in all_workers(self.client) if w.resources.get(self.name))
         return tuple(sorted(members, key=lambda w: (len(w.name), w.name)))  # sorts 10 behind 9
 
     @property
     def slots(self) -> int:
-        """Tasks that the partition runs at a time."""
+        """Maximum number of tasks that the partition runs at the same time."""
         return int(sum(worker.resources[self.name] for worker in self.workers))
 
     def __len__(self) -> int:
@@ -111,33 +119,30 @@ class Partition:
         return f"<Partition {self.name!r}: {size}>" if size else f"<Partition {self.name!r}>"
 
     def _size_in_words(self) -> str:
-        """Return the number of workers and slots in words, or "" where nobody can be asked."""
-        client = self._client  # none in a task that has not used the partition yet
-        if client is None or client.asynchronous or client.status != "running":
-            return ""
-        with suppress(RuntimeError):  # no event loop runs in this thread
-            if asyncio.get_running_loop() is client.loop.asyncio_loop:
-                return ""
-        try:
-            return str(on_scheduler(client, size_of, name=self.name, answer_s=_REPR_S))
-        except (PoolError, OSError):
-            return ""
+        """Return the number of workers and slots, or "" where the scheduler cannot be asked."""
+        return str(ask_for_repr(self._client, size_of, name=self.name) or "")
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show."""
         return table_of_partition(lambda: self.client, repr(self), self.name)
 
     def stats(self) -> PartitionStats:
-        """Return the load and the number of finished tasks of the partition, for all clients.
+        """Return the load of the partition and the counts of its finished tasks, for all clients.
 
-        In a divided pool, tasks are counted since its division. In a partition that the workers
+        In a divided pool, tasks are counted since the division. In a partition that the workers
         were started with, they are counted since a client submitted its first task through
-        `Partition`, or since this method was first called. `PartitionStats.since` is that time.
+        `Partition`, or since this method was first called. `PartitionStats.since` contains this
+        time.
 
         Raises
         ------
         PoolError
-            If the scheduler lacks this package.
+            If poolpart is not installed in the environment of the scheduler.
+
+        Examples
+        --------
+        >>> gpu.stats().running                                          # doctest: +SKIP
+        4
         """
         stats: list[PartitionStats] = on_scheduler(self.client, stats_of, names=[self.name])
         return stats[0]
@@ -145,13 +150,18 @@ class Partition:
     def tasks(self) -> TaskTable:
         """Return the individual tasks of the partition, for all clients.
 
-        The table has all unfinished tasks, and the last 1,000 tasks that have finished since
-        counting began (see `stats`).
+        The table contains all unfinished tasks, and the last 1,000 tasks that have finished since
+        counting began. See `stats` for when counting begins.
 
         Raises
         ------
         PoolError
-            If the scheduler lacks this package.
+            If poolpart is not installed in the environment of the scheduler.
+
+        Examples
+        --------
+        >>> [task.function for task in gpu.tasks() if task.state == "failed"]  # doctest: +SKIP
+        ['cast']
         """
         rows, since = on_scheduler(self.client, tasks_of, name=self.name)
         return TaskTable.from_rows(rows, moment(since))
@@ -175,37 +185,44 @@ class Partition:
         Parameters
         ----------
         function, args, kwargs
-            The call. Give arguments that have the name of an option of `Client.submit`, such as
-            `key` or `workers`, by position, or bind them with `functools.partial`.
+            The function and its arguments. If an argument has the same name as an option of
+            `Client.submit`, such as `key` or `workers`, pass it by position or use
+            `functools.partial`.
         key
-            The task's key; by default a new one, so that equal calls run each by itself.
+            Key of the task. By default, each call has a new key, so equal calls run separately.
         priority
-            Of tasks that wait for the same worker, those with higher priority run first.
+            Priority of the task. Tasks with a higher priority run first.
         retries
-            How often the task runs again if it fails.
+            Maximum number of times that the task runs again after an error.
         slots
-            Slots of one worker that it takes while it runs. In a task of a partition they are
-            lent to others while it waits for other tasks.
+            Number of slots of one worker that the task takes while it runs. A task of a partition
+            lends its slots while it waits for other tasks.
         workers
-            Name or address of the member to run on, or a list of them. Names become the addresses
-            that the members have when the task arrives: if these workers leave, or are started
-            again, the task waits for ever.
+            Name or address of the member that runs the task, or a list of them. Names are resolved
+            to addresses when the task arrives at the scheduler. If these workers leave or restart,
+            the task waits forever.
 
         Returns
         -------
         Future
-            Its `result` raises PoolError if the partition was dissolved, none of its workers has
-            so many slots, or a worker belongs to another partition. Without any workers the task
-            waits for one.
+            Its `result` raises `PoolError` if the partition was dissolved, if none of its workers
+            has enough slots, or if a worker in `workers` belongs to another partition. If the
+            partition has no workers, the task waits for one.
 
         Raises
         ------
         ValueError
             If `slots` is below 1.
         PoolError
-            If the function is a coroutine function, or an option cannot be given; also, for the
-            first task of a client, what `result` would raise. The first task waits for an answer
-            of the scheduler, unless the client is asynchronous; later tasks do not.
+            If the function is a coroutine function, or if an option of Dask is passed that the
+            partition sets itself. The first task of a client also raises the errors of `result`. It
+            waits for a response of the scheduler, unless the client is asynchronous. Later tasks do
+            not wait.
+
+        Examples
+        --------
+        >>> gpu.submit(pow, 2, 10).result()                              # doctest: +SKIP
+        1024
         """
         _check_function(self.name, function)
         _refuse_options("submit", kwargs, **_OF_TASKS)
@@ -215,8 +232,8 @@ class Partition:
             several = [workers] if isinstance(workers, str | int) else workers
             if not isinstance(several, Iterable):
                 raise PoolError(
-                    f"The workers of a task are {workers!r}: give the name or address of a member "
-                    f"of partition {self.name!r}, or a list of these."
+                    f"Invalid value {workers!r} for `workers`. Expected the name or address of a "
+                    f"member of partition {self.name!r}, or a list of names and addresses."
                 )
             # LocalCluster's are numbers.
             workers = [MemberName(name) if asks else str(name) for name in several]
@@ -240,7 +257,9 @@ class Partition:
         `asks` allows a request to the scheduler.
         """
         if not isinstance(slots, int) or slots < 1:
-            raise ValueError(f"slots is {slots!r}; give a whole number, 1 or more.")
+            raise ValueError(
+                f"Invalid value {slots!r} for `slots`. Expected an integer of at least 1."
+            )
         if asks:
             self.by_rule = register(self.client, self.name, slots, self.by_rule)
         return {self.name: slots}
@@ -262,65 +281,75 @@ class Partition:
     ) -> Results:
         """Call a function for each item and return an iterator of the results.
 
-        The number of items may be infinite: items are taken, and results fetched, while
-        results are read, and a bounded number is under way. Small items share a task; their
-        number is learned from their time and size.
+        The number of items may be infinite, because items are taken and results are fetched while
+        the results are read. The number of tasks in flight is limited. Several small items share a
+        task, depending on their duration and size.
 
-        A map over the results of another map fetches them between workers, past driver and
-        scheduler, even if the partitions differ. That holds for one unread map among the iterables.
+        If an iterable is the result of another map, workers fetch its results directly from each
+        other, even if the partitions differ. The data does not pass through the client or the
+        scheduler. This applies to one unread map among the iterables.
 
         Parameters
         ----------
         function, iterables
-            The function gets one item of each iterable, until the shortest ends.
+            Function that is called with one item of each iterable, until the shortest iterable
+            ends.
         ordered
-            Results in the order of the items, or as they complete.
+            Whether to return results in the order of the items (True) or as they complete (False).
         window
-            Maximum number of tasks in flight. By default, enough that workers do not wait for the
-            client: two tasks for each slot or, if tasks are short, as many as take one second.
-            The number doubles when workers and client have waited for each other, as with a client
-            that computes between results, up to 512 tasks and 64 MiB of items and results. It
-            follows the number of slots.
+            Maximum number of tasks in flight. By default, the number is chosen such that workers do
+            not wait for the client: two tasks for each slot, or, if tasks are short, as many as
+            take one second. The number doubles if workers and client have waited for each other,
+            for example if the client computes between results, up to 512 tasks and 64 MiB of items
+            and results. It adapts to the number of slots.
         chunk
-            Items in a task; by default as many as take a tenth of a second, or longer if there
-            are many slots, and have a mebibyte. Give 1 if items differ much, or must not wait for
-            others.
+            Number of items per task. By default, as many as take a tenth of a second (longer if
+            there are many slots) and have 1 MiB. Pass 1 if the durations of items vary
+            considerably, or if items must not wait for others.
         priority
-            Higher runs first.
+            Priority of the tasks. Tasks with a higher priority run first.
         retries
-            How often a failed item is tried again, at least.
+            Minimum number of times that a failed item is run again.
         slots
-            Slots of one worker that each task takes.
+            Number of slots of one worker that each task takes.
         return_exceptions
-            Errors that `function` raises are results, in their places. A map over this map gets
-            them as arguments. An item that kills its workers still ends the map.
+            Whether to return errors of `function` as results at their position. A map over this map
+            receives them as arguments. An item that kills its workers still ends the map.
         empty_s
-            Seconds for which the map waits if the partition has no workers and none is starting,
-            waiting in a queue, or added by `adapt`; `math.inf` for ever.
+            Maximum time in seconds to wait if the partition has no workers, and none is starting,
+            queued or added by `adapt`. Pass `math.inf` to wait forever.
         kwargs
-            Keyword arguments of each call. Bind those that have the name of an option with
-            `functools.partial`; scatter large ones, and give the futures.
+            Keyword arguments of each call. Use `functools.partial` for arguments with the name of
+            an option. Scatter large arguments and pass the futures.
 
         Returns
         -------
         Results
-            An iterator. It raises an error of `function` after the results before it; a note
-            names the item. It raises PoolError if the partition is dissolved meanwhile or has no
-            workers for `empty_s`, and CancelledError after `Client.restart`. To stop early, close
-            or delete the iterator: waiting tasks are cancelled. ``len`` is the number of items if
-            each iterable has one, so that progress bars such as ``tqdm(partition.map(…))`` work,
-            and `Results.done` counts those read. ``client.gather`` of it is an iterator of the
+            Iterator of the results. If `function` raises an error, the iterator first returns the
+            earlier results, and then raises the error with a note that names the item. It raises
+            `PoolError` if the partition is dissolved or has no workers for `empty_s` seconds, and
+            `CancelledError` after `Client.restart`. To stop early, close or delete the iterator,
+            which cancels waiting tasks. If all iterables have a length, so does the iterator, and
+            progress bars such as ``tqdm(partition.map(…))`` work. `Results.done` is the number of
+            results that were read. ``client.gather`` of the iterator returns an iterator of the
             same results.
 
         Raises
         ------
         ValueError
-            If the window, the chunk or `slots` is below 1, or `retries` or `empty_s` below 0.
+            If `window`, `chunk` or `slots` is below 1, or if `retries` or `empty_s` is below 0.
         PoolError
-            If the partition was dissolved, or the function is a coroutine function.
+            If the partition was dissolved, if the function is a coroutine function, or if `pure` or
+            `resources` is passed.
+
+        Examples
+        --------
+        >>> sum(io.map(abs, range(-9, 0)))                               # doctest: +SKIP
+        45
         """
         require(MAP)
         _check_function(self.name, function)
+        _refuse_options("map", kwargs, **_OF_MAPS)
         self._taking(slots)
         stage = Stage(
             self.client,
@@ -375,55 +404,57 @@ class Partition:
         empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> int | concurrent.futures.Future[int]:
-        """Call a function for each item of a pipe or an iterable, in a task each.
+        """Run a task that calls a function, for each item of a pipe or an iterable.
 
-        It ends once the pipe is closed, or the iterable is at its end, and all tasks are done. A
-        bounded number of tasks is under way. Further items wait in the pipe, so that producers wait
-        when it is full. An item whose worker dies is run on another; several `for_each` may share a
-        pipe.
+        This method returns after the pipe was closed, or the iterable has ended, and all tasks have
+        finished. The number of tasks in flight is limited. Further items wait in the pipe, so
+        producers wait if it is full. If the worker of an item dies, the item is run on another
+        worker. Several calls of `for_each` may share a pipe.
 
-        Pipes that the function puts into stay open. Close them when this method has returned or,
-        without `wait`, when its future has a result.
+        Pipes that the function puts items into remain open. Close them after this method has
+        returned or, with ``wait=False``, after its future has a result.
 
         Parameters
         ----------
         items, function
-            The function gets an item, or the result of a future that a `distributed.Queue` has
-            put or an iterable has. Its result is dropped: it may put something into another pipe.
-            The next item of an iterable is taken when a slot is free for it; an error of a task is
-            noticed after that. ``as_completed(futures)`` is an iterable of futures as they end.
+            Pipe or iterable, and the function that is called with each item. If an item is a
+            future, the function receives its result. The return value of the function is discarded,
+            but the function may put items into another pipe. The next item of an iterable is taken
+            when a slot is free for it, and errors of tasks are raised after that.
+            ``as_completed(futures)`` is an iterable of futures in order of completion.
         wait
-            False returns a future at once; a thread of this process submits the tasks.
+            If False, return a future immediately. A thread of this process submits the tasks.
         window
-            Maximum number of tasks in flight. By default two for each slot, and more if slots
-            become idle before this process can submit the next tasks, up to 16 for each slot. The
-            default follows the number of slots.
+            Maximum number of tasks in flight. By default, two for each slot. If slots become idle
+            before this process can submit further tasks, the number increases, up to 16 for each
+            slot. It adapts to the number of slots.
         priority, retries, slots
-            Of each task, as in `submit`.
+            Options of each task, as in `submit`.
         empty_s
-            Seconds for which tasks wait for a partition without workers, as in `map`.
+            Maximum time in seconds that tasks wait for a partition without workers, as in `map`.
         kwargs
-            Keyword arguments of each call. Bind those that have the name of an option with
-            `functools.partial`.
+            Keyword arguments of each call. Use `functools.partial` for arguments with the name of
+            an option.
 
         Returns
         -------
         int or concurrent.futures.Future
-            Number of items, or without `wait` a future of this number. ``future.cancel()`` cancels
-            the tasks that have not started, and the pipe fails, so that producers end. It returns
-            False once all is done. The tasks go on if the future is dropped.
+            Number of items, or, with ``wait=False``, a future of this number. ``future.cancel()``
+            cancels the tasks that have not started and lets the pipe fail, so that producers end.
+            It returns False if everything has finished. The tasks continue if the future is
+            deleted.
 
         Raises
         ------
         PipeFailed
-            If the pipe was failed or deleted. Tasks that have not started are cancelled.
+            If the pipe fails or is deleted. Tasks that have not started are canceled.
         PoolError
-            If the partition is dissolved meanwhile, or has no workers for `empty_s` while tasks
-            wait. The pipe fails with it.
+            If the partition is dissolved, or has no workers for `empty_s` seconds while tasks wait.
+            The pipe fails with this error.
         Exception
-            What the function raises first; a note names the item. The pipe fails with it, so that
-            producers end, and tasks that have not started are cancelled. Without `wait`, the future
-            has these errors.
+            The first error of the function, with a note that names the item. The pipe fails with
+            the error, so that producers end, and tasks that have not started are canceled. With
+            ``wait=False``, the future raises these errors.
 
         Examples
         --------
@@ -435,7 +466,7 @@ class Partition:
         """
         options = {"priority": priority, "retries": retries, "slots": slots, **kwargs}
         _check_function(self.name, function)
-        _refuse_options("for_each", kwargs, **_OF_TASKS)
+        _refuse_options("for_each", kwargs, **_OF_MAPS)
         self._taking(slots)
         tasks = ItemTasks(self, items, function, window, options, empty_s)
         return tasks.run() if wait else in_background(tasks.run, tasks.stop)
@@ -446,34 +477,36 @@ class Partition:
         *,
         running: Literal["continue", "restart"] = "continue",
     ) -> dict[Any, str]:
-        """Cancel tasks of this partition and return what happened to each.
+        """Cancel tasks of this partition and return what happened to each of them.
 
         Parameters
         ----------
         futures
-            Futures of the tasks. Futures that were cancelled before are accepted.
+            Future of a task, or several futures. Futures that were canceled before are accepted.
         running
-            What to do with tasks that run. Dask does not stop them: they keep their slot until
-            their function returns, which can look whether it was `cancelled`. With "restart", a
-            worker that runs nothing but such tasks is restarted by its nanny, and comes back to
-            the partition. A worker is never restarted if it has another task, an actor, or a
-            result that no other worker has. Neither is a worker that does not answer within 5 s,
-            for instance because a function holds the interpreter lock. The call returns after 80 s
-            at the latest, even if a restarted worker has not come back.
+            What to do with tasks that are running. Dask does not stop them. They keep their slots
+            until their functions return, and the functions can check `cancelled`. With "restart",
+            the nanny restarts a worker that only runs these tasks, and the worker returns to the
+            partition. A worker is never restarted if it has another task, an actor, or a result
+            that no other worker has, or if it does not respond within 5 s, for example because a
+            function holds the interpreter lock. The call returns after at most 80 s, even if a
+            restarted worker has not rejoined.
 
         Returns
         -------
         dict
-            {key: what happened}. Each text begins with one of these words. ``cancelled``: the task
-            will not run. ``ended``: it had ended before, and its result is gone. ``running: …``: it
-            still runs, or may run on a worker that does not answer; the text names the worker and
-            the reason why it was not restarted. ``restarted: …``: its worker was restarted.
-            ``kept: …``: another client wants its result.
+            Mapping of keys to texts that begin with one of the following words. ``cancelled``: the
+            task will not run. ``ended``: it had ended before, and its result is gone. ``running:
+            …``: it is still running, or may run on a worker that does not respond. The text names
+            the worker and the reason why it was not restarted. ``restarted: …``: its worker was
+            restarted. ``kept: …``: another client needs its result.
 
         Raises
         ------
+        ValueError
+            If `running` has another value.
         PoolError
-            If a task is of another partition; then nothing is cancelled.
+            If a task belongs to another partition. In this case, no task is canceled.
 
         Examples
         --------
@@ -483,11 +516,13 @@ class Partition:
         """
         require(CANCELLING)
         if running not in ("continue", "restart"):
-            raise ValueError(f'running is {running!r}; give "continue" or "restart".')
+            raise ValueError(
+                f'Invalid value {running!r} for `running`. Expected "continue" or "restart".'
+            )
         tasks = {}
         for task in [futures] if isinstance(futures, Future) else futures:
             if not isinstance(task, Future):
-                raise PoolError(f"Partition.cancel takes futures of Dask, not {task!r}.")
+                raise PoolError(f"`Partition.cancel` expects Dask futures, but got {task!r}.")
             tasks[task.key] = task
         outcomes = {
             key: "ended" if task.status in ("finished", "error") else "cancelled"
@@ -502,23 +537,25 @@ class Partition:
     # -- collections and data ----------------------------------------------------------
 
     def compute(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
-        """Compute Dask collections on these workers: arrays, dataframes, bags, delayed values.
+        """Compute Dask collections on these workers: arrays, dataframes, bags or delayed values.
 
-        Each of their tasks takes a slot. Rechunking and shuffling stay on these workers too.
+        Each of their tasks takes a slot. Rechunks and shuffles also stay on these workers. If a
+        client still holds a result of a collection, Dask returns it and does not compute it again.
 
         Parameters
         ----------
         collections
-            One, or a list of them.
+            Collection, or a list of collections.
         slots
-            Slots that each task takes.
+            Number of slots that each task takes.
         options
-            Others of `Client.compute`, such as ``sync=True`` for the result instead of a future.
-            To keep results on these workers, use ``with partition:`` and ``persist``.
+            Further options of `Client.compute`, such as ``sync=True`` to return the result instead
+            of a future. To keep results on these workers, use ``with partition:`` and ``persist``.
 
         Returns
         -------
         Future or list of Future
+            Future of each result.
 
         Examples
         --------
@@ -530,35 +567,46 @@ class Partition:
         return self.client.compute(collections, resources=self._taking(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
-        """Put data into the memory of these workers and return futures.
+        """Send data to the memory of these workers and return futures.
 
-        Scattered data cannot be recomputed when its worker dies.
+        Scattered data cannot be recomputed if its worker dies.
 
         Parameters
         ----------
         data
-            As `Client.scatter` takes it: a value, a list or a dict of values.
+            Value, or a list or dict of values, as in `Client.scatter`.
         options
-            Others of `Client.scatter`, such as ``broadcast=True`` for a copy on each worker.
+            Further options of `Client.scatter`, such as ``broadcast=True`` for a copy on each
+            worker.
 
         Raises
         ------
         PoolError
-            If the partition has no workers, or `workers` is given.
+            If the partition has no workers, or if `workers` is passed.
+
+        Examples
+        --------
+        >>> [scene] = gpu.scatter([scene], broadcast=True)               # doctest: +SKIP
         """
-        _refuse_options("scatter", options, workers="the data is put on members of the partition")
+        _refuse_options(
+            "scatter", options, workers="The data is stored on the members of the partition."
+        )
         addresses = [worker.address for worker in self.workers]
         if not addresses:  # Dask would take any worker
-            raise PoolError(f"Partition {self.name!r} has no workers to keep data.")
+            raise PoolError(f"Partition {self.name!r} has no workers to store the data.")
         return self.client.scatter(data, workers=addresses, **options)
 
     def __enter__(self) -> Self:
         """Run everything that is computed or submitted in the block on these workers.
 
-        This covers `compute` and `persist` of Dask collections, including dataframes,
-        `dask.compute`, and `Client.submit` and `Client.map` of this partition's client, in this
-        thread. Each task takes a slot. A dataframe that is created in the block and computed after
-        it runs on any worker.
+        In the current thread, this applies to `compute` and `persist` of Dask collections,
+        including dataframes, to `dask.compute`, and to `Client.submit` and `Client.map` of this
+        partition's client. Each task takes a slot.
+
+        Only the place where a collection is computed matters. A dataframe that is created in the
+        block and computed after it runs on any worker. If a client still holds a result of the
+        collection, for example because it was persisted, Dask returns this result and runs nothing
+        in the partition.
 
         Examples
         --------
@@ -586,31 +634,32 @@ class Partition:
     def grow(
         self, workers: int = 1, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:
-        """Move workers into this partition while everything runs, and return their names.
+        """Move workers into this partition while tasks run, and return their names.
 
-        Tasks of the former partition that a worker runs end there first, and its waiting tasks
-        go to other members. If this partition's rule is `n_workers`, its number grows too. After
-        the loss of a worker, use `resize` to return to the former size.
+        A worker first finishes its running tasks of the former partition. Its waiting tasks are
+        moved to other members of that partition. If the rule of this partition is `n_workers`, the
+        number of the rule increases as well. After a worker was lost, use `resize` to return to the
+        former size.
 
         Parameters
         ----------
         workers
-            How many.
+            Number of workers to move.
         source
-            Name of the partition that they leave; by default they come from workers without a
-            partition and from the partition that has the rest.
+            Name of the partition that provides the workers. By default, workers without a partition
+            and workers of the partition with the rule `rest` are used.
         timeout_s
-            How long to wait until they are free.
+            Maximum time in seconds to wait until the workers are free.
 
         Raises
         ------
         PoolError
-            If there are too few, beyond the minimum of `source`; or if tasks do not end in time. In
-            the latter case their workers stay.
+            If the source has too few workers beyond its minimum, or if tasks do not finish in time.
+            In the latter case, the workers stay in their partition.
 
         Examples
         --------
-        >>> gpu.grow(2, source="OTHER")                                # doctest: +SKIP
+        >>> gpu.grow(2, source="OTHER")                                  # doctest: +SKIP
         ['5', '6']
         """
         arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
@@ -620,40 +669,41 @@ class Partition:
     def resize(
         self, workers: int, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:
-        """Give this partition a number of workers, and return the names of the workers that moved.
+        """Set the number of workers of this partition, and return the names of moved workers.
 
-        Workers move in as with `grow`, or out as with `shrink`.
+        Workers are moved in as with `grow`, or out as with `shrink`.
 
         Parameters
         ----------
         workers
             Number of workers that the partition should have. If its rule is `n_workers`, the rule
-            asks for this number from now on. Other rules stay as they are, and assign workers that
-            join later.
+            requests this number from now on. Other rules do not change, and continue to assign
+            workers that join later.
         source
-            Name of the partition that workers leave, as in `grow`.
+            Name of the partition that provides workers, as in `grow`.
         timeout_s
-            How long to wait until they are free.
+            Maximum time in seconds to wait until the workers are free.
 
         Raises
         ------
         PoolError
-            If the number is below the minimum of the partition, there are too few spare workers, or
-            tasks do not end in time. In the last case their workers stay.
+            If the number is below the minimum of the partition, if there are too few workers to
+            spare, or if tasks do not finish in time. In the last case, the workers stay in their
+            partition.
 
         Notes
         -----
         A worker that its nanny restarts keeps its place for half a minute, and counts as a member.
-        If a worker is lost for good, the rule `n_workers` still asks for the former number: `stats`
-        has it as `target`, and the next worker that joins the cluster fills the place. Present
-        workers of other partitions do not fill it by themselves, unless they joined later and went
-        to the rest; ``resize(2)`` moves workers in until there are two. `grow` and `shrink` change
-        the target by the number of workers that they move: after a loss, they do not fill the place
-        either.
+        If a worker is lost permanently, the rule `n_workers` still requests the former number,
+        which `stats` reports as `target`. The next worker that joins the cluster fills the place,
+        and so does a worker of the remainder that joined after the division. Other present workers
+        do not fill it automatically. ``resize(2)`` moves workers in until there are two. `grow` and
+        `shrink` change the target by the number of workers that they move, so they do not fill the
+        place either.
 
         Examples
         --------
-        >>> gpu.resize(2)                                              # doctest: +SKIP
+        >>> gpu.resize(2)                                                # doctest: +SKIP
         ['5']
         """
         arguments = {"count": workers, "source": source, "timeout_s": timeout_s}
@@ -661,15 +711,20 @@ class Partition:
         return moved
 
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
-        """Move workers out of this partition while everything runs, and return their names.
+        """Move workers out of this partition while tasks run, and return their names.
 
-        They go to the partition that has the rest, or to none, as described for `grow`. Those
-        with the least load go first.
+        The workers with the lowest load are moved to the partition with the rule `rest`, or belong
+        to no partition if there is none. They first finish their tasks, as described for `grow`.
 
         Raises
         ------
         PoolError
-            If fewer than its minimum would be left, or their tasks do not end in time.
+            If fewer workers than the minimum would remain, or if tasks do not finish in time.
+
+        Examples
+        --------
+        >>> gpu.shrink()                                                 # doctest: +SKIP
+        ['6']
         """
         arguments = {"count": workers, "timeout_s": timeout_s}
         moved: list[str] = ask(self.client, shrink, name=self.name, **arguments)
@@ -678,45 +733,46 @@ class Partition:
     # -- workers that come and go ------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
-        """Let the number of jobs follow the work, of `start_partitions` or `scale_groups`.
+        """Set the range for the number of jobs of an adaptive partition.
 
-        Jobs are started for tasks that can run and have no slot, second by second, and for what
-        clients `want`. One is returned, or cancelled while it waits in the queue, when it was not
-        needed for `idle_s`: a worker with a task, also one that has seceded, with a result that no
-        other worker has, or with an actor is kept. A lost worker is replaced while there is work.
-        Two equal numbers fix the number of jobs.
+        Jobs are started for tasks that are ready to run but have no slot, checked once per second,
+        and for slots that clients request with `want`. A job that was not needed for `idle_s`
+        seconds is ended, or canceled while it waits in the queue. A worker is kept while it has a
+        task (even if the task has seceded), an actor, or a result that no other worker has. A lost
+        worker is replaced while there is work. Two equal numbers set a fixed number of jobs.
 
         Parameters
         ----------
         minimum, maximum
-            Least and greatest number of jobs. With a minimum of 0 the partition may be empty.
+            Minimum and maximum number of jobs. With a minimum of 0, the partition may be empty.
         idle_s
-            After so many seconds without need a job ends.
+            Time in seconds after which a job that is not needed ends.
 
         Raises
         ------
         PoolError
-            If neither `start_partitions` nor `scale_groups` starts the workers, or the numbers are
-            not possible.
+            If neither `start_partitions` nor `scale_groups` starts the workers, or if a number is
+            invalid.
 
         Examples
         --------
-        >>> gpu.adapt(0, 8)                                            # doctest: +SKIP
+        >>> gpu.adapt(0, 8)                                              # doctest: +SKIP
         """
         bounds = Bounds.checked(self.name, minimum, maximum, idle_s)
         if not on_scheduler(self.client, adapt, name=self.name, bounds=bounds):
             raise PoolError(
-                f"Partition {self.name!r} has no jobs that can be started: only partitions of "
-                "start_partitions and scale_groups adapt. Those of a divided pool grow by "
-                "Partition.grow."
+                f"Partition {self.name!r} has no jobs that can be started. Only partitions that "
+                "`start_partitions` or `scale_groups` created are adaptive. To change the size of "
+                "a partition of a divided pool, use `Partition.resize`."
             )
 
     def want(self, slots: int) -> bool:
-        """Say how many slots this client wants, and return whether the number of workers adapts.
+        """Request slots for this client, and return whether the partition is adaptive.
 
-        For a program that chooses a worker for each task and so has none waiting: as long as it
-        wants slots, jobs are started as if tasks waited for them, and kept. 0 ends it, and so does
-        the end of the client. Tasks that wait need no such word.
+        Use this method in a program that selects a worker for each task, so that none of its tasks
+        wait for a worker. While slots are requested, jobs are started and kept as if tasks waited
+        for them. The request ends with ``want(0)`` or when the client closes. Tasks that wait for a
+        slot do not need a request.
 
         Raises
         ------
@@ -725,24 +781,28 @@ class Partition:
 
         Examples
         --------
-        >>> gpu.want(4)                                                # doctest: +SKIP
+        >>> gpu.want(4)                                                  # doctest: +SKIP
         True
         """
-        check_count("The number of slots that are wanted", slots, minimum=0)
+        check_count("the number of requested slots", slots, minimum=0)
         asking = {"slots": slots, "asking": self.client.id}
         return bool(on_scheduler(self.client, want, name=self.name, **asking))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
-        """Undo this partition, as `Pool.dissolve` does."""
+        """Dissolve this partition, as `Pool.dissolve` does for all partitions."""
         ask_to_dissolve(self.client, [self.name], timeout_s)
 
 
-_SLOTS_INSTEAD = "slots=2 takes two slots of the partition"
-_BOUND = "; bind an argument of the function that has this name by functools.partial"
-# {option of Dask that `submit` sets: what to give instead}
+_SLOTS_INSTEAD = "To request several slots of the partition, pass `slots`."
+_BOUND = " To pass an argument of this name to the function, use `functools.partial`."
+# {option of Dask that the partition sets: what to do instead}
 _OF_TASKS = {
     "resources": _SLOTS_INSTEAD + _BOUND,
-    "pure": "each call runs by itself, unless calls have the same key" + _BOUND,
+    "pure": "Each call runs separately, unless calls have the same `key`." + _BOUND,
+}
+_OF_MAPS = {
+    "resources": _SLOTS_INSTEAD + _BOUND,
+    "pure": "The function is called for each item, even if items are equal." + _BOUND,
 }
 
 
@@ -750,7 +810,7 @@ def _refuse_options(method: str, options: Mapping[str, Any], **instead: str) -> 
     """Raise PoolError if options of Dask were given that the partition sets itself."""
     for option, advice in instead.items():
         if option in options:
-            raise PoolError(f"Partition.{method} sets {option} itself: {advice}.")
+            raise PoolError(f"`Partition.{method}` does not accept `{option}`. {advice}")
 
 
 def _names_of_pipes(arguments: Iterable[Any]) -> list[str]:
@@ -767,10 +827,10 @@ def _check_function(name: str, function: Callable[..., Any]) -> None:
     would leave the partition; and a coroutine cannot lend its slot while it waits for them.
     """
     if not callable(function):
-        raise PoolError(f"A task of partition {name!r} needs a function, not {function!r}.")
+        raise PoolError(f"Partition {name!r} expects a callable, but got {function!r}.")
     if inspect.iscoroutinefunction(function):
         raise PoolError(
-            f"Partition {name!r} takes plain functions, and {funcname(function)} is a coroutine "
-            "function, whose tasks would leave the partition: give a function that calls "
-            "asyncio.run."
+            f"Partition {name!r} only accepts plain functions, but {funcname(function)!r} is a "
+            "coroutine function, whose nested tasks would leave the partition. Pass a function "
+            "that calls `asyncio.run`."
         )

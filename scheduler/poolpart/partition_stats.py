@@ -24,26 +24,34 @@ def size_in_words(workers: int, target: int | None, slots: int) -> str:
 
 @dataclass(frozen=True)
 class StageStats:
-    """Tasks of a stage, that is, with a common key prefix.
+    """Tasks of a stage, that is, tasks with a common key prefix.
+
+    For most tasks, the prefix is the name of the function. Tasks of `Partition.map` have the suffix
+    ``-map``.
 
     Parameters
     ----------
     waiting
-        Tasks that wait for results of others.
+        Number of tasks that wait for results of other tasks.
     queued
-        Tasks that wait for a worker, or for their turn on one.
+        Number of tasks that wait for a worker, or for a slot of a worker.
     running
-        Running tasks. The scheduler does not see when a task starts: of a worker's tasks, as many
-        count as running as the worker has slots.
+        Number of running tasks. The scheduler is not notified when a task starts, so it counts as
+        many tasks of a worker as the worker has slots.
     done
-        Successful runs of tasks, including those whose result was lost and recomputed.
+        Number of successful runs, including those whose results were lost and recomputed.
     failed
-        Tasks that raised an error or were given up after too many dead workers. Their dependents,
-        which never ran, do not count.
+        Number of tasks that raised an error, or were given up after too many workers had died.
+        Their dependents, which never ran, do not count.
     seconds
-        Running time of tasks, including failed ones, without those lost with their worker.
+        Running time of finished tasks in seconds, including failed tasks, but without runs that
+        were lost.
     queued_seconds
-        Time that these tasks waited for a worker or for a slot, after all their inputs were there.
+        Time in seconds that these tasks waited for a worker or a slot after their inputs were
+        available.
+    lost
+        Number of runs that were lost because their worker died. Dask runs these tasks again. A
+        task that is given up after too many workers have died counts as failed instead.
     """
 
     waiting: int = 0
@@ -53,6 +61,7 @@ class StageStats:
     failed: int = 0
     seconds: float = 0.0
     queued_seconds: float = 0.0
+    lost: int = 0
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show."""
@@ -68,26 +77,26 @@ class StageStats:
 class PartitionStats(StageStats):
     """Current and finished tasks of a partition.
 
-    Finished tasks are counted since the cluster was divided, a client submitted its first task to
-    a partition, statistics were first requested, or the page was opened, whichever came first.
+    Finished tasks are counted since the cluster was divided, a client submitted its first task to a
+    partition, statistics were first requested, or the page was opened, whichever came first.
 
     Parameters
     ----------
     name
         Name of the partition.
     workers
-        Workers that it has now.
+        Current number of workers.
     target
-        Workers that its rule asks for, or None if the rule, such as `rest`, has no such number.
-        More than `workers` after the loss of a worker.
+        Number of workers that the rule requests, or None if the rule, such as `rest`, does not
+        request a number. It is greater than `workers` after a worker was lost.
     slots, busy
-        Slots of these workers, and how many are held by a task.
+        Number of slots of these workers, and number of slots in use.
     exclusive
-        Whether a fence keeps other tasks out.
+        Whether other tasks are kept off the workers.
     stages
-        The same counts by stage.
+        Counts of each stage, by name.
     since
-        When counting began, in UTC.
+        Time in UTC when counting began.
     """
 
     name: str = ""
@@ -103,7 +112,8 @@ class PartitionStats(StageStats):
         size = size_in_words(self.workers, self.target, self.slots)
         since = f", counted since {self.since:%H:%M:%S} UTC" if self.since else ""
         stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
-        title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{since}>"
+        lost = f", {self.lost} lost {'run' if self.lost == 1 else 'runs'}" if self.lost else ""
+        title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{lost}{since}>"
         return f"{title}\n{text_table(_HEAD_OF_STAGES, [*stages, ['all', *self._figures]])}"
 
     def _repr_html_(self) -> str:

@@ -46,9 +46,10 @@ from .pipe_states import (
     answer_pipes,
     delete_pipes,
     open_pipe,
+    state_in_words,
 )
 from .task_context import own_client
-from .workers import check_client, on_scheduler
+from .workers import ask_for_repr, check_client, on_scheduler
 
 WAIT_S = 1.0  # longest wait of a request, seconds; a pipe that is closed or fails ends it
 _AGAIN_S = 0.01  # between two requests of one wait
@@ -56,72 +57,77 @@ _LINGER_S = 0.002  # `get` waits so long for more items, which saves requests
 
 
 class Pipe:
-    """A bounded first-in-first-out connection that can be closed and can fail.
+    """Bounded first-in-first-out pipe between tasks that can be closed and can fail.
 
-    The maker of the pipe calls `create`, passes it to the tasks on both ends (it is small when
-    pickled), and finally calls `delete`, as a ``with`` block does; it is also deleted when the
-    maker's client closes or dies.
-    Any number of producers and consumers may share it, in any process and thread; threads may
-    share the object itself.
-
-    With several `producers`, the pipe is closed once each of them has called `close`.
-
-    After `fail`, every `put` raises `PipeFailed`. A `get` first hands out what this object has
-    already taken, and then raises; waiting calls raise within a second. A pipe that does not exist,
-    or was deleted, raises the same error, `close` and `fail` included. If the scheduler has died,
-    calls raise OSError, after Dask's ``distributed.comm.timeouts.connect``. If the scheduler does
-    not answer, they raise OSError after five minutes.
-
-    An open pipe also fails when a task that uses it is lost, because the other end would wait
-    forever. This applies to tasks of `Partition.submit` and `Partition.for_each` that have the pipe
-    as an argument, directly or in a list. The pipe fails if such a task fails after all retries, or
-    if it is cancelled before it has used the pipe, for instance because no future of it was kept.
-    A running task is not stopped by cancelling it, so it can go on using the pipe. If
-    `Partition.cancel` restarts its worker, the pipe fails, unless the task is a consumer. A task
-    that Dask runs again because its worker has died does not affect the pipe. After
-    `Client.restart`, all open pipes of the cluster fail. A task that returns without calling
-    `close` is not an error: other producers may follow.
-
-    A consumer takes all queued items, up to about `capacity`, in one request; `get` and
-    iteration hand them out one by one. At most ``capacity * (1 + consumers)`` items are
-    under way. With slow items and several consumers, choose a small capacity, so that no consumer
-    holds items while another idles. Items that an object has taken are lost if its process dies, or
-    if the object is dropped, such as by a `break` and the end of the task: for exactly-once
-    delivery, record what has arrived, and put missing items again.
-
-    Each object hands out items in the order of their `put`, but threads that share an object get
-    them in any order. An item that cannot be unpickled raises its error when its turn
-    comes, and is lost; the items after it are not. A wait that is interrupted, as by Ctrl-C, takes
-    no item away: an item that arrives within the next second stays in the object for its next
-    `get`. A thread that an event loop no longer awaits (`asyncio.to_thread`) goes on waiting, and
-    its item is lost: use `timeout_s` there.
+    The creator of the pipe calls `create`, passes the pipe to the tasks at both ends, and finally
+    calls `delete`. A ``with`` block calls both methods. The pipe is also deleted when the client of
+    its creator closes or dies. A pickled pipe is small. Any number of producers and consumers may
+    share a pipe, in any process and thread, and threads may share the same object. With several
+    `producers`, the pipe is closed after each of them has called `close`.
 
     Parameters
     ----------
     name
-        Unique on the cluster; put something random in it.
+        Name of the pipe, which must be unique on the cluster. Include a random part.
     capacity
-        Items that may be queued; `put` waits while there are as many.
+        Maximum number of queued items. `put` waits while the pipe contains as many.
     client
-        The client to use. By default, on a worker, the worker's own.
+        Client to use. By default, a task uses the client of its worker.
     producers
-        Number of producers. Each producer calls `close` when it is done.
+        Number of producers. Each producer calls `close` when it has finished.
     fails_with_tasks
-        Whether the pipe fails when a task that has it as an argument is lost. Pass False if the
+        Whether the pipe fails if a task that has it as an argument is lost. Pass False if the
         program submits lost tasks again.
 
     Notes
     -----
-    Any client can use ``Queue(pipe.name)`` and ``Variable(pipe.name)`` of Dask. The queue has the
-    items of the pipe, in the same order and within the same capacity. Its `put` and `get` raise
-    `PipeClosed` and `PipeFailed`, too. Unlike `Pipe.get`, `Queue.get` loses an item if its client
-    is killed while it waits: the scheduler does not know whose request it is. A
-    ``Queue.get(batch=5)`` that has got fewer items when the pipe ends raises, and loses these
-    items: use ``batch=True``, which does not wait. The variable is the state, a
-    `poolpart.pipe_states.PipeState`. ``variable.set({**variable.get(), "closed": True})`` closes
-    the pipe. What does not follow from the state is a ValueError. So is a state that has changed
-    since it was read: read and set it again. ``Variable.delete``, or releasing the last reference
-    to the queue, deletes the pipe.
+    **Failures.** After `fail`, every `put` raises `PipeFailed`. `get` first returns the items that
+    this object has already taken, and then raises the error. Waiting calls raise it within a
+    second. If a pipe does not exist or was deleted, all methods raise `PipeFailed`, including
+    `close` and `fail`. If the scheduler has died, calls raise `OSError` after Dask's
+    ``distributed.comm.timeouts.connect``. If it does not respond, they raise `OSError` after five
+    minutes.
+
+    An open pipe also fails if a task that uses it is lost, because the other end would wait
+    forever. This applies to tasks of `Partition.submit` and `Partition.for_each` that have the pipe
+    as an argument, directly or in a list. The pipe fails if such a task fails after all retries, or
+    if it is canceled before it has used the pipe, for example because no future of it was kept.
+    Canceling does not stop a running task, so the task can continue to use the pipe. If
+    `Partition.cancel` restarts its worker, the pipe fails, unless the task is a consumer. A task
+    that Dask runs again because its worker has died does not affect the pipe. A task that returns
+    without calling `close` does not affect it either, because other producers may follow. After
+    `Client.restart`, all open pipes of the cluster fail.
+
+    **Items in flight.** A consumer takes all queued items, up to about `capacity`, in one request.
+    `get` and iteration return them one by one. At most ``capacity * (1 + consumers)`` items are in
+    flight. If items are slow to process and there are several consumers, choose a small capacity,
+    so that no consumer holds items while another one is idle.
+
+    **Lost items.** The items that an object has taken are lost if its process dies or the object is
+    deleted, for example if a task leaves the loop with `break` and returns. To process each item
+    exactly once, record the items that have arrived, and put missing items again. If an item cannot
+    be unpickled, its error is raised when it would be returned, and the item is lost, but later
+    items are not. If a wait is interrupted, for example by Ctrl-C, no item is lost: an item that
+    arrives within the next second is kept in the object for its next `get`. If an event loop no
+    longer awaits a thread (`asyncio.to_thread`), the thread continues to wait, and its item is
+    lost. Pass `timeout_s` in this case.
+
+    **Order.** Each object returns items in the order in which they were put. Threads that share an
+    object receive them in any order.
+
+    **Queue and Variable.** Any client can use Dask's ``Queue(pipe.name)`` and
+    ``Variable(pipe.name)``. The queue contains the items of the pipe, with the same order and
+    capacity, and its `put` and `get` also raise `PipeClosed` and `PipeFailed`. Unlike `Pipe.get`,
+    `Queue.get` loses an item if its client is killed while it waits, because the scheduler cannot
+    determine which client has sent the request. If the pipe ends before ``Queue.get(batch=5)`` has
+    received five items, it raises an error, and the items that it has received are lost. Use
+    ``batch=True``, which does not wait.
+
+    The variable contains the state, a `poolpart.pipe_states.PipeState`.
+    ``variable.set({**variable.get(), "closed": True})`` closes the pipe. Setting a value that
+    cannot follow from the current state raises `ValueError`. So does a value that is based on an
+    outdated state. In this case, read the variable and set it again. ``Variable.delete``, or
+    releasing the last reference to the queue, deletes the pipe.
 
     Examples
     --------
@@ -145,8 +151,10 @@ class Pipe:
     ) -> None:
         for quantity, number in (("capacity", capacity), ("number of producers", producers)):
             if not isinstance(number, int) or number < 1:
-                wrong = f"The {quantity} of pipe {name!r} is {number!r}"
-                raise ValueError(f"{wrong}; give a whole number, 1 or more.")
+                raise ValueError(
+                    f"Invalid value {number!r} for the {quantity} of pipe {name!r}. Expected an "
+                    "integer of at least 1."
+                )
         self.name = name
         self.capacity = capacity
         self.producers = producers
@@ -162,7 +170,12 @@ class Pipe:
         return partial(Pipe, fails_with_tasks=self.fails_with_tasks), arguments
 
     def __repr__(self) -> str:
-        return f"<Pipe {self.name!r} capacity {self.capacity}>"
+        state = self._state_in_words()
+        return f"<Pipe {self.name!r}: {state}>" if state else f"<Pipe {self.name!r}>"
+
+    def _state_in_words(self) -> str:
+        """Return the number of items and the state, or "" where the scheduler cannot be asked."""
+        return str(ask_for_repr(self._client, state_in_words, name=self.name) or "")
 
     def _repr_html_(self) -> str:
         """Return the table that notebooks show: depth, capacity and state."""
@@ -170,7 +183,7 @@ class Pipe:
 
     @property
     def client(self) -> Client:
-        """The client that is used."""
+        """The client that the pipe uses."""
         # Kept: a seceded thread of a worker would get another one each time.
         if self._client is None:
             self._client = own_client()
@@ -179,27 +192,27 @@ class Pipe:
     # -- creating and deleting ---------------------------------------------------------
 
     def create(self) -> Pipe:
-        """Open the pipe on the scheduler and return itself.
+        """Create the pipe on the scheduler and return it.
 
         Raises
         ------
         ValueError
-            If the cluster has a queue or a variable of that name.
+            If the cluster already has a queue or a variable with this name.
         PoolError
-            If this version of Dask lacks what pipes need.
+            If the installed version of Dask does not support pipes.
         """
         require(PIPES)
         client = self.client
         state = {"owner": client.id, "capacity": self.capacity, "producers": self.producers}
         if not on_scheduler(client, open_pipe, name=self.name, **state):
             raise ValueError(
-                f"The cluster has a queue or variable {self.name!r}: give the pipe another "
-                "name, or delete what is left of an earlier one."
+                f"The cluster already has a queue or variable named {self.name!r}. Choose another "
+                "name for the pipe, or delete an earlier pipe of this name."
             )
         return self
 
     def delete(self) -> None:
-        """Delete the pipe on the scheduler, with all queued items, if it exists."""
+        """Delete the pipe and all queued items on the scheduler, if the pipe exists."""
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
@@ -216,7 +229,7 @@ class Pipe:
         list of packed items that were taken (TAKE). `PipeFailed` if the pipe does not exist.
         """
         if self.name not in replies:
-            raise PipeFailed(f"Pipe {self.name!r} does not exist: never created, or deleted.")
+            raise PipeFailed(f"Pipe {self.name!r} does not exist. It was deleted or never created.")
         reply = replies[self.name]
         self._advice = reply["advice"]
         return reply
@@ -271,25 +284,29 @@ class Pipe:
 
     @property
     def depth(self) -> int:
-        """Number of items that are queued now."""
+        """Current number of queued items."""
         return int(self._change()["answer"])
 
     def close(self) -> None:
         """Close the pipe for a producer.
 
-        The last producer closes the pipe for all.
-
-        Then nothing can be put, and consumers take the remaining items and end. With several
-        `producers`, each task counts once, even if it is run again; elsewhere each call counts.
+        When the last producer has closed the pipe, it accepts no more items, and consumers end
+        after they have taken the remaining items. With several `producers`, each task counts once,
+        even if it runs again. Outside of tasks, each call counts.
         """
         self._change(producer=_producer())
 
     def fail(self, reason: str) -> None:
-        """Make every `put` and `get`, at both ends, raise `PipeFailed` with this reason.
+        """Let the pipe fail, so that every `put` and `get` at both ends raises `PipeFailed`.
 
-        The first reason stays.
+        If the pipe has already failed, the first reason is kept.
+
+        Parameters
+        ----------
+        reason
+            Message of the error.
         """
-        self._change(failure=reason or "no reason was given")
+        self._change(failure=reason or "No reason was given.")
 
     # -- producers ---------------------------------------------------------------------
 
@@ -299,31 +316,32 @@ class Pipe:
         Parameters
         ----------
         item
-            Plain data: numbers, strings, bytes, lists, dicts; the key of a task rather than its
-            Future. It travels through the scheduler: keep it small.
+            Plain data such as numbers, strings, bytes, lists and dicts. It travels through the
+            scheduler, so it should be small. Put the key of a task instead of its future.
         timeout_s
-            Longest wait in seconds.
+            Maximum wait in seconds.
         unbounded
-            Ignore the capacity: for producers that limit their items themselves.
+            Whether to ignore the capacity, for producers that limit their items themselves.
 
         Raises
         ------
         PipeClosed
             If the pipe was closed.
         PipeFailed
-            If it was failed, with the reason.
+            If the pipe has failed. The message contains the reason.
         TimeoutError
-            If it stayed full for so long.
+            If the pipe remained full for `timeout_s` seconds.
         """
         self.put_many([item], timeout_s, unbounded=unbounded)
 
     def put_many(
         self, items: Iterable[Any], timeout_s: float | None = None, *, unbounded: bool = False
     ) -> None:
-        """Add items in order, up to `capacity` items in a request, and wait like `put`.
+        """Add several items in order, up to `capacity` items per request, and wait like `put`.
 
-        The items may be endless; `capacity` of them are read before they are sent. After an error,
-        such as that `timeout_s` was too short for all, the first of them may be in the pipe.
+        The iterable may be infinite. Up to `capacity` items are read before they are sent. If an
+        error is raised, for example because `timeout_s` was too short, some of the items may
+        already be in the pipe.
         """
         deadline = _deadline(timeout_s)
         source = iter(items)
@@ -333,35 +351,36 @@ class Pipe:
             if reply["failure"]:
                 raise PipeFailed(reply["failure"])
             if reply["closed"]:
-                raise PipeClosed(f"Pipe {self.name!r} is closed; nothing can be put into it.")
+                raise PipeClosed(f"Pipe {self.name!r} is closed and accepts no more items.")
             unsent = unsent[reply["answer"] :]
             if unsent and time.monotonic() > deadline:
-                raise TimeoutError(f"Pipe {self.name!r} stayed full for {timeout_s} s.")
+                raise TimeoutError(f"Pipe {self.name!r} remained full for {timeout_s} s.")
 
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self, timeout_s: float = 0.0) -> tuple[Any, bool]:
         """Take the next item if there is one in time, like MATLAB's ``[item, ok] = poll(queue)``.
 
-        `get` raises `TimeoutError` in place of False, and `PipeClosed` at the end of the pipe.
+        Unlike this method, `get` raises `TimeoutError` if there is no item, and `PipeClosed` at the
+        end of the pipe.
 
         Parameters
         ----------
         timeout_s
-            Longest wait in seconds. By default, this method does not wait.
+            Maximum wait in seconds. By default, this method does not wait.
 
         Returns
         -------
         item
             The item, or None.
         ok
-            Whether there was an item. It is also False, without a wait, if the pipe was closed and
-            is empty.
+            Whether there was an item. If the pipe is closed and empty, False is returned without
+            waiting.
 
         Raises
         ------
         PipeFailed
-            If the pipe was failed, with the reason.
+            If the pipe has failed. The message contains the reason.
 
         Examples
         --------
@@ -374,30 +393,33 @@ class Pipe:
     def drain(self) -> list[Any]:
         """Take all queued items, possibly none, without waiting.
 
-        Raises `PipeFailed`.
+        Raises
+        ------
+        PipeFailed
+            If the pipe has failed. The message contains the reason.
         """
         self._fill_buffer(-math.inf)
         return self._unpack(self._remove())
 
     def get_all(self, timeout_s: float | None = None, *, linger_s: float = 0.0) -> list[Any]:
-        """Take all queued items, and wait until there are any.
+        """Take all queued items, and wait until there is at least one.
 
         Parameters
         ----------
         timeout_s
-            Longest wait in seconds.
+            Maximum wait in seconds.
         linger_s
-            Longest wait in seconds for further items after the first, 1 s at most. A full pipe ends
-            this wait.
+            Maximum wait in seconds for further items after the first one, at most 1. A full pipe
+            ends this wait.
 
         Raises
         ------
         PipeClosed
-            If the pipe was closed and is empty.
+            If the pipe is closed and empty.
         PipeFailed
-            If it was failed, with the reason.
+            If the pipe has failed. The message contains the reason.
         TimeoutError
-            If nothing came for so long.
+            If no item arrived in time.
         """
         deadline = _deadline(timeout_s)
         while True:
@@ -407,9 +429,10 @@ class Pipe:
             self._raise_at_end(reply, deadline, timeout_s)
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """Take the next item, waiting for an item and 2 ms for more.
+        """Take the next item, and wait until there is one.
 
-        Raises like `get_all`.
+        After the first item, it waits up to 2 ms for further items. It raises the same errors as
+        `get_all`.
         """
         deadline = _deadline(timeout_s)
         while True:
@@ -478,7 +501,7 @@ class Pipe:
         if reply["closed"]:
             raise PipeClosed(f"Pipe {self.name!r} is closed and empty.")
         if time.monotonic() > deadline:
-            raise TimeoutError(f"Nothing came through pipe {self.name!r} for {timeout_s} s.")
+            raise TimeoutError(f"No item arrived in pipe {self.name!r} within {timeout_s} s.")
 
     def __iter__(self) -> Iterator[Any]:
         """Yield items until the pipe is closed and empty."""
@@ -487,23 +510,23 @@ class Pipe:
                 yield self.get()
 
     def listen(self, function: Callable[[Any], Any]) -> Listener:
-        """Call a function for each item, in this process, until the pipe ends, without waiting.
+        """Start to call a function in this process for each item, until the pipe ends.
 
-        The calls are in the order of the items, in one thread. This process is any consumer of the
-        pipe: items that others take do not come here.
+        The function is called in the order of the items, in one thread. The listener is an ordinary
+        consumer of the pipe, so it does not receive items that other consumers take.
 
         Parameters
         ----------
         function
-            If it raises an error, it is not called again, and the pipe fails with the error, so
-            that producers end.
+            Function that is called with each item. If it raises an error, it is not called again,
+            and the pipe fails with the error, so that producers end.
 
         Returns
         -------
         Listener
             Its `join` waits for the end of the pipe and of the last call, and raises the error of
-            the function; its `close` stops listening. At the end of a ``with`` block, it is joined,
-            or closed if the block raises an error.
+            the function. Its `close` stops listening. At the end of a ``with`` block, the listener
+            is joined, or closed if the block raises an error.
 
         Examples
         --------
@@ -555,7 +578,9 @@ def advise(pipe: Pipe, amount: int) -> None:
     Only one consumer may call this.
     """
     if amount < 1:
-        raise ValueError(f"The advice for pipe {pipe.name!r} is {amount}; give 1 or more.")
+        raise ValueError(
+            f"Invalid advice {amount} for pipe {pipe.name!r}. Expected an integer of at least 1."
+        )
     if amount != advice_of(pipe):
         pipe._change(advice=amount)
 

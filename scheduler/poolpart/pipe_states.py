@@ -100,7 +100,7 @@ class PipeState:
     def why_no_get(self) -> PipeFailed | None:
         """Return the error of taking items now, or None while items may be taken."""
         if not self.exists:
-            return PipeFailed(f"Pipe {self.name!r} does not exist: it was deleted.")
+            return PipeFailed(f"Pipe {self.name!r} does not exist. It was deleted.")
         reason = self.value["failure"]
         return PipeFailed(reason) if reason else None
 
@@ -140,18 +140,19 @@ class PipeState:
     def check(self, value: Any) -> None:
         """Raise ValueError unless a client may set the Variable to a value."""
         if not self.exists:
-            raise ValueError(f"Variable {self.name!r} belongs to a pipe that was deleted.")
+            raise ValueError(f"Variable {self.name!r} belonged to a pipe that was deleted.")
         if doubt := self._doubt(value):
             raise ValueError(
-                f"Variable {self.name!r} is the state of a pipe, now {self.value}: {doubt}. Change "
-                f"{', '.join(_SETTABLE)} of what Variable.get returns."
+                f"Variable {self.name!r} holds the state of a pipe, and {doubt}. The current state "
+                f"is {self.value}. Get the value with `Variable.get`, and only change `closed`, "
+                "`failure` and `advice`."
             )
 
     def _doubt(self, value: Any) -> str:
         """Return why a client may not set the Variable to a value, or an empty string."""
         state = self.value
         if not isinstance(value, dict) or value.keys() != state.keys():
-            return f"{value!r} has other fields"
+            return f"the value {value!r} has different fields"
         for name, setting in value.items():
             current = state[name]
             if name == "closed_by" and isinstance(setting, list | tuple):
@@ -159,14 +160,14 @@ class PipeState:
                 setting = tuple(setting)
                 current = tuple(current)
             if type(setting) is not type(current):
-                return f"{name} cannot be {setting!r}"
+                return f"`{name}` cannot be {setting!r}"
             if name not in _SETTABLE and setting != current:
-                return f"{name} cannot be changed to {setting!r}"
+                return f"`{name}` cannot be changed to {setting!r}"
         if state["closed"] and not value["closed"]:
-            return "a closed pipe stays closed"
+            return "a closed pipe cannot be opened again"
         if state["failure"] and value["failure"] != state["failure"]:
-            return "the first reason of a failure stays"
-        return "" if value["advice"] >= 1 else f"advice is at least 1, not {value['advice']}"
+            return "the reason for a failure cannot be changed"
+        return "" if value["advice"] >= 1 else f"`advice` must be at least 1, not {value['advice']}"
 
 
 def pipes_of(scheduler: Any) -> dict[str, PipeState]:
@@ -177,6 +178,18 @@ def pipes_of(scheduler: Any) -> dict[str, PipeState]:
 def names_of_pipes(dask_scheduler: Any = None) -> list[str]:
     """Return the names of all pipes. Runs on the scheduler."""
     return list(pipes_of(dask_scheduler))
+
+
+def state_in_words(name: str, dask_scheduler: Any = None) -> str:
+    """Return the number of queued items of a pipe and its state in words.
+
+    Runs on the scheduler.
+    """
+    pipe = pipes_of(dask_scheduler).get(name)
+    if pipe is None:
+        return "does not exist"
+    depth, capacity, state = pipe.figures
+    return f"{depth} of {capacity} items, {state}"
 
 
 async def open_pipe(
@@ -262,12 +275,12 @@ class Pipes(SchedulerPlugin):
         # deleted, and so did a producer whose consumer was gone.
         if finish == "erred":
             blamed = task.exception_blame or task
-            error = blamed.exception_text or "the workers that ran it have died"
-            self._fail_soon(names, f"Task {task.key!r}, which uses the pipe, has failed: {error}.")
+            error = blamed.exception_text or "the workers that ran it died"
+            self._fail_soon(names, f"Task {task.key!r}, which uses the pipe, failed: {error}.")
         elif finish == "forgotten" and task.key in self._released:
             reason = (
-                f"Task {task.key!r}, which uses the pipe, was cancelled before it had used the "
-                "pipe. Dask also cancels a task if no future of it is kept."
+                f"Task {task.key!r}, which uses the pipe, was canceled before it had used the "
+                "pipe. Dask also cancels a task if no reference to its future is kept."
             )
             self._fail_soon(names, reason, cancelled=str(task.key))
         if finish == "released" and start in _UNFINISHED:
@@ -296,7 +309,7 @@ class Pipes(SchedulerPlugin):
         for state in self._existing(names).values():
             if not state.has_ended and str(key) not in state.takers:  # other consumers can go on
                 state.fail(
-                    f"Task {key!r}, which uses the pipe, was cancelled, and its worker "
+                    f"Task {key!r}, which uses the pipe, was canceled, and its worker "
                     "was restarted."
                 )
 

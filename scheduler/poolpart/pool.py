@@ -6,7 +6,6 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
@@ -17,6 +16,7 @@ from .division import ask, ask_to_dissolve, declare
 from .errors import PoolError
 from .extras.dashboard_page import leave_page, partitions_page
 from .extras.notebook import table_of_partitions
+from .membership import partition_names
 from .partition import Partition
 from .pipe_states import names_of_pipes
 from .probe import worker_gpus
@@ -34,15 +34,15 @@ logger = logging.getLogger(__name__)
 class Pool:
     """Workers of a Dask cluster that can be divided into partitions.
 
-    `Pool.from_client` returns all workers of a cluster. `partition` takes some of them under a name
-    and returns the partition and a pool of the remaining workers; `divide` makes several partitions
-    by rules. A pool is a view of the running cluster: workers that join later belong to it, and
-    each use asks the scheduler.
+    `Pool.from_client` returns all workers of a cluster. `partition` creates a partition, and
+    returns it together with a pool of the remaining workers. `divide` creates several partitions by
+    rules. A pool is a view of the running cluster: workers that join later belong to it, and each
+    use requests the current state from the scheduler.
 
-    If workers were started with ``--resources "GPU=1"`` and the like, the cluster is divided
-    already: ``pool["GPU"]`` returns a partition. At the end of a ``with pool:`` block, the
-    partitions that the pool has made are dissolved. `Pool.local` starts a separate cluster, which
-    ends with its block.
+    If workers were started with ``--resources "GPU=1"``, the cluster is already divided, and
+    ``pool["GPU"]`` returns the partition. At the end of a ``with pool:`` block, the partitions that
+    the pool has created are dissolved. `Pool.local` starts a separate cluster, which is closed at
+    the end of its block.
 
     Examples
     --------
@@ -76,19 +76,24 @@ class Pool:
         client
             Client of the cluster.
         declaring
-            Only workers that declare one of these resources; others are not contacted, and need
-            not have this package.
+            Names of resources. If given, the pool only contains workers that declare one of them.
+            Other workers are not contacted and do not need this package.
 
         Raises
         ------
         PoolError
-            If the cluster has no workers and no adaptive partitions, a worker cannot import this
-            package, or the client is closed or asynchronous.
+            If the cluster has neither workers nor adaptive partitions, if a worker cannot import
+            this package, or if the client is closed or asynchronous.
+
+        Examples
+        --------
+        >>> Pool.from_client(client)                                       # doctest: +SKIP
+        <Pool: workers 3, hosts 1, GPUs 0; partitions: IO 1, OTHER 2>
         """
         if not all_workers(client) and not on_scheduler(client, adaptive_names):
             raise PoolError(
-                f"The cluster at {client.scheduler.address} has no workers: start some with "
-                f'dask worker {client.scheduler.address} --resources "GPU=1"'
+                f"The cluster at {client.scheduler.address} has no workers. Start workers, for "
+                f'example with `dask worker {client.scheduler.address} --resources "GPU=1"`.'
             )
         pool = cls(client, ())
         pool._belongs = partial(_declares_one_of, names=declaring)
@@ -103,25 +108,27 @@ class Pool:
         idle_s: float = math.inf,
         **options: Any,
     ) -> Pool:
-        """Start a cluster on this machine, divided into partitions, and a client of it.
+        """Start a cluster on this machine, with partitions and a client.
 
-        At the end of a ``with`` block, they end, whatever runs. The workers are processes; a script
-        needs no main guard.
+        At the end of a ``with`` block, the cluster is closed, even if tasks are running. The
+        workers are processes. A script does not need a main guard.
 
         Parameters
         ----------
         partitions
-            {name: (workers, slots of each worker)}. A worker has as many threads as slots.
+            Mapping of each name to (number of workers, slots of each worker). A worker has as many
+            threads as slots.
         idle_s
-            Everything also ends after so many seconds without a task, a result that somebody keeps,
-            or a pipe. The log says so; the pool can then no longer be used.
+            Time in seconds after which the cluster is also closed if there is no task, no result
+            that a client holds, and no pipe. A warning is logged, and the pool can no longer be
+            used.
         options
-            Others of `poolpart.deploy.local_cluster`.
+            Further options of `poolpart.deploy.local_cluster`.
 
         Raises
         ------
         PoolError
-            If there would be no worker, a number is not possible, or the workers do not start.
+            If there would be no workers, if a number is invalid, or if the workers do not start.
 
         Examples
         --------
@@ -151,7 +158,8 @@ class Pool:
     def __repr__(self) -> str:
         try:
             workers = self.workers
-            declared = Counter(name for w in all_workers(self.client) for name in w.partitions)
+            declared = Counter(dict.fromkeys(on_scheduler(self.client, partition_names), 0))
+            declared.update(name for w in all_workers(self.client) for name in w.partitions)
         except (PoolError, OSError):  # its client was closed
             workers = self._workers
             declared = Counter()
@@ -167,8 +175,13 @@ class Pool:
 
     def __getitem__(self, name: str) -> Partition:
         if (part := (parts := self.partitions()).get(name)) is None:
-            names = ", ".join(parts) or "none yet: divide makes some"
-            raise PoolError(f"There is no partition {name!r}; there are {names}.")
+            if not parts:
+                raise PoolError(
+                    f"There is no partition {name!r}, because the pool has not been divided. Use "
+                    "`Pool.divide` to create partitions."
+                )
+            names = ", ".join(map(repr, parts))
+            raise PoolError(f"There is no partition {name!r}. Existing partitions: {names}.")
         if part.note and name not in self._noted:
             self._noted.add(name)
             logger.warning("Partition %r: %s", name, part.note)
@@ -176,10 +189,10 @@ class Pool:
 
     @property
     def workers(self) -> tuple[WorkerInfo, ...]:
-        """The workers that belong to the pool now, with their GPUs.
+        """Workers that currently belong to the pool, with their GPUs.
 
-        A remainder has the workers that are in no partition. Only workers that have joined since
-        the last look are asked for their GPUs.
+        The remainder of a division contains the workers without a partition. Only workers that have
+        joined since the last access are asked for their GPUs.
         """
         if self._belongs is not None:
             present = [worker for worker in all_workers(self.client) if self._belongs(worker)]
@@ -197,61 +210,72 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Return the partitions that workers declare now, and adaptive partitions, by name.
+        """Return all partitions of the cluster by name, including those without workers.
 
-        A partition that its workers were started with has a `note` if their slots and threads
-        differ.
+        These are the partitions that were created by a division, adaptive partitions, and the
+        partitions that workers were started with. A partition of the last kind has a `note` if the
+        numbers of slots and threads of a worker differ.
+
+        Examples
+        --------
+        >>> list(pool.partitions())                                        # doctest: +SKIP
+        ['GPU', 'IO']
         """
         workers = all_workers(self.client)
-        names = {name for worker in workers for name in worker.partitions}
-        adaptive, with_rule = on_scheduler(self.client, _adaptive_and_divided)
+        names, with_rule = on_scheduler(self.client, _all_and_divided)
         return {
             name: Partition(
                 name, self.client, "" if name in with_rule else note_on_slots(name, workers)
             )
-            for name in sorted(names | adaptive)
+            for name in names
         }
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
         """Check that partitions have enough slots before tasks are submitted.
 
-        Dask itself would wait silently for ever for a resource that no worker declares.
+        In plain Dask, a task waits forever without a message if no worker declares its resource.
 
         Parameters
         ----------
         slots
-            Slots needed, by partition.
+            Required number of slots by partition.
         purpose
-            What they are needed for, by partition; shown in the error.
+            Purpose of the slots by partition, which is included in the error message.
 
         Raises
         ------
         PoolError
-            If a partition has fewer, or a worker declares two of the partitions or a number of
-            slots that is not whole.
+            If a partition has too few slots, if a worker declares two of the partitions, or if a
+            number of slots is not an integer.
+
+        Examples
+        --------
+        >>> pool.require({"GPU": 1, "IO": 4})                              # doctest: +SKIP
         """
         workers = self.workers
         for worker in workers:
             for name in slots.keys() & worker.resources.keys():
                 if (has := worker.resources[name]) % 1 or not 0 <= has < 2**31:
                     raise PoolError(
-                        f"Worker {worker.name} declares {name}={has:g}: give it a whole number of "
-                        f'slots, such as --resources "{name}=1".'
+                        f"Worker {worker.name} declares {name}={has:g}, which is not a valid "
+                        "number of slots. Start it with an integer, for example "
+                        f'`--resources "{name}=1"`.'
                     )
             if len(several := [name for name in slots if name in worker.partitions]) > 1:
                 raise PoolError(
-                    f"Worker {worker.name} declares {' and '.join(several)}: give each worker "
-                    "one of them, because tasks of one would delay those of the other."
+                    f"Worker {worker.name} declares the resources {' and '.join(several)}. Start "
+                    "each worker with only one of them, because tasks of one partition would delay "
+                    "tasks of the other."
                 )
         for name, minimum in slots.items():
             total = int(sum(worker.resources.get(name, 0) for worker in workers))
             if total < minimum:
                 reason = f" ({purpose[name]})" if purpose and name in purpose else ""
                 raise PoolError(
-                    f"Partition {name!r} has {total} of the "
-                    f"{minimum} {'slot' if minimum == 1 else 'slots'} needed{reason}: "
-                    f'start workers with --resources "{name}=1" or one with --nthreads {minimum} '
-                    f'--resources "{name}={minimum}".'
+                    f"Partition {name!r} has {total} of the {minimum} required "
+                    f"{'slot' if minimum == 1 else 'slots'}{reason}. Start workers with "
+                    f'`--resources "{name}=1"`, or one worker with `--nthreads {minimum} '
+                    f'--resources "{name}={minimum}"`.'
                 )
 
     # -- dividing ----------------------------------------------------------------------
@@ -270,33 +294,35 @@ class Pool:
         except (PoolError, OSError) as failure:
             if error is None:
                 raise
-            error.add_note(f"poolpart: the partitions stay: {failure}")  # what came first counts
+            error.add_note(
+                f"poolpart: The partitions were not dissolved. {failure}"
+            )  # what came first counts
 
     def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
-        """Divide this pool by rules, which stay in force, also when this client has gone.
+        """Divide this pool by rules, which remain in force after this client has closed.
 
-        Each rule takes from the workers that the rules before it have left. The scheduler keeps
-        the rules: a worker that joins later gets its partition by them, first where workers are
-        missing, and waiting tasks run. A restarted worker returns to its partition; its place is
-        kept for half a minute. An adaptive cluster keeps the workers that a partition needs for
-        its minimum.
+        Each rule selects from the workers that the previous rules have left. The scheduler keeps
+        the rules: it assigns workers that join later, first to partitions with missing workers, and
+        starts waiting tasks on them. A restarted worker returns to its partition, and its place is
+        kept for half a minute. An adaptive cluster keeps the workers that a partition needs for its
+        minimum.
 
         Parameters
         ----------
         rules
-            Rule of each partition, by name: `per_gpu`, `per_host`, `n_workers`,
-            `named` or `rest`.
+            Rule of each partition by name: `per_gpu`, `per_host`, `n_workers`, `named` or `rest`.
 
         Returns
         -------
         dict
-            The partitions by name.
+            Partitions by name. If a partition has fewer workers than its rule requests, its `note`
+            contains the reason, which is logged as a warning.
 
         Raises
         ------
         PoolError
-            If a partition would have fewer workers than its minimum, or another client makes one
-            of this name at the same moment.
+            If a partition would have fewer workers than its minimum, or if another client creates a
+            partition of this name at the same time.
 
         Examples
         --------
@@ -307,7 +333,7 @@ class Pool:
         >>> parts["GPU"].submit(pow, 2, 10).result()                   # doctest: +SKIP
         1024
         """
-        return self._divide(rules, rules)[0]
+        return self._divide(rules)[0]
 
     def partition(
         self,
@@ -321,28 +347,30 @@ class Pool:
         minimum: int = 1,
         exclusive: bool = False,
     ) -> tuple[Partition, Pool]:
-        """Take workers out of this pool under a name.
+        """Create a partition from workers of this pool.
 
-        Give exactly one selector, which chooses from the workers that the pool has now. The chosen
-        workers declare the Dask resource `name`, also after a restart by their nanny. Pending tasks
-        for the resource are sent to them. Workers that belong to another partition are not chosen.
-        Workers that join later are chosen by the same selector, as with `divide`.
+        Pass exactly one selector, which selects from the current workers of the pool. The selected
+        workers declare the Dask resource `name`, also after their nanny has restarted them. Pending
+        tasks that request the resource are sent to them. Workers of other partitions are not
+        selected. Workers that join later are selected by the same rule, as with `divide`.
 
         Parameters
         ----------
         name
             Name of the partition and of the resource.
         max_workers_per_gpu
-            At most so many workers for each GPU. If the pool has no GPU at all, the partition
-            takes so many CPU workers a host instead. A warning says so, which `note` keeps.
+            Maximum number of workers for each GPU. If the pool has no GPU, the partition takes up
+            to this number of CPU workers on each host instead. A warning is logged and stored in
+            `note`.
         max_workers_per_host
-            At most so many workers of each host.
+            Maximum number of workers on each host.
         n_workers
-            So many workers, wherever they are.
+            Number of workers on any host.
         workers
-            These workers, by name or address.
+            Names or addresses of workers.
         slots, minimum, exclusive
-            As of every `Rule`.
+            Options of the rule. See `Rule`. If the rule selects fewer workers than it requests, but
+            at least `minimum`, the partition has a `note`, which is logged as a warning.
 
         Returns
         -------
@@ -352,8 +380,12 @@ class Pool:
         Raises
         ------
         PoolError
-            If the selectors are not exactly one, a worker is not in this pool or belongs to
-            another partition, there are too few, or other workers have this partition.
+            If not exactly one selector is passed, if the rule selects fewer workers than `minimum`,
+            or if other workers already have this partition.
+
+        Examples
+        --------
+        >>> gpu, remainder = pool.partition("GPU", max_workers_per_gpu=1)  # doctest: +SKIP
         """
         common: dict[str, Any] = {"slots": slots, "minimum": minimum, "exclusive": exclusive}
         numbers = (
@@ -365,96 +397,94 @@ class Pool:
         if workers is not None:
             if isinstance(workers, str) or not isinstance(workers, Iterable):
                 raise PoolError(
-                    f"The workers of partition {name!r} are {workers!r}: give a list of names or "
-                    f"addresses, such as [{str(workers)!r}], or a number by n_workers."
+                    f"Invalid value {workers!r} for `workers` of partition {name!r}. Expected a "
+                    f"list of names or addresses, for example [{str(workers)!r}]. To select a "
+                    "number of workers, use `n_workers`."
                 )
             workers = list(workers)
             selectors.append(named(*workers, **common))
         if len(selectors) != 1:
             raise PoolError(
-                "Give exactly one of max_workers_per_gpu, max_workers_per_host, n_workers and "
-                f"workers to partition {name!r}, not {len(selectors)}."
+                f"Partition {name!r} requires exactly one of `max_workers_per_gpu`, "
+                "`max_workers_per_host`, `n_workers` and `workers`, but "
+                f"{len(selectors) or 'none'} were given."
             )
         [rule] = selectors
-        # All of the workers have to be present now; later there may be fewer.
-        initial_minimum = n_workers or len(workers or ()) or max(1, minimum)
-        parts, remainder = self._divide(
-            {name: rule}, {name: replace(rule, minimum=initial_minimum)}
-        )
+        parts, remainder = self._divide({name: rule})
         return parts[name], remainder
 
     def page(self) -> str:
         """Add a page to Dask's dashboard and return its URL.
 
-        The page shows partitions, stages, workers and pipes.
-
-        All users of the cluster can see it, and it is read-only. It needs no bokeh, and is as
-        public as the dashboard: on a shared network, whoever reaches one can see the other. It
-        stays until the last client that wanted it closes or leaves it (`leave_page`), or all
-        partitions are dissolved.
+        The page shows partitions, stages, workers and pipes. It is read-only, does not require
+        bokeh, and is visible to all users of the cluster. It is as public as the dashboard: on a
+        shared network, everyone who can reach the dashboard can see it. The page is removed when
+        the last client that has opened it closes or calls `leave_page`, or when all partitions are
+        dissolved.
 
         Raises
         ------
         PoolError
-            If the scheduler lacks this package, or runs no HTTP server.
+            If poolpart is not installed in the environment of the scheduler, or if the scheduler
+            has no HTTP server.
+
+        Examples
+        --------
+        >>> pool.page()                                                    # doctest: +SKIP
+        'http://127.0.0.1:8787/partitions'
         """
         return partitions_page(self.client)
 
     def pipes(self) -> list[str]:
         """Return the names of all pipes of the cluster, created by any client.
 
-        Dask's ``Queue(name)`` has the items of a pipe, and ``Variable(name)`` its state.
+        Dask's ``Queue(name)`` contains the items of a pipe, and ``Variable(name)`` its state.
         """
         return sorted(on_scheduler(self.client, names_of_pipes))
 
     def leave_page(self) -> None:
-        """Remove the page, unless further clients want the page."""
+        """Remove the page, unless another client has opened it as well."""
         on_scheduler(self.client, leave_page, owner=self.client.id)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
-        """Undo every partition that any client has made while this cluster ran.
+        """Dissolve all partitions that any client has created on this cluster.
 
-        Workers declare their original resources again. Rules, fences, statistics and the page
-        are removed. Results that are held stay; if one is lost, any worker recomputes it.
-        Partitions that workers were started with stay.
+        Workers declare their original resources again. Rules, statistics and the page are removed,
+        and exclusive partitions end. Results that a client holds are kept. If such a result is
+        lost, any worker may recompute it. Partitions that workers were started with remain.
 
         Parameters
         ----------
         timeout_s
-            How long to wait for the partitions' tasks to end.
+            Maximum time in seconds to wait for the tasks of the partitions.
 
         Returns
         -------
         list of str
-            Names of the partitions.
+            Names of the dissolved partitions.
 
         Raises
         ------
         PoolError
-            If their tasks have not ended; then everything stays.
+            If tasks have not finished in time. In this case, nothing changes.
         """
         names = ask_to_dissolve(self.client, None, timeout_s)
         self._partition_names.clear()
         return names
 
-    def _divide(
-        self, rules: Mapping[str, Rule], initial_rules: Mapping[str, Rule]
-    ) -> tuple[dict[str, Partition], Pool]:
-        """Make all partitions or none, and return them by name, with a pool of the remainder.
-
-        Workers are chosen by `initial_rules` at first, and by `rules` when workers join later.
-        """
+    def _divide(self, rules: Mapping[str, Rule]) -> tuple[dict[str, Partition], Pool]:
+        """Make all partitions or none, and return them by name, with a pool of the remainder."""
         if not isinstance(rules, Mapping):
             raise PoolError(
-                f"The rules are {rules!r}: give them by partition, such as "
-                '{"IO": n_workers(2), "OTHER": rest()}.'
+                f"Invalid rules {rules!r}. Expected a mapping of partition names to rules, for "
+                'example `{"IO": n_workers(2), "OTHER": rest()}`.'
             )
         for name, rule in rules.items():
             check_name(name)
             if not isinstance(rule, Rule):
                 raise PoolError(
-                    f"The rule of partition {name!r} is {rule!r}: give one such as n_workers(2), "
-                    "per_gpu(1) or rest()."
+                    f"Invalid rule {rule!r} for partition {name!r}. Expected a rule such as "
+                    "`n_workers(2)`, `per_gpu(1)` or `rest()`."
                 )
         for worker in self.workers:  # workers that have joined since the pool was made
             first_seen = self._first_seen.get(worker.name, worker)
@@ -463,7 +493,6 @@ class Pool:
             self.client,
             declare,
             rules=dict(rules),
-            initial_rules=dict(initial_rules),
             pool=self._first_seen,
             known_partitions=set(self.partitions()),
             own_partitions=set(self._partition_names),
@@ -480,12 +509,12 @@ class Pool:
         return parts, remainder
 
 
-def _adaptive_and_divided(dask_scheduler: Any = None) -> tuple[Set[str], Set[str]]:
-    """Return the names of adaptive partitions, and of partitions with a rule.
+def _all_and_divided(dask_scheduler: Any = None) -> tuple[list[str], Set[str]]:
+    """Return the names of all partitions, and of partitions with a rule.
 
     Runs on the scheduler.
     """
-    return adaptive_names(dask_scheduler), names_with_rule(dask_scheduler)
+    return partition_names(dask_scheduler), names_with_rule(dask_scheduler)
 
 
 def _declares_one_of(worker: WorkerInfo, names: Set[str] | None) -> bool:
@@ -507,7 +536,7 @@ def _ask_for_gpus(client: Client, workers: Sequence[WorkerInfo]) -> dict[str, tu
     for worker in workers:
         if isinstance(error := answers.get(worker.address), BaseException):
             raise PoolError(
-                f"Worker {worker.name} at {worker.address} cannot describe its machine "
-                f"({type(error).__name__}: {error}). Is poolpart installed there?"
+                f"Worker {worker.name} at {worker.address} cannot report its GPUs "
+                f"({type(error).__name__}: {error}). Check that poolpart is installed there."
             )
     return answers

@@ -55,7 +55,7 @@ def visible_gpus() -> tuple[str, ...]:
         return list_gpus()
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         logger.warning(
-            "No GPU is used, because listing them failed: %s %s", error, error.stderr or ""
+            "No GPU is used, because the GPUs could not be listed: %s %s", error, error.stderr or ""
         )
         return ()
 

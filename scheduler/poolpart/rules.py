@@ -11,23 +11,23 @@ from typing import Any, NamedTuple
 from .errors import PoolError
 from .workers import WorkerInfo
 
-NO_GPU = "no GPU in the pool: CPU workers instead"
+NO_GPU = "The pool has no GPU. The partition uses CPU workers instead."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """Rule of a partition, with parameters by name that every rule takes.
+    """Base class of the rules that select workers for a partition.
 
     Parameters
     ----------
     slots
-        Tasks that each worker takes at a time; its number of threads by default.
+        Number of tasks that each worker runs at the same time. By default, its number of threads.
     minimum
-        Least number of workers: making the partition with fewer is an error, and moving workers
-        never leaves it with fewer.
+        Minimum number of workers. Creating the partition with fewer workers is an error, and moving
+        workers never leaves it with fewer.
     exclusive
-        Whether to keep other tasks off its workers: un-annotated tasks, collections, tasks of other
-        users. Tasks that a worker already has end there.
+        Whether to keep other tasks off the workers: tasks without a partition, collections, and
+        tasks of other users. Tasks that a worker already has finish on it.
     """
 
     slots: int | None = None
@@ -38,35 +38,38 @@ class Rule:
         for name, lower_bound in (("slots", 1), ("minimum", 0), ("max_workers", 1), ("workers", 0)):
             value = getattr(self, name, None)
             if value is not None:
-                check_count(f"{name} of the rule {type(self).__name__}", value, lower_bound)
+                check_count(f"`{name}` of the rule `{type(self).__name__}`", value, lower_bound)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose from available workers, and prefer the first workers.
+        """Select workers from the available ones, and prefer those that come first.
 
-        This base class chooses none: the members of a partition without a rule were started with
-        its resource.
+        The base class selects none. It is the rule of partitions whose members were started with
+        the resource.
         """
         return []
 
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Whether to add a worker to the members, where `everyone` lists all workers."""
+        """Return whether to add a worker to the members, where `everyone` lists all workers."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     @property
     def target(self) -> int | None:
-        """Number of workers that the rule asks for, or None if that depends on the cluster."""
+        """Number of workers that the rule requests, or None if it depends on the cluster."""
         return None
 
     def slots_of(self, worker: WorkerInfo) -> int:
-        """Return the slots of a worker as a member."""
+        """Return the number of slots that a worker has as a member."""
         return self.slots or worker.nthreads
 
 
 @dataclass(frozen=True)
 class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
-    """At most `max_workers` for each GPU or, in a pool without GPUs, CPU workers of each host.
+    """Select up to `max_workers` workers for each GPU.
+
+    If the pool has no GPU, select up to `max_workers` CPU workers on each host instead. The
+    partition then has a note, which is logged as a warning.
 
     Examples
     --------
@@ -77,7 +80,7 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose workers that share the GPUs evenly."""
+        """Select workers that share the GPUs evenly."""
         if not any(worker.gpus for worker in free):
             return per_host(self.max_workers).choose(free)
         workers_of_gpu: Counter[str] = Counter()
@@ -94,7 +97,7 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Whether the worker has a spare GPU, or no worker has any."""
+        """Return whether the worker has a spare GPU, or whether no worker has a GPU."""
         if not worker.gpus and any(candidate.gpus for candidate in everyone):
             return False
         same_kind = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
@@ -103,12 +106,18 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
 
 @dataclass(frozen=True)
 class per_host(Rule):  # noqa: N801
-    """At most `max_workers` of each host."""
+    """Select up to `max_workers` workers on each host.
+
+    Examples
+    --------
+    >>> per_host(2, slots=4)
+    per_host(slots=4, minimum=1, exclusive=False, max_workers=2)
+    """
 
     max_workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose the first workers of each host."""
+        """Select the first workers of each host."""
         workers_of_host: Counter[str] = Counter()
         chosen = []
         for worker in free:
@@ -120,17 +129,25 @@ class per_host(Rule):  # noqa: N801
 
 @dataclass(frozen=True)
 class n_workers(Rule):  # noqa: N801
-    """A number of workers on any host."""
+    """Select a number of workers on any host.
+
+    If the cluster has fewer workers, but at least `minimum`, workers that join later are added.
+
+    Examples
+    --------
+    >>> n_workers(2, minimum=0)
+    n_workers(slots=None, minimum=0, exclusive=False, workers=2)
+    """
 
     workers: int
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose the first workers."""
+        """Select the first workers."""
         return list(free[: self.workers])
 
     @property
     def target(self) -> int:
-        """The given number."""
+        """The number of workers."""
         return self.workers
 
 
@@ -157,29 +174,42 @@ class Named(Rule):
 
 @dataclass(frozen=True)
 class rest(Rule):  # noqa: N801
-    """Every worker that no earlier rule takes, perhaps none."""
+    """Select all workers that no earlier rule selects, possibly none.
+
+    Only one rule of a division can be `rest`.
+
+    Examples
+    --------
+    >>> rest(exclusive=True)
+    rest(slots=None, minimum=0, exclusive=True)
+    """
 
     minimum: int = field(default=0, kw_only=True)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose all available workers."""
+        """Select all available workers."""
         return list(free)
 
 
 def named(*names: str | int, **common: Any) -> Named:
-    """Return a rule that takes the workers of these names or addresses, now or when they join.
+    """Return a rule that selects workers by name or address, including those that join later.
 
     Raises
     ------
     PoolError
-        If no name is given, or a name is a list or the like.
+        If no name is passed, or if a name is not a string or an integer.
+
+    Examples
+    --------
+    >>> named("gpu-0", "gpu-1").names
+    ('gpu-0', 'gpu-1')
     """
     wrong = [name for name in names if isinstance(name, bool) or not isinstance(name, str | int)]
     if wrong or not names:
-        value = repr(wrong[0]) if wrong else "nothing"
+        problem = f"an invalid argument {wrong[0]!r}" if wrong else "no arguments"
         raise PoolError(
-            f"The rule named() got {value}; give names or addresses of workers, each as an "
-            'argument, such as named("0", "1").'
+            f"The rule `named` was called with {problem}. Pass the name or address of each worker "
+            'as a separate argument, for example `named("0", "1")`.'
         )
     return Named(tuple(map(str, names)), **common)
 
@@ -209,28 +239,31 @@ def divide(
     if len(takers_of_rest) > 1:
         first, second, *_ = takers_of_rest
         raise PoolError(
-            f"Partitions {first!r} and {second!r} both have the rule rest(), and {first!r} takes "
-            f"all workers: give {second!r} another rule, such as n_workers(2), before {first!r}."
+            f"Partitions {first!r} and {second!r} both have the rule `rest()`, but only one "
+            f"partition can have it. Choose another rule for {second!r}, for example "
+            f"`n_workers(2)`, and place it before {first!r}."
         )
     chosen: dict[str, list[WorkerInfo]] = {}
     notes: dict[str, str] = {}
     for name, (rule, free, workers) in _choices(rules, pool).items():
         chosen[name] = workers
         if len(workers) < rule.minimum:
-            advice = _advice(rule, free, pool)
             raise PoolError(
-                f"Partition {name!r} would have {len(workers)} of the "
-                f"{workers_in_words(rule.minimum)} that it needs: {advice}"
+                f"Partition {name!r} requires at least {workers_in_words(rule.minimum)}, but its "
+                f"rule selects {len(workers)}. {_advice(rule, free, pool)}"
             )
         if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU
         if isinstance(rule, n_workers) and len(workers) < rule.workers:
             notes[name] = (
-                f"has {len(workers)} of the {workers_in_words(rule.workers)} that it asks for; "
-                "later workers join it"
+                f"The partition has {len(workers)} of the {workers_in_words(rule.workers)} that "
+                "its rule requests. Workers that join the cluster later are added to it."
             )
         if isinstance(rule, Named) and (missing := rule.missing(workers)):
-            notes[name] = f"lacks {', '.join(map(repr, missing))}, for which its rule asks"
+            notes[name] = (
+                "The partition does not have all workers that its rule names. Missing: "
+                f"{', '.join(map(repr, missing))}."
+            )
     return chosen, notes
 
 
@@ -273,9 +306,9 @@ def shortfalls(
     now = _choices(rules, pool)
     expected = _choices(rules, pool_as_seen)
     return {
-        name: f"has {len(now[name].workers)} of the {workers_in_words(len(choice.workers))} that "
-        "its rule would have taken when this pool was made: other partitions have taken workers "
-        "since"
+        name: f"The partition has {len(now[name].workers)} of the "
+        f"{workers_in_words(len(choice.workers))} that its rule would have selected when the pool "
+        "was created. The other workers have been assigned to other partitions since then."
         for name, choice in expected.items()
         if len(now[name].workers) < len(choice.workers)
     }
@@ -283,24 +316,34 @@ def shortfalls(
 
 def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) -> str:
     """Return advice about a rule that has too few workers."""
+    if isinstance(rule, n_workers) and rule.workers < rule.minimum:
+        return (
+            f"The rule allows at most {workers_in_words(rule.workers)}. Increase this number, or "
+            f"pass `minimum={rule.workers}`."
+        )
     elsewhere = [worker for worker in pool if worker.partitions and worker not in free]
     advice = ""
     if elsewhere:
         resources = sorted({resource for worker in elsewhere for resource in worker.partitions})
         verb = "declares" if len(elsewhere) == 1 else "declare"
         advice = (
-            f" {len(elsewhere)} {verb} the resource{'s' if len(resources) > 1 else ''} "
-            f"{', '.join(resources[:9])} already, and a worker belongs to one partition. To divide "
-            "the workers anew, dissolve their partitions. To move workers of a partition, even if "
-            "they were started with its resource, give a rule with minimum=0, and call resize with "
-            "source."
+            f" {workers_in_words(len(elsewhere))} already {verb} the "
+            f"resource{'s' if len(resources) > 1 else ''} {', '.join(map(repr, resources[:9]))}, "
+            "and a worker can belong to only one partition. To divide these workers again, "
+            "dissolve their partitions. To move workers of another partition, including workers "
+            "that were started with `--resources`, create this partition with `minimum=0` and "
+            f"call `resize`, for example `partition.resize(1, source={resources[0]!r})`."
         )
     if not isinstance(rule, Named):
-        return f"{len(free)} of {len(pool)} are left for it. Start more, or list it first.{advice}"
+        verb = "is" if len(free) == 1 else "are"
+        return (
+            f"{len(free)} of {len(pool)} workers {verb} available to this partition. "
+            f"Start more workers, or place this partition before the others.{advice}"
+        )
     present = ", ".join(repr(worker.name) for worker in pool[:9])
     ending = ", …." if len(pool) > 9 else "."
     names = ", ".join(map(repr, rule.names))
-    return f"it asks for {names}, and there are {present}{ending}{advice}"
+    return f"The rule names {names}, but the pool contains {present}{ending}{advice}"
 
 
 def partition_for(
@@ -324,18 +367,20 @@ def partition_for(
     return next(iter([*by_name, *short, *willing]), None)
 
 
-def workers_in_words(count: int, kind: str = "") -> str:
-    """Return a number of workers for a message, such as "1 spare worker"."""
-    return " ".join(filter(None, (str(count), kind, "worker" if count == 1 else "workers")))
+def workers_in_words(count: int) -> str:
+    """Return a number of workers for a message, such as "1 worker"."""
+    return f"{count} {'worker' if count == 1 else 'workers'}"
 
 
 def check_name(partition: object) -> None:
     """Raise a PoolError unless a value can be the name of a partition."""
     if not isinstance(partition, str) or not partition:
-        raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
+        raise PoolError(f"Invalid partition name {partition!r}. Expected a string such as 'GPU'.")
 
 
 def check_count(name: str, count: object, minimum: int = 1) -> None:
     """Raise a PoolError unless a count is a whole number of at least `minimum`."""
     if not isinstance(count, Integral) or count < minimum:
-        raise PoolError(f"{name} is {count!r}; give a whole number, {minimum} or more.")
+        raise PoolError(
+            f"Invalid value {count!r} for {name}. Expected an integer of at least {minimum}."
+        )

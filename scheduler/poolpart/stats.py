@@ -50,6 +50,7 @@ class Statistics(SchedulerPlugin):
         # {partition: its tasks that have ended, newest first}
         self.recent: dict[str, deque[TaskRow]] = defaultdict(lambda: deque(maxlen=KEPT))
         self._runnable: dict[Any, float] = {}  # {key: time since when a task could run}
+        self._deaths: dict[Any, int] = {}  # {key of a task: workers that died while they ran it}
         for feature in FEATURES:
             feature.begin_counting(self)
 
@@ -62,9 +63,16 @@ class Statistics(SchedulerPlugin):
         if finish in _RUNNABLE:
             return
         runnable = self._runnable.pop(key, None)
-        if start != "processing" or finish not in ("memory", "erred"):
+        if finish == "forgotten":
+            self._deaths.pop(key, None)
+        if start != "processing" or finish not in ("memory", "erred", "released"):
             return
         task = self.scheduler.tasks[key]
+        if finish == "released":  # its worker has died, or it was cancelled or rescheduled
+            if task.suspicious > self._deaths.get(key, 0):
+                self._deaths[key] = task.suspicious
+                self.ended[partition_of(task), task.prefix.name]["lost"] += 1
+            return
         counts: dict[str, Any] = self.ended[partition_of(task), task.prefix.name]
         counts["done" if finish == "memory" else "failed"] += 1
         computing = [span for span in kwargs.get("startstops") or () if span["action"] == "compute"]
@@ -88,6 +96,9 @@ class Statistics(SchedulerPlugin):
         """Keep a task that has ended: `report` is what its worker told of it."""
         partition = partition_of(task)
         worker = self.scheduler.workers.get(report.get("worker"))
+        started = moment(computing[0]["start"] if computing else None)
+        finished = moment(computing[-1]["stop"] if computing else None)
+        seconds = (finished - started).total_seconds() if started and finished else None
         self.recent[partition].appendleft(
             TaskRow(
                 state="done" if finish == "memory" else "failed",
@@ -96,9 +107,10 @@ class Statistics(SchedulerPlugin):
                 worker="" if worker is None else str(worker.name),
                 slots=_slots_taken(task, partition),
                 queued=moment(runnable),
-                started=moment(computing[0]["start"] if computing else None),
-                finished=moment(computing[-1]["stop"] if computing else None),
+                started=started,
+                finished=finished,
                 error=" ".join(str(report.get("exception_text") or "").split())[:_ERROR_LETTERS],
+                seconds=seconds,
             )
         )
 
@@ -184,17 +196,34 @@ def tasks_of(name: str, dask_scheduler: Any = None) -> tuple[list[TaskRow], floa
         if state == "assigned":
             state = "running" if task.key in running else "queued"
         worker = task.processing_on
+        started, seconds = _times_of_running(task) if state == "running" else (None, None)
         rows.append(
             TaskRow(
-                state,
-                str(task.key),
-                task.prefix.name,
-                "" if worker is None else str(worker.name),
-                _slots_taken(task, name),
-                moment(statistics.queued_since(task.key)),
+                state=state,
+                key=str(task.key),
+                function=task.prefix.name,
+                worker="" if worker is None else str(worker.name),
+                slots=_slots_taken(task, name),
+                queued=moment(statistics.queued_since(task.key)),
+                started=moment(started),
+                seconds=seconds,
             )
         )
     return [*rows, *statistics.recent.get(name, ())], statistics.since
+
+
+def _times_of_running(task: Any) -> tuple[float | None, float | None]:
+    """Return when a running task started, in seconds since 1970, and for how long it has run.
+
+    A worker reports the running time of its tasks with each heartbeat. Both are None before the
+    first heartbeat after the start.
+    """
+    worker = task.processing_on
+    reported_s = worker.executing.get(task)
+    if reported_s is None:
+        return None, None
+    started = worker.last_seen - reported_s
+    return started, max(reported_s, time.time() - started)
 
 
 def size_of(name: str, dask_scheduler: Any = None) -> str:

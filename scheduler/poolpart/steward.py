@@ -153,8 +153,8 @@ class Steward(SchedulerPlugin):
         members = [s for s in self.seats.values() if s.partition is None and s.original.get(name)]
         if not members:
             raise PoolError(
-                f"There is no partition {name!r}: no worker declares it, and it was not made "
-                "with Pool.partition or Pool.divide."
+                f"There is no partition {name!r}. No worker declares this resource, and the "
+                "partition was not created with `Pool.partition` or `Pool.divide`."
             )
         self.enter(name, Rule(minimum=0))
         for seat in members:
@@ -296,7 +296,7 @@ class Steward(SchedulerPlugin):
     def _ended(self, seat: Seat, task: asyncio.Task[None]) -> None:
         """Remove the seat of a worker that cannot declare resources, and leave if all is done."""
         if not (task.cancelled() or seat.away) and (error := task.exception()):
-            logger.error("Worker %s can be in no partition: %r", seat.info.name, error)
+            logger.error("Worker %s cannot be assigned to a partition: %r", seat.info.name, error)
             self.put(seat, None)
             self._give_up(seat)  # the worker may lack this package; absent workers keep their seat
         self.remove_if_done()
@@ -313,7 +313,7 @@ class Steward(SchedulerPlugin):
                 if not await self._step(seat, worker, requested_moves):
                     await asyncio.sleep(LOOK_EVERY_S)
             except OSError as error:  # the worker is leaving, or the connection was bad
-                logger.info("The worker at %s does not answer: %s", address, error)
+                logger.info("The worker at %s does not respond: %s", address, error)
                 await asyncio.sleep(10 * LOOK_EVERY_S)
         # `show` does not start the tasks that have waited for a worker with these resources.
         if worker:

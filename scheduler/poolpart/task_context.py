@@ -79,6 +79,6 @@ def telling_departure() -> Iterator[None]:
         with suppress(ValueError):  # not in a task
             if get_worker().status in _LEAVING:
                 # Without the cause, which may not be picklable.
-                message = f"the worker has left ({type(error).__name__}: {error})"
+                message = f"The worker has left the cluster ({type(error).__name__}: {error})"
                 raise WorkerLeft(message) from None
         raise

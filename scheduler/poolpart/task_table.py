@@ -18,29 +18,32 @@ _HEAD = ("state", "key", "function", "worker", "slots", "queued", "started", "se
 
 
 class TaskRow(NamedTuple):
-    """A task of a partition.
+    """Task of a partition.
 
     Parameters
     ----------
     state
-        "waiting" for results of others, "queued" for a worker or for its turn on one, "running",
-        "done" or "failed". The scheduler does not see when a task starts: of a worker's tasks, as
-        many count as running as the worker has slots.
+        "waiting" for results of other tasks, "queued" for a worker or for a slot of a worker,
+        "running", "done" or "failed". The scheduler is not notified when a task starts, so it
+        counts as many tasks of a worker as running as the worker has slots.
     key
-        Key of the task, as of its future.
+        Key of the task and of its future.
     function
-        Prefix of the key, for most tasks the function's name.
+        Prefix of the key, which is the name of the function for most tasks.
     worker
-        Name of the worker that runs or ran it; "" for none yet.
+        Name of the worker that runs or has run the task, or "" if there is none yet.
     slots
-        Slots of the partition that it holds while it runs.
+        Number of slots of the partition that the task takes while it runs.
     queued
-        When it could run: all its inputs were there, and it waited for a slot. None before, and of
-        tasks that were there before tasks were counted.
+        Time when all inputs were available and the task waited for a slot, or None. Also None if
+        the task existed before counting began.
     started, finished
-        When it started and ended, by the clock of the scheduler; None before it has ended.
+        Times when the task started and finished, according to the clock of the scheduler, or None.
+        The start of a running task is unknown until the first heartbeat of its worker.
     error
-        The error of a failed task, in a line; "" for none.
+        Error of a failed task in one line, or "".
+    seconds
+        Running time in seconds, up to now for a running task, or None if the start is unknown.
     """
 
     state: str
@@ -52,28 +55,28 @@ class TaskRow(NamedTuple):
     started: datetime | None = None
     finished: datetime | None = None
     error: str = ""
-
-    @property
-    def seconds(self) -> float | None:
-        """Running time of a task that has ended, seconds."""
-        if self.started is None or self.finished is None:
-            return None
-        return (self.finished - self.started).total_seconds()
+    seconds: float | None = None
 
 
 class TaskTable(tuple[TaskRow, ...]):
-    """Tasks of a partition: unfinished tasks by state, then finished tasks, newest first.
+    """Table of the tasks of a partition.
 
-    `since` is when counting began, in UTC: tasks that had finished before are missing.
+    Unfinished tasks are listed first, by state, followed by finished tasks, newest first.
+
+    `since` is the time in UTC when counting began. Tasks that had finished before are missing.
+
+    Examples
+    --------
+    >>> gpu.tasks().to_pandas().groupby("function")["seconds"].sum()   # doctest: +SKIP
     """
 
     since: datetime | None = None
 
     @classmethod
     def from_rows(cls, rows: Iterable[TaskRow], since: datetime | None = None) -> TaskTable:
-        """Return the table of rows.
+        """Return a table of rows, sorted by state.
 
-        Rows of a state keep their order. So do rows of finished tasks.
+        Rows with the same state, and rows of finished tasks, keep their order.
         """
         table = cls(sorted(rows, key=lambda row: min(STATES.index(row.state), _ENDED)))
         table.since = since
@@ -95,20 +98,25 @@ class TaskTable(tuple[TaskRow, ...]):
             return ""
         counts = Counter(row.state for row in self)
         by_state = ", ".join(f"{counts[state]:,} {state}" for state in STATES if counts[state])
-        return f"… the first {_SHOWN} of {len(self):,} tasks: {by_state}. to_pandas() has all."
+        return (
+            f"… The first {_SHOWN} of {len(self):,} tasks: {by_state}. `to_pandas()` returns all."
+        )
 
     def to_pandas(self) -> Any:
         """Return a DataFrame with a row for each task.
 
-        Raises PoolError if pandas is not installed.
+        Raises
+        ------
+        PoolError
+            If pandas is not installed.
         """
         try:
             import pandas as pd
         except ImportError:
-            raise PoolError("pandas is not installed: pip install pandas.") from None
-        return pd.DataFrame(
-            [(*row, row.seconds) for row in self], columns=[*TaskRow._fields, "seconds"]
-        )
+            raise PoolError(
+                "pandas is not installed. Install it with `pip install pandas`."
+            ) from None
+        return pd.DataFrame(list(self), columns=list(TaskRow._fields))
 
 
 def _cells(row: TaskRow) -> tuple[str, ...]:

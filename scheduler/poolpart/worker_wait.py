@@ -22,7 +22,7 @@ class WorkerWait:
     partition
         Name of the partition.
     waiting
-        What waits, for messages, such as "a map".
+        What waits, as the beginning of a sentence, such as "A map".
     seconds
         Longest wait while no worker is there, and none is expected; `math.inf` for ever.
     """
@@ -46,20 +46,34 @@ class WorkerWait:
         if prospects.has_workers:
             self._since = None
             return
-        sentence = f"Partition {self._partition!r} has no workers: {self._waiting} on it"
         if self._since is None:
             self._since = time.monotonic()
-            limit = "" if math.isinf(self._seconds) else f", for {self._seconds:g} s at most"
-            logger.warning("%s waits%s.", sentence, limit)
+            limit = "" if math.isinf(self._seconds) else f" at most {self._seconds:g} s"
+            logger.warning(
+                "Partition %r has no workers. %s waits%s for a worker.",
+                self._partition,
+                self._waiting,
+                limit,
+            )
         if time.monotonic() - self._since >= self._seconds:
             raise PoolError(
-                f"{sentence} has waited for {self._seconds:g} s, and no worker is starting. Start "
-                f'workers with --resources "{self._partition}=1", move some by Partition.grow, or '
-                "give a longer empty_s."
+                f"Partition {self._partition!r} has no workers. {self._waiting} has waited for "
+                f"{self._seconds:g} s, and no worker is starting. Start workers with "
+                f'`--resources "{self._partition}=1"`, move workers with `Partition.grow`, or pass '
+                "a longer `empty_s`."
             )
+
+    def until_next_check(self, longest_s: float) -> float:
+        """Return after how many seconds to check again, at most `longest_s`."""
+        if self._since is None:
+            return longest_s
+        return max(0.0, min(longest_s, self._since + self._seconds - time.monotonic()))
 
 
 def check_wait(seconds: object) -> None:
     """Raise ValueError unless a value is a number of seconds for `WorkerWait`."""
     if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not seconds >= 0:
-        raise ValueError(f"empty_s is {seconds!r}; give seconds, such as {WAIT_S:g}.")
+        raise ValueError(
+            f"Invalid value {seconds!r} for `empty_s`. Expected a number of seconds, for example "
+            f"{WAIT_S:g}."
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,26 +17,28 @@ from .internals.worker import resources_here as resources_here  # records of tas
 
 SILENT_S = 20.0  # without a heartbeat, after which a worker counts as stopped or stuck
 MISSED_BEATS = 3  # heartbeats that a worker may miss at least
+_REPR_S = 2.0  # longest wait of a `repr` for the scheduler
 _LOOK_S = 2.0  # between looks for silent workers
 
 
 @dataclass(frozen=True)
 class WorkerInfo:
-    """One worker of a cluster.
+    """Description of a worker of a cluster.
 
     Parameters
     ----------
     name, address, host
-        A given name outlives a restart by the nanny; the address, and a default name made from
-        it, do not.
+        Name, address and host of the worker. If its nanny restarts the worker, a name that was set
+        explicitly remains the same, while the address and a default name, which is derived from the
+        address, change.
     nthreads
-        Its threads.
+        Number of threads.
     memory
-        Its memory limit in bytes, 0 for none.
+        Memory limit in bytes, or 0 if there is none.
     gpus
-        UUIDs of the CUDA devices it may use, by ordinal.
+        UUIDs of the CUDA devices that the worker may use, by ordinal.
     resources
-        Dask resources that it declares, by name.
+        Dask resources that the worker declares, by name.
     """
 
     name: str
@@ -48,16 +51,16 @@ class WorkerInfo:
 
     @property
     def partitions(self) -> frozenset[str]:
-        """Partitions of the worker: resources that the worker declares a slot of."""
+        """Names of the partitions of the worker, which are the resources with at least one slot."""
         return frozenset(name for name, slots in self.resources.items() if slots)
 
     def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
-        """Return a copy with these GPUs."""
+        """Return a copy with other GPUs."""
         return replace(self, gpus=tuple(gpus))
 
     @classmethod
     def from_identity(cls, address: str, identity: Mapping[str, Any]) -> WorkerInfo:
-        """Return the description of a worker that the scheduler describes."""
+        """Return a worker from its description on the scheduler."""
         return cls(
             name=str(identity["name"]),
             address=address,
@@ -74,10 +77,10 @@ def note_on_slots(name: str, workers: Iterable[WorkerInfo]) -> str:
         slots = worker.resources.get(name, 0)
         if not slots or slots == worker.nthreads:
             continue
-        has = f"worker {worker.name} has {slots:g} {'slot' if slots == 1 else 'slots'} and "
-        has += f"{worker.nthreads} {'thread' if worker.nthreads == 1 else 'threads'}, so that "
+        has = f"Worker {worker.name} has {slots:g} {'slot' if slots == 1 else 'slots'} but "
+        has += f"{worker.nthreads} {'thread' if worker.nthreads == 1 else 'threads'}, so "
         has += "threads stay idle" if slots < worker.nthreads else "tasks wait for a thread"
-        return f'{has}. To use each thread, start it with --resources "{name}={worker.nthreads}".'
+        return f'{has}. Start it with `--resources "{name}={worker.nthreads}"` to use every thread.'
     return ""
 
 
@@ -107,9 +110,26 @@ def on_scheduler(
         return client.sync(request)
     except ModuleNotFoundError as error:
         raise PoolError(
-            f"The scheduler at {client.scheduler.address} has no module {error.name!r}: start "
-            "it in the same environment as this process."
+            f"The scheduler at {client.scheduler.address} cannot import {error.name!r}. Start it "
+            "in the same environment as this process."
         ) from error
+
+
+def ask_for_repr(client: Client | None, function: Callable[..., Any], **kwargs: Any) -> Any:
+    """Call a function on the scheduler for a `repr`.
+
+    Returns None if there is no answer in 2 s, or if waiting for one would block an event loop.
+    """
+    # A task that has not used its partition or pipe yet has no client.
+    if client is None or client.asynchronous or client.status != "running":
+        return None
+    with suppress(RuntimeError):  # no event loop runs in this thread
+        if asyncio.get_running_loop() is client.loop.asyncio_loop:
+            return None
+    try:
+        return on_scheduler(client, function, answer_s=_REPR_S, **kwargs)
+    except (PoolError, OSError):
+        return None
 
 
 def check_client(client: Client) -> None:
@@ -119,11 +139,12 @@ def check_client(client: Client) -> None:
     """
     if client.asynchronous:
         raise PoolError(
-            "poolpart needs a client that is not asynchronous: make one with Client(address), "
-            "and call it in a thread (asyncio.to_thread) if there is an event loop."
+            "poolpart does not support asynchronous clients. Create a client with "
+            "`Client(address)`. In an event loop, use it in a thread, for example with "
+            "`asyncio.to_thread`."
         )
     if client.status in ("closing", "closed"):
-        raise PoolError(f"The client is {client.status}: make a new client and a new pool.")
+        raise PoolError(f"The client is {client.status}. Create a new client and a new pool.")
 
 
 def worker_identities(client: Client) -> dict[str, dict[str, Any]]:

@@ -228,7 +228,7 @@ def test_jobs_that_the_queue_refuses_are_tried_again_while_there_is_work(queue, 
         gpu = Partition("GPU", client)
         task = gpu.submit(worker_name)
         wait_until(lambda: said)
-        assert said == ["A worker cannot be started: the queue is full"]
+        assert said == ["A worker could not be started: the queue is full"]
         task.cancel()
         wait_until(lambda: not client.cluster.worker_spec)
         task = gpu.submit(worker_name)
@@ -299,7 +299,7 @@ def test_a_map_has_work_for_all_that_may_come(queue, wait_until):
 
 def test_a_task_that_no_worker_to_come_can_run_is_refused(queue):
     with cluster_of({"GPU": adaptive(0, 3, slots=2)}) as client:
-        with pytest.raises(PoolError, match=r"asks for 3 slots .* have 2 at most"):
+        with pytest.raises(PoolError, match=r"requests 3 slots .* have at most 2"):
             Partition("GPU", client).submit(worker_name, slots=3)
         assert Partition("GPU", client).submit(worker_name, slots=2).result(LONG_S) == "GPU-0"
 
@@ -338,18 +338,18 @@ def test_no_task_is_lost_or_run_again_while_workers_come_and_go(queue, monkeypat
 
 
 WRONG = {
-    "a number": ({"adapt": 3}, r"adapt of partition 'GPU' is 3; .* such as \[0, 8\]"),
-    "three": ({"adapt": [1, 2, 3]}, "the least and the greatest"),
-    "workers beside it": ({"adapt": [0, 1], "workers": 1}, "no workers beside it"),
-    "below 0": ({"adapt": [-1, 1]}, "minimum of partition 'GPU' is -1"),
-    "swapped": ({"adapt": [8, 1]}, "maximum of partition 'GPU' is 1; .* 8 or more"),
-    "nothing": ({"adapt": [0, 0]}, "maximum of partition 'GPU' is 0; .* 1 or more"),
-    "a time": ({"adapt": [0, 1], "idle_s": "1m"}, "idle_s of partition 'GPU' is '1m'"),
-    "a time alone": ({"idle_s": 60}, "idle_s without adapt"),
+    "a number": ({"adapt": 3}, r"value 3 for `adapt` of partition 'GPU'\. .* for example \[0, 8\]"),
+    "three": ({"adapt": [1, 2, 3]}, "the minimum and maximum"),
+    "workers beside it": ({"adapt": [0, 1], "workers": 1}, "cannot be combined with `workers`"),
+    "below 0": ({"adapt": [-1, 1]}, "value -1 for the minimum of partition 'GPU'"),
+    "swapped": ({"adapt": [8, 1]}, "value 1 for the maximum of partition 'GPU'. .* at least 8"),
+    "nothing": ({"adapt": [0, 0]}, "value 0 for the maximum of partition 'GPU'. .* at least 1"),
+    "a time": ({"adapt": [0, 1], "idle_s": "1m"}, "value '1m' for `idle_s` of partition 'GPU'"),
+    "a time alone": ({"idle_s": 60}, "`idle_s` without `adapt`"),
     "an option": ({"adapt": [0, 1], "mem": "1GB"}, "'GPU' cannot be started.*'mem'"),
     "another option": ({"mem": "1GB"}, "'GPU' cannot be started.*'mem'"),
-    "slots": ({"slots": 0}, "slots of partition 'GPU' is 0"),
-    "workers": ({"workers": "2"}, "workers of partition 'GPU' is '2'"),
+    "slots": ({"slots": 0}, "value 0 for the number of slots of partition 'GPU'"),
+    "workers": ({"workers": "2"}, "value '2' for the number of workers of partition 'GPU'"),
 }
 
 
@@ -364,7 +364,9 @@ def test_what_is_wrong_is_told_before_anything_starts(queue, case):
 def test_other_partitions_do_not_adapt(start):
     client = start({name: {} for name in "ab"})
     parts = Pool.from_client(client).divide({"A": n_workers(1), "B": rest()})
-    with pytest.raises(PoolError, match=r"'A' has no jobs .* start_partitions .* Partition.grow"):
+    with pytest.raises(
+        PoolError, match=r"'A' has no jobs .*start_partitions`.* `Partition\.resize"
+    ):
         parts["A"].adapt(0, 2)
     assert not parts["A"].want(2)
 

@@ -79,8 +79,8 @@ def test_logs_tell_why_workers_are_missing(queue, tmp_path, wait_until):
         (tmp_path / "gpu-3.err").write_text("out of memory\n")
         wait_until(lambda: len(said) == 2)
     first, second = said
-    assert first == f"The log {tmp_path}/gpu-1.err ends: no such file: job 1"
-    assert second.endswith("gpu-3.err ends: out of memory")
+    assert first == f"The last line of the log {tmp_path}/gpu-1.err is: no such file: job 1"
+    assert second.endswith("gpu-3.err is: out of memory")
 
 
 def test_the_end_of_a_log_is_reported_once_and_after_the_log_is_complete(tmp_path):
@@ -93,7 +93,7 @@ def test_the_end_of_a_log_is_reported_once_and_after_the_log_is_complete(tmp_pat
     log.write_text("loading modules\nno such file\n")
     os.utime(log, (1, 1))
     assert list(logs.endings()) == [], "the log has changed"
-    assert list(logs.endings()) == [f"The log {log} ends: no such file"]
+    assert list(logs.endings()) == [f"The last line of the log {log} is: no such file"]
     assert list(logs.endings()) == []
 
 
@@ -106,7 +106,7 @@ def test_a_job_that_is_refused(cluster, queue):
 
 
 def test_a_partition_needs_a_name(cluster, queue):
-    with pytest.raises(PoolError, match="name of a partition"):
+    with pytest.raises(PoolError, match="Invalid partition name"):
         start_partitions(cluster, {"IO": {}, "": {}})
     assert queue.submitted == []
 
@@ -114,7 +114,7 @@ def test_a_partition_needs_a_name(cluster, queue):
 def test_clusters_that_are_not_taken(cluster, queue):
     with (
         thread_cluster({"GPU": 1}) as other,
-        pytest.raises(PoolError, match=r"SpecCluster has workers of one kind.*divide"),
+        pytest.raises(PoolError, match=r"SpecCluster has only one kind of worker.*divide"),
     ):
         start_partitions(other, {"GPU": {}})
     start_partitions(cluster, {"GPU": {}})

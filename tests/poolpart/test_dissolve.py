@@ -145,7 +145,10 @@ def test_tasks_that_have_not_ended_are_waited_for(start, wait_until):
     # They come by another connection than what follows.
     wait_until(lambda: len(client.cluster.scheduler.tasks) == 3)
     before = declared(client)
-    with pytest.raises(PoolError, match="After 0 s 3 tasks of A and B had not ended, such as t-"):
+    with pytest.raises(
+        PoolError,
+        match=r"3 tasks of partitions 'A' and 'B' have not finished after 0 s, for example 't-",
+    ):
         pool.dissolve(timeout_s=0)
     assert declared(client) == before
     threading.Timer(0.3, event.set).start()

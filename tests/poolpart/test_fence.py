@@ -196,7 +196,7 @@ def test_nothing_is_stolen_into_a_partition(client, wait_until):
 def complaints(warned):
     """What was said of waiting tasks; what earlier tests have left may be warned of as well."""
     said = [str(warning.message) for warning in list(warned)]
-    return [text for text in said if text.startswith("Tasks wait")]
+    return [text for text in said if text.startswith("Tasks such as")]
 
 
 @pytest.mark.extended
@@ -220,7 +220,7 @@ def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(cl
 def test_waiting_tasks_go_to_a_worker_that_leaves_the_partition(start, wait_until):
     client = start({"A-0": {}})
     part, _ = Pool.from_client(client).partition("A", n_workers=1, exclusive=True, minimum=0)
-    with pytest.warns(UserWarning, match="Tasks wait") as told:
+    with pytest.warns(UserWarning, match="are waiting, because all workers") as told:
         waiting = [
             client.submit(worker_name, pure=False),
             *client.map(worker_name, range(50), pure=False),

@@ -63,7 +63,7 @@ def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
     leave(client, "a")
     pipe = Pipe("of-nobody", 3, client).create()
     pipe.put(-1)
-    message = "Partition 'A' has no workers: for_each on it has waited for 0.2 s"
+    message = "Partition 'A' has no workers. `for_each` has waited for 0.2 s"
     with pytest.raises(PoolError, match=message):
         Partition("A", client).for_each(pipe, abs, empty_s=0.2)
     with pytest.raises(PipeFailed, match=message):
@@ -123,8 +123,8 @@ def test_an_error_is_raised_at_once_and_ends_the_producers(client, a, make_pipe,
     pipe.put_many([4, 2, 0])
     error = consumer.exception(LONG_S)
     assert isinstance(error, ZeroDivisionError)
-    assert error.__notes__ == [f"poolpart: this was item 2 of pipe {pipe.name!r}: 0"]
-    with pytest.raises(PipeFailed, match="invert has failed: ZeroDivisionError"):
+    assert error.__notes__ == [f"poolpart: The error occurred for item 2 of pipe {pipe.name!r}: 0"]
+    with pytest.raises(PipeFailed, match="Function 'invert' failed: ZeroDivisionError"):
         pipe.put(1)
 
 
@@ -167,7 +167,10 @@ def test_an_item_may_be_a_future_that_a_queue_has_put(client, a, make_pipe):
 
 @pytest.mark.parametrize("options", [{"window": 0}, {"slots": 0}])
 def test_options_that_make_no_sense(client, a, make_pipe, options):
-    with pytest.raises(ValueError, match=r"is 0; give a whole number, 1 or more"):
+    with pytest.raises(
+        ValueError,
+        match=r"Invalid value 0 for `(window|slots)`\. Expected an integer of at least 1",
+    ):
         a.for_each(make_pipe(client), abs, **options)
 
 
@@ -237,7 +240,7 @@ def test_a_future_has_the_first_error(client, a, make_pipe):
     pipe.put_many([4, 0])
     error = count.exception(LONG_S)
     assert isinstance(error, ZeroDivisionError)
-    assert error.__notes__ == [f"poolpart: this was item 1 of pipe {pipe.name!r}: 0"]
+    assert error.__notes__ == [f"poolpart: The error occurred for item 1 of pipe {pipe.name!r}: 0"]
 
 
 def test_a_cancelled_future_ends_tasks_and_producers(client, b, make_pipe, wait_until):
@@ -248,7 +251,7 @@ def test_a_cancelled_future_ends_tasks_and_producers(client, b, make_pipe, wait_
     wait_until(lambda: pipe.depth == 3)  # two have a task, one of which runs
     assert count.cancel()
     assert concurrent.futures.wait([count], LONG_S).done == {count}
-    with pytest.raises(PipeFailed, match="for_each of wait_for was cancelled"):
+    with pytest.raises(PipeFailed, match="`for_each` with function 'wait_for' was canceled"):
         pipe.put("more")
     event.set()
     wait_until(lambda: not client.cluster.scheduler.tasks)
@@ -292,8 +295,8 @@ def test_an_error_of_an_iterable_or_of_its_items(client, a):
         a.for_each((1 / n for n in (1, 0)), abs)
     with pytest.raises(ZeroDivisionError) as caught:
         a.for_each([1, 0], invert)
-    assert caught.value.__notes__ == ["poolpart: this was item 1 of the iterable: 0"]
-    with pytest.raises(PoolError, match="takes a pipe or an iterable of items, not 5"):
+    assert caught.value.__notes__ == ["poolpart: The error occurred for item 1 of the iterable: 0"]
+    with pytest.raises(PoolError, match="expects a pipe or an iterable of items, but got 5"):
         a.for_each(5, abs)
 
 

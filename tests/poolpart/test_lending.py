@@ -450,7 +450,7 @@ def test_polling_for_a_nested_task_is_reported_to_the_client(client, b, warned, 
     future = b.submit(poll, stop)
     wait_until(lambda: any(future.key in message for message in warned(client)))
     [message] = [message for message in warned(client) if future.key in message]
-    assert "partition 'B'" in message and "use Future.result, distributed.wait" in message
+    assert "partition 'B'" in message and "Use `Future.result`, `distributed.wait`" in message
     stops[stop].set()
     assert future.result(LONG_S) is False
 

@@ -58,7 +58,7 @@ def test_after_an_error_the_function_is_not_called_again(client, make_pipe):
         with pytest.raises(ValueError, match="two"):
             listener.join()
     assert items == [0, 1, 2]
-    with pytest.raises(PipeFailed, match="fail_on_two has failed: ValueError"):
+    with pytest.raises(PipeFailed, match="Function 'fail_on_two' failed: ValueError"):
         pipe.put(9)
 
 
@@ -149,8 +149,8 @@ def test_the_function_may_close_its_listener_but_not_join_it(client, make_pipe):
     listener.join(LONG_S)
     assert items == [1]
     assert errors == [
-        "take_one waits for the end of its own listener. Call join in another thread, or stop "
-        "listening with close."
+        "Function 'take_one' waits for the end of its own listener. Call `join` in "
+        "another thread, or stop listening with `close`."
     ]
     assert pipe.get(LONG_S) == 2
 
@@ -159,7 +159,7 @@ def test_a_join_with_a_time_limit_leaves_the_listener_as_it_is(client, make_pipe
     pipe = make_pipe(client)
     items = []
     listener = pipe.listen(items.append)
-    with pytest.raises(TimeoutError, match=f"^Pipe '{pipe.name}' has not ended within 0.05 s"):
+    with pytest.raises(TimeoutError, match=f"^Pipe '{pipe.name}' did not end within 0.05 s"):
         listener.join(0.05)
     pipe.put(1)
     pipe.close()
@@ -174,7 +174,7 @@ def fail_at_once(pipe):
 def test_a_producer_that_fails_ends_the_listener(client, a, make_pipe):
     """Also before its first item."""
     pipe = make_pipe(client)
-    expected = r"^Task 'producer', which uses the pipe, has failed: ValueError\('no such file'\)\.$"
+    expected = r"^Task 'producer', which uses the pipe, failed: ValueError\('no such file'\)\.$"
     with pytest.raises(PipeFailed, match=expected), pipe.listen(print):
         producer = a.submit(fail_at_once, pipe, key="producer")
     assert producer.status == "error"

@@ -69,7 +69,7 @@ def children():
 
 
 def test_a_number_of_workers_says_nothing_of_their_kinds(processes):
-    with pytest.raises(PoolError, match=r"fixed number of workers: .* Partition\.grow"):
+    with pytest.raises(PoolError, match=r"fixed number of workers\. .* `Partition\.grow"):
         processes.cluster.scale(2)
     assert len(Pool.from_client(processes)) == 3
 
@@ -104,10 +104,10 @@ def resource_tracker_pid():
 @pytest.mark.parametrize(
     ("partitions", "message"),
     [
-        ({"A": (-1, 1)}, "number of workers of partition 'A' is -1; give a whole number, 0 or"),
-        ({"A": (1, 0)}, "number of slots of partition 'A' is 0; give a whole number, 1 or more"),
-        ({"A": (1, 1), "": (1, 1)}, "name of a partition is ''"),
-        ({"A": (0, 1)}, "There would be no worker"),
+        ({"A": (-1, 1)}, "value -1 for the number of workers of partition 'A'"),
+        ({"A": (1, 0)}, "value 0 for the number of slots of partition 'A'"),
+        ({"A": (1, 1), "": (1, 1)}, "Invalid partition name ''"),
+        ({"A": (0, 1)}, "would have no workers"),
     ],
 )
 def test_partitions_that_cannot_be(partitions, message):

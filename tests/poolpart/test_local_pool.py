@@ -70,17 +70,17 @@ def test_it_ends_when_it_is_idle_but_not_under_results_and_pipes(wait_until, cap
         second.put(1)
         second.delete()
         wait_until(lambda: pool.client.status == "closed")
-        assert "The local pool has ended: it had no task for 0.2 s." in caplog.text
+        assert "The local pool was closed, because it was idle for 0.2 s." in caplog.text
         with pytest.raises(PoolError, match="The client is closed"):
             io.for_each([1], abs)
 
 
 @pytest.mark.parametrize("idle_s", [0, -1, "60", True])
 def test_an_idle_time_that_makes_no_sense(idle_s):
-    with pytest.raises(PoolError, match="give seconds above 0"):
+    with pytest.raises(PoolError, match="Expected a positive number of seconds"):
         Pool.local({"IO": (1, 1)}, idle_s=idle_s)
 
 
 def test_a_pool_without_workers():
-    with pytest.raises(PoolError, match="There would be no worker"):
+    with pytest.raises(PoolError, match="would have no workers"):
         Pool.local({"IO": (0, 1)})

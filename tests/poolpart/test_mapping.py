@@ -16,7 +16,7 @@ from distributed import CancelledError, Client, Event, as_completed, get_worker
 from tests.daemons import wait_until
 from tests.poolpart.helpers import LONG_S, join, kill, leave, twice, wait_for
 
-from poolpart import Partition, Pool, PoolError, n_workers, named, rest
+from poolpart import Partition, Pool, PoolError, mapping, n_workers, named, rest
 
 
 def add(x, y):
@@ -119,7 +119,7 @@ def test_its_length_is_that_of_the_shortest_iterable(a, b):
     assert len(rest) == len(list(rest)) == 8
     for iterables in ([itertools.count(), [1]], [a.map(twice, iter([1])), [1]]):
         results = a.map(add, *iterables)
-        with pytest.raises(TypeError, match="one of them has none"):
+        with pytest.raises(TypeError, match="one of its iterables has no length"):
             len(results)
         results.close()
 
@@ -237,7 +237,7 @@ def test_items_of_a_slow_iterable_are_sent_as_they_come(a, monkeypatch):
 def test_what_dask_does_with_results(a, client):
     assert list(client.gather(a.map(twice, range(50)))) == list(range(0, 100, 2))
     results = a.map(twice, iter(range(3)))
-    with pytest.raises(TypeError, match=r"map gives results, not futures.* list\(partition\.map"):
+    with pytest.raises(TypeError, match=r"map` returns an iterator of results, not futures"):
         as_completed(results)
     assert list(results) == [0, 2, 4]
 
@@ -245,7 +245,7 @@ def test_what_dask_does_with_results(a, client):
 def test_the_first_tasks_start_at_once(a, client, wait_until):
     results = a.map(twice, range(100))
     wait_until(lambda: task_count(client) == 2 * a.slots)
-    assert repr(results) == "<Results of twice on 'A': 8 items taken, 8 tasks under way>"
+    assert repr(results) == "<Results of twice on 'A': 8 items taken, 8 tasks in flight>"
     assert next(results) == 0
     results.close()
     assert repr(results).endswith("items taken, closed>")
@@ -260,7 +260,7 @@ def test_an_error_names_its_item_and_lets_go_of_the_others(a, client, ordered, c
     with pytest.raises(ZeroDivisionError, match="at 3") as caught:
         taken.extend(results)
     assert taken == [0, 1, 2] or not ordered
-    assert caught.value.__notes__ == ["poolpart: this was item 3 of a map: 3"]
+    assert caught.value.__notes__ == ["poolpart: The error occurred for item 3 of a map: 3"]
     assert "fail_at_3" in [entry.name for entry in caught.traceback]
     assert list(results) == []
     wait_until(lambda: task_count(client) <= 1)  # the failed one, by the traceback
@@ -274,7 +274,9 @@ def test_errors_are_results_in_their_places(a, ordered, chunk, retries):
     options = {"ordered": ordered, "chunk": chunk, "retries": retries}
     results = list(a.map(fail_at_tens, range(1, 50), return_exceptions=True, **options))
     errors = {r.__notes__[0]: r for r in results if isinstance(r, ZeroDivisionError)}
-    assert errors.keys() == {f"poolpart: this was item {x - 1} of a map: {x}" for x in TENS}
+    assert errors.keys() == {
+        f"poolpart: The error occurred for item {x - 1} of a map: {x}" for x in TENS
+    }
     shown = [str(r) if isinstance(r, ZeroDivisionError) else r for r in results]
     expected = [f"at {x}" if x in TENS else x for x in range(1, 50)]
     assert shown == expected if ordered else Counter(shown) == Counter(expected)
@@ -283,7 +285,7 @@ def test_errors_are_results_in_their_places(a, ordered, chunk, retries):
 def test_an_error_that_cannot_be_sent_is_a_result_that_shows_it(a):
     (error,) = a.map(fail_unpicklably, [1], return_exceptions=True)
     assert "UnpicklableError('item 1'" in str(error)
-    assert error.__notes__ == ["poolpart: this was item 0 of a map: 1"]
+    assert error.__notes__ == ["poolpart: The error occurred for item 0 of a map: 1"]
 
 
 @pytest.mark.extended
@@ -320,14 +322,16 @@ def test_stopping_lets_go_of_tasks_that_have_not_started(b, client, gate, stop, 
 
 @pytest.mark.parametrize("value", [-1, None, True, "5 min", float("nan")])
 def test_a_longest_wait_that_cannot_be(a, value):
-    with pytest.raises(ValueError, match=f"empty_s is {value!r}; give seconds, such as 300"):
+    with pytest.raises(
+        ValueError, match=f"value {value!r} for `empty_s`. Expected a number of seconds"
+    ):
         a.map(twice, [1], empty_s=value)
 
 
 @pytest.mark.parametrize(("option", "least"), [("window", 1), ("chunk", 1), ("retries", 0)])
 @pytest.mark.parametrize("value", [-1, 1.5])
 def test_options_are_checked_at_once(a, option, least, value):
-    message = f"{option} is {value}; give a whole number, {least} or more"
+    message = f"value {value} for `{option}`. Expected an integer of at least {least}"
     with pytest.raises(ValueError, match=message):
         a.map(twice, [1], **{option: value})
 
@@ -350,7 +354,7 @@ def test_a_partition_that_is_dissolved_ends_it(start, monkeypatch, by_another, o
     assert next(results) == 0
     with Client(client.cluster) as other:
         Pool(other if by_another else client, []).dissolve()
-    with pytest.raises(PoolError, match="Partition 'A' was dissolved: divide the pool again"):
+    with pytest.raises(PoolError, match=r"Partition 'A' was dissolved\. Divide the pool again"):
         list(results)
     assert next(results, "ended") == "ended"
 
@@ -376,19 +380,19 @@ def test_a_restart_of_the_cluster_ends_it(own_nannies):
 
 @pytest.mark.parametrize(
     ("empty_s", "limit"),
-    [(math.inf, ""), (1.5, ", for 1.5 s at most"), (300.0, ", for 300 s at most")],
+    [(math.inf, ""), (1.5, " at most 1.5 s"), (300.0, " at most 300 s")],
 )
 def test_a_partition_without_workers_is_told_of(client, caplog, empty_s, limit):
     with caplog.at_level(logging.WARNING, "poolpart"):
         results = Partition("nobody", client).map(twice, range(10), empty_s=empty_s)
-    assert f"Partition 'nobody' has no workers: a map on it waits{limit}." in caplog.text
+    assert f"Partition 'nobody' has no workers. A map waits{limit} for a worker." in caplog.text
     results.close()
 
 
 WAITED = (
-    r"Partition '{}' has no workers: a map on it has waited for {:g} s, and no worker is "
-    r'starting\. Start workers with --resources "{}=1", move some by Partition\.grow, or give a '
-    r"longer empty_s\."
+    r"Partition '{}' has no workers\. A map has waited for {:g} s, and no worker is "
+    r'starting\. Start workers with `--resources "{}=1"`, move workers with `Partition\.grow`, or '
+    r"pass a longer `empty_s`\."
 )
 
 
@@ -417,6 +421,15 @@ def test_a_map_waits_again_as_long_after_a_worker_has_come(start, monkeypatch, w
     results = Partition("A", client).map(twice, [1, 2], chunk=1, empty_s=LONG_S)
     join(client, "a", resources={"A": 1})
     assert list(results) == [2, 4]
+
+
+def test_a_map_does_not_wait_for_workers_much_longer_than_its_limit(start):
+    client = start({"b": {}})
+    results = Partition("A", client).map(twice, [1], empty_s=0.5)
+    begun = time.monotonic()
+    with pytest.raises(PoolError, match=WAITED.format("A", 0.5, "A")):
+        list(results)
+    assert time.monotonic() - begun < mapping.LOOK_S
 
 
 @pytest.mark.extended
@@ -496,7 +509,7 @@ def test_an_error_of_the_inner_map_names_its_item(a, b, chunk):
         for result in results:
             got.append(result)  # noqa: PERF402 - the error is to leave what came before
     assert got == [0, 2, 4]
-    assert "this was item 3 of a map: 3" in "".join(caught.value.__notes__)
+    assert "The error occurred for item 3 of a map: 3" in "".join(caught.value.__notes__)
 
 
 # -- lost workers ----------------------------------------------------------------------
@@ -537,8 +550,8 @@ def test_results_that_are_lost_before_they_are_fetched(start, wait_until, ordere
 def test_items_that_kill_their_workers_are_named(nannies, as_results):
     partition, _ = Pool.from_client(nannies).partition("N", n_workers=2)
     options = {"chunk": 2, "window": 1, "return_exceptions": as_results}
-    with pytest.raises(Exception, match="map-die_at_3") as caught:
+    with pytest.raises(Exception, match="die_at_3-map") as caught:
         list(partition.map(die_at_3, [3, 2, 1, 0], **options))
     assert type(caught.value).__name__ == "KilledWorker"
     (note,) = caught.value.__notes__
-    assert note.startswith("poolpart: the task was for items 0 to 1 of a map; unless window=1")
+    assert note.startswith("poolpart: The task processed items 0 to 1 of a map. Unless `window=1`")

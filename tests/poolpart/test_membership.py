@@ -39,7 +39,7 @@ def test_a_partition_that_was_dissolved(start):
     pool.dissolve()
     for partition in (part, found, copy):
         for call in calls(partition):
-            with pytest.raises(PoolError, match="Partition 'A' was dissolved: divide the pool"):
+            with pytest.raises(PoolError, match=r"Partition 'A' was dissolved\. Divide the pool"):
                 call()
     pool.divide({"A": rest()})
     assert part.submit(worker_name).result(LONG_S) in ("a", "b")
@@ -54,7 +54,7 @@ def test_by_another_client(start, monkeypatch):
     monkeypatch.setattr("poolpart.division.forget_registrations", lambda: None)
     with Client(client.cluster) as other:
         Pool(other, []).dissolve()
-    dissolved = "Partition 'A' was dissolved: divide the pool"
+    dissolved = "Partition 'A' was dissolved. Divide the pool"
     with pytest.raises(PoolError, match=dissolved):
         part.submit(worker_name).result(LONG_S)
     with part, pytest.raises(PoolError, match=dissolved):
@@ -72,15 +72,15 @@ def test_by_another_client(start, monkeypatch):
 def test_more_slots_than_any_worker_has(start):
     client = start({"a": {"nthreads": 2}, "b": {"nthreads": 3}, "c": {"resources": {"C": 1}}})
     part, _ = Pool.from_client(client).partition("A", workers=["a", "b"])
-    message = "A task asks for 4 slots of one worker, and workers of partition 'A' have 3 at most"
+    message = "A task requests 4 slots on one worker, but workers of partition 'A' have at most 3"
     for submit in (
         part.submit,  # asks at first
         lambda f, slots: part.submit(f, slots=3) and part.submit(f, slots=slots).result(LONG_S),
         lambda f, slots: part.map(f, [1], slots=slots),
     ):
-        with pytest.raises(PoolError, match=f"{message}.* by slots=4 in its rule"):
+        with pytest.raises(PoolError, match=f"{message}.* with `slots=4` in the rule"):
             submit(worker_name, slots=4)
-    with pytest.raises(PoolError, match=r'have 1 at most: ask for fewer.*--resources "C=2"'):
+    with pytest.raises(PoolError, match=r'have at most 1\. Request fewer.*--resources "C=2"'):
         Partition("C", client).compute(dask.delayed(1), slots=2)
     assert part.submit(worker_name, slots=3).result(LONG_S) == "b"
     join(client, "d", nthreads=1, resources={"A": 5})
@@ -99,6 +99,20 @@ def test_without_workers_at_the_moment_it_waits(start):
     assert waiting[1].result(LONG_S) == 4
 
 
+def test_a_partition_that_no_worker_declares_is_reported_once(start, caplog):
+    client = start({"a": {}, "b": {"resources": {"B": 1}}})
+    Pool.from_client(client).divide({"A": named("a"), "EMPTY": n_workers(0, minimum=0)})
+    caplog.set_level("WARNING")  # a cluster that is started silences it
+    part = Partition("NOPE", client)
+    waiting = [part.submit(twice, number) for number in range(2)]
+    assert caplog.messages == [
+        "Partition 'NOPE' has no workers. Its tasks wait until a worker with the resource 'NOPE' "
+        "joins the cluster. Existing partitions: 'A', 'B', 'EMPTY'."
+    ]
+    join(client, "late", resources={"NOPE": 1})
+    assert [future.result(LONG_S) for future in waiting] == [0, 2]
+
+
 def test_while_the_only_worker_is_started_again(nannies):
     part = Pool.from_client(nannies).divide({"A": named("0", slots=2)})["A"]
     assert part.submit(twice, 1).result(LONG_S) == 2
@@ -113,7 +127,7 @@ def test_workers_by_name_address_or_both(start):
     for workers, names in (("b", {"b"}), (there["c"], {"c"}), (["a", there["b"]], {"a", "b"})):
         assert {part.submit(worker_name, workers=workers).result(LONG_S) for _ in range(8)} <= names
     for stranger in ("stranger", "nobody", there["stranger"]):
-        with pytest.raises(PoolError, match=r"does not belong to partition 'A': .* \(a, b, c\)"):
+        with pytest.raises(PoolError, match=r"does not belong to partition 'A'. .* a, b, c\."):
             part.submit(worker_name, workers=["a", stranger]).result(LONG_S)
     join(client, "d", resources={"A": 1})
     assert part.submit(worker_name, workers="d").result(LONG_S) == "d"
@@ -178,7 +192,7 @@ def test_a_client_that_connects_again_registers_again(start, wait_until, monkeyp
     client.loop.add_callback(connection.comm.abort)
     wait_until(lambda: client.scheduler_comm not in (None, connection))
     assert part.submit(nested).result(LONG_S) == ["a"] * 9
-    with pytest.raises(PoolError, match="have 1 at most"):
+    with pytest.raises(PoolError, match="have at most 1"):
         part.submit(worker_name, slots=2).result(LONG_S)
 
 
@@ -223,7 +237,7 @@ def test_registrations_end_with_the_clients_outside_tasks(start, wait_until):
 
 def test_who_cannot_submit_is_not_registered(start, monkeypatch):
     client = start({"a": {"resources": {"A": 1}}})
-    with pytest.raises(PoolError, match="asks for 2 slots"):
+    with pytest.raises(PoolError, match="requests 2 slots"):
         Partition("A", client).submit(worker_name, slots=2)
     # The last request of a client that was killed may arrive after it has left.
     monkeypatch.setattr(client, "id", "gone")
@@ -273,7 +287,10 @@ def test_a_coroutine_submits_without_asking(start):
 def test_fewer_workers_than_a_rule_asks_for_are_noted(start, caplog):
     client = start({name: {} for name in "abc"})
     caplog.set_level("WARNING")  # a cluster that is started silences it
-    note = "has 3 of the 9 workers that it asks for; later workers join it"
+    note = (
+        "The partition has 3 of the 9 workers that its rule requests. Workers that join the "
+        "cluster later are added to it."
+    )
     part = Pool.from_client(client).divide({"A": n_workers(9)})["A"]
     assert part.note == note
     assert f"Partition 'A': {note}" in caplog.text

@@ -82,14 +82,19 @@ def test_a_partition_is_resized_to_a_number_of_workers(divided):
     a, rest_of_pool = parts["A"], parts["C"]
     assert a.resize(3) == [] and len(a) == 3
     assert len(a.resize(5)) == 2 and (len(a), len(rest_of_pool)) == (5, 0)
-    with pytest.raises(PoolError, match="'A' cannot grow by 1: the remainder has 0 spare workers"):
+    with pytest.raises(
+        PoolError,
+        match=r"cannot grow by 1 worker, .* should provide them as `source`",
+    ):
         a.resize(6)
     assert len(a.resize(2)) == 3 and (len(a), len(rest_of_pool)) == (2, 3)
     (moved,) = a.resize(3, source="C")
     assert moved in members(a) and a.stats().target == 3
-    with pytest.raises(PoolError, match=r"'A' cannot have 0 workers, because .* the minimum 1"):
+    with pytest.raises(
+        PoolError, match=r"'A' cannot be resized to 0 workers, because its minimum is 1"
+    ):
         a.resize(0)
-    with pytest.raises(PoolError, match="number of workers of partition 'A' is -1"):
+    with pytest.raises(PoolError, match="value -1 for the number of workers of partition 'A'"):
         a.resize(-1)
     assert rest_of_pool.stats().target is None
 
@@ -147,7 +152,9 @@ def test_a_task_that_does_not_end_keeps_its_worker(divided, wait_until):
     scheduler = client.cluster.scheduler
     wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 3)
     before = declared(client)
-    with pytest.raises(PoolError, match=r"1 of 1 workers .* 0.2 s, .*: \w stay\."):
+    with pytest.raises(
+        PoolError, match=r"1 of 1 worker could .* 0\.2 s\. .* in their partition: \w\."
+    ):
         parts["A"].shrink(1, timeout_s=0.2)
     wait_until(lambda: declared(client) == before)
     assert declared_by_themselves(client) == before
@@ -205,11 +212,20 @@ def test_never_below_the_minimum(start):
     rules = {"A": n_workers(2, minimum=2), "B": n_workers(1), "C": rest(minimum=1)}
     parts = Pool.from_client(client).divide(rules)
     before = declared(client)
-    with pytest.raises(PoolError, match="'A' cannot shrink by 1: it has 2 workers and needs at"):
+    with pytest.raises(
+        PoolError,
+        match="'A' cannot shrink by 1 worker, because it has 2 workers and its minimum is 2",
+    ):
         parts["A"].shrink()
-    with pytest.raises(PoolError, match="'B' cannot grow by 1: the remainder has 0 spare workers"):
+    with pytest.raises(
+        PoolError,
+        match="the remainder of the pool has no workers to spare",
+    ):
         parts["B"].grow()
-    with pytest.raises(PoolError, match="'B' cannot grow by 1: partition 'A', beyond its min"):
+    with pytest.raises(
+        PoolError,
+        match="partition 'A' has no workers to spare beyond its minimum",
+    ):
         parts["B"].grow(source="A")
     assert declared(client) == before
 
@@ -217,13 +233,15 @@ def test_never_below_the_minimum(start):
 def test_what_makes_no_sense(divided):
     client, parts = divided
     for workers in (0, -1, 1.5):
-        with pytest.raises(PoolError, match="number of workers to move is"):
+        with pytest.raises(PoolError, match="for the number of workers to move"):
             parts["A"].grow(workers)
-        with pytest.raises(PoolError, match="number of workers to move is"):
+        with pytest.raises(PoolError, match="for the number of workers to move"):
             parts["A"].shrink(workers)
     with pytest.raises(PoolError, match="'A' cannot take workers from itself"):
         parts["A"].grow(source="A")
-    with pytest.raises(PoolError, match="There is no partition 'X': no worker declares it"):
+    with pytest.raises(
+        PoolError, match=r"There is no partition 'X'\. No worker declares this resource"
+    ):
         parts["A"].grow(source="X")
     with pytest.raises(PoolError, match="There is no partition 'X'"):
         Partition("X", client).shrink()

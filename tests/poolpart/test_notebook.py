@@ -47,25 +47,29 @@ def test_a_table_of_partitions_and_a_link_to_the_open_page(pool):
 
 def test_a_partition_says_how_the_page_opens_and_that_it_was_dissolved(pool):
     part, _ = pool.partition("CPU", workers=["b"])
-    assert "<code>Pool.from_client(client).page()</code> opens it" in part._repr_html_()
+    assert "call <code>Pool.from_client(client).page()</code>" in part._repr_html_()
     part.dissolve()
     text = part._repr_html_()
     assert "<table>" not in text
-    assert "The partition was dissolved, or its workers have left" in text
-    assert "no worker declares it" in Partition("never", pool.client)._repr_html_()
+    assert "It was dissolved, or its workers have left" in text
+    assert "No worker declares this partition" in Partition("never", pool.client)._repr_html_()
 
 
 def test_a_pipe_shows_its_depth_capacity_and_state(pool):
     pipe = Pipe("<numbers>", 3, pool.client)
-    assert "The pipe was deleted, or never created." in pipe._repr_html_()
+    assert "The pipe does not exist. It was deleted or never created." in pipe._repr_html_()
+    assert repr(pipe) == "<Pipe '<numbers>': does not exist>"
     with pipe:
         pipe.put_many([1, 2])
+        assert repr(pipe) == "<Pipe '<numbers>': 2 of 3 items, open>"
         assert rows_of(pipe._repr_html_()) == {"<numbers>": ["2", "3", "open"]}
         pipe.close()
         assert rows_of(pipe._repr_html_()) == {"<numbers>": ["2", "3", "closed"]}
+        assert repr(pipe) == "<Pipe '<numbers>': 2 of 3 items, closed>"
         pipe.fail("no <disk>")
+        assert repr(pipe) == "<Pipe '<numbers>': 2 of 3 items, failed: no <disk>>"
         assert rows_of(pipe._repr_html_()) == {"<numbers>": ["2", "3", "failed: no &lt;disk&gt;"]}
-    assert "The pipe was deleted" in pipe._repr_html_()
+    assert "The pipe does not exist" in pipe._repr_html_()
 
 
 def test_statistics_are_tables_of_a_partition_and_of_its_stages(pool):

@@ -87,18 +87,32 @@ def test_a_client_that_cannot_be_asked(_threads):
         part = Partition("A", client)
         assert len(part) == 2
     for ask in (part.stats, part.grow, lambda: len(part), lambda: part.map(twice, [1])):
-        with pytest.raises(PoolError, match="The client is closed: make a new client"):
+        with pytest.raises(PoolError, match=r"The client is closed\. Create a new client"):
             ask()
     with pytest.raises(PoolError, match="The client is closed"):
         Pool.from_client(client)
 
 
+def keywords_of(_, **keywords):
+    return sorted(keywords)
+
+
+def test_options_of_dask_are_not_passed_to_the_function_of_a_map(a):
+    with pytest.raises(
+        PoolError, match=r"map` does not accept `pure`\. The function is called for"
+    ):
+        a.map(keywords_of, [1], pure=True)
+    with pytest.raises(PoolError, match=r"map` does not accept `resources`\. To request"):
+        a.map(keywords_of, [1], resources={"A": 2})
+    assert list(a.map(keywords_of, [1], other=1)) == [["other"]]
+
+
 def test_an_asynchronous_client_is_refused(_threads):
     async def ask():
         async with Client(_threads, asynchronous=True, set_as_default=False) as client:
-            with pytest.raises(PoolError, match="needs a client that is not asynchronous"):
+            with pytest.raises(PoolError, match="does not support asynchronous clients"):
                 Pool.from_client(client)
-            with pytest.raises(PoolError, match="needs a client that is not asynchronous"):
+            with pytest.raises(PoolError, match="does not support asynchronous clients"):
                 Partition("A", client).stats()
 
     _threads.sync(ask)
@@ -116,7 +130,9 @@ def test_a_task_may_take_several_slots(a, client, wait_until):
     assert behind.result() in ("A-0", "A-1")
     assert list(a.map(abs, range(5), slots=2)) == list(range(5))
     for call in (a.submit, a.map):
-        with pytest.raises(ValueError, match="slots is 0; give a whole number, 1 or more"):
+        with pytest.raises(
+            ValueError, match=r"Invalid value 0 for `slots`\. Expected an integer of at least 1"
+        ):
             call(abs, [1], slots=0)
 
 
@@ -158,22 +174,34 @@ def test_data_is_put_on_its_workers(a, client):
     assert client.gather(data) == {"x": 1, "y": 2}
     assert {w for held in client.who_has(list(data.values())).values() for w in held} <= address
     assert set(client.who_has(a.scatter(3, broadcast=True)).popitem()[1]) == address
-    with pytest.raises(PoolError, match="Partition 'C' has no workers to keep data"):
+    with pytest.raises(PoolError, match="Partition 'C' has no workers to store the data"):
         Partition("C", client).scatter(1)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda a: a.submit(abs, 1, resources={"A": 2}), "submit sets resources itself: slots=2"),
-        (lambda a: a.submit(abs, 1, pure=True), "submit sets pure itself: each call runs by"),
-        (lambda a: a.for_each(None, abs, resources={}), "for_each sets resources itself: slots=2"),
-        (lambda a: a.compute([], resources={"A": 2}), "compute sets resources itself: slots=2"),
-        (lambda a: a.scatter([1], workers=["x"]), "scatter sets workers itself: the data"),
-        (lambda a: a.submit(abs, 1, workers=1.5), "workers of a task are 1.5: give the name"),
-        (lambda a: a.submit(3), "partition 'A' needs a function, not 3"),
-        (lambda a: a.map(3, [1]), "partition 'A' needs a function, not 3"),
-        (lambda a: a.for_each(None, 3), "partition 'A' needs a function, not 3"),
+        (
+            lambda a: a.submit(abs, 1, resources={"A": 2}),
+            "submit` does not accept `resources`. To request",
+        ),
+        (lambda a: a.submit(abs, 1, pure=True), "submit` does not accept `pure`. Each call"),
+        (
+            lambda a: a.for_each(None, abs, resources={}),
+            "for_each` does not accept `resources`. To request",
+        ),
+        (
+            lambda a: a.compute([], resources={"A": 2}),
+            "compute` does not accept `resources`. To request",
+        ),
+        (lambda a: a.scatter([1], workers=["x"]), "scatter` does not accept `workers`. The data"),
+        (
+            lambda a: a.submit(abs, 1, workers=1.5),
+            "Invalid value 1.5 for `workers`. Expected the name",
+        ),
+        (lambda a: a.submit(3), "Partition 'A' expects a callable, but got 3"),
+        (lambda a: a.map(3, [1]), "Partition 'A' expects a callable, but got 3"),
+        (lambda a: a.for_each(None, 3), "Partition 'A' expects a callable, but got 3"),
     ],
 )
 def test_what_cannot_be_given(a, call, message):

@@ -124,7 +124,7 @@ def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
     try:
         for operation, item in operations:
             if operation == "put" and len(queued) == capacity:
-                with pytest.raises(TimeoutError, match="stayed full for 0 s"):
+                with pytest.raises(TimeoutError, match="remained full for 0 s"):
                     producer.put(item, timeout_s=0)
             elif operation == "put":
                 producer.put(item)
@@ -139,7 +139,7 @@ def test_behaves_as_a_bounded_queue(_threads_client, operations, capacity):
                 taken.clear()
                 queued.clear()
             else:
-                with pytest.raises(TimeoutError, match=r"Nothing came .* for 0 s"):
+                with pytest.raises(TimeoutError, match=r"No item arrived in .* within 0 s"):
                     getattr(pipe, operation)(timeout_s=0)
             assert producer.depth == len(queued)
     finally:
@@ -239,9 +239,7 @@ def test_a_consumer_that_fails_ends_its_producers(client, b, make_pipe, pool):
     consumer = b.submit(take_one_and_fail, [pipes[0], kept], key=f"consumer-{pipes[0].name}")
     with pytest.raises(OSError, match="the disk is full"):
         consumer.result(LONG_S)
-    reason = (
-        rf"^Task '{consumer.key}', which uses the pipe, has failed: OSError\('the disk is full'"
-    )
+    reason = rf"^Task '{consumer.key}', which uses the pipe, failed: OSError\('the disk is full'"
     with pytest.raises(PipeFailed, match=reason):
         produce(pipes[0], range(9))
     kept.put("the program submits another consumer")
@@ -264,7 +262,7 @@ def test_a_closed_pipe_does_not_fail_with_its_task(client, b, make_pipe):
 def test_a_task_whose_input_fails_ends_its_pipe_with_the_error_of_the_input(client, b, make_pipe):
     pipe = make_pipe(client)
     dependent = b.submit(produce, pipe, b.submit(int, "no number"), key=f"producer-{pipe.name}")
-    reason = rf"^Task '{dependent.key}', which uses the pipe, has failed: ValueError\(.*'no number'"
+    reason = rf"^Task '{dependent.key}', which uses the pipe, failed: ValueError\(.*'no number'"
     with pytest.raises(PipeFailed, match=reason):
         pipe.get(LONG_S)
 
@@ -273,9 +271,7 @@ def test_a_task_of_for_each_that_fails_ends_the_consumers_of_its_pipe(client, a,
     results = make_pipe(client)
     with pytest.raises(ValueError, match="bad item"):
         a.for_each([1], put_or_fail, results=results)
-    with pytest.raises(
-        PipeFailed, match=r"^Task 'put_or_fail-.*has failed: ValueError\('bad item'"
-    ):
+    with pytest.raises(PipeFailed, match=r"^Task 'put_or_fail-.*failed: ValueError\('bad item'"):
         results.get(LONG_S)
 
 
@@ -292,7 +288,7 @@ def test_a_producer_that_is_cancelled_ends_its_consumers(client, b, make_pipe, w
     waiting = b.submit(produce, pipe, range(3), key=key)
     wait_until(lambda: key in client.cluster.scheduler.tasks)
     del waiting
-    reason = f"^Task '{key}', which uses the pipe, was cancelled before it had used the pipe"
+    reason = f"^Task '{key}', which uses the pipe, was canceled before it had used the pipe"
     with pytest.raises(PipeFailed, match=reason):
         pipe.get(LONG_S)
     gate.put("go on")
@@ -333,7 +329,7 @@ def test_a_task_that_ends_without_closing_its_pipe_is_no_failure(client, a, make
     for item in range(2):
         assert a.submit(pipe.put, item).result(LONG_S) is None
         assert a.submit(produce, pipe, [item]).result(LONG_S) is None
-    assert a.submit(str, pipe).result(LONG_S) == str(pipe)  # does not use it
+    assert pipe.name in a.submit(str, pipe).result(LONG_S)  # does not use it
     wait_until(lambda: not client.cluster.scheduler.tasks)
     assert sorted(pipe.get_all(LONG_S)) == [0, 0, 1, 1]
     pipe.put(3)
@@ -355,7 +351,7 @@ def test_advice_is_requested_once_and_sent_only_if_it_changes(client, make_pipe,
     advise(pipe, 2)
     assert advice_of(pipe) == 2
     assert len(requests) == 2
-    with pytest.raises(ValueError, match=r"is 0; give 1 or more"):
+    with pytest.raises(ValueError, match=r"Invalid advice 0 .* of at least 1"):
         advise(pipe, 0)
 
 
@@ -375,7 +371,7 @@ def test_each_request_waits_for_a_part_of_the_time_that_is_left(
     requests.clear()
     assert pipe.drain() == []
     pipe.put_many([0, 1])
-    with pytest.raises(TimeoutError, match="stayed full for 0 s"):
+    with pytest.raises(TimeoutError, match="remained full for 0 s"):
         pipe.put(2, timeout_s=0)
     assert pipe.get() == 0
     assert pipe.get_all() == [1]  # has it already, and looks for more
@@ -439,7 +435,7 @@ def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
     source = itertools.count()
     pipe.put_many([])
     pipe.put("first")
-    with pytest.raises(TimeoutError, match=r"stayed full for 0\.1 s"):
+    with pytest.raises(TimeoutError, match=r"remained full for 0\.1 s"):
         pipe.put_many(source, timeout_s=0.1)
     assert next(source) == 2  # no more than fit into one request
     assert pipe.drain() == ["first", 0]
@@ -452,7 +448,7 @@ def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
     assert list(pipe) == [0, 1, 2, 3, 4]
     failed = make_pipe(client)
     failed.fail("")
-    with pytest.raises(PipeFailed, match="no reason was given"):
+    with pytest.raises(PipeFailed, match="No reason was given"):
         failed.put(1)
     failed = make_pipe(client)
     failed.fail("no more")
@@ -486,13 +482,15 @@ def test_using_a_deleted_pipe_says_so_and_does_not_bring_it_back(client, make_pi
     pipe.delete()
     for use in USES.values():
         for end in (pipe, other_end(pipe)):
-            with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
+            with pytest.raises(
+                PipeFailed, match=r"does not exist\. It was deleted or never created"
+            ):
                 use(end)
     assert known(client) == before
 
 
 def use_in_task(name, use):
-    with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
+    with pytest.raises(PipeFailed, match=r"does not exist\. It was deleted or never created"):
         USES[use](Pipe(name))
 
 
@@ -501,7 +499,7 @@ def test_a_pipe_that_was_never_created_is_an_error_of_its_user_only(start, caplo
     client = start({"a": {}})
     caplog.set_level(logging.WARNING)  # a cluster that is started silences it
     for use in USES.values():
-        with pytest.raises(PipeFailed, match="does not exist: never created, or deleted"):
+        with pytest.raises(PipeFailed, match=r"does not exist\. It was deleted or never created"):
             use(Pipe("never-created", client=client))
     assert take_news(client, 0.0, ["never-created"]) == {}
     with Client(client.cluster) as other:
@@ -524,7 +522,7 @@ def test_leaving_its_block_deletes_a_pipe_also_after_an_error(client):
 def test_two_pipes_of_one_name(client, make_pipe):
     pipe = make_pipe(client)
     pipe.put("mine")
-    with pytest.raises(ValueError, match=f"has a queue or variable {pipe.name!r}"):
+    with pytest.raises(ValueError, match=f"already has a queue or variable named {pipe.name!r}"):
         other_end(pipe).create()
     assert pipe.get() == "mine"
     pipe.delete()
@@ -536,7 +534,7 @@ def test_a_pipe_does_not_take_over_a_queue_or_variable(client, kind):
     name = f"taken-{kind.__name__}"
     found = kind(name, client)
     found.put(1) if kind is Queue else found.set(1)
-    with pytest.raises(ValueError, match=f"has a queue or variable '{name}'"):
+    with pytest.raises(ValueError, match=f"already has a queue or variable named '{name}'"):
         Pipe(name, client=client).create()
     assert found.get() == 1
     found.close() if kind is Queue else found.delete()
@@ -726,7 +724,9 @@ def test_a_task_that_is_run_again_closes_for_one_producer(client, a, make_pipe, 
 
 @pytest.mark.parametrize("options", [{"capacity": 0}, {"producers": 0}, {"producers": 1.5}])
 def test_numbers_that_make_no_pipe(client, options):
-    with pytest.raises(ValueError, match=r"is (0|1\.5); give a whole number, 1 or more"):
+    with pytest.raises(
+        ValueError, match=r"Invalid value (0|1\.5) for the .* Expected an integer of at least 1"
+    ):
         Pipe("nothing", client=client, **options)
 
 
@@ -852,14 +852,14 @@ def test_the_variable_is_the_state(client, other, make_pipe, pool):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"closed": False}, "a closed pipe stays closed"),
-        ({"capacity": 9}, "capacity cannot be changed to 9"),
-        ({"owner": ""}, "owner cannot be changed to ''"),
-        ({"closed_by": ["x"]}, "closed_by cannot be changed"),
-        ({"closed": 1}, "closed cannot be 1"),
-        ({"advice": 0}, "advice is at least 1, not 0"),
-        ({"failure": "another"}, "the first reason of a failure stays"),
-        ({"size": 2}, "has other fields"),
+        ({"closed": False}, "a closed pipe cannot be opened again"),
+        ({"capacity": 9}, "`capacity` cannot be changed to 9"),
+        ({"owner": ""}, "`owner` cannot be changed to ''"),
+        ({"closed_by": ["x"]}, "`closed_by` cannot be changed"),
+        ({"closed": 1}, "`closed` cannot be 1"),
+        ({"advice": 0}, "`advice` must be at least 1, not 0"),
+        ({"failure": "another"}, "the reason for a failure cannot be changed"),
+        ({"size": 2}, "has different fields"),
     ],
 )
 def test_what_cannot_follow_from_the_state_is_refused(client, other, make_pipe, change, message):
@@ -868,10 +868,10 @@ def test_what_cannot_follow_from_the_state_is_refused(client, other, make_pipe, 
     pipe.fail("the first")
     variable = Variable(pipe.name, other)
     state = variable.get()
-    with pytest.raises(ValueError, match=f"is the state of a pipe.*{message}"):
+    with pytest.raises(ValueError, match=f"holds the state of a pipe.*{message}"):
         variable.set({**state, **change})
     for value in (None, 5, client.submit(pow, 2, 10)):
-        with pytest.raises(ValueError, match="has other fields"):
+        with pytest.raises(ValueError, match="has different fields"):
             variable.set(value)
     assert variable.get() == state
 
@@ -988,7 +988,7 @@ def test_a_killed_task_ends_the_open_pipes_that_it_does_not_consume(client, b, m
 
     client.run_on_scheduler(fail)
     if case == "open":
-        reason = "^Task 'producer', which uses the pipe, was cancelled, and its worker was restart"
+        reason = "^Task 'producer', which uses the pipe, was canceled, and its worker was restart"
         with pytest.raises(PipeFailed, match=reason):
             pipe.poll()
     else:

@@ -175,7 +175,7 @@ def test_a_scheduler_that_does_not_answer_is_an_error_of_each_call(monkeypatch):
             "want": lambda: part.want(1),
             "first submit": lambda: Partition("Q", client).submit(abs, 1),
         }
-        message = f"^The scheduler at {address} has not answered for 0.[0-9]+ s. Check that"
+        message = f"^The scheduler at {address} has not responded for 0.[0-9]+ s. Check that"
         for name, call in calls.items():
             with pytest.raises(OSError, match=message):
                 call()

@@ -26,7 +26,9 @@ def test_what_a_pool_knows(start):
 
 
 def test_a_cluster_without_workers(start):
-    with pytest.raises(PoolError, match="has no workers: start some with dask worker"):
+    with pytest.raises(
+        PoolError, match=r"has no workers\. Start workers, for example with `dask worker"
+    ):
         Pool.from_client(start({}))
 
 
@@ -59,9 +61,9 @@ def test_a_cluster_from_the_command_line_is_divided_already(start):
         (
             4,
             1,
-            "worker w has 1 slot and 4 threads, so that threads stay idle. To use each thread, ",
+            "Worker w has 1 slot but 4 threads, so threads stay idle. Start it with `--",
         ),
-        (1, 4, "worker w has 4 slots and 1 thread, so that tasks wait for a thread. To use each "),
+        (1, 4, "Worker w has 4 slots but 1 thread, so tasks wait for a thread. Start it with "),
         (2, 2, ""),
     ],
 )
@@ -71,9 +73,9 @@ def test_threads_that_slots_do_not_use_are_noted_once(start, caplog, threads, sl
     with caplog.at_level(logging.WARNING, "poolpart"):
         parts = [pool["IO"] for _ in range(2)]
     assert {part.note[: len(note)] for part in parts} == {note}
-    assert caplog.text.count("worker w has") == bool(note)
+    assert caplog.text.count("Worker w has") == bool(note)
     if note:
-        assert parts[0].note.endswith(f'start it with --resources "IO={threads}".')
+        assert parts[0].note.endswith(f'`--resources "IO={threads}"` to use every thread.')
     by_rule, _ = pool.partition("P", workers=["free"], slots=3)
     assert pool["P"].note == by_rule.note == ""  # as its rule says
 
@@ -88,13 +90,15 @@ def test_workers_by_name_and_by_address(start):
 
 @pytest.mark.parametrize(("workers", "shown"), [(3, "'3'"), ("a", "'a'")])
 def test_workers_that_are_no_list(start, workers, shown):
-    message = rf"workers of partition 'P' are {workers!r}: give a list .*, such as \[{shown}\]"
+    message = rf"value {workers!r} for `workers` of partition 'P'\. Expected a list .* \[{shown}\]"
     with pytest.raises(PoolError, match=message):
         Pool.from_client(start(PLAIN)).partition("P", workers=workers)
 
 
 def test_rules_without_names_of_partitions(start):
-    with pytest.raises(PoolError, match=r"The rules are .*: give them by partition"):
+    with pytest.raises(
+        PoolError, match=r"Invalid rules .* Expected a mapping of partition names to rules"
+    ):
         Pool.from_client(start(PLAIN)).divide([rest()])
 
 
@@ -102,14 +106,17 @@ def test_rules_for_a_partition_that_workers_were_started_with(start):
     client = start({"a": {"resources": {"CPU": 1}}, "b": {"resources": {"CPU": 1}}, "c": {}})
     pool = Pool.from_client(client)
     message = (
-        r"Workers were started with the resource 'CPU', and the rule does not take all of them "
-        r"\([ab] would be left\): use Pool.partitions\(\)\['CPU'\] as it is, or give a rule"
+        r"Workers were started with the resource 'CPU', and the rule does not select all of them\. "
+        r"Workers that are not selected: [ab]\. Use the existing partition with "
+        r"`Pool\.from_client\(client\)\['CPU'\]`, pass a rule"
     )
     with pytest.raises(PoolError, match=message):
         pool.divide({"CPU": n_workers(1), "OTHER": rest()})
     message = (
-        r"0 of 3 are left for it\. Start more, or list it first\. 2 declare the resource CPU "
-        r"already, .* dissolve their partitions\. .* with minimum=0, and call resize with source\."
+        r"0 of 3 workers are available to this partition\. Start more workers, or place this "
+        r"partition before the others\. 2 workers already declare the resource 'CPU', "
+        r".* dissolve their partitions\. .*"
+        r" with `minimum=0` and call `resize`, for example `partition\.resize\(1, source='CPU'\)`"
     )
     with pytest.raises(PoolError, match=message):
         pool.divide({"ALL": n_workers(1), "OTHER": n_workers(1)})
@@ -131,11 +138,39 @@ def test_workers_of_a_partition_that_they_were_started_with_move_to_another(star
     assert [len(part), len(pool["CPU"])] == [0, 3]
 
 
+def test_a_partition_without_workers_is_listed(start):
+    client = start({"a": {}, "b": {}})
+    pool = Pool.from_client(client)
+    empty, _ = pool.partition("LATER", n_workers=0, minimum=0)
+    pool.divide({"ALL": rest()})
+    assert {name: len(part) for name, part in pool.partitions().items()} == {"ALL": 2, "LATER": 0}
+    assert repr(pool) == "<Pool: workers 2, hosts 1, GPUs 0; partitions: ALL 2, LATER 0>"
+    assert pool["LATER"].name == empty.name == "LATER"
+
+
+@pytest.mark.parametrize("minimum", [0, 1])
+def test_divide_and_partition_treat_a_lack_of_workers_alike(start, minimum):
+    note = "The partition has 2 of the 5 workers that its rule requests."
+    pool = Pool.from_client(start({"a": {}, "b": {}}))
+    first, _ = pool.partition("A", n_workers=5, minimum=minimum)
+    assert len(first) == 2 and first.note.startswith(note)
+    pool.dissolve()
+    second = pool.divide({"B": n_workers(5, minimum=minimum)})["B"]
+    assert len(second) == 2 and second.note == first.note
+    pool.dissolve()
+    for call in (
+        lambda: pool.partition("C", n_workers=5, minimum=3),
+        lambda: pool.divide({"C": n_workers(5, minimum=3)}),
+    ):
+        with pytest.raises(PoolError, match="requires at least 3 workers, but its rule selects 2"):
+            call()
+
+
 def test_rules_for_workers_that_were_started_with_two_resources(start):
     pool = Pool.from_client(start({"a": {"resources": {"CPU": 1, "MEM": 5}}}))
-    with pytest.raises(PoolError, match="1 declares the resources CPU, MEM already"):
+    with pytest.raises(PoolError, match="1 worker already declares the resources 'CPU', 'MEM'"):
         pool.divide({"CPU": n_workers(1)})
-    message = r'resources CPU, MEM, and a worker belongs to one .*--resources "CPU=1" alone'
+    message = r'resources CPU, MEM, but a worker can belong to .* with only `--resources "CPU=1"`'
     with pytest.raises(PoolError, match=message):
         pool.divide({"CPU": rest()})
 
@@ -159,10 +194,10 @@ def test_a_refused_request_changes_nothing(start):
     for arguments in (
         {},
         {"n_workers": 1, "max_workers_per_host": 1},
-        {"n_workers": 4},
+        {"n_workers": 4, "minimum": 4},
         {"n_workers": 0},
         {"workers": []},
-        {"workers": ["a", "nobody"]},
+        {"workers": ["a", "nobody"], "minimum": 2},
         {"workers": ["other"]},
     ):
         with pytest.raises(PoolError):
@@ -177,7 +212,7 @@ def test_a_pool_that_is_divided_twice_does_not_give_one_worker_to_two(start):
     _, rest = pool.partition("Q", n_workers=1)
     assert sorted(map(list, declared(client).values())) == [["P"], ["P"], ["Q"]]
     assert rest.names == []
-    with pytest.raises(PoolError, match="3 declare the resources P, Q already"):
+    with pytest.raises(PoolError, match="3 workers already declare the resources 'P', 'Q'"):
         pool.partition("R", workers=["a", "b"])
 
 
@@ -189,9 +224,9 @@ def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
     part, rest = pool.partition("P", n_workers=2)
     assert ([w.name for w in part.workers], rest.names) == (["b", "c"], [])
     assert list(pool.partitions()) == ["P"]
-    with pytest.raises(PoolError, match=r"rule of partition 'Q' is 3: .* n_workers\(2\)"):
+    with pytest.raises(PoolError, match=r"Invalid rule 3 for partition 'Q'\. .* `n_workers\(2\)`"):
         pool.divide({"Q": 3})
-    with pytest.raises(PoolError, match="would have 0 of the 1 worker"):
+    with pytest.raises(PoolError, match="requires at least 1 worker, but its rule selects 0"):
         pool.partition("Q", workers=["a"])
 
 
@@ -214,12 +249,12 @@ def test_workers_that_join_after_the_pool_was_made_belong_to_it(start, monkeypat
 
 def test_a_partition_is_found_by_its_name(start):
     pool = Pool.from_client(start(PLAIN))
-    with pytest.raises(PoolError, match="no partition 'P'; there are none yet: divide makes some"):
+    with pytest.raises(PoolError, match="no partition 'P', because the pool has not been divided"):
         pool["P"]
     pool.divide({"P": n_workers(1), "Q": rest()})
     assert pool["P"].submit(pow, 2, 3).result() == 8 and len(pool["Q"]) == 2
     assert repr(pool) == "<Pool: workers 3, hosts 1, GPUs 0; partitions: P 1, Q 2>"
-    with pytest.raises(PoolError, match="no partition 'GPU'; there are P, Q"):
+    with pytest.raises(PoolError, match=r"no partition 'GPU'\. Existing partitions: 'P', 'Q'"):
         pool["GPU"]
     pool.client.close()
     assert repr(pool) == "<Pool: workers 3, hosts 1, GPUs 0>"
@@ -242,7 +277,7 @@ def test_a_block_dissolves_what_its_pool_has_made(start):
         pool.partition("P", n_workers=1)
         client.close()
         raise ZeroDivisionError
-    assert "the partitions stay: The client is closed" in raised.value.__notes__[0]
+    assert "The partitions were not dissolved. The client is closed" in raised.value.__notes__[0]
 
 
 def test_a_worker_that_is_stopped_is_left_out(nannies, monkeypatch):
@@ -269,7 +304,7 @@ def test_without_gpus_the_fall_back_is_told_once(start, caplog):
     pool = Pool.from_client(start(PLAIN))
     with caplog.at_level(logging.WARNING, "poolpart"):
         gpu, _ = pool.partition("GPU", max_workers_per_gpu=1)
-    assert gpu.note == "no GPU in the pool: CPU workers instead"
+    assert gpu.note == "The pool has no GPU. The partition uses CPU workers instead."
     assert (caplog.text + repr(gpu)).count(gpu.note) == 1
     assert f"Partition 'GPU': {gpu.note}" in caplog.text
     assert len(gpu) == 1
@@ -278,9 +313,9 @@ def test_without_gpus_the_fall_back_is_told_once(start, caplog):
 def test_slots_that_are_missing_are_named_with_their_purpose(start):
     pool = Pool.from_client(start({"l": {"resources": {"IO": 2}}}))
     pool.require({"IO": 2})
-    with pytest.raises(PoolError, match=r"'IO' has 2 of the 4 slots needed \(four stages\): "):
+    with pytest.raises(PoolError, match=r"'IO' has 2 of the 4 required slots \(four stages\)\. "):
         pool.require({"IO": 4}, {"IO": "four stages"})
-    with pytest.raises(PoolError, match="'GPU' has 0 of the 1 slot needed: start workers"):
+    with pytest.raises(PoolError, match=r"'GPU' has 0 of the 1 required slot\. Start workers"):
         pool.require({"GPU": 1}, {"IO": "four stages"})
 
 
@@ -288,12 +323,17 @@ def test_slots_that_are_missing_are_named_with_their_purpose(start):
 def test_slots_that_are_no_whole_number(slots):
     pool = Pool(None, [WorkerInfo("w", "tcp://w", "h", 1, resources={"GPU": slots})])
     pool.require({"IO": 0})
-    with pytest.raises(PoolError, match=f"Worker w declares GPU={slots:g}: give it a whole number"):
+    with pytest.raises(
+        PoolError, match=f"Worker w declares GPU={slots:g}, which is not a valid number of slots"
+    ):
         pool.require({"GPU": 0})
 
 
 def test_a_worker_in_two_partitions():
     pool = Pool(None, [WorkerInfo("w", "tcp://w", "h", 1, resources={"GPU": 1, "IO": 4})])
     pool.require({"GPU": 1})
-    with pytest.raises(PoolError, match="Worker w declares GPU and IO: give each worker one"):
+    with pytest.raises(
+        PoolError,
+        match=r"Worker w declares the resources GPU and IO\. Start each worker with only one",
+    ):
         pool.require({"GPU": 1, "IO": 1})

@@ -64,5 +64,5 @@ def test_a_broken_driver_counts_as_none_and_is_reported(fake_driver, caplog, opt
     fake_driver(**options)
     with caplog.at_level(logging.WARNING, "poolpart"):
         assert probe.visible_gpus() == ()
-    assert "No GPU is used, because listing them failed" in caplog.text
+    assert "No GPU is used, because the GPUs could not be listed" in caplog.text
     assert why in caplog.text

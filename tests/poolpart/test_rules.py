@@ -45,40 +45,46 @@ def test_workers_that_a_rule_names_are_kept_for_it():
 
 def test_fewer_than_the_minimum():
     pool = [worker("a"), worker("b")]
-    message = "'Q' would have 0 of the 1 worker that it needs: 0 of 2 are left"
+    message = "'Q' requires at least 1 worker, but its rule selects 0. 0 of 2 workers are available"
     with pytest.raises(PoolError, match=message):
         divide({"P": n_workers(2), "Q": per_host(1)}, pool)
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
-    with pytest.raises(PoolError, match=r"asks for 'c', and there are 'a', 'b'\."):
+    with pytest.raises(PoolError, match=r"names 'c', but the pool contains 'a', 'b'\."):
         divide({"P": named("c")}, pool)
-    with pytest.raises(PoolError, match="would have 2 of the 3 workers"):
+    with pytest.raises(PoolError, match="requires at least 3 workers, but its rule selects 2"):
         divide({"P": rest(minimum=3)}, pool)
 
 
 def test_two_rules_for_the_rest():
-    with pytest.raises(PoolError, match=r"'P' and 'Q' both have the rule rest\(\).*before 'P'"):
+    with pytest.raises(PoolError, match=r"'P' and 'Q' both have the rule `rest\(\)`.*before 'P'"):
         divide({"P": rest(), "Q": rest()}, [worker("a")])
 
 
 @pytest.mark.parametrize(
     ("names", "message"),
-    [((), "got nothing"), ((["a", "b"],), r"got \['a', 'b'\]"), ((True,), "got True")],
+    [
+        ((), "no arguments"),
+        ((["a", "b"],), r"an invalid argument \['a', 'b'\]"),
+        ((True,), "an invalid argument True"),
+    ],
 )
 def test_what_names_no_workers(names, message):
-    with pytest.raises(PoolError, match=f"{message}; give names or addresses of workers, each as"):
+    with pytest.raises(PoolError, match=f"{message}. Pass the name or address"):
         named(*names)
 
 
 def test_workers_that_a_rule_names_and_that_are_not_there():
     rules = {"P": named("a", "tcp://b", 3)}
     _, notes = divide(rules, [worker("a"), worker("b")])
-    assert notes == {"P": "lacks '3', for which its rule asks"}
+    assert notes == {
+        "P": "The partition does not have all workers that its rule names. Missing: '3'."
+    }
 
 
 @pytest.mark.parametrize("number", [{"workers": 1.5}, {"workers": 1, "slots": 0}])
 def test_a_number_that_cannot_be_is_refused_by_name(number):
     with pytest.raises(
-        PoolError, match=f"{[*number][-1]} of the rule n_workers is .* whole number"
+        PoolError, match=f"for `{[*number][-1]}` of the rule `n_workers`. Expected an integer"
     ):
         n_workers(**number)
 

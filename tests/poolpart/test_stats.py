@@ -1,6 +1,8 @@
 """Statistics of partitions: each task counted once, whatever happens."""
 
+import os
 import re
+import signal
 import threading
 import time
 import urllib.request
@@ -12,7 +14,7 @@ from distributed import Client, get_worker, worker_client
 from prometheus_client import parser
 from tests.poolpart.helpers import LONG_S
 
-from poolpart import Partition, StageStats
+from poolpart import Partition, Pool, StageStats, n_workers
 
 CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
 
@@ -67,6 +69,41 @@ def test_tasks_that_wait_run_and_end(client, wait_until):
     dependent = part.submit(after, failing[0])
     wait_until(lambda: dependent.status == "error" and all(task.done() for task in failing))
     assert (part.stats().failed, part.stats().done) == (3, 6)  # the dependent one never ran
+
+
+def test_stages_are_named_by_their_function(start):
+    part = Partition("A", start({"a": {"resources": {"A": 1}}}))
+    part.stats()  # counting begins
+
+    def f1(x):
+        return x
+
+    def f2(x):
+        return x
+
+    assert list(part.map(f1, range(3), chunk=1)) == list(part.map(f2, range(3), chunk=1))
+    assert part.submit(f1, 0).result(LONG_S) == 0
+    stages = part.stats().stages
+    assert {name: stage.done for name, stage in stages.items()} == {
+        "f1": 1,
+        "f1-map": 3,
+        "f2-map": 3,
+    }
+
+
+def die_once(marker):
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_runs_that_are_lost_with_their_worker_are_counted(nannies, tmp_path):
+    part = Pool.from_client(nannies).divide({"A": n_workers(1)})["A"]
+    assert part.submit(die_once, tmp_path / "marker").result(LONG_S) is None
+    stats = part.stats()
+    assert (stats.lost, stats.done, stats.failed) == (1, 1, 0)
+    assert stats.stages["die_once"].lost == 1
+    assert "1 lost run" in repr(stats)
 
 
 def metrics_of(client):

@@ -87,7 +87,7 @@ class ClosingWorker:
 
 def test_what_is_raised_while_a_worker_leaves_says_so(monkeypatch):
     monkeypatch.setattr("poolpart.task_context.get_worker", ClosingWorker)
-    message = r"the worker has left \(AttributeError: 'NoneType' object has no"
+    message = r"The worker has left the cluster \(AttributeError: 'NoneType' object has no"
     with pytest.raises(WorkerLeft, match=message) as caught, telling_departure():
         None.queue_get  # noqa: B018 - what Dask does with a client that was closed
     assert caught.value.__cause__ is None

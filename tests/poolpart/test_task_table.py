@@ -70,6 +70,19 @@ def test_tasks_that_wait_run_and_end(part, wait_until):
     assert error == "ValueError('two\\nlines')"
 
 
+def test_the_time_of_a_running_task(part, wait_until):
+    before = datetime.now(UTC)
+    running = part.submit(held, 0)
+    wait_until(lambda: part.tasks() and part.tasks()[0].started is not None)
+    (task,) = part.tasks()
+    assert (task.key, task.state, task.finished) == (running.key, "running", None)
+    slack = timedelta(milliseconds=50)
+    assert before - slack < task.started < datetime.now(UTC)
+    assert 0 < task.seconds <= (datetime.now(UTC) - before + slack).total_seconds()
+    (later,) = part.tasks()
+    assert later.seconds > task.seconds
+
+
 def test_only_the_last_that_have_ended_are_kept(part):
     part.tasks()
     futures = part.client.map(after, range(KEPT + 5), resources={"A": 1}, key="many", batch_size=50)
@@ -101,6 +114,9 @@ def test_a_long_table_is_printed_in_part(part):
     table = part.tasks()
     *lines, last = repr(table).splitlines()
     assert len(table) >= 30 and len(lines) == 1 + 20
-    assert last == f"… the first 20 of {len(table)} tasks: {len(table)} done. to_pandas() has all."
+    assert (
+        last
+        == f"… The first 20 of {len(table)} tasks: {len(table)} done. `to_pandas()` returns all."
+    )
     page = table._repr_html_()
     assert page.count("<tr>") == 1 + 20 and last in page

@@ -50,10 +50,19 @@ def both(monkeypatch):
 @pytest.mark.parametrize(
     ("rule", "note"),
     [
-        (n_workers(3), "has 1 of the 3 workers that it asks for"),
-        (rest(), "has 1 of the 4 workers that its rule would have taken when this pool was made"),
-        (per_host(3), "has 1 of the 3 workers that its rule would have taken when this pool"),
-        (named("a", "b", "d"), "lacks 'a', 'b', for which its rule asks"),
+        (n_workers(3), "The partition has 1 of the 3 workers that its rule requests"),
+        (
+            rest(),
+            "The partition has 1 of the 4 workers that its rule would have selected when the pool",
+        ),
+        (
+            per_host(3),
+            "The partition has 1 of the 3 workers that its rule would have selected when the pool",
+        ),
+        (
+            named("a", "b", "d"),
+            "The partition does not have all workers that its rule names. Missing: 'a', 'b'.",
+        ),
     ],
 )
 def test_the_second_of_two_is_told_what_it_lacks(two, caplog, rule, note):
@@ -64,7 +73,7 @@ def test_the_second_of_two_is_told_what_it_lacks(two, caplog, rule, note):
     assert len(part) == 1
     assert note in part.note
     assert f"Partition 'Q': {note}" in caplog.text
-    with pytest.raises(PoolError, match="'Q' would have 1 of the 2 workers that it needs"):
+    with pytest.raises(PoolError, match="'Q' requires at least 2 workers, but its rule selects 1"):
         second.divide({"Q": replace(rule, minimum=2)})
 
 
@@ -77,7 +86,7 @@ def test_a_pool_that_has_made_a_partition_does_not_miss_its_workers(two):
 def test_a_second_rest_is_told_who_gets_later_workers(two):
     first, second = map(Pool.from_client, two)
     first.divide({"P": named("a"), "Q": rest()})
-    note = "workers that join later go to partition 'Q', which has the rest already"
+    note = "are assigned to partition 'Q', which already has the rule `rest()`."
     assert second.divide({"R": rest()})["R"].note.endswith(note)
     assert first.divide({"Q": rest()})["Q"].note == ""
 
@@ -96,8 +105,8 @@ def test_one_name(two, both, others):
         lambda: mine.partition("P", workers=["a", "b"])[0],
         lambda: theirs.partition("P", **others)[0],
     )
-    assert "Partition 'P' exists already" in (message := told(outcomes))
-    assert "Pool.partitions()['P']" in message
+    assert "Partition 'P' already exists" in (message := told(outcomes))
+    assert "Pool.from_client(client)['P']" in message
     (part,) = (outcome for outcome in outcomes if isinstance(outcome, Partition))
     members = {worker.name for worker in part.workers}
     assert len(members) == 2
@@ -111,10 +120,10 @@ def test_one_name(two, both, others):
 def test_the_same_workers_under_different_names(two, both):
     mine, theirs = map(Pool.from_client, two)
     outcomes = both(
-        lambda: mine.partition("P", n_workers=3, exclusive=True),
-        lambda: theirs.partition("Q", n_workers=2, exclusive=True),
+        lambda: mine.partition("P", n_workers=3, minimum=3, exclusive=True),
+        lambda: theirs.partition("Q", n_workers=2, minimum=2, exclusive=True),
     )
-    assert " of 4 are left for it" in told(outcomes)
+    assert "of 4 workers" in told(outcomes)
     taken = [names for names in declared(two[0]).values() if names]
     assert taken in ([{"P": 1}] * 3, [{"Q": 1}] * 2)
     # Nothing of the one that was refused is left, a fence least of all.

@@ -69,5 +69,5 @@ def test_tasks_whose_inputs_are_fetched_beside_it_run(processes, io, gpu):
 
 
 def test_a_map_of_a_map_ends_with_the_error(processes, io, gpu):
-    with pytest.raises(PoolError, match="cannot unpickle the result of task 'map-make-"):
+    with pytest.raises(PoolError, match="cannot unpickle the result of task 'make-map-"):
         list(gpu.map(use, io.map(make, range(6), chunk=1), chunk=1))

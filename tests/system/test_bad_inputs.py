@@ -229,10 +229,13 @@ CLUSTERS: dict[str, tuple[list[dict[str, int]], str]] = {
     "no workers": ([], "has no workers. Start workers"),
     "little LIDAR": (
         [{"GPU": 1}, {"LIDAR": 3}, {"OTHER": 1}],
-        "Partition 'LIDAR' has 3 of the 4 slots",
+        "Partition 'LIDAR' has 3 of the 4 required slots",
     ),
     "no OTHER": ([{"GPU": 1}, {"LIDAR": 4}], "unless `planning` is removed from the scenario"),
-    "two resources": ([{"GPU": 1, "LIDAR": 4}, {"OTHER": 1}], "declares GPU and LIDAR"),
+    "two resources": (
+        [{"GPU": 1, "LIDAR": 4}, {"OTHER": 1}],
+        "declares the resources GPU and LIDAR",
+    ),
 }
 
 
@@ -276,7 +279,7 @@ def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monke
         outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "1s")
     assert outcome.code == 2
     assert re.search(
-        r"note: waiting for workers for up to \d s more: Partition 'LIDAR' has 0 of the 4 slots",
+        r"note: waiting for workers for up to \d s more: Partition 'LIDAR' has 0 of the 4 required",
         outcome.err,
     )
     assert outcome.err.splitlines()[-1].startswith("lidarpool: Partition 'LIDAR' has 0 of the 4")

@@ -440,7 +440,7 @@ def test_a_cluster_that_lacks_a_partition(check, cluster):
     assert outcome.code == 2
     said = json.loads(outcome.out)
     assert said["slots"]["OTHER"] == {"needed": 1, "there": 0}
-    assert "Partition 'OTHER' has 0 of the 1 slot" in said["reasons"][0]
+    assert "Partition 'OTHER' has 0 of the 1 required slot" in said["reasons"][0]
     assert said["reasons"][0] in outcome.err
 
 

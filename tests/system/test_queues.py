@@ -120,7 +120,7 @@ def test_a_run_waits_for_its_jobs_and_takes_them_with_it(empty_queue, tmp_path):
     held = [*JOBS["GPU"]["job_extra_directives"], "--hold"]
     run = Command(tmp_path, slurm_file(tmp_path, job_extra_directives=held))
     run.wait_for(
-        r"waiting for workers for up to 35\d\d s more: Partition 'GPU' has 0 of the 1 slot"
+        r"waiting for workers for up to 35\d\d s more: Partition 'GPU' has 0 of the 1 required slot"
     )
     states = {state for _, state in empty_queue.jobs().values()}
     assert states == {"PENDING", "RUNNING"}
@@ -196,7 +196,7 @@ def test_partitions_without_jobs_get_some_when_a_run_needs_them(empty_queue, tmp
     run = Command(tmp_path, file)
     run.wait_for(r"started SLURMCluster: up to 5 workers, GPU 0 to 2, LIDAR 1, OTHER 0 to 2")
     run.wait_for(
-        r"waiting for workers, for .*: Partition 'GPU' has 0 of the 1 slot .* jobs in the queue"
+        r"waiting for workers, for .*: Partition 'GPU' has 0 of the 1 required .* jobs in the queue"
     )
     assert empty_queue.jobs()["waiting"][1] == "PENDING"
     empty_queue.ask("scontrol", "release", "jobname=waiting")

@@ -167,4 +167,4 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
         "2 jobs are in the queue or starting. If they are only waiting in the queue, increase "
         "`--wait`."
     ]
-    assert told == [f"The log {tmp_path}/gpu-1.err ends: no module named lidarpool"]
+    assert told == [f"The last line of the log {tmp_path}/gpu-1.err is: no module named lidarpool"]

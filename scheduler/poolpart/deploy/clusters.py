@@ -41,38 +41,39 @@ def start_partitions(
     partitions: Mapping[str, Mapping[str, Any]],
     tell: Callable[[str], object] = logger.warning,
 ) -> None:
-    """Start the workers of partitions on a cluster of dask-jobqueue, or on an `SSHCluster`.
+    """Start the workers of partitions on a dask-jobqueue cluster or an `SSHCluster`.
 
-    They declare their partition from the start, and are named after it: ``GPU-0``, ``GPU-1``.
-    This returns when all jobs are in the queue, or all hosts have been reached; workers join when
-    the queue has started them. As long as the cluster is open, a job that has ended is submitted
-    again, and partitions with ``adapt`` get jobs as tasks wait for them, and return idle ones. They
-    go away with the cluster.
+    The workers declare their partition from the beginning and are named after it, for example
+    ``GPU-0`` and ``GPU-1``. The function returns when all jobs have been submitted, or all hosts
+    have been contacted. Workers join when the queue has started them. While the cluster is open,
+    jobs that have ended are submitted again. Partitions with ``adapt`` submit jobs while tasks
+    wait, and stop idle jobs. All jobs end with the cluster.
 
     Parameters
     ----------
     cluster
-        One without workers: ``SLURMCluster(cores=1, memory="8GB")``, ``SSHCluster(["head"])``.
+        Cluster without workers, such as ``SLURMCluster(cores=1, memory="8GB")`` or
+        ``SSHCluster(["head"])``.
     partitions
-        {name: options}. ``workers`` is their number, 1 by default, and ``slots`` the tasks that
-        each takes at a time, 1 by default. In place of ``workers``, ``adapt`` is their least and
-        greatest number, such as ``[0, 8]`` (`Partition.adapt` describes it), and ``idle_s`` after
-        how many seconds without work they are returned, 60 by default. All other options belong to
-        the cluster's class, where this partition differs: ``job_extra_directives``, ``queue``,
-        ``memory``. An SSHCluster takes ``connect_options``, ``remote_python``, ``worker_class``,
-        ``worker_options``, and ``hosts``. Workers are dealt out to the hosts in turn; by default
-        there is one for each.
+        Mapping of each name to its options. ``workers`` is the number of workers (1 by default),
+        and ``slots`` is the number of tasks that each worker runs at the same time (1 by default).
+        Instead of ``workers``, ``adapt`` sets the minimum and maximum number, for example ``[0,
+        8]`` (see `Partition.adapt`), and ``idle_s`` the time in seconds without work after which a
+        job ends (60 by default). All other options are passed to the class of the cluster, for
+        example ``job_extra_directives``, ``queue`` or ``memory``. An `SSHCluster` accepts
+        ``connect_options``, ``remote_python``, ``worker_class``, ``worker_options`` and ``hosts``.
+        Workers are distributed over the hosts in turn. By default, there is one for each host.
     tell
-        Called with what went wrong later: the last line of a job's log while workers are missing,
-        or why a worker cannot be started.
+        Function that is called with problems that occur later: the last line of a job's log while
+        workers are missing, or the reason why a worker cannot be started.
 
     Raises
     ------
     PoolError
-        If the cluster is another, has workers, or does not take an option, or its scheduler lacks
-        this package.
+        If the cluster has another type, already has workers, or does not accept an option, or if
+        poolpart is not installed in the environment of the scheduler.
     RuntimeError
-        Or what else the cluster raises where a job is refused, or a host does not answer.
+        If a job is rejected, or a host does not respond. The cluster may also raise other errors.
 
     Examples
     --------
@@ -93,14 +94,15 @@ def start_partitions(
         describe = _process
     else:
         raise PoolError(
-            f"A {type(cluster).__name__} has workers of one kind: start them, and divide them with "
-            "Pool.from_client(client).divide(…). Clusters of dask-jobqueue and SSHCluster can "
-            "start them by partition."
+            f"A {type(cluster).__name__} has only one kind of worker. Start its workers, and "
+            "divide them with `Pool.from_client(client).divide(…)`. Only dask-jobqueue clusters "
+            "and `SSHCluster` can start workers by partition."
         )
     if cluster.worker_spec or _NAME in cluster.periodic_callbacks:
         raise PoolError(
-            f"The cluster has {len(cluster.worker_spec)} workers, or jobs for some, already: make "
-            "one without (no n_workers; of an SSHCluster's hosts only the scheduler's)."
+            f"The cluster already has {len(cluster.worker_spec)} workers or jobs. Create a cluster "
+            "without workers, that is, without `n_workers`, or for an `SSHCluster` with only the "
+            "scheduler's host."
         )
     parts = {
         name: _PartitionJobs.from_options(cluster, describe, name, options)
@@ -138,7 +140,7 @@ class _PartitionJobs:
         check_name(name)
         cluster_options = dict(options)
         slots = cluster_options.pop("slots", 1)
-        check_count(f"The number of slots of partition {name!r}", slots)
+        check_count(f"the number of slots of partition {name!r}", slots)
         bounds = take_bounds(name, cluster_options)
         try:
             if bounds is not None:
@@ -146,11 +148,11 @@ class _PartitionJobs:
             else:
                 hosts = cluster_options.get("hosts", ".")
                 count = cluster_options.pop("workers", len(hosts))
-            check_count(f"The number of workers of partition {name!r}", count, minimum=0)
+            check_count(f"the number of workers of partition {name!r}", count, minimum=0)
             # A first description shows that the cluster's class takes the options.
             sample = describe(cluster, f"{name}-0", name, slots, 0, cluster_options)
         except (TypeError, ValueError) as error:
-            raise PoolError(f"Partition {name!r} cannot be started: {error}") from error
+            raise PoolError(f"Partition {name!r} cannot be started. {error}") from error
         kind = JobKind(slots, len(sample.get("group", ".")), bounds)
         return cls(name, cluster_options, count, kind, describe)
 
@@ -182,13 +184,17 @@ def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
     idle_s = options.pop("idle_s", None)
     if adapt is None:
         if idle_s is not None:
-            raise PoolError(f"Partition {name!r} has idle_s without adapt: give it [0, 8] or so.")
+            raise PoolError(
+                f"Partition {name!r} has `idle_s` without `adapt`. Set `adapt`, for example to "
+                "[0, 8]."
+            )
         return None
     require(ADAPTING)
     if "workers" in options or not isinstance(adapt, Sequence) or len(adapt) != 2:
         raise PoolError(
-            f"adapt of partition {name!r} is {adapt!r}; give the least and the greatest "
-            "number of workers, such as [0, 8], and no workers beside it."
+            f"Invalid value {adapt!r} for `adapt` of partition {name!r}. Expected the minimum and "
+            "maximum number of workers, for example [0, 8]. `adapt` cannot be combined with "
+            "`workers`."
         )
     minimum, maximum = adapt
     return Bounds.checked(name, minimum, maximum, IDLE_S if idle_s is None else idle_s)
@@ -221,7 +227,7 @@ class _JobStarter:
             await ask_of_cluster(self._cluster, begin, kinds=kinds)
         except ModuleNotFoundError as error:
             raise PoolError(
-                f"The cluster's scheduler has no module {error.name!r}: start it in the same "
+                f"The scheduler of the cluster cannot import {error.name!r}. Start it in the same "
                 "environment as this process."
             ) from error
         for part in self._parts.values():
@@ -244,7 +250,7 @@ class _JobStarter:
                 try:
                     await _start(self._cluster)
                 except Exception as error:
-                    self._say(f"A worker cannot be started: {error}")
+                    self._say(f"A worker could not be started: {error}")
             if due:
                 self._logs_read_at = looked_at
                 if self._cluster.plan - self._cluster.observed:  # workers are missing
@@ -329,7 +335,7 @@ class JobLogs:
                 log.seek(max(0, path.stat().st_size - 4000))
                 last_line = log.read().decode(errors="replace").rstrip().rpartition("\n")[2]
             if last_line and INFORMATION not in last_line:
-                yield f"The log {path} ends: {last_line}"
+                yield f"The last line of the log {path} is: {last_line}"
 
 
 def _job(
@@ -372,7 +378,7 @@ def _process(
     )
     hosts: Sequence[str] = options.pop("hosts", ())
     if isinstance(hosts, str) or not hosts:
-        raise ValueError('it needs "hosts", a list of those that its workers are to be on.')
+        raise ValueError("`hosts` is missing. Set it to a list of hosts for the workers.")
     kwargs = {"name": name, "nthreads": slots, "resources": {partition: slots}}
     kwargs["death_timeout"] = _DEATH_S  # not every SSH server ends processes for its client
     options["kwargs"] = kwargs | options.pop("worker_options", {})

@@ -11,14 +11,14 @@ from ..errors import PoolError
 class KubernetesGroups:
     """Worker groups of a `KubeCluster` of dask-kubernetes, for `scale_groups`.
 
-    This was tested against the documented interface of dask-kubernetes 2026.3.0; it was not run on
-    a cluster.
+    This class was tested with a stand-in for the documented interface of dask-kubernetes 2026.3.0.
+    It has not been tested on a Kubernetes cluster.
 
-    The worker group of partition ``GPU`` is ``gpu``: Kubernetes permits neither capitals nor
-    underscores in names. It is added by ``cluster.add_worker_group("gpu", n_workers=…,
-    worker_command=…)``. Its worker command declares the partition, such as ``dask worker
-    --nthreads 1 --resources GPU=1``. A ``KubeCluster(n_workers=0)`` has no workers outside the
-    groups.
+    The worker group of the partition ``GPU`` is called ``gpu``, because Kubernetes does not allow
+    capital letters and underscores in names. Add it with ``cluster.add_worker_group("gpu",
+    n_workers=…, worker_command=…)``. Its worker command declares the partition, for example ``dask
+    worker --nthreads 1 --resources GPU=1``. A ``KubeCluster(n_workers=0)`` has no workers outside
+    of the groups.
 
     Parameters
     ----------
@@ -27,23 +27,24 @@ class KubernetesGroups:
 
     Notes
     -----
-    By its source, the operator closes the least busy workers of the whole cluster when a group
-    shrinks, even if they belong to other groups. So the Deployments of the workers that
-    `scale_groups` has closed are deleted first: then the group has its new size, and the operator
-    closes no worker. That needs the right to delete Deployments in the cluster's namespace.
+    According to its source code, the operator closes the least busy workers of the whole cluster if
+    a group shrinks, even if they belong to other groups. Therefore, the Deployments of the workers
+    that `scale_groups` has closed are deleted first. The group then already has its new size, and
+    the operator closes no worker. This requires the permission to delete Deployments in the
+    namespace of the cluster.
     """
 
     def __init__(self, cluster: Any) -> None:
         for attribute in ("scale", "add_worker_group", "namespace"):
             if not hasattr(cluster, attribute):
                 raise PoolError(
-                    "KubernetesGroups takes a KubeCluster of dask_kubernetes.operator, not a "
-                    f"{type(cluster).__name__}, which has no {attribute}."
+                    "`KubernetesGroups` expects a `KubeCluster` from `dask_kubernetes.operator`, "
+                    f"but got a {type(cluster).__name__}, which has no attribute `{attribute}`."
                 )
         self._cluster = cluster
 
     def scale(self, group: str, n: int, leaving: Sequence[str] = ()) -> None:
-        """Give a group `n` workers, as `WorkerGroups.scale` describes."""
+        """Set the number of workers of a group, as `WorkerGroups.scale` describes."""
         if leaving:
             self._delete(leaving)
         self._cluster.scale(n, worker_group=group.lower().replace("_", "-"))

@@ -31,34 +31,35 @@ def local_cluster(
     dashboard_port: int | None = 0,
     security: Security | bool = False,
 ) -> SpecCluster:
-    """Start a Dask cluster on this machine, divided into partitions.
+    """Start a Dask cluster on this machine that is divided into partitions.
 
-    Scheduler, workers and dashboard listen on the loopback interface only. Workers are processes
-    with a nanny, which restarts them when they die. They do not import the script that starts
-    them, which needs no main guard for it.
+    The scheduler, the workers and the dashboard only listen on the loopback interface. The workers
+    are processes with nannies, which restart them if they die. They do not import the script that
+    starts them, so the script does not need a main guard.
 
     Parameters
     ----------
     partitions
-        {name: (workers, slots of each worker)}. A worker has as many threads as slots. Workers
-        are named after their partition: ``GPU-0``, ``GPU-1``. A partition of 0 workers is left out.
+        Mapping of each name to (number of workers, slots of each worker). A worker has as many
+        threads as slots. Workers are named after their partition, for example ``GPU-0`` and
+        ``GPU-1``. Partitions with 0 workers are omitted.
     dashboard_port
-        Port of Dask's dashboard, 0 for any free one, None for none.
+        Port of Dask's dashboard, 0 for any free port, or None to disable the dashboard.
     security
-        True encrypts the traffic between the processes, with a certificate that is made for
-        this cluster and kept in memory; nobody can connect without it. A
-        `distributed.Security` has your own certificates. The dashboard stays http.
+        If True, encrypt the traffic between the processes with a certificate that is created for
+        this cluster and only stored in memory. Nobody can connect without it. Pass a
+        `distributed.Security` to use your own certificates. The dashboard is not encrypted.
 
     Returns
     -------
     SpecCluster
-        Use it as a context manager, or call its `close`. The scheduler runs in this process.
+        The cluster, which can be used as a context manager. The scheduler runs in this process.
 
     Raises
     ------
     PoolError
-        If there would be no worker, a number of workers is below 0 or of slots below 1, or the
-        workers do not start.
+        If there would be no workers, if a number of workers is below 0 or a number of slots below
+        1, or if the workers do not start.
 
     Examples
     --------
@@ -68,10 +69,13 @@ def local_cluster(
     require(CLUSTERS)
     for name, (count, slots) in partitions.items():
         check_name(name)
-        check_count(f"The number of workers of partition {name!r}", count, minimum=0)
-        check_count(f"The number of slots of partition {name!r}", slots)
+        check_count(f"the number of workers of partition {name!r}", count, minimum=0)
+        check_count(f"the number of slots of partition {name!r}", slots)
     if not any(count for count, _ in partitions.values()):
-        raise PoolError('There would be no worker; give {"NAME": (workers, slots)}.')
+        raise PoolError(
+            "The cluster would have no workers. Specify the partitions as "
+            '`{"NAME": (workers, slots)}`, with at least one worker.'
+        )
     if not isinstance(security, Security):
         security = Security.temporary() if security else Security()
     workers = {
@@ -97,8 +101,8 @@ def local_cluster(
             )
     except RuntimeError as error:
         raise PoolError(
-            f"The workers did not start ({error.__cause__ or error}): see their output above "
-            "this, and whether memory is short."
+            f"The workers did not start: {error.__cause__ or error}. Check their output above, "
+            "and whether the machine has enough memory."
         ) from error
 
 

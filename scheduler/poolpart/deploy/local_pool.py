@@ -32,7 +32,10 @@ class LocalPool:
         self, partitions: Mapping[str, tuple[int, int]], idle_s: float, options: dict[str, Any]
     ) -> None:
         if isinstance(idle_s, bool) or not isinstance(idle_s, int | float) or not idle_s > 0:
-            raise PoolError(f"idle_s is {idle_s!r}; give seconds above 0, such as 1800.")
+            raise PoolError(
+                f"Invalid value {idle_s!r} for `idle_s`. Expected a positive number of seconds, "
+                "for example 1800."
+            )
         with ExitStack() as stack:
             cluster = stack.enter_context(local_cluster(partitions, **options))
             self.client = stack.enter_context(Client(cluster))
@@ -59,7 +62,7 @@ class LocalPool:
                 last_transitions = transitions
                 used_at = time.monotonic()
             elif time.monotonic() - used_at >= idle_s:
-                logger.warning("The local pool has ended: it had no task for %g s.", idle_s)
+                logger.warning("The local pool was closed, because it was idle for %g s.", idle_s)
                 self.close()
 
 

@@ -82,6 +82,7 @@ class FixedCluster(SpecCluster):
             super().scale(n, **options)
             return
         raise PoolError(
-            "A cluster of local_cluster has a fixed number of workers: give it when you start "
-            "one, or move workers with Partition.grow and Partition.shrink."
+            "A cluster that `local_cluster` started has a fixed number of workers. Specify the "
+            "number when you start the cluster. To move workers between partitions, use "
+            "`Partition.grow` and `Partition.shrink`."
         )

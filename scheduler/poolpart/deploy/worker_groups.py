@@ -25,12 +25,13 @@ ADAPT_EVERY_S = 1.0  # seconds between two questions to the scheduler
 
 
 class WorkerGroups(Protocol):
-    """Interface of an object that scales groups of workers, wherever the workers run."""
+    """Interface of objects that set the sizes of worker groups on any system."""
 
     def scale(self, group: str, n: int, leaving: Sequence[str] = ()) -> object:
-        """Give a group `n` workers.
+        """Set the number of workers of a group.
 
-        The call is repeated until it succeeds, so that a part of it may have been done before.
+        The call is repeated until it succeeds, so a part of the work may already have been done by
+        an earlier call.
 
         Parameters
         ----------
@@ -39,13 +40,13 @@ class WorkerGroups(Protocol):
         n
             Number of workers, without the workers in `leaving`.
         leaving
-            Names of workers that have been closed, and must not be started again. No other worker
-            may be removed: it may have tasks, and results that no other worker has.
+            Names of workers that have been closed and must not be started again. Other workers must
+            not be removed, because they may have tasks, or results that no other worker has.
 
         Raises
         ------
         Exception
-            If that is not possible now; it is tried again.
+            If the group cannot be scaled at the moment. The call is repeated later.
         """
 
 
@@ -55,36 +56,38 @@ def scale_groups(
     partitions: Mapping[str, Mapping[str, Any]],
     tell: Callable[[str], object] = logger.warning,
 ) -> GroupScaler:
-    """Let the sizes of groups of workers follow the work of their partitions.
+    """Adapt the sizes of worker groups to the work of their partitions.
 
-    Workers join with the resource of their partition, such as ``--resources "GPU=1"``. A group has
-    its least number of workers when this is called. A worker that has not joined yet is not
-    cancelled: if its task has ended meanwhile, it joins, and is closed once it has been idle.
+    Workers join with the resource of their partition, for example with ``--resources "GPU=1"``.
+    Initially, each group has its minimum number of workers. Workers that have not joined yet are
+    not canceled. If their tasks have ended in the meantime, they join and are closed after they
+    have been idle.
 
     Parameters
     ----------
     client
         Client of the cluster.
     groups
-        What scales the groups, such as a `KubernetesGroups`.
+        Object that scales the groups, such as a `KubernetesGroups`.
     partitions
-        {name: options}. ``adapt`` is the least and the greatest number of workers, such as
-        ``[0, 8]``; ``slots`` the tasks that each takes at a time, 1 by default; ``idle_s`` after
-        how many seconds without work a worker is closed, 60 by default. `Partition.adapt` changes
-        the range.
+        Mapping of each name to its options. ``adapt`` is the minimum and maximum number of workers,
+        for example ``[0, 8]``. ``slots`` is the number of tasks that each worker runs at the same
+        time (1 by default). ``idle_s`` is the time in seconds without work after which a worker is
+        closed (60 by default). `Partition.adapt` changes the range.
     tell
-        Called with why a group cannot be scaled; each message once.
+        Function that is called with the reason if a group cannot be scaled, once for each message.
 
     Returns
     -------
     GroupScaler
-        Ends with its ``with`` block, with the client, or by its `close`. The groups keep their
-        sizes then.
+        Stops scaling at the end of its ``with`` block, when the client closes, or when its `close`
+        is called. The groups then keep their sizes.
 
     Raises
     ------
     PoolError
-        If an option is wrong, or the scheduler lacks this package.
+        If an option is invalid, or if poolpart is not installed in the environment of the
+        scheduler.
 
     Examples
     --------
@@ -93,8 +96,8 @@ def scale_groups(
     """
     if not callable(getattr(groups, "scale", None)):
         raise PoolError(
-            f"scale_groups takes an object with scale(group, n, leaving), not {groups!r}; for "
-            "dask-kubernetes give KubernetesGroups(cluster)."
+            "`scale_groups` expects an object with a method `scale(group, n, leaving)`, but got "
+            f"{groups!r}. For dask-kubernetes, pass `KubernetesGroups(cluster)`."
         )
     kinds = {name: _kind(name, options) for name, options in partitions.items()}
     on_scheduler(client, begin, kinds=kinds)
@@ -110,11 +113,13 @@ def _kind(name: str, options: Mapping[str, Any]) -> JobKind:
     remaining = dict(options)
     bounds = take_bounds(name, remaining)
     slots = remaining.pop("slots", 1)
-    check_count(f"The number of slots of partition {name!r}", slots)
+    check_count(f"the number of slots of partition {name!r}", slots)
     if bounds is None or remaining:
-        wrong = f"not {', '.join(sorted(remaining))}" if remaining else "adapt is missing"
+        unknown = f"Unknown options: {', '.join(sorted(remaining))}."
+        problem = unknown if remaining else "`adapt` is missing."
         raise PoolError(
-            f'Partition {name!r} takes "adapt", such as [0, 8], "slots" and "idle_s"; {wrong}.'
+            f"Invalid options for partition {name!r}. {problem} Expected `adapt`, for example "
+            "[0, 8], and optionally `slots` and `idle_s`."
         )
     return JobKind(slots, bounds=bounds, cancellable=False)
 
@@ -174,7 +179,7 @@ class GroupScaler:
         try:
             self._groups.scale(name, advice.size, advice.leaving)
         except Exception as error:
-            message = f"Group {name!r} cannot be scaled to {advice.size} workers: {error}"
+            message = f"Group {name!r} could not be scaled to {advice.size} workers: {error}"
             if message not in self._messages:
                 self._messages.add(message)
                 self._tell(message)

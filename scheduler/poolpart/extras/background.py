@@ -60,24 +60,25 @@ def after_all(
     futures: Iterable[Future | concurrent.futures.Future[Any]],
     function: Callable[[list[Any]], Result],
 ) -> concurrent.futures.Future[Result]:
-    """Call `function(results)` once all futures have succeeded and return a future of its result.
+    """Call `function(results)` after all futures have succeeded, and return a future of its result.
 
-    The function is called in this process, in a thread. To call it on a partition, give the futures
-    to a task: ``partition.submit(function, futures)``.
+    The function is called in a thread of this process. To call it on a partition, pass the futures
+    to a task instead: ``partition.submit(function, futures)``.
 
     Parameters
     ----------
     futures
-        Futures of Dask, and those that `Partition.for_each`, `after_all` and the executors of
-        Python return. The results are in the same order.
+        Futures of Dask, of `Partition.for_each` and `after_all`, and of Python's executors. The
+        results are in the same order.
     function
-        Is not called if a future fails or is cancelled: then the returned future fails at once,
-        with the same error.
+        Function that is called with the list of results. If a future fails or is canceled, the
+        function is not called, and the returned future immediately fails with the same error.
 
     Returns
     -------
     concurrent.futures.Future
-        Its `cancel` keeps the function from being called. It cancels none of `futures`.
+        Future of the return value. Its `cancel` prevents the call of the function, but does not
+        cancel `futures`.
 
     Examples
     --------

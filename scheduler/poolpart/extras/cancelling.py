@@ -34,10 +34,11 @@ RESTART_S = 60.0  # seconds for a worker to come back
 
 
 def cancelled() -> bool:
-    """Return whether the task that calls this function was cancelled.
+    """Return whether the task that calls this function was canceled.
 
-    For functions that run long: Dask does not stop them, and they keep their slot. Call it now and
-    then, in the thread of the task, and return if it is True. Outside tasks it is False.
+    Dask does not stop running functions, so a canceled function keeps its slot until it returns.
+    Call `cancelled` regularly in long-running functions, in the thread of the task, and return if
+    it is True. Outside of tasks, it returns False.
 
     Examples
     --------
@@ -85,19 +86,19 @@ async def _cancel_tasks(
     known = {key: scheduler.tasks[key] for key in keys if key in scheduler.tasks}
     for key, task in known.items():
         if not asks_for(task, [name]):
-            return {}, f"Task {key!r} is not of partition {name!r}: nothing was cancelled."
+            return {}, f"Task {key!r} does not belong to partition {name!r}. No task was canceled."
     workers = {key: task.processing_on for key, task in known.items()}
     annotations = {key: task.annotations for key, task in known.items()}
     cancel_keys(scheduler, keys, asking)
     kept = [key for key in known if key in scheduler.tasks]
-    outcomes: Outcomes = dict.fromkeys(kept, "kept: another client wants its result")
+    outcomes: Outcomes = dict.fromkeys(kept, "kept: another client needs its result")
     members = [worker for worker in scheduler.workers.values() if worker.resources.get(name)]
     loads = await asyncio.gather(*(_load(scheduler, worker) for worker in members))
     affected: dict[Any, list[Any]] = {}  # {worker: keys of cancelled tasks that it runs}
     for worker, load in zip(members, loads, strict=True):
         if load is None:  # such a task may keep it from answering
             silent = [key for key, at in workers.items() if at is worker and key not in outcomes]
-            outcomes |= dict.fromkeys(silent, f"running: worker {worker.name} does not answer")
+            outcomes |= dict.fromkeys(silent, f"running: worker {worker.name} does not respond")
         elif running := [key for key in load.running if key in keys and key not in outcomes]:
             affected[worker] = running
     ends = (_end(scheduler, worker, running, restarts) for worker, running in affected.items())
@@ -123,10 +124,10 @@ async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool)
     alone = load is not None and not load.holds_results and {*load.running} <= {*keys}
     if not alone or not holds_nothing(scheduler, worker):
         reopen(scheduler, worker)
-        return f"{still_running} has another task or result"
+        return f"{still_running} holds other tasks or results"
     if await _within(restart(scheduler, worker, RESTART_S), RESTART_S + ANSWER_S):
         return f"restarted: worker {worker.name}"
-    return f"restarted: worker {worker.name}, which is not back after {RESTART_S:g} s"
+    return f"restarted: worker {worker.name}, which has not rejoined after {RESTART_S:g} s"
 
 
 class _Load(NamedTuple):

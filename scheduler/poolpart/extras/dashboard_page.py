@@ -23,7 +23,7 @@ from ..fence import fences_of
 from ..html_table import WORDS, shown_seconds
 from ..internals.names import PAGE, require
 from ..internals.scheduler import serve, serve_no_longer
-from ..membership import release_statistics
+from ..membership import partition_names, release_statistics
 from ..partition_stats import COUNTS, StageStats
 from ..pipe_states import pipes_of
 from ..stats import NAME as STATISTICS
@@ -74,7 +74,7 @@ th { font-weight: 400; color: #667; }
 }
 @media (prefers-color-scheme: dark) { h1 + p, th, td::before { color: #9aa !important; } }
 </style>
-<h1>Partitions of a cluster</h1>
+<h1>Cluster partitions</h1>
 <p>{{ address }}: {{ counts }}</p>
 {% for title, head, rows in tables %}{% if rows %}<table>
 <caption>{{ title }}</caption>
@@ -86,14 +86,14 @@ th { font-weight: 400; color: #667; }
 {% end %}</table>
 {% end %}{% end %}""")
 _FIGURES = (*COUNTS, "seconds")
-_OF_A_WORKER = ("worker", "partition", "slots", "busy", "tasks given", "status", "address")
+_OF_A_WORKER = ("worker", "partition", "slots", "busy", "assigned tasks", "status", "address")
 
 
 def page_of(scheduler: Any) -> bytes:
     """Return the HTML of the current page."""
     workers = list(scheduler.workers.values())
-    names = {name for worker in workers for name, slots in worker.resources.items() if slots}
-    names |= fences_of(scheduler) | {name for name, _ in statistics_of(scheduler).ended if name}
+    names = {*partition_names(scheduler)} | fences_of(scheduler)
+    names |= {name for name, _ in statistics_of(scheduler).ended if name}
     partitions: list[list[object]] = []
     stages: list[list[object]] = []
     pipes: list[list[object]] = []
@@ -158,7 +158,7 @@ class _Handler(web.RequestHandler):
         if reason:
             self.set_status(HTTPStatus.FORBIDDEN)
             self.set_header("Content-Type", "text/plain; charset=utf-8")
-            self.finish(f"{reason}; distributed.dashboard.link may have another name")
+            self.finish(f"{reason} `distributed.dashboard.link` may contain another name.")
 
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")
@@ -207,8 +207,8 @@ def partitions_page(client: Client) -> str:
     link = page_link(client)
     if link is None:
         raise PoolError(
-            f"The scheduler at {client.scheduler.address} has no HTTP server for a page: start "
-            "it with a dashboard address, such as 127.0.0.1:8787."
+            f"The scheduler at {client.scheduler.address} has no HTTP server for the page. Start "
+            "the scheduler with a dashboard address, for example 127.0.0.1:8787."
         )
     return link
 

@@ -82,7 +82,7 @@ def _items_of(source: object) -> _PipeItems | _IterableItems:
         return _PipeItems(source)
     if isinstance(source, Iterable):
         return _IterableItems(source)
-    raise PoolError(f"for_each takes a pipe or an iterable of items, not {source!r}.")
+    raise PoolError(f"`for_each` expects a pipe or an iterable of items, but got {source!r}.")
 
 
 class ItemTasks:
@@ -105,7 +105,9 @@ class ItemTasks:
     ) -> None:
         check_wait(empty_s)
         if window is not None and (not isinstance(window, int) or window < 1):
-            raise ValueError(f"window is {window!r}; give a whole number, 1 or more.")
+            raise ValueError(
+                f"Invalid value {window!r} for `window`. Expected an integer of at least 1."
+            )
         self._count = 0  # items that have a task, or had
         self._partition = partition
         self._items = _items_of(source)
@@ -118,7 +120,8 @@ class ItemTasks:
         self._slots = 0  # of the partition
         self._per_slot = 2  # tasks in flight, without a window
         self._next_look = 0.0
-        self._wait = WorkerWait(partition.name, "for_each", empty_s)
+        self._until_next_s = LOOK_S
+        self._wait = WorkerWait(partition.name, "`for_each`", empty_s)
         self._stopped = False
 
     def run(self) -> int:
@@ -133,9 +136,9 @@ class ItemTasks:
                 futures = self._futures()
                 if self._items.drained or (self._items.closed and not free):
                     with suppress(TimeoutError):
-                        wait(futures, timeout=LOOK_S, return_when="FIRST_COMPLETED")
+                        wait(futures, timeout=self._until_next_s, return_when="FIRST_COMPLETED")
                 else:
-                    items = self._items.take(futures, free, LOOK_S)
+                    items = self._items.take(futures, free, self._until_next_s)
                     self._submit(items)
                 full = len(self._running) >= self._window
                 self._check()
@@ -144,7 +147,7 @@ class ItemTasks:
                     self._set_window()
         except BaseException as error:
             self._cancel()
-            reason = f"{funcname(self._function)} has failed: {error!r}"
+            reason = f"Function {funcname(self._function)!r} failed: {error!r}"
             self._items.fail(str(error) if isinstance(error, PoolError) else reason)
             raise
         return self._count
@@ -152,7 +155,7 @@ class ItemTasks:
     def stop(self) -> None:
         """End `run` in another thread: cancel the tasks, and fail the pipe."""
         self._stopped = True
-        self._items.fail(f"for_each of {funcname(self._function)} was cancelled")
+        self._items.fail(f"`for_each` with function {funcname(self._function)!r} was canceled.")
         self._cancel()
 
     def _cancel(self) -> None:
@@ -178,7 +181,8 @@ class ItemTasks:
         self._set_window()
         if self._running:
             self._wait.check(of_partition)
-        self._next_look = time.monotonic() + LOOK_S
+        self._until_next_s = self._wait.until_next_check(LOOK_S)
+        self._next_look = time.monotonic() + self._until_next_s
 
     def _set_window(self) -> None:
         if self._given_window is None:
@@ -209,6 +213,7 @@ class ItemTasks:
                 except Exception as error:
                     shown = reprlib.repr(item)
                     error.add_note(
-                        f"poolpart: this was item {number} of {self._items.name}: {shown}"
+                        f"poolpart: The error occurred for item {number} of {self._items.name}: "
+                        f"{shown}"
                     )
                     raise

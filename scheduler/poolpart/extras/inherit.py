@@ -52,10 +52,12 @@ class Inheritance(SchedulerPlugin):
         self._rules = Rules()
         self._choice: WorkerChoice | None = None
         self._unreadable: UnreadableInputs | None = None
-        self.lends = self._begin(NESTED, "tasks from inside tasks may run anywhere", self._nest)
-        self._begin(SHUFFLES, "shuffles may leave their partition", self._shuffle)
-        self._begin(CHOOSING, "placing a task takes longer in larger clusters", self._choose)
-        self._begin(READING, "tasks wait for inputs that cannot be unpickled", self._read)
+        self.lends = self._begin(
+            NESTED, "Tasks that other tasks submit may run on any worker.", self._nest
+        )
+        self._begin(SHUFFLES, "Shuffles may use workers outside their partition.", self._shuffle)
+        self._begin(CHOOSING, "Task placement takes longer in larger clusters.", self._choose)
+        self._begin(READING, "Tasks whose inputs cannot be unpickled wait forever.", self._read)
         scheduler.add_plugin(self)
 
     def _begin(self, feature: str, without: str, begin: Callable[[], None]) -> bool:
@@ -67,8 +69,8 @@ class Inheritance(SchedulerPlugin):
             require(feature)
             begin()
         except PoolError as error:  # partitions are of use without
-            self.note = "; ".join(filter(None, (self.note, f"{without}: {error}")))
-            logger.warning("Partitions: %s: %s", without, error)
+            self.note = " ".join(filter(None, (self.note, f"{without} {error}")))
+            logger.warning("Partitions: %s %s", without, error)
             return False
         return True
 

@@ -235,9 +235,9 @@ class Lender:
         names = " and ".join(repr(name) for name in restrictions)
         message = (
             f"Task {submitter.key!r} of partition {names} holds a slot while task {key!r}, which "
-            "it has submitted, waits for one. If it polls, as with Future.done in a loop, both "
-            "wait for ever: use Future.result, distributed.wait, as_completed or Pipe.get, which "
-            "lend the slot."
+            "it has submitted, waits for a slot. If the first task polls, for example by calling "
+            "`Future.done` in a loop, both tasks wait forever. Use `Future.result`, "
+            "`distributed.wait`, `as_completed` or `Pipe.get`, which lend the slot while they wait."
         )
         logger.warning(message)
         self.worker.log_event("warn", {"message": pickle.dumps(message)})

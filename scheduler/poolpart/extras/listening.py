@@ -22,13 +22,18 @@ _CHECK_S = 1.0  # interval at which the thread checks whether the listener was c
 class Listener:
     """Thread that calls a function for each item of a pipe, as started by `Pipe.listen`.
 
-    `join` waits until the pipe has ended; `close` stops listening. At the end of a ``with`` block,
-    the listener is joined, or closed if the block raises an error.
+    `join` waits until the pipe has ended, and `close` stops listening. At the end of a ``with``
+    block, the listener is joined, or closed if the block raises an error.
 
     Notes
     -----
-    If a task at either end of the pipe fails, the pipe fails, and `join` raises `PipeFailed`; see
-    `Pipe`. The same applies after `Client.restart`.
+    If a task at either end of the pipe fails, the pipe fails, and `join` raises `PipeFailed`. The
+    same applies after `Client.restart`. See `Pipe` for details.
+
+    Examples
+    --------
+    >>> listener = hits.listen(print)                                    # doctest: +SKIP
+    >>> listener.join(timeout_s=60)                                      # doctest: +SKIP
     """
 
     def __init__(self, pipe: Pipe, function: Callable[[Any], Any]) -> None:
@@ -42,40 +47,40 @@ class Listener:
     def join(self, timeout_s: float | None = None) -> None:
         """Wait until the pipe has ended and the function has been called for all items.
 
-        Returns immediately after `close`.
+        After `close`, this method returns immediately.
 
         Parameters
         ----------
         timeout_s
-            Longest wait in seconds. By default, the wait is not limited.
+            Maximum wait in seconds. By default, the wait is unlimited.
 
         Raises
         ------
         PipeFailed
-            If the pipe has failed, was deleted, or the cluster was restarted.
+            If the pipe has failed or was deleted, or if the cluster was restarted.
         TimeoutError
             If the pipe has not ended in time. The listener continues.
         RuntimeError
             If the function itself calls this method.
         Exception
-            The error that the function has raised.
+            The error that the function has raised, if any.
         """
         if threading.current_thread() is self._thread:
             raise RuntimeError(
-                f"{funcname(self._function)} waits for the end of its own listener. Call join in "
-                "another thread, or stop listening with close."
+                f"Function {funcname(self._function)!r} waits for the end of its own listener. "
+                "Call `join` in another thread, or stop listening with `close`."
             )
         concurrent.futures.wait([self._done], timeout_s)
         if not self._done.done():
-            raise TimeoutError(f"Pipe {self._pipe.name!r} has not ended within {timeout_s} s.")
+            raise TimeoutError(f"Pipe {self._pipe.name!r} did not end within {timeout_s} s.")
         self._done.result()
 
     def close(self) -> None:
-        """Stop listening, without waiting for the end of the pipe.
+        """Stop listening without waiting for the end of the pipe.
 
-        A call of the function that is running is waited for; the function is not called again.
-        Remaining items stay in the pipe. Errors of the function or of the pipe are not raised here;
-        `join` raises them.
+        If the function is currently running, this method waits for it to return. The function is
+        not called again, and the remaining items stay in the pipe. This method does not raise
+        errors of the function or of the pipe. Use `join` to raise them.
         """
         self._closed.set()
         if threading.current_thread() is self._thread:
@@ -118,5 +123,5 @@ class Listener:
                     self._function(item)
         except BaseException as error:
             with suppress(PipeFailed, OSError):  # the pipe or the scheduler is gone
-                self._pipe.fail(f"{funcname(self._function)} has failed: {error!r}")
+                self._pipe.fail(f"Function {funcname(self._function)!r} failed: {error!r}")
             raise

@@ -36,23 +36,19 @@ class PartitionCollector:
         prefix = f"{namespace}_partition"
         gauges = {
             "workers": GaugeMetricFamily(f"{prefix}_workers", "Workers", labels=_LABELS),
-            "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots of these workers", labels=_LABELS),
-            "busy": GaugeMetricFamily(
-                f"{prefix}_busy_slots", "Slots that a task holds", labels=_LABELS
-            ),
+            "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots of the workers", labels=_LABELS),
+            "busy": GaugeMetricFamily(f"{prefix}_busy_slots", "Slots in use", labels=_LABELS),
         }
-        tasks = GaugeMetricFamily(
-            f"{prefix}_tasks", "Tasks that have not ended", labels=[*_LABELS, "state"]
-        )
+        tasks = GaugeMetricFamily(f"{prefix}_tasks", "Unfinished tasks", labels=[*_LABELS, "state"])
         ended = CounterMetricFamily(
-            f"{prefix}_tasks_ended", "Tasks that have ended", labels=[*_LABELS, "state"]
+            f"{prefix}_tasks_ended", "Finished tasks", labels=[*_LABELS, "state"]
         )
         running = CounterMetricFamily(
-            f"{prefix}_running_seconds", "Time that ended tasks ran", labels=_LABELS
+            f"{prefix}_running_seconds", "Running time of finished tasks", labels=_LABELS
         )
         waiting = CounterMetricFamily(
             f"{prefix}_waiting_seconds",
-            "Time that ended tasks waited for a worker or a slot",
+            "Time that finished tasks waited for a worker or a slot",
             labels=_LABELS,
         )
         for stats in self._collect_stats():

@@ -11,7 +11,7 @@ from tornado.template import Template
 from ..adapting import adaptive_names
 from ..errors import PoolError
 from ..html_table import html_paragraph, html_table
-from ..membership import has_rule
+from ..membership import has_rule, partition_names
 from ..partition_stats import COUNTS, PartitionStats
 from ..pipe_states import pipes_of
 from ..stats import stats_of
@@ -19,8 +19,8 @@ from ..workers import on_scheduler
 from .dashboard_page import is_open, page_link
 
 _LINK = Template("""\
-{% if link %}<p><a href="{{ link }}" target="_blank" rel="noreferrer">Page of partitions</a></p>\
-{% else %}<p>Page of partitions: <code>{{ opener }}</code> opens it.</p>{% end %}""")
+{% if link %}<p><a href="{{ link }}" target="_blank" rel="noreferrer">Partitions page</a></p>\
+{% else %}<p>To open the partitions page, call <code>{{ opener }}</code>.</p>{% end %}""")
 _PLAIN = Template("<pre>{{ text }}</pre>")
 _HEAD = ("partition", "workers", "slots", "busy", *COUNTS)
 _HEAD_OF_A_PIPE = ("pipe", "depth", "capacity", "state")
@@ -43,13 +43,13 @@ def table_of_partitions(client: Client, title: str) -> str:
 
 def table_of_partition(get_client: Callable[[], Client], title: str, name: str) -> str:
     """Return the HTML of the figures of a partition, or a sentence if it was dissolved."""
-    gone = "The partition was dissolved, or its workers have left: no worker declares it."
+    gone = "No worker declares this partition. It was dissolved, or its workers have left."
     return _table_of_one(get_client, _one_partition, name, (title, _HEAD, gone))
 
 
 def table_of_pipe(get_client: Callable[[], Client], title: str, name: str) -> str:
     """Return the HTML of the state of a pipe, or a sentence if it was deleted."""
-    gone = "The pipe was deleted, or never created."
+    gone = "The pipe does not exist. It was deleted or never created."
     return _table_of_one(get_client, _one_pipe, name, (title, _HEAD_OF_A_PIPE, gone))
 
 
@@ -99,9 +99,7 @@ def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]],
 
     Runs on the scheduler.
     """
-    workers = dask_scheduler.workers.values()
-    declared = {name for worker in workers for name, n in worker.resources.items() if n}
-    names = [*sorted(declared | adaptive_names(dask_scheduler)), ""]
+    names = [*partition_names(dask_scheduler), ""]
     return [_row(stats) for stats in stats_of(names, dask_scheduler)], is_open(dask_scheduler)
 
 

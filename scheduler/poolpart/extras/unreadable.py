@@ -79,7 +79,7 @@ class UnreadableInputs:
             return
         del self._attempts[task.key, worker]
         for dependent in waiting:
-            reason = error or "its log has the error"
+            reason = error or "the worker log contains the error"
             message = (
                 f"Task {dependent.key!r} cannot run, because worker {state.name} cannot unpickle "
                 f"the result of task {task.key!r}: {reason}. Return plain data, or install the "

@@ -158,7 +158,7 @@ async def answer_of_scheduler(
             raise
         # Not a TimeoutError, which `Pipe.get` raises if no item comes.
         raise OSError(
-            f"The scheduler at {client.scheduler.address} has not answered for {seconds:g} s. "
+            f"The scheduler at {client.scheduler.address} has not responded for {seconds:g} s. "
             "Check that its process is running."
         ) from error
 

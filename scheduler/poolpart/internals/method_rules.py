@@ -67,8 +67,8 @@ class _Method:
         if rule not in self._logged:
             self._logged.add(rule)
             logger.exception(
-                "A rule of poolpart for %s failed with distributed %s, so Dask decides without "
-                "it: tasks may run outside their partition, or others in it.",
+                "The poolpart rule for %s failed with distributed %s and is ignored. Tasks may run "
+                "outside their partition, and other tasks may run inside it.",
                 self.__name__,
                 distributed.__version__,
             )
@@ -110,9 +110,9 @@ class Rules:
         if method is None or not parameters <= inspect.signature(method).parameters.keys():
             self.take_back()
             raise PoolError(
-                f"{type(owner).__name__} of distributed {distributed.__version__} has no "
-                f"{name}({', '.join(sorted(parameters))}), which poolpart needs: use a version "
-                "that it asks for."
+                f"{type(owner).__name__} in distributed {distributed.__version__} has no method "
+                f"{name}({', '.join(sorted(parameters))}), which poolpart requires. Install a "
+                "version of distributed that poolpart supports."
             )
         stand_in = vars(owner).get(name)
         if not isinstance(stand_in, _Method):
@@ -213,8 +213,9 @@ def rule_for_fences(
     """
     if not isinstance(getattr(scheduler, "idle_task_count", None), set):
         raise PoolError(
-            f"The scheduler of distributed {distributed.__version__} keeps no set of idle "
-            "workers, which fences need: use a version that poolpart asks for."
+            f"The scheduler of distributed {distributed.__version__} has no set of idle workers, "
+            "which exclusive partitions require. Install a version of distributed that poolpart "
+            "supports."
         )
 
     def valid_workers(valid: Any, task: Any) -> Any:

@@ -23,15 +23,15 @@ from .queues import PRIVATE_NAMES as PIPE_NAMES
 TESTED = "2025.5.0", "2026.8.0"  # oldest and newest version of distributed (`make compat`)
 
 NESTED = "keeping nested tasks in their partition"
-REFUSING = "refusing tasks that could never run"
+REFUSING = "rejecting tasks that can never run"
 FENCES = "exclusive partitions"
 DIVIDING = "dividing a pool"
 CHOOSING = "choosing workers in constant time"
 SHUFFLES = "shuffles inside a partition"
 MAP = "Partition.map"
 PIPES = "pipes"
-FETCHING = "fetching results straight from workers"
-PAGE = "the page of partitions"
+FETCHING = "fetching results directly from workers"
+PAGE = "the partitions page"
 CLUSTERS = "clusters with several kinds of workers"
 ADAPTING = "adaptive partitions"
 CANCELLING = "Partition.cancel"
@@ -62,7 +62,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER}._create_taskstate_from_graph"
             "(submitting_task, annotations_by_type, global_annotations, dsk)",
         ),
-        "nested tasks get their parent's partition",
+        "nested tasks inherit the partition of their parent",
         (
             "test_inherit.py::test_at_any_depth_and_on_a_single_slot",
             "test_inherit.py::test_what_an_actor_submits_belongs_to_the_partition_of_the_actor",
@@ -80,7 +80,7 @@ PRIVATE_NAMES = (
             "distributed.client:as_completed.__next__",
             "distributed.actor:ActorFuture.result",
         ),
-        "a worker notices that a task waits; wrapped once in a process, and for good",
+        "detect that a task is waiting; wrapped once per process and never restored",
         ("test_lending.py::test_what_another_library_has_wrapped_meanwhile_stays",),
     ),
     PrivateNames(
@@ -96,7 +96,7 @@ PRIVATE_NAMES = (
             "distributed.worker:thread_state",
             f"{_SCHEDULER}.worker_plugins",
         ),
-        "a waiting task lends its slots; workers lend before they get tasks",
+        "a waiting task lends its slots; lending is set up before a worker receives tasks",
         (
             "test_lending.py::test_on_one_slot_nested_tasks_and_their_parent_run_one_at_a_time",
             "test_lending.py::test_a_tree_of_waiting_tasks_on_two_slots_ends",
@@ -110,7 +110,7 @@ PRIVATE_NAMES = (
             "(client, annotations_by_type, global_annotations)",
             f"{_SCHEDULER}.resources",
         ),
-        "an error in place of a task that waits for ever, without a request for each task",
+        "raise an error instead of letting a task wait forever, without a request per task",
         (
             "test_membership.py::test_by_another_client",
             "test_membership.py::test_more_slots_than_any_worker_has",
@@ -125,7 +125,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER}.decide_worker_non_rootish(ts)",
             f"{_SCHEDULER}.idle_task_count",
         ),
-        "other tasks stay out",
+        "keep other tasks off the workers",
         (
             "test_fence.py::test_other_tasks_stay_out",
             "test_fence.py::test_nothing_is_stolen_into_a_partition",
@@ -140,7 +140,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER_TASK}.host_restrictions",
             f"{_SCHEDULER_WORKER}.long_running",
         ),
-        "a few workers are compared for a task, not all",
+        "compare a few workers per task instead of all",
         ("test_choosing.py::test_simulated_workers_get_tasks_as_evenly_as_from_dask",),
     ),
     PrivateNames(
@@ -150,7 +150,7 @@ PRIVATE_NAMES = (
             "(spec)",
             "distributed.shuffle._core:barrier_key",
         ),
-        "shuffles stay on permitted workers",
+        "keep shuffles on the permitted workers",
         (
             "test_shuffles.py::test_inside_a_task_of_a_partition",
             "test_shuffles.py::test_of_a_collection_that_a_partition_computes",
@@ -167,7 +167,7 @@ PRIVATE_NAMES = (
             f"{_WORKER_STATE}.available_resources",
             f"{_WORKER_STATE}.all_running_tasks",
         ),
-        "what workers declare",
+        "read and change the resources that workers declare",
         (
             "test_moves.py::test_slots_are_those_of_the_partition",
             "test_moves.py::test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves",
@@ -181,13 +181,13 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER}.check_idle_saturated",
             f"{_SCHEDULER}.stimulus_queue_slots_maybe_opened",
         ),
-        "tasks that wait for a slot are woken",
+        "resume tasks that wait for a slot",
         ("test_fence.py::test_waiting_tasks_go_to_a_worker_that_leaves_the_partition",),
     ),
     PrivateNames(
         DIVIDING,
         (f"{_STEALING}.move_task_request", f"{_STEALING}.in_flight"),
-        "waiting tasks leave a worker that moves",
+        "move waiting tasks off a worker that changes its partition",
         ("test_moves.py::test_what_has_not_started_is_shared_out_evenly",),
     ),
     PrivateNames(
@@ -197,19 +197,19 @@ PRIVATE_NAMES = (
             "distributed.worker:Worker.run",
             "distributed.scheduler:Scheduler.identity",
         ),
-        "requests to single workers",
+        "send requests to single workers",
         ("test_pool.py::test_more_workers_than_dask_lists_by_default",),
     ),
     PrivateNames(
         MAP,
         ("distributed.client:Future._state",),
-        "lost results are noticed",
+        "detect lost results",
         ("test_mapping.py::test_results_that_are_lost_before_they_are_fetched",),
     ),
     PrivateNames(
         PIPES,
         PIPE_NAMES,
-        "a pipe is a Queue and a Variable, which all clients see and set",
+        "implement a pipe as a Queue and a Variable that all clients can use",
         (
             "test_pipe_processes.py::test_deleting_forgets_consumers_that_were_killed",
             "test_pipe_processes.py::test_a_plain_client_of_another_process_uses_queue_and_variable",
@@ -223,7 +223,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER_TASK}.exception_blame",
             f"{_SCHEDULER_TASK}.exception_text",
         ),
-        "a pipe fails with the tasks that use it",
+        "let a pipe fail when a task that uses it fails",
         (
             "test_listening.py::test_a_producer_that_fails_ends_the_listener",
             "test_pipe.py::test_a_producer_that_is_cancelled_ends_its_consumers",
@@ -232,13 +232,13 @@ PRIVATE_NAMES = (
     PrivateNames(
         FETCHING,
         ("distributed.utils_comm:gather_from_workers", "distributed.worker:Worker.handlers"),
-        "a dead worker is not waited for",
+        "do not wait for dead workers",
         ("test_fetch.py::test_a_worker_that_is_slow_is_waited_for",),
     ),
     PrivateNames(
         PAGE,
         (f"{_SCHEDULER}.http_application",),
-        "the page is part of Dask's dashboard",
+        "serve the page as part of Dask's dashboard",
         ("test_page.py::test_it_is_served_and_taken_away",),
     ),
     PrivateNames(
@@ -255,7 +255,7 @@ PRIVATE_NAMES = (
             "distributed.deploy.ssh:Worker",
             f"{_SCHEDULER}.transition_counter",
         ),
-        "workers of several kinds, forked from one process, left to their nannies",
+        "start workers of several kinds, forked from one process and restarted by their nannies",
         (
             "test_local.py::test_a_worker_that_is_slow_to_come_back_is_not_given_up",
             "test_local.py::test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers",
@@ -281,7 +281,7 @@ PRIVATE_NAMES = (
             f"{_SCHEDULER_TASK}.host_restrictions",
             f"{_SCHEDULER_TASK}.loose_restrictions",
         ),
-        "jobs follow the tasks that wait; idle workers end without losing anything",
+        "adapt the number of jobs to the waiting tasks; stop idle workers without data loss",
         (
             "test_adapting.py::test_no_task_is_lost_or_run_again_while_workers_come_and_go",
             "test_adapting.py::test_a_worker_is_kept_for_what_would_be_lost_with_it",
@@ -304,7 +304,7 @@ PRIVATE_NAMES = (
             f"{_WORKER_STATE}.all_running_tasks",
             f"{_WORKER_TASK}.state",
         ),
-        "a worker that runs nothing but cancelled tasks is restarted",
+        "restart a worker that only runs canceled tasks",
         (
             "test_cancelling.py::test_a_worker_with_nothing_but_cancelled_tasks_is_restarted",
             "test_cancelling.py::test_a_function_sees_that_it_was_cancelled",
@@ -323,7 +323,7 @@ PRIVATE_NAMES = (
             "distributed.core:connect(addr)",
             "distributed.core:send_recv(comm)",
         ),
-        "a task fails whose worker cannot unpickle its input",
+        "let a task fail if its worker cannot unpickle an input",
         ("test_unreadable.py::test_a_task_whose_worker_cannot_unpickle_its_input_fails",),
     ),
 )
@@ -343,8 +343,8 @@ def require(feature: str) -> None:
     missing = missing_names(feature)
     if missing:
         raise PoolError(
-            f"distributed {distributed.__version__} lacks {', '.join(missing)}, so {feature} is "
-            f"off; versions {TESTED[0]} to {TESTED[1]} have it."
+            f"distributed {distributed.__version__} has no {', '.join(missing)}, which poolpart "
+            f"requires for {feature}. Install a version from {TESTED[0]} to {TESTED[1]}."
         )
 
 
@@ -361,8 +361,8 @@ def warn_if_untested() -> None:
     oldest, version, newest = map(_numbers, (TESTED[0], distributed.__version__, TESTED[1]))
     if not oldest <= version <= newest:
         warnings.warn(
-            f"poolpart was tested with distributed {TESTED[0]} to {TESTED[1]}, and this is "
-            f"{distributed.__version__}.",
+            f"poolpart was tested with distributed {TESTED[0]} to {TESTED[1]}, but the installed "
+            f"version is {distributed.__version__}.",
             stacklevel=3,
         )
 
