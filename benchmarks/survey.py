@@ -1,7 +1,7 @@
 """A whole survey beside the script that an expert would write: time, bytes, and the same points.
 
 The script runs in one process: Open3D casts on all cores, NumPy thins and rounds, Open3D writes
-the PLY. Ours is the command with ``--only cloud`` on a cluster that it starts itself, with all the
+the PLY. Ours is the command with ``--cloud-only`` on a cluster that it starts itself, with all the
 guarantees of a run. Both are processes of their own, measured from start to end, in turns.
 
 Run: ``python -m benchmarks.survey [--rays 1e8] [--rounds 3] [--pictures]``
@@ -119,7 +119,7 @@ def time_side(side: str, rays: int, folder: Path) -> tuple[float, float]:
     python = [sys.executable, "-m"]
     command = {
         "script": [*python, "benchmarks.survey", "--script", str(out_folder), "--rays", str(rays)],
-        "ours": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q", "--only", "cloud"],
+        "ours": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q", "--cloud-only"],
         "pictures": [*python, "lidarpool", "run", str(folder / "survey.yaml"), "-q"],
     }[side]
     if side != "script":

@@ -41,7 +41,9 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
         live_page(COUNT, campaign.names, "Heights", port=0, browser=False) as live,
     ):
         output = DataSetOutput(tmp_path / "set", campaign)
-        options = RunOptions(client=client, wait_s=120.0, folder=tmp_path / "set" / "run")
+        options = RunOptions(
+            client=client, startup_timeout_s=120.0, folder=tmp_path / "set" / "run"
+        )
 
         def hold(progress):
             """Stand still once a job is done, until the browser has shown it."""

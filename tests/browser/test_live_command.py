@@ -13,7 +13,7 @@ SCENARIO = "scene: seed\nsensor: {rays_per_revolution: 100, layers: 8}\n"
 
 def test_a_run_with_a_page_ends_by_itself_where_it_is_not_to_stay(tmp_path):
     (tmp_path / "small.yaml").write_text(SCENARIO)
-    options = ["small.yaml", "--live", "--no-stay"]
+    options = ["small.yaml", "--live", "--exit"]
     ended = subprocess.run(
         [sys.executable, "-m", "lidarpool", "run", *options],
         cwd=tmp_path, capture_output=True, text=True, timeout=180,

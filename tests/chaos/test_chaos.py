@@ -15,7 +15,7 @@ from tests.chaos.survey import disturbed, reference
 SEED = 7
 FAULTS = 20
 PLANNED = 24  # some may find nobody to strike
-PATIENT = {"patience_s": 300.0}  # with partitions whose last worker is starting again
+PATIENT = {"worker_timeout_s": 300.0}  # with partitions whose last worker is starting again
 
 # One after the other in one run; somebody passes each of these points with each scan.
 DEATHS = [

@@ -69,7 +69,7 @@ def test_given_up_by_the_scheduler_what_it_does_counts_once(
 ):
     name = lonely(partition, slots)
     fault = Fault(0, STOP, point, scan=100, worker=name, stop_s=STOP_S, given_up=True)
-    outcome = disturbed(arena, what, known, [fault], patience_s=300.0)
+    outcome = disturbed(arena, what, known, [fault], worker_timeout_s=300.0)
     assert outcome.sound, outcome.error or outcome.verdict
     assert outcome.done == {(STOP, point): 1}  # there was no other worker that could come to it
     assert outcome.verdict.recovered

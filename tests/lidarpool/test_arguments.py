@@ -270,7 +270,11 @@ def test_keywords_are_the_options_of_runs():
     ("call", "keyword", "says"),
     [
         (partial(simulate, Scene.seed(), Survey(poses=AT)), "retry_failed", "simulate() got"),
-        (partial(simulate, Scene.seed(), Survey(poses=AT)), "wait", "Did you mean 'wait_s'?"),
+        (
+            partial(simulate, Scene.seed(), Survey(poses=AT)),
+            "startup_timeout",
+            "Did you mean 'startup_",
+        ),
         (partial(CAMPAIGN.run, "nowhere"), "folder", "run() got"),
         (CAMPAIGN.stream, "resume", "stream() got"),
         (CAMPAIGN.stream, "scheduler", "stream() got"),
@@ -312,7 +316,7 @@ def test_unknown_arguments_are_refused_with_a_hint(call, keyword, says):
         ({"backend": "opencl"}, "backend must be … but is 'opencl'"),
         ({"batch_mb": 0}, "batch_mb must be from 1 to 1000000, but is 0"),
         ({"client": "tcp://x"}, "client must be a Client or None, but is 'tcp://x'"),
-        ({"wait_s": -1}, "wait_s must be at least 0, but is -1"),
+        ({"startup_timeout_s": -1}, "startup_timeout_s must be at least 0, but is -1"),
     ],
 )
 def test_options_of_runs_are_checked(options, says):

@@ -259,7 +259,7 @@ def test_of_many_points_and_cells_some_are_compared(monkeypatch):
     assert found["ranges"]["residual"]["rmse_m"] == pytest.approx(0.02, rel=0.07)
     assert "2,000 points and cells" in found["notes"][0]
     whole = Cloud(cloud().positions, {})
-    thin = compare(whole, whole, most_points=3000).figures
+    thin = compare(whole, whole, max_points=3000).figures
     assert (
         thin["a"]["points"] == 3000
         and "11,520 points, of which 26 % are compared" in thin["notes"][1]

@@ -518,7 +518,8 @@ def test_where_only_the_ground_is_smooth_noise_is_not_determined():
 def test_intensities_of_unknown_scale_need_the_white_one():
     made = replace(recorded(Noise(range_m=0.01, detection_range_m=10, seed=4)), energies=False)
     found = fit(made)
-    assert "detection_range_m" not in found.figures["figures"] and "--white" in repr(found)
+    assert "detection_range_m" not in found.figures["figures"]
+    assert "--white-intensity" in repr(found)
 
     def calibrated(number):
         points, columns, pose = made.read(number)

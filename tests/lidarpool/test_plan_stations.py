@@ -191,7 +191,7 @@ def test_the_report_names_the_targets(tmp_path):
     plan.write_text("scene: site.glb\nposes: [[-8, 0, 1.7]]\nsensor: ouster/os0-128\n")
     x, y = np.full(40, -2.0), np.linspace(-2, 2, 40)
     np.save(tmp_path / "scan.npy", np.stack([x, y, 0 * x + 1], axis=1))
-    command = ["stations", str(plan), "--of", str(tmp_path / "scan.npy"), "--target", "H*"]
+    command = ["stations", str(plan), "--cloud", str(tmp_path / "scan.npy"), "--target", "H*"]
     command += ["--slant", "90"]
     figures = json.loads(CliRunner().invoke(cli, [*command, "--json"]).stdout)
     assert [*figures["objects"]] == ["House"]
@@ -209,7 +209,7 @@ def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
     np.save(tmp_path / "scan.npy", np.stack([x, y, 0 * x], axis=1))
     plan = tmp_path / "plan.yaml"
     plan.write_text("scene: hall.glb\nposes: [[-3, 0, 1.7], [3, 0, 1.7]]\nsensor: ouster/os0-128\n")
-    command = ["stations", str(plan), "--of", str(tmp_path / "scan.npy"), "--slant", "90"]
+    command = ["stations", str(plan), "--cloud", str(tmp_path / "scan.npy"), "--slant", "90"]
     figures = json.loads(CliRunner().invoke(cli, [*command, "--json"]).stdout)
     floor = figures["objects"]["Floor"]
     assert floor["covered_m2"] == pytest.approx(6.05 * 6, rel=0.03)
@@ -226,9 +226,15 @@ def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["hall.glb", "--of", "scan.npy"], "the scenario has no poses"),
-        (["hall.glb", "--of", "scan.npy", "--count", "2"], "`--count` cannot be used with `--of`"),
-        (["hall.glb", "--of", "scan.npy", "--within", "0"], "`--within` is 0; it must be greater"),
+        (["hall.glb", "--cloud", "scan.npy"], "the scenario has no poses"),
+        (
+            ["hall.glb", "--cloud", "scan.npy", "--count", "2"],
+            "`--count` cannot be used with `--cloud`",
+        ),
+        (
+            ["hall.glb", "--cloud", "scan.npy", "--within", "0"],
+            "`--within` is 0; it must be greater",
+        ),
         (["hall.glb"], "`--sensor` is required, because hall.glb does not specify a sensor model"),
     ],
 )
@@ -263,7 +269,7 @@ def test_the_table_has_the_names_that_targets_match(tmp_path):
     plan = tmp_path / "plan.yaml"
     plan.write_text("scene: hall.glb\nposes: [[3, 0, 1.7]]\nsensor: ouster/os0-128\n")
     np.save(tmp_path / "scan.npy", np.array([[3.0, 1.0, 0.0]]))
-    command = ["stations", str(plan), "--of", str(tmp_path / "scan.npy"), "--target"]
+    command = ["stations", str(plan), "--cloud", str(tmp_path / "scan.npy"), "--target"]
     outcome = CliRunner().invoke(cli, [*command, "site_*"])
     shown = re.findall(r"^(site_\w+) +[\d,.]+ m²", outcome.output, re.M)
     assert {*shown} == {f"site_{mesh.name}" for mesh in rooms()}

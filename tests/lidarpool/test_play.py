@@ -88,7 +88,7 @@ def test_a_loop_goes_on_in_time_until_ctrl_c(kept, tmp_path):
 def test_a_result_gives_the_points_of_its_scenario(cluster, tmp_path):
     scenario = tmp_path / "s.yaml"
     scenario.write_text(f"{SCENARIO}output: {{write: [pcap]}}\n")
-    options = ["--out", str(tmp_path / "out"), "--only", "cloud"]
+    options = ["--out", str(tmp_path / "out"), "--cloud-only"]
     outcome = CliRunner().invoke(cli, ["run", str(scenario), *options, "--scheduler", cluster])
     assert outcome.exit_code == 0, outcome.output
     with open_source(tmp_path / "out") as recorded, open_source(scenario, Kept.format) as cast:

@@ -535,7 +535,7 @@ def test_parts_of_another_mark_stay(unfinished, tmp_path):
 def test_a_damaged_database_is_dropped_with_the_parts_of_its_folder(unfinished):
     (unfinished / "run.db").write_bytes(bytes(8192))
     put(unfinished / "parts", ["a.npz"])
-    with pytest.raises(LidarError, match="Remove the run with `--fresh`"):
+    with pytest.raises(LidarError, match="Remove the run with `--restart`"):
         opened(unfinished)
     assert len(names(unfinished)) == 5
     remove_run(unfinished)

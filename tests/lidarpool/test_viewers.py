@@ -427,7 +427,7 @@ def test_live_may_stand_alone_before_a_scenario():
     for words, live in (
         (["--live", "s.yaml"], "page"),
         (["s.yaml", "--live"], "page"),
-        (["s.yaml", "--live", "--no-stay"], "page"),
+        (["s.yaml", "--live", "--exit"], "page"),
         (["--live", "foxglove", "s.yaml"], "foxglove"),
         (["--live=rerun", "s.yaml"], "rerun"),
         (["s.yaml"], None),

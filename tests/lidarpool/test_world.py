@@ -214,7 +214,7 @@ def test_commands_warn_of_the_place(tmp_path, command):
     scenario.write_text(yaml.safe_dump(data))
     options = {
         "check": [],
-        "run": ["--out", f"{tmp_path}/out", "--only", "cloud"],
+        "run": ["--out", f"{tmp_path}/out", "--cloud-only"],
         "stations": ["--sensor", "riegl-vz400", "--count", "1", "--out", f"{tmp_path}/plan"],
     }
     outcome = CliRunner().invoke(cli, [command, str(scenario), *options[command]])

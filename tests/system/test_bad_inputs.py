@@ -68,8 +68,8 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "misspelt column": (["run", "a.stl", "--columns", "rang,time"], "Did you mean 'range'?"),
     "misspelt format": (["run", "a.stl", "--format", "lass"], "Did you mean 'las'?"),
     "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is not a position. Expected X,Y,Z"),
-    "no time": (["run", "good.yaml", "--wait", "soon"], "'soon' is not a duration"),
-    "both": (["run", "good.yaml", "--resume", "--fresh"], "cannot be combined"),
+    "no time": (["run", "good.yaml", "--startup-timeout", "soon"], "'soon' is not a duration"),
+    "both": (["run", "good.yaml", "--resume", "--restart"], "cannot be combined"),
     "certificates alone": (["doctor", "--tls-key", "a.stl"], "require `--scheduler` with"),
     "certificate that is not there": (["doctor", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
     "two clusters": (
@@ -102,7 +102,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
         "'tcp://127.0.0.1:1' does not start with tls://",
     ),
     "no scheduler file": (
-        ["run", "good.yaml", "--wait", "0s", "--scheduler", "sched.json"],
+        ["run", "good.yaml", "--startup-timeout", "0s", "--scheduler", "sched.json"],
         "The scheduler file sched.json does not exist",
     ),
     "no such scheduler file": (
@@ -124,7 +124,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
             "good.yaml",
             "--out",
             "new/deep",
-            "--wait",
+            "--startup-timeout",
             "0s",
             "--scheduler",
             "tcp://127.0.0.1:1",
@@ -221,7 +221,7 @@ def test_out_is_in_use_by_another_run(place, refused):
 def test_a_listener_that_is_no_scheduler(refused, impatient):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        command = ["run", "good.yaml", "--wait", "0s"]
+        command = ["run", "good.yaml", "--startup-timeout", "0s"]
         refused([*command, "--scheduler", f"tcp://127.0.0.1:{port}"], "No Dask scheduler")
 
 
@@ -244,7 +244,7 @@ def test_a_cluster_that_lacks_something(case, refused):
     resources, says = CLUSTERS[case]
     with thread_cluster(*resources) as cluster:
         command = ["run", "good.yaml", "--scheduler", cluster.scheduler_address]
-        refused(command if case == "two resources" else [*command, "--wait", "0s"], says)
+        refused(command if case == "two resources" else [*command, "--startup-timeout", "0s"], says)
 
 
 # {scenario: what the message says}
@@ -276,7 +276,7 @@ def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monke
     monkeypatch.setattr(lidarpool_watch, "TELL_EVERY_S", 0.0)
     with thread_cluster({"GPU": 1}, {"OTHER": 1}) as cluster:
         address = cluster.scheduler_address
-        outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--wait", "1s")
+        outcome = lidarpool("run", "good.yaml", "--scheduler", address, "--startup-timeout", "1s")
     assert outcome.code == 2
     assert re.search(
         r"note: waiting for workers for up to \d s more: Partition 'LIDAR' has 0 of the 4 required",
@@ -311,7 +311,8 @@ def test_jobs_that_do_not_begin_are_cancelled(place, refused, monkeypatch):
     monkeypatch.setattr(job, "_close_job", cancel)
     (place / "queue.yaml").write_text(QUEUE)
     refused(
-        ["run", "good.yaml", "--cluster", "queue.yaml", "--wait", "0s", "--quiet"], "has no workers"
+        ["run", "good.yaml", "--cluster", "queue.yaml", "--startup-timeout", "0s", "--quiet"],
+        "has no workers",
     )
     assert len(submitted) == 4
     assert sorted(cancelled) == submitted

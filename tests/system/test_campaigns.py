@@ -163,7 +163,7 @@ def test_a_note_says_which_sensor_is_lidar_top_of_nuscenes(client, tmp_path):
 
 @pytest.mark.slow
 def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots):
-    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
+    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--cloud-only"]
     out = files / "job-5"
     done = lidarpool(*run, "--job", 5, "--out", out)
     assert (done.code, done.err) == (0, "")
@@ -365,7 +365,7 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     assert (
         "Only `pool` and `count` may change, and `count` must not decrease. Remove it" in other.err
     )
-    assert "--fresh" in other.err and "choose a different folder" in other.err
+    assert "--restart" in other.err and "choose a different folder" in other.err
 
 
 def third_if(there: Path, made: list[int]) -> Callable[[int, np.random.Generator], Job]:
@@ -529,7 +529,7 @@ def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots):
 
 
 def test_one_slot_too_few_names_what_it_is_for(files, lidarpool, tmp_path):
-    run = ["run", files / "c.yaml", "-q", "--out", files / "ds", "--wait", "0s"]
+    run = ["run", files / "c.yaml", "-q", "--out", files / "ds", "--startup-timeout", "0s"]
     with thread_cluster({"GPU": 1}, {"LIDAR": 4}) as few:
         refused = lidarpool(*run, "--scheduler", few.scheduler_address)
     assert refused.code == 2 and refused.err.count("\n") == 1
@@ -641,7 +641,7 @@ def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where)
     link = here / "ds" / where
     stranger = here / "stranger"
     before = lead_away(link, stranger)
-    for how in ("resume", "fresh"):
+    for how in ("resume", "restart"):
         with pytest.raises(LidarError) as caught:
             unwritten.run(here / "ds", client=client, **{how: True})
         assert f"{where} is a link" in str(caught.value)
@@ -706,7 +706,7 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
         (ds / name).parent.mkdir(exist_ok=True)
         (ds / name).write_text("mine")
         before = all_of(ds)
-        for how in ("fresh", "resume"):
+        for how in ("restart", "resume"):
             with pytest.raises(
                 LidarError, match=f"contains {name}, but a data set requires a separate folder"
             ):
@@ -714,12 +714,12 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
         assert before == all_of(ds) | {"run/run.db": before["run/run.db"]}
         (ds / name).unlink()
     (ds / "x").rmdir()
-    assert unwritten.run(ds, client=client, fresh=True).resumed == 0
+    assert unwritten.run(ds, client=client, restart=True).resumed == 0
     # An empty folder that is called run says nothing, nor does one that is called points.
     (here / "other" / "run").mkdir(parents=True)
     (here / "mine").mkdir()
     (here / "other" / "jobs").symlink_to(here / "mine")
-    for how in ("resume", "fresh", "overwrite"):
+    for how in ("resume", "restart", "overwrite"):
         with pytest.raises(LidarError, match=r"holds jobs: a data set|jobs is a link"):
             unwritten.run(here / "other", client=client, **{how: True})
     assert [*(here / "mine").iterdir()] == []
@@ -734,7 +734,7 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     Campaign(make, 2, keep=kept, splits={"a": 0.5, "b": 0.5}).run(ds, client=client)
     before = all_of(ds)
     other = Campaign(failing(1), 2, keep="folder")
-    for options in ({}, {"fresh": True}):
+    for options in ({}, {"restart": True}):
         with pytest.raises(LidarError, match=r"contains a finished data set, .* `--overwrite`"):
             other.run(ds, client=client, **options)
         assert all_of(ds) == before
@@ -744,13 +744,13 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
         other.run(ds, client=client, overwrite=True)
     (ds / "notes.txt").unlink()
     assert all_of(ds) == before
-    assert len(other.run(ds, client=client, fresh=True, overwrite=True).failed) == 1
+    assert len(other.run(ds, client=client, restart=True, overwrite=True).failed) == 1
     assert {name.split("/")[0] for name in all_of(ds)} == {
         "run", ".jobs", "jobs", "campaign.json", "dataset.json", "jobs.csv", "jobs.parquet",
         "README.md", "report.html", "report.csv", "report.json", "pictures",
     }  # fmt: skip
     with pytest.raises(LidarError, match="contains a finished data set"):
-        other.run(ds, client=client, fresh=True)
+        other.run(ds, client=client, restart=True)
 
 
 @pytest.mark.parametrize(
@@ -758,9 +758,9 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     [
         (["--job", 99], "Job 99 does not exist"),
         (["--resume", "--overwrite"], "`overwrite` cannot be combined with `resume`"),
-        (["--only", "cloud"], "cannot be used with campaigns"),
-        (["--resume", "--fresh"], "--fresh"),
-        (["--retry-failed", "--fresh"], "--fresh"),
+        (["--cloud-only"], "cannot be used with campaigns"),
+        (["--resume", "--restart"], "--restart"),
+        (["--retry-failed", "--restart"], "--restart"),
         (["--retry-failed", "--job", 1], "--retry-failed"),
     ],
 )
@@ -780,7 +780,7 @@ def test_several_scenarios_are_a_campaign(files, lidarpool, slots):
     done = lidarpool("run", *two, "-q", "--scheduler", slots, "--out", files / "ds")
     assert done.code == 0, done
     for path in two:
-        alone = ["--out", files / path.stem, "--only", "cloud"]
+        alone = ["--out", files / path.stem, "--cloud-only"]
         assert lidarpool("run", path, "-q", "--scheduler", slots, *alone).code == 0
         cloud = (files / path.stem / "cloud.ply").read_bytes()
         assert cloud == (files / "ds" / "jobs" / path.stem / "cloud.ply").read_bytes()
@@ -814,7 +814,7 @@ def test_killed_drivers_leave_the_same_bytes_and_no_remains(
     files, slots, whole, client, left_over, kills
 ):
     parts = files / "parts"
-    options = ["--resume", "-q", "--scheduler", slots, "--out", "ds", "--parts", str(parts)]
+    options = ["--resume", "-q", "--scheduler", slots, "--out", "ds", "--scratch-dir", str(parts)]
     ended = drive(files, kills, "c.yaml", *options)
     assert ended == [-9] * (len(kills) - 1) + [0]
     assert bytes_of(files / "ds") == whole

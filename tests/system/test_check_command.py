@@ -354,10 +354,10 @@ def test_options_describe_the_survey_of_a_mesh(cluster, tmp_path, lidarpool):
     )
     words = shlex.split(outcome.out.splitlines()[-1].partition("The scenario can be run: ")[2])
     assert words[:14] == ["lidarpool", "run", "there/my part.stl", *options[:11]]
-    assert lidarpool(*words[1:], "--only", "cloud", "--quiet").code == 0
+    assert lidarpool(*words[1:], "--cloud-only", "--quiet").code == 0
     # The scenario that init writes of the same options gives the same.
     assert lidarpool("init", "a/b", "--mesh", "there/my part.stl", *options).code == 0
-    of_scenario = ["--scheduler", cluster, "--out", "second", "--only", "cloud"]
+    of_scenario = ["--scheduler", cluster, "--out", "second", "--cloud-only"]
     assert lidarpool("run", "a/b/scenario.yaml", *of_scenario).code == 0
     for name in ("cloud.ply", "cloud.las"):
         made = [(tmp_path / f / name).read_bytes() for f in ("lidarpool-out", "second")]
@@ -409,14 +409,14 @@ def test_the_command_that_is_named_runs_where_another_result_is(
 ):
     first = SHORT | {"steps": 3}
     (tmp_path / "s.yaml").write_text(json.dumps(first))
-    given = ("--out", tmp_path / "out", "--only", "cloud", "--scheduler", cluster)
+    given = ("--out", tmp_path / "out", "--cloud-only", "--scheduler", cluster)
     assert lidarpool("run", tmp_path / "s.yaml", *given).code == 0
     for k, number in enumerate((2, 3), 4):  # a result of another survey is in the way each time
         outcome = check("--scheduler", cluster, text=json.dumps(SHORT | {"steps": k}))
         assert "holds the result of another survey" in outcome.out
         words = shlex.split(outcome.out.splitlines()[-1].partition("The scenario can be run: ")[2])
         assert str(tmp_path / f"out-{number}") in words
-        assert lidarpool(*words[1:], "--only", "cloud").code == 0
+        assert lidarpool(*words[1:], "--cloud-only").code == 0
 
 
 def test_workers_that_cast_are_no_gpus_without_any(check):

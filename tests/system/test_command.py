@@ -219,7 +219,7 @@ def test_verbose_shows_what_driver_and_workers_log(tmp_path):
     (tmp_path / "s.yaml").write_text(SHORT)
     # In a process of its own: the workers of the tests' cluster log elsewhere.
     ended = subprocess.run(
-        [*COMMAND, "run", "s.yaml", "-v", "-q", "--only", "cloud"],
+        [*COMMAND, "run", "s.yaml", "-v", "-q", "--cloud-only"],
         cwd=tmp_path, check=True, capture_output=True, text=True,
     )  # fmt: skip
     assert {"scheduler", "worker"} <= set(re.findall(r"distributed\.(\w+) - INFO", ended.stderr))
@@ -269,7 +269,7 @@ def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_p
     assert run("--quiet", "--pictures").code == 0
     assert json.loads((out / "report.json").read_text())["files"] == MADE
     assert names_in(out) == {*MADE} and hidden(out / "report.html") == ["intensity"]
-    outcome = run("--pictures", "--only", "cloud")
+    outcome = run("--pictures", "--cloud-only")
     assert outcome.code == 2 and "leaves out what --pictures draws" in outcome.err
 
 
@@ -292,7 +292,7 @@ def test_help_and_completion_load_nothing_of_a_run(words):
 @pytest.mark.extended
 @pytest.mark.parametrize(
     "arguments",
-    [["sensors"], pytest.param(["run", "s.yaml", "--only", "cloud", "-q"], marks=pytest.mark.slow)],
+    [["sensors"], pytest.param(["run", "s.yaml", "--cloud-only", "-q"], marks=pytest.mark.slow)],
 )
 def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
     (tmp_path / "s.yaml").write_text(PLAIN)
@@ -322,7 +322,7 @@ def test_a_timeline_says_when_each_step_ended_and_no_process_is_left(tmp_path):
     mark = f"LIDARPOOL_TEST_{os.getpid()}"
     (tmp_path / "scenario.yaml").write_text(SHORT)
     page = tmp_path / "timeline.html"
-    arguments = ["run", "scenario.yaml", "-q", "--only", "cloud", "--timeline", page]
+    arguments = ["run", "scenario.yaml", "-q", "--cloud-only", "--timeline", page]
     environment = {**os.environ, mark: "1"}
     began_s = time.monotonic()
     ended = subprocess.run(

@@ -20,7 +20,7 @@ def surveys(tmp_path_factory, cluster):
         (folder / f"{name}.yaml").write_text(SCENARIO + more)
         arguments = ["run", str(folder / f"{name}.yaml"), "--out", str(folder / name)]
         with pytest.raises(SystemExit) as ended:
-            main([*arguments, "--scheduler", cluster, "--only", "cloud", "-q"])
+            main([*arguments, "--scheduler", cluster, "--cloud-only", "-q"])
         assert ended.value.code == 0
     return folder
 

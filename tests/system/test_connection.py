@@ -55,7 +55,7 @@ def address():
 def waiting_run(tmp_path, address):
     """A run that waits for its scheduler, and has said so."""
     scenario = "sensor: {layers: 2, step_deg: 90}\nsteps: 2\nplanning: {enabled: false}\n"
-    options = ["--scheduler", address, "--wait", "10m", "--only", "cloud"]
+    options = ["--scheduler", address, "--startup-timeout", "10m", "--cloud-only"]
     run = RunningCommand(tmp_path, scenario, *options)
     yield run.wait_for(rf"note: waiting for the scheduler at {address} for up to 59\d s more: ")
     run.close()

@@ -288,4 +288,4 @@ def test_all_together_share_equal_files(built, tmp_path):
     together.pip("uninstall", "--yes", *shared)
     assert surveys(together, tmp_path).startswith("exit 1")
     together.pip("install", "--force-reinstall", "lidarpool")
-    assert "results in out: cloud.ply" in surveys(together, tmp_path, "--only", "cloud")
+    assert "results in out: cloud.ply" in surveys(together, tmp_path, "--cloud-only")

@@ -73,7 +73,7 @@ def test_a_partition_that_stays_empty_ends_the_run(tmp_path, monkeypatch):
     ):
         simulate(
             Scene.seed(), SURVEY, client=client, on_frame=on_frame, folder=tmp_path / "run",
-            patience_s=2.0,
+            worker_timeout_s=2.0,
         )  # fmt: skip
     assert '--resources "GPU=1"' in str(end.value)
     assert "of 180 scans are kept" in end.value.__notes__[0]

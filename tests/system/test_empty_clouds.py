@@ -45,7 +45,7 @@ def run(tmp_path, lidarpool, slots) -> Callable[..., Any]:
 
     def run(*options: object, out: str = "out", **changed: Any) -> Any:
         (tmp_path / "s.yaml").write_text(json.dumps(SURVEY | changed))
-        given = ("--out", tmp_path / out, "--scheduler", slots, "--only", "cloud")
+        given = ("--out", tmp_path / out, "--scheduler", slots, "--cloud-only")
         return lidarpool("run", tmp_path / "s.yaml", *given, *options)
 
     return run

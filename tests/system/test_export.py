@@ -32,7 +32,7 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
 ):
     (tmp_path / "s.yaml").write_text(SCENARIO)
     out = tmp_path / "out"
-    run = ("run", tmp_path / "s.yaml", "--out", out, "--scheduler", cluster, "--only", "cloud")
+    run = ("run", tmp_path / "s.yaml", "--out", out, "--scheduler", cluster, "--cloud-only")
     done = lidarpool(*run, "-q")
     assert done.code == 0, done.err
     made = {"cloud.ply", "sweeps.npz", "cloud.laz", "cloud.mcap", "kitti", "report.json"}
@@ -100,7 +100,7 @@ def test_instruments_have_files_and_topics_of_the_same_numbers(cluster, lidarpoo
     text = SCENARIO.replace("[ply, laz, {format: mcap, layout: ouster}, kitti]", "[mcap]")
     navigation = "navigation: {imu: {gyroscope_bias: 1.0e-3}, gnss: {horizontal_m: 0.1}}\n"
     scenario.write_text(text + navigation)
-    run = ("run", scenario, "--out", out, "--scheduler", cluster, "--only", "cloud", "-q")
+    run = ("run", scenario, "--out", out, "--scheduler", cluster, "--cloud-only", "-q")
     done = lidarpool(*run)
     assert done.code == 0, done.err
     measured = {"imu.csv", "gnss.csv"}
@@ -174,7 +174,7 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
 def many_files(lidarpool, tmp_path, address):
     """Run a survey that exports to KITTI, with a range for each sweep."""
     (tmp_path / "s.yaml").write_text(SCENARIO.replace("laz, {format: mcap, layout: ouster}, ", ""))
-    run = ("run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--only", "cloud", "-q")
+    run = ("run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--cloud-only", "-q")
     return lambda *more: lidarpool(*run, "--scheduler", address, *more)
 
 

@@ -64,8 +64,8 @@ def run(environment, cluster, lidarpool, tmp_path) -> Callable[..., Any]:
 
     def run(folder: str, *options: str, scheduler: str = cluster) -> Any:
         return lidarpool(
-            "run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--only", "cloud", "-q",
-            "--scheduler", scheduler, "--parts", f"{BUCKET}/{folder}", *options,
+            "run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--cloud-only", "-q",
+            "--scheduler", scheduler, "--scratch-dir", f"{BUCKET}/{folder}", *options,
         )  # fmt: skip
 
     return run
@@ -102,11 +102,11 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     Storage.at(f"{url}/pcd").write("000000.pcd", b"of an earlier result")
     Storage.at(url).write("path.png", b"of an earlier result")
     arguments = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--out", url]
-    refused = lidarpool(*arguments, "--only", "cloud", "-q")
+    refused = lidarpool(*arguments, "--cloud-only", "-q")
     assert (
         refused.code == 2 and "contains path.png, which does not belong to a result" in refused.err
     )
-    done = lidarpool(*arguments, "--only", "cloud", "--json", "-q", "--overwrite")
+    done = lidarpool(*arguments, "--cloud-only", "--json", "-q", "--overwrite")
     assert (done.code, done.err) == (0, "")
     out = Storage.at(url)
     assert Storage.at(f"{url}/run").sizes() == Storage.at(f"{url}/run/parts").sizes() == {}
@@ -137,7 +137,7 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     url = f"{BUCKET}/results/sweeps"
     here = tmp_path / "here"
     Storage.at(f"{url}/nuscenes").write("v1.0-lidarpool/map.json", b"of an earlier result")
-    run = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--only", "cloud", "-q"]
+    run = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--cloud-only", "-q"]
     run += ["--overwrite", "--out"]
     for place in (here, url):
         assert lidarpool(*run, place).code == 0
@@ -225,10 +225,11 @@ def test_forks_read_a_data_set_that_their_parent_has_opened(environment, format)
         ("s9://surveys/x", "Protocol not known: s9"),
     ],
 )
-@pytest.mark.parametrize("option", ["--out", "--parts"])
+@pytest.mark.parametrize("option", ["--out", "--scratch-dir"])
 def test_a_place_that_there_cannot_be(option, url, words, lidarpool, run, tmp_path):
-    refused = lidarpool("demo", "--out", url) if option == "--out" else run("", "--parts", url)
-    assert refused.code == 2 and (words in refused.err or option == "--parts")
+    is_out = option == "--out"
+    refused = lidarpool("demo", "--out", url) if is_out else run("", "--scratch-dir", url)
+    assert refused.code == 2 and (words in refused.err or option == "--scratch-dir")
     assert len(refused.err.splitlines()) == 1
     assert not (tmp_path / "out" / "run").exists()
 
@@ -269,7 +270,7 @@ def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
     here = tmp_path / "here"
     here.mkdir()
     (here / "s.yaml").write_text(RESUMED)
-    whole = ["--out", tmp_path / "whole", "--only", "cloud", "-q", "--scheduler", cluster]
+    whole = ["--out", tmp_path / "whole", "--cloud-only", "-q", "--scheduler", cluster]
     assert lidarpool("run", here / "s.yaml", *whole).code == 0
     often = "import lidarpool.run.store.remote as r, lidarpool.run.run_loop as run\n"
     often += "r.COPY_EVERY_S = r.COPY_REST = run.SAVE_EVERY_S = 0\n"

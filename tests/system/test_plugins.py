@@ -76,7 +76,7 @@ def test_a_survey_by_plugins_of_each_kind(tmp_path, installed):
     file.write_text(yaml.safe_dump(scenario))
     mesh_file = json.loads(lidarpool("schema"))["$defs"]["MeshFile"]
     assert mesh_file["properties"]["grow_m"]["maximum"] == 10
-    lidarpool("run", "walk/scenario.yaml", "--out", "result", "--only", "cloud", "--quiet")
+    lidarpool("run", "walk/scenario.yaml", "--out", "result", "--cloud-only", "--quiet")
 
     cloud = read_cloud(tmp_path / "result" / "cloud.ply")
     [sweep] = sorted((tmp_path / "result" / "npy").iterdir())
@@ -98,7 +98,7 @@ def test_a_worker_without_the_plugin_is_named(tmp_path, monkeypatch, installed, 
     scenario = {"scene": {"files": "hall.boxes"}, "sensor": "acme/x1", "poses": [[0, 0, 1.8]]}
     text = yaml.safe_dump({**scenario, "output": {"write": ["npy"]}})
     (tmp_path / "scenario.yaml").write_text(text)
-    options = "--only", "cloud", "--quiet", "--scheduler", client.scheduler.address
+    options = "--cloud-only", "--quiet", "--scheduler", client.scheduler.address
     outcome = lidarpool("run", "scenario.yaml", *options)
     assert outcome.code == 2
     [line] = outcome.err.splitlines()
@@ -144,7 +144,7 @@ def test_a_worker_that_cannot_import_the_plugin_is_named(tmp_path, monkeypatch, 
     client.run(sys_path_with, str(folder))
     try:
         (tmp_path / "scenario.yaml").write_text("scene: seed\noutput: {write: [alone]}")
-        options = "--only", "cloud", "--quiet", "--scheduler", client.scheduler.address
+        options = "--cloud-only", "--quiet", "--scheduler", client.scheduler.address
         outcome = lidarpool("run", "scenario.yaml", *options)
     finally:
         client.run(sys_path_without, str(folder))

@@ -85,7 +85,7 @@ class Command(RunningCommand):
     ) -> None:
         (folder / "cluster.yaml").write_text(yaml.safe_dump(cluster))
         self.out = folder / ("out" if cluster else "local")
-        options = ["--out", str(self.out), "--backend", "numpy", "--only", "cloud"]
+        options = ["--out", str(self.out), "--backend", "numpy", "--cloud-only"]
         options += ["--cluster", "cluster.yaml"] if cluster else []
         super().__init__(folder, yaml.safe_dump(scenario), *options)
 

@@ -98,7 +98,8 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     refused = lidarpool(*arguments)
     assert (refused.code, refused.out) == (2, "")
     assert re.fullmatch(
-        rf"lidarpool: \S+/out/run {KEPT} `--resume` \(.*\), or remove it with `--fresh` \(.*\)\.\n",
+        rf"lidarpool: \S+/out/run {KEPT} `--resume` \(.*\), "
+        r"or remove it with `--restart` \(.*\)\.\n",
         refused.err,
     )
     path, *rest = arguments[1:]
@@ -107,15 +108,15 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     assert other.code == 2 and "the planning has changed: " in other.err
     wrong = lidarpool(*arguments, "--resume", "--backend", "tiles")
     assert wrong.code == 2 and "were cast with the backend 'numpy', so" in wrong.err
-    both = lidarpool(*arguments, "--resume", "--fresh")
+    both = lidarpool(*arguments, "--resume", "--restart")
     assert both.code == 2 and "cannot be combined" in both.err
     assert committed(out / "run") == before
 
-    shutil.copytree(out, tmp_path / "fresh")
-    dropped = lidarpool(*arguments, "--fresh", "--out", tmp_path / "fresh")
+    shutil.copytree(out, tmp_path / "restart")
+    dropped = lidarpool(*arguments, "--restart", "--out", tmp_path / "restart")
     assert (dropped.code, dropped.err) == (0, "")
-    assert (tmp_path / "fresh" / "cloud.ply").read_bytes() == undisturbed
-    assert report_of(tmp_path / "fresh")["resumed_scans"] == 0
+    assert (tmp_path / "restart" / "cloud.ply").read_bytes() == undisturbed
+    assert report_of(tmp_path / "restart")["resumed_scans"] == 0
 
     # Parts that are gone are made again; and the backend of the others is taken.
     (part,) = (out / "run" / "parts").glob("*-{:08d}-{:08d}.npz".format(*before[0]))
@@ -133,7 +134,7 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
 def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
     (tmp_path / "s.yaml").write_text("scene: seed\nsensor: {layers: 4}\n")
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
-    done = lidarpool(*arguments, "--only", "cloud", "-q", "--resume")
+    done = lidarpool(*arguments, "--cloud-only", "-q", "--resume")
     assert (done.code, done.err) == (0, "")
     assert f"note: {tmp_path / 'out'} contained no unfinished run to resume" in done.out
 

@@ -66,7 +66,7 @@ def test_slots_that_are_gone_are_not_waited_for_forever(cluster, monkeypatch, le
             LidarError,
             match=r"'LIDAR' has had 4 slots for 0 s, but the run needs 7\. Start another",
         ):
-            simulate(Scene.seed(), SURVEY, client=client, collectors=5, patience_s=0.5)
+            simulate(Scene.seed(), SURVEY, client=client, collectors=5, worker_timeout_s=0.5)
         assert left_over(client) == ([], [], [])
 
 

@@ -704,7 +704,7 @@ def test_killed_drivers_of_a_shard_leave_the_same_points(tmp_path, slots):
 @pytest.mark.slow
 def test_the_first_shard_plans_though_it_has_no_scans(tmp_path, lidarpool, slots):
     (tmp_path / "s.yaml").write_text(SURVEY.replace("steps: 25", "steps: 1"))  # two scans
-    run = ["run", tmp_path / "s.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
+    run = ["run", tmp_path / "s.yaml", "-q", "--scheduler", slots, "--cloud-only"]
     parts = [tmp_path / f"part-{number}" for number in (1, 2, 3)]
     for number, part in enumerate(parts, 1):
         assert lidarpool(*run, "--shard", f"{number}/3", "--out", part).code == 0

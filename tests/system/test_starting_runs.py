@@ -130,7 +130,7 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
 
         comes = threading.Timer(0.5, cluster.add, [("GPU", 1)])
         comes.start()
-        assert run(wait_s=300) > 0
+        assert run(startup_timeout_s=300) > 0
         comes.join()
         lose_gpu(lambda: cluster.kill("scheduler"))
         with pytest.raises(LidarError, match=f"{cluster.address} is no longer reachable"):
@@ -160,11 +160,11 @@ def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_p
         kinds = {GPU: {"adapt": [0, 1]}, LIDAR: {"adapt": [0, 1], "slots": 4}}
         start_partitions(cluster, kinds, told.append)
         with Client(cluster) as client, pytest.raises(LidarError) as caught:
-            simulate(Scene.seed(), SURVEY, client=client, wait_s=5.0)
+            simulate(Scene.seed(), SURVEY, client=client, startup_timeout_s=5.0)
     assert len(submitted) == 2  # they may wait in the queue: no others in their place
     assert "has no workers" in str(caught.value)
     assert caught.value.__notes__ == [
         "2 jobs are in the queue or starting. If they are only waiting in the queue, increase "
-        "`--wait`."
+        "`--startup-timeout`."
     ]
     assert told == [f"The last line of the log {tmp_path}/gpu-1.err is: no module named lidarpool"]

@@ -254,7 +254,7 @@ def test_errors_are_told_in_a_line(cluster_client):
         Client(cluster, set_as_default=False) as client,
         pytest.raises(LidarError, match="GPU"),
     ):
-        next(iter(campaign().stream(client=client, wait_s=0)))
+        next(iter(campaign().stream(client=client, startup_timeout_s=0)))
 
 
 def test_a_cluster_that_is_lost_ends_it():

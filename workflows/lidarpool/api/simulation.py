@@ -36,7 +36,7 @@ from .result import Result
 
 # Options without a meaning in a call: a survey has no data set, a campaign plans no paths, and its
 # run is stored beside the data set; a stream stores nothing and has no stages 1 and 4.
-_NOT_OF_SURVEYS = ("fresh", "retry_failed", "verify", "overwrite")
+_NOT_OF_SURVEYS = ("restart", "retry_failed", "verify", "overwrite")
 _NOT_OF_CAMPAIGNS = ("folder", "other_workers", "pace")
 _NOT_OF_STREAMS = (
     *_NOT_OF_SURVEYS,
@@ -102,7 +102,7 @@ def simulate(
         Number of workers in a local cluster. The defaults depend on the machine.
     tls
         Whether to encrypt the traffic of a local cluster with a new certificate.
-    wait_s, patience_s
+    startup_timeout_s, worker_timeout_s
         Time in seconds to wait for partitions that have no workers at the start, and for partitions
         that lose all their workers later. To wait for a scheduler, use ``Client(address,
         timeout=600)``.
@@ -189,11 +189,11 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         gpu_workers
             Number of casting workers in a local cluster. By default, the number is taken from the
             scenario.
-        parts
+        scratch_dir
             Location of the points during the run, as for `simulate`.
         resume
             Whether to continue an unfinished run in `out`. If there is none, a new run is started.
-        fresh
+        restart
             Whether to remove an unfinished run of a campaign in `out` first.
         retry_failed
             Whether to resume the run and repeat the jobs that have failed.
@@ -201,12 +201,12 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             Whether to resume the run and compare every byte of the finished jobs. Jobs with
             different bytes are damaged and are repeated.
         overwrite
-            Whether to replace a finished data set. Together with `fresh`, a data set with failed
+            Whether to replace a finished data set. Together with `restart`, a data set with failed
             jobs is replaced, too.
         live
             Whether to show the jobs in the browser, as `lidarpool run --live` does, or in the cell
             of a notebook. "foxglove" and "rerun" show sweeps of the jobs in Foxglove and Rerun.
-        tls, wait_s, patience_s
+        tls, startup_timeout_s, worker_timeout_s
             As for `simulate`.
 
         Returns
@@ -257,7 +257,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         client
             Client of a cluster whose workers declare the resource GPU. By default, each loop starts
             a local cluster and stops it at the end.
-        backend, batch_mb, gpu_workers, tls, wait_s, patience_s
+        backend, batch_mb, gpu_workers, tls, startup_timeout_s, worker_timeout_s
             As for `run`.
 
         Returns

@@ -73,7 +73,7 @@ def _read(path: Path) -> str:
     if not path.exists():
         raise MissingFileError(
             f"The scheduler file {path} does not exist. Start the scheduler with "
-            f"`dask scheduler --scheduler-file {path}`, or increase `--wait`."
+            f"`dask scheduler --scheduler-file {path}`, or increase `--startup-timeout`."
         )
     failure = f"The scheduler file {path} cannot be read"
     with explained(failure):

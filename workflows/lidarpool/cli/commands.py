@@ -62,7 +62,7 @@ _common_options = shared.combine(
         "Foxglove or in Rerun, until Ctrl-C.",
     ),
     click.option(
-        "--no-stay",
+        "--exit",
         "stay",
         flag_value=False,
         default=True,
@@ -75,8 +75,8 @@ _common_options = shared.combine(
         help="With --live, show frames in order at this multiple of the scanner's rate (default: "
         "as soon as they are cast). Not for campaigns.",
     ),
-    click.option(
-        "--only", type=click.Choice(["cloud"]), help="Write only the point cloud and report.json."
+    shared.flag(
+        "--cloud-only", help="Write only the point cloud and report.json, without report.html."
     ),
     shared.flag("--overwrite", help="Overwrite the result of a different survey, or a data set."),
     shared.path(
@@ -116,17 +116,17 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
         verbose: bool,
         as_json: bool,
         cluster: Path | None = None,
-        only: str | None,
+        cloud_only: bool,
         strict: bool,
         pictures: bool = False,
         timeline: Path | None = None,
         **settings: Any,
     ) -> None:
-        if only and pictures:
-            raise click.UsageError("`--only` and `--pictures` cannot be combined.")
+        if cloud_only and pictures:
+            raise click.UsageError("`--cloud-only` and `--pictures` cannot be combined.")
         if settings.get("pace") and not settings.get("live"):
             raise click.UsageError("`--pace` requires `--live`.")
-        settings["extent"] = "pictures" if pictures else only
+        settings["extent"] = "pictures" if pictures else "cloud" if cloud_only else None
         begin(f"reading the {'data set' if settings.get('verify') else 'scene'}", quiet=quiet)
         from ..base import timeline as steps
         from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
@@ -146,8 +146,8 @@ def _with_run_options(command: Callable[..., None]) -> Callable[..., None]:
             set_logs(verbose)
             run_settings: dict[str, Any] = {}
             if cluster is not None:
-                run_settings = {"cluster": ClusterFile.load(cluster), "wait_s": QUEUE_S}
-                run_settings["patience_s"] = QUEUE_S
+                run_settings = {"cluster": ClusterFile.load(cluster), "startup_timeout_s": QUEUE_S}
+                run_settings["worker_timeout_s"] = QUEUE_S
             # A scenario may give the backend, too.
             names = {field.name for field in fields(RunOptions)} - {"backend"}
             run_settings |= {
@@ -264,7 +264,7 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
 @shared.backend
 @shared.flag("--pictures", help="Draw pictures of the result; lidarpool plot can do this later.")
 @shared.flag("--resume", help="Resume an unfinished run, if there is one.")
-@shared.flag("--fresh", help="Discard an unfinished run and start again.")
+@shared.flag("--restart", help="Discard an unfinished run and start again.")
 @shared.flag("--retry-failed", help="Run the failed jobs of a campaign again.")
 @shared.flag(
     "--verify",
@@ -273,21 +273,21 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
 @shared.job
 @shared.shard
 @click.option(
-    "--parts",
+    "--scratch-dir",
     metavar="PLACE",
     help="Folder or URL (s3://…) where LIDAR workers store points during the run.",
 )
 @click.option(
-    "--wait",
-    "wait_s",
+    "--startup-timeout",
+    "startup_timeout_s",
     type=_seconds,
     metavar="TIME",
     help="How long to wait for the scheduler and for workers at startup, such as 90s or 10m "
     f"(default: {WAIT_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
 )
 @click.option(
-    "--patience",
-    "patience_s",
+    "--worker-timeout",
+    "worker_timeout_s",
     type=_seconds,
     metavar="TIME",
     help="How long to wait for new workers if a partition loses all of its workers during the run "
@@ -333,12 +333,12 @@ def run(
     from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
 
-    if options.fresh and (options.resume or options.verify):
-        raise click.UsageError("`--fresh` cannot be combined with `--resume` or `--verify`.")
+    if options.restart and (options.resume or options.verify):
+        raise click.UsageError("`--restart` cannot be combined with `--resume` or `--verify`.")
     if number is not None and settings["shard"] is not None:
         raise click.UsageError("`--job` and `--shard` cannot be combined.")
-    if options.retry_failed and (options.fresh or number is not None):
-        raise click.UsageError("`--retry-failed` cannot be combined with `--fresh` or `--job`.")
+    if options.retry_failed and (options.restart or number is not None):
+        raise click.UsageError("`--retry-failed` cannot be combined with `--restart` or `--job`.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))
@@ -356,7 +356,7 @@ def run(
         if number is not None:
             run_job(campaign, number, terminal, options, backend, extent)
         elif extent is not None:
-            raise click.UsageError("`--only` and `--pictures` cannot be used with campaigns.")
+            raise click.UsageError("`--cloud-only` and `--pictures` cannot be used with campaigns.")
         else:
             run_campaign(campaign.of_shard(settings["shard"] or ALL), terminal, options, backend)
     elif options.retry_failed or options.verify or number is not None:

@@ -403,7 +403,7 @@ def view(
     help="Distance threshold in meters for the F-score; can be repeated.",
 )
 @click.option(
-    "--most-points",
+    "--max-points",
     type=int,
     default=10_000_000,
     show_default=True,
@@ -454,7 +454,10 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
 )
 @click.option("--intensity", metavar="COLUMN", help="Column that contains the intensity.")
 @click.option(
-    "--white", type=float, help="Intensity of a white surface, if it does not depend on the range."
+    "--white-intensity",
+    "white",
+    type=float,
+    help="Intensity of a white surface, if it does not depend on the range.",
 )
 @options.as_json
 def fit(
@@ -468,7 +471,7 @@ def fit(
     \b
     Examples:
       lidarpool fit recording.pcap --model velodyne/vlp16 --out my-vlp16.yaml
-      lidarpool fit sweeps --white 255 --out mine.yaml
+      lidarpool fit sweeps --white-intensity 255 --out mine.yaml
       lidarpool fit recording.mcap --scene hall.glb --pose 2,0,1.5 --out mine.yaml
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory

@@ -213,7 +213,7 @@ def scheduler(command: Command) -> Command:
         files = TlsFiles(*(settings.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
         file = settings.pop("scheduler_file")
         _check_combination(settings, file, files)
-        address = _scheduler_address(settings["scheduler"], file, settings.get("wait_s"))
+        address = _scheduler_address(settings["scheduler"], file, settings.get("startup_timeout_s"))
         if address is not None:
             check_certificates(address, files)
         command(*arguments, files=files, **settings | {"scheduler": address})
@@ -270,13 +270,15 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
             input_size(pem)
 
 
-def _scheduler_address(given: str | None, file: Path | None, wait_s: float | None) -> str | None:
+def _scheduler_address(
+    given: str | None, file: Path | None, startup_timeout_s: float | None
+) -> str | None:
     """Return the address of --scheduler or --scheduler-file, after checking it."""
     if given is not None and is_scheduler_file(given):
         file = Path(given)
     if file is not None:
         return read_scheduler_file(
-            file, wait_s or 0.0, lambda text: click.echo(f"note: {text}", err=True)
+            file, startup_timeout_s or 0.0, lambda text: click.echo(f"note: {text}", err=True)
         )
     if given is not None:
         check_address(given)

@@ -70,7 +70,7 @@ def _share(text: str) -> float:
     ),
 )
 @options.path(
-    "--of",
+    "--cloud",
     "cloud",
     help="Compare the stations in SCENARIO with this result or cloud; no stations are chosen.",
 )
@@ -79,7 +79,7 @@ def _share(text: str) -> float:
     "within_m",
     default=0.1,
     metavar="M",
-    help="With --of, the distance from a point within which a surface is covered, in meters.",
+    help="With --cloud, the distance from a point within which a surface is covered, in meters.",
 )
 @click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
 @click.option(
@@ -136,7 +136,7 @@ def stations(
     is by area, of what any of these places sees of the objects to cover. A scenario with the
     stations is written, and a picture of what they cover.
 
-    With --of, the stations of the scenario are taken, and of the area that they see, the share
+    With --cloud, the stations of the scenario are taken, and of the area that they see, the share
     near points of a result, or of any cloud that `lidarpool compare` reads.
 
     \b
@@ -145,7 +145,7 @@ def stations(
       lidarpool stations site.glb --sensor riegl-vz400 --coverage 95% --target "Wall*" --target Roof
       lidarpool stations hall.stl --sensor riegl-vz400 --unit mm --up-axis y
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
-      lidarpool stations hall-stations/stations.yaml --of hall-scan
+      lidarpool stations hall-stations/stations.yaml --cloud hall-scan
     """  # noqa: D301 - click wants the character, not its name
     if settings["count"] is not None and settings["coverage"] is not None:
         raise click.UsageError("`--count` and `--coverage` cannot be combined.")
@@ -226,7 +226,7 @@ def _refuse_beside_cloud(scene: Path, settings: dict[str, Any]) -> None:
     }
     if unused := [f"`{name}`" for name, value in chosen.items() if value is not None]:
         raise click.UsageError(
-            f"{joined(unused)} cannot be used with `--of`, which takes the stations and the "
+            f"{joined(unused)} cannot be used with `--cloud`, which takes the stations and the "
             f"sensor from {scene}."
         )
 
@@ -247,7 +247,7 @@ def _show_coverage(
 
     if scenario.poses is None:
         raise LidarError(
-            "`--of` requires a scenario with stations, but the scenario has no poses. Use "
+            "`--cloud` requires a scenario with stations, but the scenario has no poses. Use "
             "the file stations.yaml from lidarpool stations, or set `poses` to the stations "
             "of the scan."
         )
@@ -256,7 +256,7 @@ def _show_coverage(
     built, notes = _built_with_notes(scenario, terminal)
     if len(built.survey.carried) > 1:
         raise LidarError(
-            "`--of` compares the scan of a single sensor, but the scenario has several sensors."
+            "`--cloud` compares the scan of a single sensor, but the scenario has several sensors."
         )
     positions = _station_positions(built)
     clouds = (

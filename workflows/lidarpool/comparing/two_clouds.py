@@ -49,7 +49,7 @@ def compare(
     keep_noise: bool = False,
     azimuth_deg: Annotated[float, Field(gt=0, le=90)] | None = None,
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
-    most_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
+    max_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
 ) -> Comparison:
     """Compare two clouds or recordings of the same place.
 
@@ -86,7 +86,7 @@ def compare(
     distances_m
         Distances in meters within which a point counts as present in the other cloud, for precision
         and recall.
-    most_points
+    max_points
         Maximum number of points of each cloud in memory. Larger clouds are subsampled evenly.
 
     Returns
@@ -133,8 +133,8 @@ def compare(
         f"{cloud.name} has no sweeps. All points are compared at once in world coordinates, "
         "by distances and intensities only"
     )
-    points_a = comparing.read_cloud(first, most_points)
-    points_b = comparing.read_cloud(second, most_points)
+    points_a = comparing.read_cloud(first, max_points)
+    points_b = comparing.read_cloud(second, max_points)
     if max(len(points_a), len(points_b)) > MAX_VALUES:
         comparing.note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
     comparing.add_points(points_a, points_b, MAX_VALUES)

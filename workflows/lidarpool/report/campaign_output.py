@@ -93,7 +93,7 @@ class DataSetOutput(Output[CampaignRun]):
         run_folder = storage.below(RUN_FOLDER)
         entries = storage.entries()
         unfinished = FILE in run_folder.sizes()
-        starts_anew = options.fresh or options.overwrite
+        starts_anew = options.restart or options.overwrite
         if not run.resume and (starts_anew or not unfinished):
             if INDEX_FILE in entries and not options.overwrite:
                 raise LidarError(

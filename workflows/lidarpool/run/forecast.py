@@ -351,7 +351,7 @@ def _folder_notes(location: Path | Storage) -> list[str]:
     unfinished = FILE in Storage.at(location).below(RUN_FOLDER).sizes()
     note = (
         f"{location} contains an unfinished run. Continue it with `--resume`, or delete it with "
-        "`--fresh`"
+        "`--restart`"
     )
     return [note] if unfinished else []
 

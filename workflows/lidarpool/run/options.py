@@ -38,9 +38,9 @@ class RunOptions(TaskOptions):
     # Folder of the run's store until the result is complete; None for a temporary folder that is
     # deleted with the last user of the points.
     folder: str | Path | Storage | None = None
-    parts: str | Path | None = None
+    scratch_dir: str | Path | None = None
     resume: bool = False
-    fresh: bool = False
+    restart: bool = False
     retry_failed: bool = False
     verify: bool = False
     overwrite: bool = False
@@ -51,8 +51,8 @@ class RunOptions(TaskOptions):
     tls: bool = False
     gpu_workers: int | None = None
     other_workers: int | None = None
-    wait_s: Annotated[float, Field(ge=0)] = WAIT_S
-    patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
+    startup_timeout_s: Annotated[float, Field(ge=0)] = WAIT_S
+    worker_timeout_s: Annotated[float, Field(ge=0)] = PATIENCE_S
     live: Live = False
     pace: Annotated[float | None, Field(gt=0)] = None  # speed of frames; 1 is that of the scanner
     stay: bool = True  # False if the live page, or viewer, ends with the run
@@ -88,9 +88,9 @@ class RunKeywords(TypedDict, total=False):
     batch_mb: int
     backend: Literal[BACKENDS] | None  # type: ignore[valid-type]
     folder: str | Path | Storage | None
-    parts: str | Path | None
+    scratch_dir: str | Path | None
     resume: bool
-    fresh: bool
+    restart: bool
     retry_failed: bool
     verify: bool
     overwrite: bool
@@ -98,8 +98,8 @@ class RunKeywords(TypedDict, total=False):
     tls: bool
     gpu_workers: int | None
     other_workers: int | None
-    wait_s: float
-    patience_s: float
+    startup_timeout_s: float
+    worker_timeout_s: float
     live: Live
     pace: float | None
 

@@ -100,7 +100,7 @@ class RunLoop:
             mark,
             queue_capacity=options.queue_capacity,
             collectors=options.collectors,
-            patience_s=options.patience_s,
+            patience_s=options.worker_timeout_s,
         )
         gpus = cluster.partitions[GPU]
         workers = CastingWorkers(gpus, run_id, cluster.backend, cluster.software)

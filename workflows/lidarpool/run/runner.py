@@ -181,21 +181,21 @@ class Run(Generic[R]):
             self.stack.push(self._local)
 
     def _lock_output(self) -> None:
-        if (self.options.fresh or self.options.overwrite) and self.resume:
+        if (self.options.restart or self.options.overwrite) and self.resume:
             raise LidarError(
-                "`fresh` and `overwrite` cannot be combined with `resume`, `retry_failed` or "
+                "`restart` and `overwrite` cannot be combined with `resume`, `retry_failed` or "
                 "`verify`, because they remove the run that these options continue."
             )
         self.stack.enter_context(self.output.held())
 
     def _open_store(self) -> None:
         options = self.options
-        if options.fresh and options.folder is not None:
+        if options.restart and options.folder is not None:
             remove_run(options.folder)
         checking = "checking the points of the earlier run"
         with self.screen.status(checking) if self.continues_run else nullcontext():
             self.store = RunStore(
-                self.jobs, options.backend, options.folder, options.parts, resume=self.resume
+                self.jobs, options.backend, options.folder, options.scratch_dir, resume=self.resume
             )
         # A task of a batch queue resumes its shard whether the shard has begun or not.
         explained = self.store.committed_in_words or self.store.notes or self.jobs.shard != ALL

@@ -88,7 +88,7 @@ class SweepStream:
         screen = Screen()
         if options.starts_workers:
             check_backend_here(options.backend)
-        waiting = Waiting(options.wait_s, screen.tell)
+        waiting = Waiting(options.startup_timeout_s, screen.tell)
         with client_of(options, {GPU: 1}, waiting, screen) as client:
             try:
                 with closing(_Casting(self, client, waiting)) as casting:
@@ -186,7 +186,7 @@ class _Casting:
         run = uuid.uuid4().hex[:8]
         self._casting = CastingWorkers(partition, run, workers.backend, workers.software)
         self._dispatcher = Dispatcher(self._casting, self, "")
-        self._watch = Watch(client, [GPU], (), options.patience_s)
+        self._watch = Watch(client, [GPU], (), options.worker_timeout_s)
         self._orders: list[CollectOrder] = []  # orders for columns to be fetched
         columns = stream.campaign.keep.of_jobs.needs
         self._maker = JobMaker(stream.campaign, stream.numbers, columns)

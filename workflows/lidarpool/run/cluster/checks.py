@@ -108,7 +108,7 @@ def find_workers(
                 if coming:
                     error.add_note(
                         f"{queued(coming)}. If they are only waiting in the queue, increase "
-                        "`--wait`."
+                        "`--startup-timeout`."
                     )
                 raise
             # Without the advice to start workers: a user who waits has started some.
@@ -258,7 +258,7 @@ def common_software(
         raise LidarError(
             "The run was started with different software than the casting workers have. "
             f"The worker at {address} has {difference(installed, earlier)}. Continue the run with "
-            "the earlier software, or remove it with `--fresh` (`remove_run` in Python)."
+            "the earlier software, or remove it with `--restart` (`remove_run` in Python)."
         )
     counts = Counter(tuple(answer.items()) for answer in answers.values())
     common = max(counts, key=lambda items: (counts[items], items))

@@ -91,7 +91,7 @@ class Cluster:
         required_slots = slots_needed(options, planning=first.planning is not None, writing=writing)
         if options.cluster is not None:
             options.cluster.require(required_slots)
-        waiting = Waiting(options.wait_s, screen.tell)
+        waiting = Waiting(options.startup_timeout_s, screen.tell)
         self.client = client = enter(client_of(options, required_slots, waiting, screen, local))
         timeline.mark(timeline.WORKERS)
         self.options = options
@@ -170,7 +170,7 @@ class Cluster:
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
         """Watch workers of partitions from now on (`Watch`)."""
-        return Watch(self.client, names, lasting, self.options.patience_s, self._screen.tell)
+        return Watch(self.client, names, lasting, self.options.worker_timeout_s, self._screen.tell)
 
     def check(self, job: Job) -> None:
         """Raise JobError if the workers have too little memory for a job."""

@@ -65,8 +65,8 @@ class Watch:
 
     Dask itself would wait for ever. The workers of the partitions `names` get new tasks during the
     run; tasks of `lasting` partitions last as long as the run, so their workers need not take more.
-    A partition may be empty for `patience_s`; `tell` is called every few seconds with a message
-    meanwhile.
+    A partition may be empty for `worker_timeout_s`. Meanwhile, `tell` is called every few seconds
+    with a message.
     """
 
     def __init__(
@@ -74,14 +74,14 @@ class Watch:
         client: Client,
         names: Iterable[str],
         lasting: Iterable[str] = (),
-        patience_s: float = PATIENCE_S,
+        worker_timeout_s: float = PATIENCE_S,
         tell: Callable[[str], None] = lambda words: None,
     ) -> None:
         self.client = client
         self.lasting = frozenset(lasting)
         self._tell = tell
         # {partition: time that it may be without workers}
-        self._waits = {name: Waiting(patience_s, tell) for name in (*names, *self.lasting)}
+        self._waits = {name: Waiting(worker_timeout_s, tell) for name in (*names, *self.lasting)}
         self._looked = float("-inf")
         self.notes: list[str] = []  # notes for the user on workers that Dask has paused
 

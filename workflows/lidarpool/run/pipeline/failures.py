@@ -61,7 +61,7 @@ def naming_scans(first: int, stop: int) -> Iterator[None]:
 
 def storing(storage: Storage) -> AbstractContextManager[None]:
     """Turn an OSError of the body into a LidarError with advice on storage."""
-    advice = "Free space there, or choose a different location with `--parts`"
+    advice = "Free space there, or choose a different location with `--scratch-dir`"
     return explained(f"The points cannot be stored in {storage.url}", advice)
 
 

@@ -381,7 +381,7 @@ def _explained(path: Path) -> Iterator[None]:
         of_disk = any(phrase in words.lower() for phrase in _DISK_ERRORS)
         if not isinstance(error, sqlite3.OperationalError) or not of_disk:
             raise DamagedError(
-                f"{path} is damaged ({words}). Remove the run with `--fresh`, or choose a "
+                f"{path} is damaged ({words}). Remove the run with `--restart`, or choose a "
                 "different folder."
             ) from error
         if "locked" in words:

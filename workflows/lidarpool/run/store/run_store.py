@@ -46,7 +46,7 @@ _AND_OTHERS = "and others"
 
 # On the command line, and in Python.
 _RESUME = "`--resume` (`resume=True` in Python)"
-_DROP = "`--fresh` (`remove_run` in Python)"
+_DROP = "`--restart` (`remove_run` in Python)"
 
 
 class _EarlierDatabase(NamedTuple):
