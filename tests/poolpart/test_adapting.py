@@ -268,7 +268,7 @@ def test_what_a_client_wants_ends_with_it(queue, wait_until):
             assert len(gpu) == 2
             gpu.want(1)
             wait_until(lambda: len(gpu) == 1)
-            with pytest.raises(PoolError, match="wanted is -1"):
+            with pytest.raises(PoolError, match="value -1 for the number of requested slots"):
                 gpu.want(-1)
         wait_until(lambda: len(Partition("GPU", client)) == 0)
 

@@ -112,5 +112,5 @@ async def coroutine(number=0):
 @pytest.mark.parametrize("method", ["submit", "map"])
 def test_coroutine_functions_are_refused(client, method):
     arguments = () if method == "submit" else ([1, 2],)
-    with pytest.raises(PoolError, match="coroutine is a coroutine function"):
+    with pytest.raises(PoolError, match="'coroutine' is a coroutine function"):
         getattr(Partition("A", client), method)(coroutine, *arguments)

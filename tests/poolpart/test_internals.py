@@ -175,7 +175,8 @@ except PoolError as error:
 def test_without_what_division_needs_it_is_refused_at_once():
     printed = without("distributed.worker_state_machine:WorkerState.all_running_tasks", DIVIDE)
     assert re.match(
-        r"refused: distributed .* lacks WorkerState.all_running_tasks, so dividing a pool is off",
+        r"refused: distributed .* has no WorkerState.all_running_tasks, which poolpart requires "
+        r"for dividing a pool\.",
         printed,
     )
 
