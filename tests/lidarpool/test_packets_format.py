@@ -128,7 +128,7 @@ def test_a_scenario_that_writes_packets_keeps_what_they_hold():
     assert {"ray", "range", "reflectivity"} <= {column.name for column in survey.stored_columns}
     assert survey.keep_every == 1
     for sections, says in (
-        ({}, r"has no packets: use a model with packets, .*ot128, .* vls128"),
+        ({}, r"has no packet format. Use one of these models:  .*ot128, .* vls128"),
         (
             {"sensor": "velodyne/vlp16", "returns": {"mode": "first"}},
             r"not first: set returns.mode",

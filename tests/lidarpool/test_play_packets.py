@@ -213,7 +213,9 @@ def test_a_killed_sender_ends_the_command_in_a_line(receiver, tmp_path):
             os.kill(child, signal.SIGKILL)
         _, errors = run.communicate(timeout=60)
     assert run.returncode == 2
-    assert "lidarpool: The process that sends packets has ended: play again." in errors
+    assert (
+        "lidarpool: The process that sends packets has stopped. Start the playback again." in errors
+    )
     assert "Traceback" not in errors
 
 

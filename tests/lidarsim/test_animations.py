@@ -205,7 +205,7 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
          "cannot reshape"),
         (lambda h: h["accessors"][-2].update(count=1), "Move", "without a duration"),
         (lambda h: h["nodes"][2].update(matrix=np.eye(4).ravel().tolist()), "Move",
-         "node 2 is animated, and has a matrix"),
+         "node 2 is animated but has a matrix"),
         (lambda h: h["animations"][0]["samplers"][0].update(input=0), "Move", "do not ascend"),
         (lambda h: h["animations"][0]["channels"][0]["target"].update(node=9), "Move",
          "refers to number 9 of its nodes"),

@@ -140,7 +140,7 @@ def one_line(raised):
     ("sensor", "mode", "says"),
     [
         (Sensor.grid(), "strongest", "Sensor with 40 channels has no packets: .* vlp16"),
-        (load_sensor("hdl64e-s3"), "strongest", "has no packets: use a model with packets, "),
+        (load_sensor("hdl64e-s3"), "strongest", "has no packet format. Use one of these models:  "),
         (load_sensor("vlp16"), "first", "have the returns strongest, last, dual, not first"),
         (load_sensor("vlp16"), "all", "have the returns strongest, last, dual, not all"),
     ],
