@@ -210,7 +210,7 @@ GOOD = header([*"xyz"], ["f4"] * 3, 2, "ascii") + b"1 2 3\n4 5 6\n"
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"FIELDS x y z", b"FIELDS x y w", "its FIELDS are x, y, w: .*there is no z"),
+        (b"FIELDS x y z", b"FIELDS x y w", "its FIELDS are x, y, w: .*has no z"),
         (b"FIELDS x y z\n", b"", "its header has no FIELDS"),
         (b"SIZE 4 4 4", b"SIZE 4 4", "the lines FIELDS and SIZE of its header differ in length"),
         (b"SIZE 4 4 4", b"SIZE 4 3 4", "its field 'y' has TYPE F, SIZE 3 and COUNT 1: "),
