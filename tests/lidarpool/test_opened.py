@@ -442,7 +442,7 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     for name, words in (
         ("cut", "poses.txt has no row for frames 1 to 2. It has 1 row, and row k"),
         ("bad", r"poses.txt: line 1 has 11 cells, and 12 were expected \(m00, m01"),
-        ("uncalibrated", "calib.txt: line 1 has 'x' as m00, and a number was expected"),
+        ("uncalibrated", "calib.txt: line 1 has 'x' as m00, but a number was expected"),
         ("long", "They are probably nanoseconds. Write seconds to times.txt"),
         ("cut.bin", "cut.bin"),
         ("cut.tar", "cut.tar"),

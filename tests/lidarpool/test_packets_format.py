@@ -107,9 +107,9 @@ def test_what_cannot_be_packets_is_refused_before_a_file_is_written(tmp_path):
     unknown = replace(sweeps, fired=None)
     grids = replace(sweeps.fired, sensors=(Sensor.grid(), Sensor.grid()))
     for points, of_survey, says in (
-        (lacking, sweeps, "Packets hold reflectivity, which the cloud lacks"),
+        (lacking, sweeps, "Packets require reflectivity, but the cloud does"),
         (cloud, unknown, r"all rays and returns of a survey. Run it with keep_every 1"),
-        (cloud, replace(sweeps, fired=grids), r"has no packets: use .* vlp16"),
+        (cloud, replace(sweeps, fired=grids), r"has no packet format.* vlp16"),
     ):
         with pytest.raises(LidarError, match=says) as raised:
             Format("pcap").write(tmp_path / "packets", points, of_survey)
@@ -128,10 +128,10 @@ def test_a_scenario_that_writes_packets_keeps_what_they_hold():
     assert {"ray", "range", "reflectivity"} <= {column.name for column in survey.stored_columns}
     assert survey.keep_every == 1
     for sections, says in (
-        ({}, r"has no packets: use a model with packets, .*ot128, .* vls128"),
+        ({}, r"Use one of these models: .*ot128, .* vls128"),
         (
             {"sensor": "velodyne/vlp16", "returns": {"mode": "first"}},
-            r"not first: set returns.mode",
+            r"not first. Set returns.mode",
         ),
     ):
         with pytest.raises(LidarError, match=says):

@@ -105,10 +105,10 @@ def test_what_cannot_be_played_is_refused_in_a_line(tmp_path):
     )
     with needs_packets, open_source(tmp_path / "a.pcap"):
         pass
-    lacks_cloud = pytest.raises(LidarError, match=r"holds no cloud\.ply: give a scenario")
+    lacks_cloud = pytest.raises(LidarError, match=r"contains no cloud\.ply")
     with lacks_cloud, open_source(tmp_path):
         pass
-    with pytest.raises(LidarError, match=r"no bridge\. Did you mean 'foxglove'\? Use packets"):
+    with pytest.raises(LidarError, match=r"not a bridge\. Did you mean 'foxglove'\? Use packets"):
         bridges.bridge_class("foxglov")
 
 

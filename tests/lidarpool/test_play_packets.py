@@ -213,7 +213,9 @@ def test_a_killed_sender_ends_the_command_in_a_line(receiver, tmp_path):
             os.kill(child, signal.SIGKILL)
         _, errors = run.communicate(timeout=60)
     assert run.returncode == 2
-    assert "lidarpool: The process that sends packets has ended: play again." in errors
+    assert (
+        "lidarpool: The process that sends packets has stopped. Start the playback again." in errors
+    )
     assert "Traceback" not in errors
 
 
@@ -266,22 +268,26 @@ steps: 36
             ["--to", "front=127.0.0.1"],
             "'front', which does not exist. The sensors are roof and rear.",
         ),
-        (VLP16, ["--to", "::1"], "is of IPv6"),
+        (VLP16, ["--to", "::1"], "is an IPv6"),
         (VLP16, ["--to", "lidar=239.1.1.1"], "a multicast address"),
         (VLP16, ["--to", "255.255.255.255"], "no address of a receiver"),
         (VLP16, ["--to", "127.255.255.255"], "no address of a receiver"),
-        (VLP16, ["--to", f"127.0.0.1:{'9' * 5000}"], "is no address: give HOST or HOST:PORT"),
-        (VLP16, ["--api", f"127.0.0.1:{'9' * 5000}"], "is no address: give HOST or HOST:PORT"),
+        (VLP16, ["--to", f"127.0.0.1:{'9' * 5000}"], "is not a valid address"),
+        (VLP16, ["--api", f"127.0.0.1:{'9' * 5000}"], "is not a valid address"),
         (VLP16, ["--to", "127.0.0.1:65535"], "would be sent to port 65536, which is out of range"),
         (VLP16, ["--api", "203.0.113.1"], "cannot listen at 203.0.113.1:80"),
         (VLP16, ["--as", "radar"], "'radar' is not a bridge. Use packets"),
         (
             "scene: seed\nsensor: velodyne/hdl64e-s3\nposes: [[0, 0, 1]]\nsteps: 9\n",
             [],
-            "has no packets: use a mod",
+            "has no packet",
         ),
         (f"{VLP16}cloud: {{keep_every: 2}}\n", [], "`keep_every` is 2"),
-        (f"{VLP16}returns: {{mode: all}}\n", [], "have the returns strongest, last, dual, not all"),
+        (
+            f"{VLP16}returns: {{mode: all}}\n",
+            [],
+            "support the returns strongest, last, dual, not all",
+        ),
     ],
 )
 def test_what_cannot_be_sent_is_refused_in_a_line(scenario, options, words, tmp_path):
@@ -384,7 +390,7 @@ def test_what_a_scanner_cannot_send_is_refused_in_a_line():
     sensor = load_sensor("velodyne/vlp16")
     with pytest.raises(LidarError, match="Packets require the columns ray, range and reflectivity"):
         play(Scanner(room(), sensor), Pose((0, 0, 1)))
-    with pytest.raises(LidarError, match="have the returns strongest, last, dual, not all"):
+    with pytest.raises(LidarError, match="support the returns strongest, last, dual, not all"):
         Packets(sensor, returns=Returns("all"))
     with pytest.raises(LidarError, match="name is 'a', and a Mounted sensor"):
         Packets(Mounted(sensor, name="b"), name="a")
@@ -392,7 +398,7 @@ def test_what_a_scanner_cannot_send_is_refused_in_a_line():
     scanner = Scanner(room(), sensor, columns=packets.columns)
     sweep = scanner.sweep(Pose((0, 0, 1)), number=0)
     packets.encode(sweep)
-    with pytest.raises(LidarError, match="not of sweep 1: give Scanner"):
+    with pytest.raises(LidarError, match="not belong to sweep 1"):
         packets.encode(sweep)
 
 

@@ -135,7 +135,7 @@ def test_options_of_a_plugin_that_cannot_be_used(tmp_path, distribution, name, f
 
 def test_formats_of_the_table_are_read_without_a_look_at_plugins(tmp_path, distribution):
     mesh(distribution, "own-obj", "obj", TRIANGLE.format(ending="obj"))
-    with pytest.raises(LidarError, match="holds no triangles"):
+    with pytest.raises(LidarError, match="contains no triangles"):
         load_meshes(write(tmp_path / "a.obj", "v 0 0 0\n"))
 
 

@@ -88,7 +88,7 @@ BAD: list[dict[str, Any]] = [
 def validator() -> Draft202012Validator:
     schema = json.loads(
         schema_text(scenario_schema()), parse_constant=pytest.fail
-    )  # NaN and Infinity: no JSON
+    )  # NaN and Infinity: valid JSON
     Draft202012Validator.check_schema(schema)
     return Draft202012Validator(schema)
 

@@ -174,9 +174,9 @@ def test_true_meters_stay_as_they_are(tmp_path, system):
 def test_what_cannot_be_brought_is_refused(tmp_path):
     path = written(tmp_path / "a.las", ground("EPSG:3857"), wkt("EPSG:3857"))
     for epsg, message in (
-        (3857, r"cannot be brought to EPSG:3857 \(.*, a world map projection"),
-        (2263, r"cannot be brought to EPSG:2263 \(.*, which is not in meters"),
-        (32640, r"cannot be brought to EPSG:32640 .*EPSG:32632 has true meters"),
+        (3857, r"cannot be transformed to EPSG:3857 \(WGS.*, a world map projection"),
+        (2263, r"cannot be transformed to EPSG:2263 \(.*, which is not in meters"),
+        (32640, r"cannot be transformed to EPSG:32640 .*EPSG:32632 has true meters"),
         (1025, "EPSG:1025 is not known to PROJ"),
     ):
         with pytest.raises(LidarError, match=message):

@@ -9,7 +9,7 @@ from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scenario.point_scene import points_to_scene
 from lidarpool.scenario.surfel_gaps import expected_loss
 
-pytest.importorskip("open3d", reason="Open3D is not there")
+pytest.importorskip("open3d", reason="Open3D does not exist")
 
 OPTIONS = {
     "size": 1.0, "unit": None, "epsg": None, "keep_noise": False, "color": None,

@@ -456,7 +456,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
         ("startTimeCode = 3\nendTimeCode = 3", None, "", "an animation without a duration"),
         ("startTimeCode = 3\nendTimeCode = 3e9", None, "", "Unable to allocate|would unpack to"),
         ("timeCodesPerSecond = 0", None, "", "has no animations: export it with them, or leave"),
-        ("", QUAD, "", "has no animations: export it with them, or leave out animation"),
+        ("", QUAD, "", "contains no animations. Export it with animations, or remove animation"),
         ("", QUAD + 'token visibility.timeSamples = {0: "inherited", 24: "invisible"}', "",
          "m.usda has other vertices in pose 60: leave out animation"),
     ],

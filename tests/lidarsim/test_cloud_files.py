@@ -134,11 +134,11 @@ def test_many_lines_are_read_in_blocks_and_the_line_is_exact(tmp_path):
     [
         ("", "it is empty"),
         ("x,y,z\n", "it has no points after line 1"),
-        ("none\n", "line 1 is 'none', and x, y and z were expected, or a header"),
+        ("none\n", "line 1 is 'none', but x, y and z were expected, or a header"),
         ("2\ncomment\nC 0 0 0\nH 1 1 1\n", "line 2 is 'comment', and x, y and z"),
-        ("a,b,c\n1,2,3\n", "line 1 is 'a,b,c', and x, y and z were expected, or a header"),
-        ("x,y,z\n1,2,3\n1,2,a\n", "line 3 has 'a' as z, and a number was expected"),
-        ("x,y,z\n1,2,3\n1,2,\n", "line 3 has '' as z, and a number was expected"),
+        ("a,b,c\n1,2,3\n", "line 1 is 'a,b,c', but x, y and z were expected, or a header"),
+        ("x,y,z\n1,2,3\n1,2,a\n", "line 3 has 'a' as z, but a number was expected"),
+        ("x,y,z\n1,2,3\n1,2,\n", "line 3 has '' as z, but a number was expected"),
         ("x y z\n1 2 3\n1 2 1_0\n", "line 3 has '1_0' as z"),
         ("1 2 3\n4 5\n", "line 2 has 2 cells, and 3 were expected"),
         ("x,y,z,i\n1,2,3\n", r"line 1 names 4 columns \(x, y, z, i\), and line 2 has 3 cells"),
@@ -157,8 +157,8 @@ def test_many_lines_are_read_in_blocks_and_the_line_is_exact(tmp_path):
         ("1 5 6 7\n2 5 6 7\n3 5 6 7\n", "its first column counts the points"),
         ("ncols 3\nnrows 2\n1 2 3\n4 5 6\n", "it is a raster of heights, and no cloud"),
         ("//X Y Z\n1\n1 2 3\n4 5 6\n", "1 point announced, and 2 lines there"),
-        ("x y z\n1 2 3\n".encode("utf-16"), "it is text in UTF-16: save it as UTF-8"),
-        (b"1 2 3\n\0\0", "it is binary, and lines of text were expected"),
+        ("x y z\n1 2 3\n".encode("utf-16"), "it is encoded in UTF-16. Save it as UTF-8"),
+        (b"1 2 3\n\0\0", "it is a binary file, but a text file was expected"),
     ],
 )
 def test_what_is_wrong_names_the_line_and_what_was_expected(tmp_path, text, message):
@@ -208,9 +208,9 @@ def test_pts(tmp_path, line, columns):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "it is empty: the number of points was expected"),
+        ("", "it is empty, but the number of points was expected"),
         ("2\n1 2\n", r"line 2 is '1 2', which has 2 cells: x y z or x y z intensity or "),
-        ("2\n1 2 3\n1 2 a\n", "line 3 has 'a' as z, and a number was expected"),
+        ("2\n1 2 3\n1 2 a\n", "line 3 has 'a' as z, but a number was expected"),
         ("2\n1 2 3 4\n1 2 3\n", "line 3 has 3 cells, and 4 were expected"),
     ],
 )
@@ -271,7 +271,7 @@ def test_ptx_without_a_transformation_has_the_position_of_its_scanner(tmp_path):
         ("10 20 5 1", "10 20 5", "line 10 is '10 20 5': the last row of the transformation"),
         ("0 1 0 0\n", "0 2 0 0\n", "the transformation of the header that begins with line 1 is"),
         ("2 0 0 0.25", "2 0 0", r"line 13 has 3 cells, and 4 were expected \(x, y, z, intensity\)"),
-        ("2 0 0 0.25", "2 0 b 1", "line 13 has 'b' as z, and a number was expected"),
+        ("2 0 0 0.25", "2 0 b 1", "line 13 has 'b' as z, but a number was expected"),
         ("1 0 0 0.5", "1 0 0 0.5 9", "line 11 is '1 0 0 0.5 9', which has 5 cells: x y z intens"),
     ],
 )
@@ -334,7 +334,10 @@ def test_npy_with_fields(tmp_path):
         (npy(np.zeros(3, [("a", "f4")])), "its fields are a: an array"),
         (npy(np.zeros((9, 3))) + b"1", "its array .* has 216 bytes, and 217 are there"),
         (b"PK\x03\x04", "its first bytes are not"),
-        (npy(np.zeros((9, 3))).replace(b"shape", b"shale"), "its header is not that of an array"),
+        (
+            npy(np.zeros((9, 3))).replace(b"shape", b"shale"),
+            "its header does not describe an array",
+        ),
     ],
 )
 def test_what_is_wrong_in_npy(tmp_path, content, message):

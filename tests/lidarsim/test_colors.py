@@ -289,7 +289,7 @@ def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
     ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
     write(tmp_path / "m.obj", f"{ground}usemtl a\nf 1 2 3\nusemtl b\nf 1 3 4\nusemtl c\nf 3 4 1\n")
     scene = Scene.load(tmp_path / "m.obj", colors=True)
-    assert "its image 'gone.png' is not there" in caplog.text
+    assert "its image 'gone.png' does not exist" in caplog.text
     _, found = sweep(scene)
     assert {*map(tuple, found.tolist())} == {(188, 188, 188), (0, 255, 0)}
 

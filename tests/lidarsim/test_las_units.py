@@ -157,12 +157,12 @@ def test_of_both_the_header_says_which_counts(tmp_path, wkt_bit):
 @pytest.mark.parametrize(
     ("records", "message"),
     [
-        (keys((1024, 1), (3072, 2263)), r"EPSG:2263 may be in any unit.*--unit.*\.\[geo\]"),
-        (keys((1024, 1), (3076, 9999)), r"unit EPSG:9999 is not known.*--unit"),
-        (keys((1024, 1), (3072, 32767)), r"states no unit.*--unit"),
+        (keys((1024, 1), (3072, 2263)), r"EPSG:2263 has.*--unit.*\.\[geo\]"),
+        (keys((1024, 1), (3076, 9999)), r"unit EPSG:9999 is unknown.*--unit"),
+        (keys((1024, 1), (3072, 32767)), r"a unit.*--unit"),
         (keys((1024, 2), (2048, 4326)), r"are angles.*EPSG:4326.*reprojection"),
         (wkt(GEOGCS), r"are angles \(NAD83\)"),
-        (wkt('PROJCS["no unit",PROJECTION["x"]]'), r"'no unit' states no unit"),
+        (wkt('PROJCS["no unit",PROJECTION["x"]]'), r"'no unit' has no unit"),
         (wkt('PROJCS["cut",UNIT["foot"'), r"is cut short: its coordinate system"),
         (wkt("+proj=utm +zone=33"), "its coordinate system begins with 'PROJ', and WKT"),
     ],

@@ -250,9 +250,9 @@ GLASS = (
         (lambda h: h["images"].clear(), "Leaf (it is invalid)"),
         (lambda h: h["images"][0].update(bufferView=0), "Leaf (its image is not a PNG"),
         (lambda h: h["bufferViews"][3].update(byteLength=120), "Leaf (its image cannot be dec"),
-        (lambda h: h["images"].__setitem__(0, {"uri": "x.png"}), "'x.png' is not there"),
+        (lambda h: h["images"].__setitem__(0, {"uri": "x.png"}), "'x.png' does not exist"),
         (lambda h: h["images"].__setitem__(0, {"uri": "../x.png"}), "only files in its own"),
-        (lambda h: h["images"].__setitem__(0, {"uri": "a\0b.png"}), "is not there"),
+        (lambda h: h["images"].__setitem__(0, {"uri": "a\0b.png"}), "does not exist"),
         (lambda h: h["textures"][0].pop("source"), "in a format that cannot be read"),
         (lambda h: h["meshes"][0]["primitives"][0].update(material=9), ("material 9 (it is "
             "invalid)")),

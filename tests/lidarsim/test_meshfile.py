@@ -135,7 +135,7 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
         with pytest.raises(LidarError, match=f"announces {number} triangles and has 12"):
             load_meshes(path)
     write(path, bytes(84))
-    with pytest.raises(LidarError, match="holds no triangles"):
+    with pytest.raises(LidarError, match="contains no triangles"):
         load_meshes(path)
 
 
@@ -232,7 +232,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.obj", "v 0 0 0\nf 1 1 a/1\n", "line 2 is 'f 1 1 a/1', and numbers of vertices"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\nv 5 5 5\n", "f -1 -2 -4.*missing"),
-        ("m.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "no triangle with an area"),
+        ("m.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "only triangles without an area"),
         ("m.obj", "v 1 2\nf 1 1 1\n", "line 1 is 'v 1 2', and three numbers"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "line 6 is '3 0 1 7', .*0 to 2"),
         ("m.off", "OFF # a b\n\n3 1 0\n0 0 0\n1 0 z\n0 1 0\n3 0 1 2\n", "line 5 is '1 0 z', "),

@@ -293,5 +293,5 @@ def test_an_outline_without_end_is_refused_unless_it_is_convex():
     angles = np.linspace(0, 2 * np.pi, MAX_CORNERS + 1, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     assert len(cut(circle)) == MAX_CORNERS - 1
-    with pytest.raises(ValueError, match="is not convex: triangulate it"):
+    with pytest.raises(ValueError, match="Triangulate it"):
         cut(circle * (1 + 0.5 * (np.arange(len(angles)) % 2))[:, None])

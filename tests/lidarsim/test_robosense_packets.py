@@ -490,12 +490,12 @@ def with_identifiers(name, **identifiers):
     [
         (load_sensor("rs-lidar-16"), "first", START_NS, "returns strongest, last, dual, not first"),
         (load_sensor("rs-helios"), "all", START_NS, "strongest, last, first, dual, not all"),
-        (load_sensor("rs-lidar-16"), "last", -(10**18), "dates from 2000 to 2255, not 1938"),
+        (load_sensor("rs-lidar-16"), "last", -(10**18), "years from 2000 to 2255, not 1938"),
         (with_identifiers("rs-helios", model="RS32"), "last", START_NS, "RS16, RSHELIOS, not RS32"),
-        (with_identifiers("rs-helios", model="RS16"), "last", START_NS, "hold 16 lasers, not 32"),
+        (with_identifiers("rs-helios", model="RS16"), "last", START_NS, "contain 16 lasers, but"),
         (
             with_identifiers("vlp16", model="RS16"), "last", START_NS,
-            "without signs: the first 8 lasers look down",
+            "unsigned angles, so the first 8 lasers must point down",
         ),
     ],
 )  # fmt: skip

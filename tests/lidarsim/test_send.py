@@ -116,7 +116,7 @@ def test_a_killed_process_is_an_error_of_a_line():
         pid = sender._process.pid
         os.kill(pid, signal.SIGKILL)
         sender._process.wait()
-        with pytest.raises(LidarError, match="that sends packets has ended: play again"):
+        with pytest.raises(LidarError, match="that sends packets has stopped"):
             sender.send(0, [numbered(9, 0, 0, size=60_000)], lambda times_ns: times_ns)
 
 
@@ -195,15 +195,15 @@ def test_the_process_imports_nothing_that_takes_time_to_start():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("::1", "of IPv6: give an IPv4 address"),
-        ("[::1]:2368", "of IPv6"),
+        ("::1", "Use an IPv4 address"),
+        ("[::1]:2368", "an IPv6"),
         ("239.1.2.3:2368", "a multicast address"),
         ("0.0.0.0", "no address of a receiver"),
-        ("127.0.0.1:0", "give HOST or HOST:PORT"),
-        ("127.0.0.1:70000", "give HOST or HOST:PORT"),
-        ("127.0.0.1:x", "give HOST or HOST:PORT"),
-        ("127.0.0.1:" + "9" * 5000, "give HOST or HOST:PORT"),
-        ("127.0.0.1:\u0662", "give HOST or HOST:PORT"),
+        ("127.0.0.1:0", "Use HOST or HOST:PORT"),
+        ("127.0.0.1:70000", "Use HOST or HOST:PORT"),
+        ("127.0.0.1:x", "Use HOST or HOST:PORT"),
+        ("127.0.0.1:" + "9" * 5000, "Use HOST or HOST:PORT"),
+        ("127.0.0.1:\u0662", "Use HOST or HOST:PORT"),
         ("255.255.255.255:2368", "no address of a receiver"),
         ("127.255.255.255", "no address of a receiver"),
         ("no-such-host.invalid", "has no IPv4 address"),

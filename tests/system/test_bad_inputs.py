@@ -71,7 +71,10 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "no time": (["run", "good.yaml", "--startup-timeout", "soon"], "'soon' is not a duration"),
     "both": (["run", "good.yaml", "--resume", "--restart"], "cannot be combined"),
     "certificates alone": (["doctor", "--tls-key", "a.stl"], "require `--scheduler` with"),
-    "certificate that is not there": (["doctor", "--tls-ca", "ca.pem"], "'ca.pem' does not exist"),
+    "certificate that does not exist": (
+        ["doctor", "--tls-ca", "ca.pem"],
+        "'ca.pem' does not exist",
+    ),
     "two clusters": (
         ["run", "good.yaml", "--cluster", "c.yaml", "--scheduler", "tcp://127.0.0.1:1"],
         "`--cluster` and `--scheduler` cannot be combined",

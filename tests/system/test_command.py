@@ -117,7 +117,7 @@ def test_progress_that_is_not_for_a_terminal_comes_as_short_lines(demo):
 def test_the_report_has_all_that_is_promised(demo):
     out = demo.out
     text = (out / "report.json").read_text()
-    report = json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are no JSON
+    report = json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are valid JSON
     assert report["files"] == MADE
     assert report["scans"] == 108 and report["rays"] == 120_000
     assert (report["hits"], report["points"]) == (4926, 995)

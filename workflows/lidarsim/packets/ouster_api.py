@@ -119,7 +119,7 @@ class OusterApi(HttpService):
         if request.method == "PUT":
             text = _json(request.body)
             if not isinstance(text, str):
-                raise RefusedError("user data are text")
+                raise RefusedError("user data must be text")
             self._user_data = text
             return Answer(status=HTTPStatus.NO_CONTENT)
         if request.method == "DELETE":
@@ -146,7 +146,7 @@ class OusterApi(HttpService):
         arguments = parse_qs(request.query).get("args", [""])[-1]
         if command == "get_config_param":
             if arguments not in ("active", "staged"):
-                raise RefusedError("args is active or staged")
+                raise RefusedError("args must be active or staged")
             return Answer(self._active if arguments == "active" else self._staged)
         if command == "set_config_param":
             name, _, value = arguments.partition(" ")  # parse_qs has read + as a space
@@ -167,7 +167,7 @@ class OusterApi(HttpService):
         Raises RefusedError for what cannot be set.
         """
         if not isinstance(values, dict):
-            raise RefusedError("give an object of parameters")
+            raise RefusedError("the body must be a JSON object of parameters")
         staged = dict(self._staged)
         for name, value in values.items():
             if name == "udp_dest":
@@ -180,7 +180,7 @@ class OusterApi(HttpService):
                 raise RefusedError(f"there is no parameter {name}")
             elif value != staged[name]:
                 raise RefusedError(
-                    f"{name} is {staged[name]} in this simulated sensor: set it in the scenario"
+                    f"{name} is {staged[name]} in this simulated sensor. Set it in the scenario"
                 )
         self._staged = staged
 
@@ -203,7 +203,7 @@ def _json(body: bytes) -> Any:
     try:
         return json.loads(body)
     except (ValueError, RecursionError) as error:
-        raise RefusedError("the body is no JSON") from error
+        raise RefusedError("the body is not valid JSON") from error
 
 
 def _loose(value: str) -> Any:

@@ -154,7 +154,7 @@ class RobosenseEncoder(PacketEncoder):
         super().__init__(source)
         name = self.text("model")
         if name not in MODELS:
-            raise self.unusable(f"have the models {', '.join(MODELS)}, not {name}")
+            raise self.unusable(f"support the models {', '.join(MODELS)}, not {name}")
         self._model = MODELS[name]
         self._check_source()
         self._planes = 2 if source.mode == "dual" else 1
@@ -170,18 +170,20 @@ class RobosenseEncoder(PacketEncoder):
         model = self._model
         if source.mode not in model.modes:
             modes = ", ".join(model.modes)
-            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+            raise self.unusable(f"support the returns {modes}, not {source.mode}. Set returns.mode")
         if source.sensor.channels != model.lasers:
-            raise self.unusable(f"hold {model.lasers} lasers, not {source.sensor.channels}")
+            raise self.unusable(
+                f"contain {model.lasers} lasers, but the sensor has {source.sensor.channels}"
+            )
         year = int(np.datetime64(source.start_ns, "ns").astype("M8[Y]").astype(int)) + 1970
         if not _FIRST_YEAR <= year <= _LAST_YEAR:
             raise self.unusable(
-                f"have dates from {_FIRST_YEAR} to {_LAST_YEAR}, not {year}: set cloud.start"
+                f"support years from {_FIRST_YEAR} to {_LAST_YEAR}, not {year}. Set cloud.start"
             )
         elevations = self._elevations_deg()
         if model.lasers == 16 and ((elevations[:8] > 0).any() or (elevations[8:] < 0).any()):
             raise self.unusable(
-                "state angles without signs: the first 8 lasers look down, the others up"
+                "contain unsigned angles, so the first 8 lasers must point down and the others up"
             )
 
     def encode(self, shots: Shots) -> list[Datagrams]:

@@ -169,7 +169,9 @@ class Sender:
                 file.write(content)
                 file.flush()
         except (BrokenPipeError, ValueError) as error:
-            raise LidarError("The process that sends packets has ended: play again.") from error
+            raise LidarError(
+                "The process that sends packets has stopped. Start the playback again."
+            ) from error
 
     def _hear(self) -> None:
         """Note what the process reports, without waiting."""
@@ -266,11 +268,16 @@ class Address:
         if not separator:
             host, number = text, ""
         if ":" in host or _is_ipv6(text):
-            raise LidarError(f"{text} is of IPv6: give an IPv4 address, such as {LOOPBACK}:2368.")
+            raise LidarError(
+                f"{text} is an IPv6 address. Use an IPv4 address, such as {LOOPBACK}:2368."
+            )
         port = port_number(number) if separator else None
         if separator and not port:
             shown = shortened(text, _SHOWN_LETTERS)
-            raise LidarError(f"{shown!r} is no address: give HOST or HOST:PORT, ports to 65535.")
+            raise LidarError(
+                f"{shown!r} is not a valid address. Use HOST or HOST:PORT, with a port of at most "
+                "65535."
+            )
         name = ""
         try:
             address = IPv4Address(host)
@@ -279,7 +286,7 @@ class Address:
             name = host.lower()
         if not is_single_receiver(address):
             kind = "a multicast address" if address.is_multicast else "no address of a receiver"
-            raise LidarError(f"{text} is {kind}: give the address of one receiver.")
+            raise LidarError(f"{text} is {kind}. Use the address of a single receiver.")
         return cls(str(address), port, name)
 
     @property

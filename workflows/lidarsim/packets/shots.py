@@ -149,8 +149,8 @@ def check_columns(cloud_columns: Collection[str], names: Iterable[str]) -> None:
     if missing := [name for name in ("ray", "range", *names) if name not in cloud_columns]:
         lacks = ", ".join(missing)
         raise LidarError(
-            f"Packets hold {lacks}, which the cloud lacks: run the survey with pcap in "
-            f"output.write, or with {lacks} among its columns."
+            f"Packets require {lacks}, but the cloud does not contain it. Run the survey with "
+            f"pcap in output.write, or with {lacks} in cloud.columns."
         )
 
 
@@ -161,7 +161,7 @@ def settings_of(sensor: Sensor) -> PacketSettings:
     """
     if sensor.packets is None:
         names = ", ".join(name.rpartition("/")[2] for name in with_packets())
-        raise LidarError(f"{sensor.model} has no packets: use a model with packets, {names}.")
+        raise LidarError(f"{sensor.model} has no packet format. Use one of these models: {names}.")
     return sensor.packets
 
 

@@ -139,8 +139,8 @@ class Packets:
         scans = sweep["scan"]
         if len(scans) and not (steps.start <= scans.min() and scans.max() < steps.stop):
             raise LidarError(
-                f"The cloud is not of sweep {number}: give Scanner.sweep and Packets.encode the "
-                "same number."
+                f"The cloud does not belong to sweep {number}. Pass the same number to "
+                "Scanner.sweep and to Packets.encode."
             )
         late_ns = 0
         if start_s is not None:

@@ -114,7 +114,7 @@ class TcpService(Service):
                     continue
                 raise LidarError(
                     f"{self.name} cannot listen at {self.host}:{port} "
-                    f"({os.strerror(error.errno or 0)}): give another address, such as --api "
+                    f"({os.strerror(error.errno or 0)}). Use a different address, such as --api "
                     f"127.0.0.1:{self.example_port}."
                 ) from error
             return listener

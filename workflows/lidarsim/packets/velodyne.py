@@ -60,10 +60,10 @@ class VelodyneEncoder(PacketEncoder):
         super().__init__(source)
         if source.mode not in _MODES:
             modes = ", ".join(_MODES)
-            raise self.unusable(f"have the returns {modes}, not {source.mode}: set returns.mode")
+            raise self.unusable(f"support the returns {modes}, not {source.mode}. Set returns.mode")
         channels = source.sensor.channels
         if channels not in _CHANNELS:
-            raise self.unusable(f"hold 16, 32 or 128 lasers, not {channels}")
+            raise self.unusable(f"support 16, 32 or 128 lasers, but the sensor has {channels}")
         self._mode = _MODES[source.mode]
         self._unit_m = self.decimal("unit_m")
         self._product = self.number("product")

@@ -141,7 +141,7 @@ class VelodyneApi(HttpService):
                 raise RefusedError(f"there is no setting {name}")
             elif value != current[name]:
                 raise RefusedError(
-                    f"{name} is {current[name]} in this simulated sensor: set it in the scenario"
+                    f"{name} is {current[name]} in this simulated sensor. Set it in the scenario"
                 )
         if laser != self._laser:
             self._laser = laser

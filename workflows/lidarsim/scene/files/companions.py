@@ -59,7 +59,7 @@ def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance
     except MeshFileError as error:
         raise MaskError(str(error)) from error
     if file is None:
-        raise MaskError(f"its image {name[-80:]!r} is not there")
+        raise MaskError(f"its image {name[-80:]!r} does not exist")
     allowance.add_file(file)
     return file
 

@@ -32,7 +32,7 @@ def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray
     if len(data) % row_size:
         other_format = f" ({_NUSCENES_ENDING} has {NUSCENES[-1]} as well)" if names is KITTI else ""
         raise ValueError(
-            f"{path.name} has {len(data):,} bytes, and whole rows of {row_size} were expected: "
+            f"{path.name} has {len(data):,} bytes, but a multiple of {row_size} was expected: "
             f"{', '.join(names)} as float32{other_format}"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, len(names))
@@ -41,8 +41,8 @@ def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray
         rings = columns["channel"]
         if not ((rings >= 0) & (rings < 1 << 16) & (rings == np.floor(rings))).all():
             raise ValueError(
-                f"{path.name} has other numbers than rings, 0 to 65,535, as the last of each five: "
-                "it is no sweep of nuScenes"
+                f"{path.name} is not a nuScenes sweep, because the fifth value of a point must be "
+                "a ring number from 0 to 65,535"
             )
         columns["channel"] = rings.astype(np.uint16)
     return columns

@@ -76,7 +76,7 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
     content.turned = "as glTF asks"
     notes = [*reader.visibility_notes(), *extension_notes(header)]
     if notes and not content.meshes:
-        raise MeshFileError(f"holds no triangles that can be read: it {'; it '.join(notes)}")
+        raise MeshFileError(f"contains no triangles that can be read: it {'; it '.join(notes)}")
     content.notes = [*notes, *materials.notes.lines(), *reader.motion_notes()]
     asset = header.get("asset", {})
     content.generator = str(asset.get("generator", ""))
@@ -121,7 +121,9 @@ class _NodeReader:
         """Yield the content at each time of an animation, with colors in the first only."""
         self._channels = sample_channels(animation, times_s, self._file.accessor)
         if not self._channels:
-            raise MeshFileError("has an animation that moves no node: choose another")
+            raise MeshFileError(
+                "has an animation that does not move any node. Choose another animation"
+            )
         for index, _ in self._channels:
             self._file.part("nodes", index)
         roots = root_nodes(self._file.header)
@@ -143,7 +145,7 @@ class _NodeReader:
             if (index, path) in self._channels
         }
         if animated and "matrix" in node:
-            raise ValueError(f"node {index} is animated, and has a matrix")
+            raise ValueError(f"node {index} is animated but has a matrix")
         return _matrix({**node, **animated})
 
     def node(self, index: int) -> Node:
@@ -275,7 +277,10 @@ class _NodeReader:
             if not len(unposed.faces) or (joints is None and not any(weights)):
                 return unposed
             if DRACO in primitive.get("extensions", {}):
-                raise MeshFileError(f"bends what is packed with {DRACO}: export it without")
+                raise MeshFileError(
+                    f"deforms meshes that are compressed with {DRACO}, which is not supported. "
+                    "Export it without this extension"
+                )
             self._allowance.take(600 * len(unposed.vertices))  # temporary matrices and points
             vertices = unposed.vertices.astype(np.float64)
             for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
@@ -291,7 +296,7 @@ class _NodeReader:
         """Return matrices (j, 4, 4) of a skin's joints, from mesh to scene, by glTF 2.0, 3.7.3."""
         skin_data = self._file.part("skins", skin)
         if not skin_data.get("joints"):
-            raise MeshFileError("has a skin without joints: export it again, or without the skin")
+            raise MeshFileError("has a skin without joints. Export it again, or without the skin")
         worlds = np.array([self._world(joint) for joint in skin_data["joints"]])
         if (inverse := skin_data.get("inverseBindMatrices")) is not None:
             columns = self._file.accessor(inverse).astype(np.float64)[: len(worlds)]

@@ -32,7 +32,9 @@ def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any
     """
     names = [str(animation.get("name") or number) for number, animation in enumerate(animations)]
     if not names:
-        raise MeshFileError("has no animations: export it with them, or leave out animation")
+        raise MeshFileError(
+            "contains no animations. Export it with animations, or remove animation"
+        )
     if name and name not in names:
         hint = did_you_mean(name, names).strip() or f"there are {', '.join(names[:8])}"
         raise MeshFileError(f"has no animation {name!r} ({hint})")
@@ -49,7 +51,7 @@ def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tu
     """
     times = [read(sampler["input"])[:, 0].astype(np.float64) for sampler in animation["samplers"]]
     if any((np.diff(t) <= 0).any() or not np.isfinite(t).all() for t in times):
-        raise ValueError("times of an animation do not ascend")
+        raise ValueError("the times of an animation must be ascending")
     return min((t[0] for t in times), default=0.0), max((t[-1] for t in times), default=0.0)
 
 

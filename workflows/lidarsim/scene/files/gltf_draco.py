@@ -18,7 +18,7 @@ def unpacked(data: bytes, allowance: Allowance) -> Any:
         import DracoPy
     except ImportError as error:
         raise MeshFileError(
-            f"is packed with {DRACO}: install DracoPy to read it, or export without it"
+            f"is compressed with {DRACO}. Install DracoPy, or export it without compression"
         ) from error
     allowance.take(24 * sum(_draco_counts(data)))
     return DracoPy.decode(data)
@@ -34,7 +34,8 @@ def _draco_counts(data: bytes) -> tuple[int, int]:
         raise ValueError("its Draco data are not a mesh")
     if version != 0x0202 or flags & 0x8000:
         raise MeshFileError(
-            "has Draco data of another version than 2.2, or with metadata: export it again"
+            "has Draco data with metadata or with a version other than 2.2, which is not "
+            "supported. Export it again"
         )
     # Numbers of seven bits a byte, lowest first; the second method has a byte more before these.
     first, second = re.findall(rb"(?s)[\x80-\xff]*[\0-\x7f]", data[11 + method : 31])[:2]

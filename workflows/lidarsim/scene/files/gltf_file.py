@@ -57,9 +57,9 @@ def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     try:
         header = json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise MeshFileError(f"holds no valid JSON ({error})") from error
+        raise MeshFileError(f"does not contain valid JSON ({error})") from error
     if not isinstance(header, dict):
-        raise MeshFileError("holds no glTF object")
+        raise MeshFileError("does not contain a glTF object")
     return header, body
 
 
@@ -75,7 +75,10 @@ def check_readable(header: dict[str, Any]) -> None:
         raise MeshFileError(_OLD)
     for name in map(str, header.get("extensionsRequired", ())):
         if not _READ.match(name):
-            raise MeshFileError(f"needs {name}, which cannot be read: export without it")
+            raise MeshFileError(
+                f"requires the extension {name}, which is not supported. Export it without the "
+                "extension"
+            )
 
 
 def extension_notes(header: dict[str, Any]) -> list[str]:
@@ -122,7 +125,9 @@ class GltfFile:
         entries: list[dict[str, Any]] = self.header.get(kind, [])
         number = natural(index)
         if number >= len(entries):
-            raise ValueError(f"it refers to number {number} of its {kind}, of {len(entries)}")
+            raise ValueError(
+                f"it refers to index {number} of its {kind}, but there are {len(entries)}"
+            )
         return entries[number]
 
     def _read_accessor(self, index: int) -> AnyArray:
@@ -132,7 +137,7 @@ class GltfFile:
         if accessor["type"] not in _WIDTHS or accessor["componentType"] not in _TYPES:
             raise ValueError(
                 f"accessor {index} has the type {accessor['type']!r} of "
-                f"{accessor['componentType']!r}, which glTF does not know"
+                f"{accessor['componentType']!r}, which glTF does not define"
             )
         width = _WIDTHS[accessor["type"]]
         kind = np.dtype(_TYPES[accessor["componentType"]])
@@ -184,7 +189,9 @@ class GltfFile:
         uri = buffer.get("uri")
         if uri is None:
             if index:
-                raise MeshFileError("has a buffer without content, as packed files have: unpack it")
+                raise MeshFileError(
+                    "has a buffer without content, like compressed files. Decompress it first"
+                )
             content = self._body
         elif uri.startswith("data:"):
             content = _inline(uri)

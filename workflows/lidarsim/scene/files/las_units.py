@@ -79,14 +79,17 @@ _UNIT_NAMES = {  # names as files spell them, lower case, with spaces for "_" an
 }
 _DATUMS = range(5001, 5300)  # in a vertical system's key by GeoTIFF 1.0: datums, without units
 # Commands and functions that read a cloud have unit; compare has two clouds.
-_OVERRIDE = "give its unit (--unit, in Python unit=; of compare --unit-a and unit_a=, or b)"
+_OVERRIDE = (
+    "Specify it with --unit, or with --unit-a and --unit-b of compare (unit=, unit_a= and unit_b= "
+    "in Python)"
+)
 
 
 def advice_to_project(epsg: int | None) -> str:
-    """Return a clause on how to bring a cloud to a system in meters: a code, or any."""
+    """Return a sentence on how to transform a cloud to a system in meters: a code, or any."""
     code = epsg or "CODE"
     return (
-        f"give lidarpool scene points --epsg {code} (in Python epsg=), or project it first (pdal "
+        f"Use lidarpool scene points --epsg {code} (epsg= in Python), or project it first (pdal "
         f"translate IN OUT reprojection --filters.reprojection.out_srs=EPSG:{code})"
     )
 
@@ -132,7 +135,8 @@ class CoordinateUnits:
         if not self.vertical_stated:
             return (
                 f"is in the unit {self.horizontal.name} and was converted to meters; it states no "
-                f"unit of heights, which are taken in the same: if they are not, {_OVERRIDE}"
+                f"unit of heights, so they are assumed to have the same unit. Otherwise, "
+                f"s{_OVERRIDE[1:]}"
             )
         if self.horizontal == self.vertical:
             return f"is in the unit {self.horizontal.name} and was converted to meters"
@@ -196,7 +200,7 @@ def wkt_units(text: str) -> CoordinateUnits:
         if angular := next((part for part in parts if part.keyword in _ANGULAR), None):
             kind = "geocentric" if _is_geocentric(angular) else "angles"
             raise LidarError(
-                f"its coordinates are {kind} ({name[:80]}): {advice_to_project(None)}."
+                f"its coordinates are {kind} ({name[:80]}). {advice_to_project(None)}."
             )
         raise ValueError(
             f"its coordinate system begins with {node.keyword[:20]!r}, and WKT of a projection was "
@@ -204,7 +208,7 @@ def wkt_units(text: str) -> CoordinateUnits:
         )
     unit = _length_unit(horizontal)
     if unit is None:
-        raise LidarError(f"its coordinate system {name[:80]!r} states no unit: {_OVERRIDE}.")
+        raise LidarError(f"its coordinate system {name[:80]!r} has no unit. {_OVERRIDE}.")
     heights = _length_unit(vertical) if vertical is not None else _third_unit(horizontal)
     if heights is None:
         return CoordinateUnits(unit, unit, vertical_stated=False)
@@ -267,14 +271,14 @@ def _parsed(text: str) -> _Node:
             node.values.append(number if quoted is None else quoted.replace('""', '"'))
         elif mark in "[(":
             if not node.nodes or len(open_nodes) > _MAX_DEPTH:
-                raise ValueError("its coordinate system is no WKT")
+                raise ValueError("its coordinate system is not valid WKT")
             open_nodes.append(node.nodes[-1])
         elif mark in "])":
             if len(open_nodes) == 1:
-                raise ValueError("its coordinate system is no WKT")
+                raise ValueError("its coordinate system is not valid WKT")
             open_nodes.pop()
     if not root.nodes:
-        raise ValueError("its coordinate system is no WKT")
+        raise ValueError("its coordinate system is not valid WKT")
     if len(open_nodes) > 1:
         raise CutShortError(f"its coordinate system ends within {root.nodes[0].keyword[:20]}")
     return root.nodes[0]
@@ -307,7 +311,7 @@ def _unit_of(node: _Node) -> CoordinateUnit:
     name, *factors = node.values
     meters = float(factors[0]) if factors else 0.0
     if not 1e-6 <= meters <= 1e6:
-        raise LidarError(f"its unit {name[:40]!r} has no length in meters: {_OVERRIDE}.")
+        raise LidarError(f"its unit {name[:40]!r} is not a length. {_OVERRIDE}.")
     return CoordinateUnit(name[:40], meters)
 
 
@@ -322,7 +326,7 @@ def geo_keys(records: Mapping[int, bytes]) -> dict[int, float]:
     doubles = records.get(GEO_DOUBLES, b"")
     (count,) = struct.unpack_from("<H", data, 6)
     if 8 + 8 * count > len(data):
-        raise CutShortError(f"{count} GeoTIFF keys announced, and there are fewer")
+        raise CutShortError(f"{count} GeoTIFF keys were expected, but there are fewer")
     return dict(_key_values(data, count, doubles))
 
 
@@ -345,7 +349,7 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     ):
         code = int(keys.get(_GEODETIC_CRS, 0))
         kind = "geocentric" if model == _GEOCENTRIC else "angles"
-        raise LidarError(f"its coordinates are {kind} (EPSG:{code}): {advice_to_project(None)}.")
+        raise LidarError(f"its coordinates are {kind} (EPSG:{code}). {advice_to_project(None)}.")
     unit = _unit_of_code(keys.get(_LINEAR_UNIT))
     heights = None
     if keys.get(_LINEAR_UNIT) == USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
@@ -357,7 +361,7 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     if unit is None:
         if not projected:
             return None  # keys that say nothing of a projection
-        raise LidarError(f"its coordinate system is of its own and states no unit: {_OVERRIDE}.")
+        raise LidarError(f"it uses a custom coordinate system without a unit. {_OVERRIDE}.")
     heights = height_unit_of_keys(keys) or heights
     if heights is None:
         return CoordinateUnits(unit, unit, vertical_stated=False)
@@ -382,7 +386,7 @@ def _unit_of_code(code: float | None) -> CoordinateUnit | None:
     if code is None or code in (0, USER_DEFINED):
         return None
     if int(code) not in _EPSG_UNITS:
-        raise LidarError(f"its unit EPSG:{int(code)} is not known: {_OVERRIDE}.")
+        raise LidarError(f"its unit EPSG:{int(code)} is unknown. {_OVERRIDE}.")
     return CoordinateUnit(*_EPSG_UNITS[int(code)])
 
 
@@ -405,10 +409,10 @@ def _wkt_of_epsg(code: int) -> str:
     """Return a system of the EPSG registry as WKT."""
     if not has_registry():
         raise LidarError(
-            f"its coordinate system EPSG:{code} may be in any unit: {_OVERRIDE}, or install what "
-            f"knows it, {install_command('lidarpool[geo]')}."
+            f"its coordinate system EPSG:{code} has an unknown unit. {_OVERRIDE}, or look the "
+            f"unit up with the extra geo: {install_command('lidarpool[geo]')}."
         )
     crs = crs_of_code(code)
     if crs is None:
-        raise LidarError(f"its coordinate system EPSG:{code} is not known: {_OVERRIDE}.")
+        raise LidarError(f"its coordinate system EPSG:{code} is unknown. {_OVERRIDE}.")
     return str(crs.to_wkt(version="WKT2_2019"))

@@ -154,7 +154,7 @@ def load_objects(
     _tell_notes(path, content, tell, unit_given=unit is not None)
     meshes = objects.at_start(lambda _: None)
     if not any((o.mesh if isinstance(o, SceneInstance) else o).has_area for o in meshes):
-        raise LidarError(f"{path} has no triangle with an area.")
+        raise LidarError(f"{path} contains only triangles without an area.")
     if (
         shared.up_axis is None
         and content.generator != GENERATOR
@@ -207,7 +207,7 @@ def _in_world(
             name, reach_m = next(iter(reaches_m.items()))
             raise LidarError(
                 f"Object {name!r} reaches {reach_m:.3g} m from the origin, farther than anything "
-                "on Earth: check its unit and placement."
+                "on Earth. Check its unit and placement."
             )
     if reaches_m:
         content.notes.append(
@@ -377,10 +377,10 @@ def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOpti
     if content.meshes or content.moving:
         return content
     if content.skipped:
-        raise MeshFileError("has no triangle with an area")
+        raise MeshFileError("contains only triangles without an area")
     raise MeshFileError(
-        "holds no triangles: it is empty, or has only points, lines or other things that reflect "
-        "no light"
+        "contains no triangles. It is empty, or contains only points, lines or other elements "
+        "without surfaces"
     )
 
 
@@ -415,7 +415,7 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
         reason = getattr(error, "strerror", None) or error
         raise LidarError(f"{path} cannot be read: {reason}.") from error
     if not data:
-        raise LidarError(f"{path} is empty (0 bytes): export the mesh again.")
+        raise LidarError(f"{path} is empty (0 bytes). Export the mesh again.")
     return data.removeprefix(codecs.BOM_UTF8)  # the byte order mark of text editors
 
 
@@ -472,7 +472,7 @@ def _actor_of_part(
     rotation = placement.linear / scale
     if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > _MAX_UNEVENNESS:
         raise LidarError(
-            f"Object {name!r} moves, and its placement scales it unevenly: give one factor."
+            f"Object {name!r} moves but is scaled non-uniformly. Use a single scale factor."
         )
     objects = [item.moved(name, scale * upright.linear, np.zeros(3)) for item in part.objects]
     linear = matmul(placement.linear, upright.linear)

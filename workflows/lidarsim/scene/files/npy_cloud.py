@@ -95,16 +95,18 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     readers = {(1, 0): layout.read_array_header_1_0, (2, 0): layout.read_array_header_2_0}
     start = file.read(len(layout.MAGIC_PREFIX))
     if start != layout.MAGIC_PREFIX:
-        raise ValueError("its first bytes are not \\x93NUMPY, with which a .npy begins")
+        raise ValueError("its first bytes are not \\x93NUMPY, the signature of .npy files")
     version = (*file.read(2),)
     if version not in readers:
-        raise ValueError(f"it has the version {version} of .npy: 1.0 or 2.0 were expected")
+        raise ValueError(
+            f"it has the version {version} of .npy, but only 1.0 and 2.0 are supported"
+        )
     try:
         shape, is_fortran, kind = readers[version](file)
     except Exception as error:  # NumPy parses the header as Python, with errors of any class
         if "EOF: reading" in str(error):
-            raise CutShortError("its header ends too early") from error
-        raise ValueError("its header is not that of an array") from error
+            raise CutShortError("its header is truncated") from error
+        raise ValueError("its header does not describe an array") from error
     return shape, is_fortran, kind
 
 

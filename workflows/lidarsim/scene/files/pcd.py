@@ -94,7 +94,7 @@ def read_pcd(path: Path) -> list[CloudScan]:
     if end is None:
         is_header = any(line.startswith(_STARTS) for line in data[:_HEADER_MAX_BYTES].splitlines())
         failure = CutShortError if is_header else ValueError
-        raise failure("it has no line DATA, with which the header of a .pcd ends")
+        raise failure("its header has no DATA line")
     header = _parse_header(data[: end.start()], end[1].decode("latin-1"))
     body = memoryview(data)[end.end() :]
     if header.encoding == "ascii":
@@ -107,8 +107,8 @@ def read_pcd(path: Path) -> list[CloudScan]:
     if missing := [axis for axis in "xyz" if axis not in columns]:
         names = ", ".join(field.name for field in header.fields)
         raise ValueError(
-            f"its FIELDS are {printable(names)}: x, y and z of a number each are needed, and there "
-            f"is no {', '.join(missing)}"
+            f"its FIELDS are {printable(names)}: x, y and z are required, with one number each, "
+            f"but the file has no {', '.join(missing)}"
         )
     with np.errstate(invalid="ignore"):  # NaN of any kind may be invalid
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
@@ -182,7 +182,8 @@ def _parse_header(data: bytes, encoding: str) -> _Header:
         entries[keyword] = number, words[1:]
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(
-            f"its DATA is {printable(encoding)[:20]!r}, not ascii, binary or binary_compressed"
+            f"its DATA is {printable(encoding)[:20]!r}, but must be ascii, binary or "
+            "binary_compressed"
         )
     return _Header(
         _fields(entries), _count_of_points(entries), encoding, _viewpoint(entries), len(lines) + 1
@@ -239,7 +240,7 @@ def _count_of_points(entries: _Entries) -> int:
         raise ValueError("its header has no POINTS")
     if points >= 0 and width >= 0 and points != width * height:
         raise ValueError(
-            f"its header has {points:,} POINTS, and a WIDTH of {width:,} by a HEIGHT of {height:,}"
+            f"its header has {points:,} POINTS, but a WIDTH of {width:,} by a HEIGHT of {height:,}"
         )
     return points if points >= 0 else width * height
 
@@ -257,7 +258,7 @@ def _whole_numbers(
     if not all(word.isdecimal() for word in words) or count not in (None, len(words)):
         raise ValueError(
             f"line {number} of its header is {printable(' '.join([keyword, *words]))[:60]!r}: "
-            f"{'a whole number' if count == 1 else 'whole numbers'} from 0 on expected"
+            f"{'a whole number' if count == 1 else 'whole numbers'} of at least 0 expected"
         )
     return list(map(int, words))
 
@@ -325,7 +326,7 @@ def _check_length(header: _Header, row_size: int, size: int) -> None:
     """
     if header.points * row_size > size:
         raise CutShortError(
-            f"{header.points:,} points of {row_size} bytes announced, and "
+            f"{header.points:,} points of {row_size} bytes are declared, but "
             f"{size // max(row_size, 1):,} are there"
         )
 
@@ -378,7 +379,9 @@ def _unpacked(packed: memoryview, size: int) -> Bytes:
 
     content = np.zeros(size, np.uint8)
     if size and unpack_lzf(np.frombuffer(bytearray(packed), np.uint8), content) != size:
-        raise ValueError("its packed points are damaged: they do not unpack to their size")
+        raise ValueError(
+            "its compressed points are damaged, because their size is wrong after decompression"
+        )
     return content
 
 

@@ -308,7 +308,9 @@ def read_off(data: bytes, path: Path, options: ReadOptions) -> Content:
     keyword = _OFF.match(text)
     text = text[keyword.end() if keyword else 0 :]
     if text.lstrip().upper().startswith(b"BINARY"):
-        raise MeshFileError("is binary OFF, which is not supported: export it as text, or as .ply")
+        raise MeshFileError(
+            "is a binary OFF file, which is not supported. Export it as text, or as .ply"
+        )
     first_line = 1 + uncommented[: len(uncommented) - len(text)].count(b"\n")
     vertex_lines, face_lines = _off_lines(text, first_line)
     is_colored = options.colors and keyword is not None and keyword[0].upper() == b"COFF"
@@ -423,7 +425,7 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
     if not solids:
         raise MeshFileError(
             f"announces {announced:,} triangles and has {max(0, len(data) - 84) // 50:,}: it is "
-            "cut short, or not an .stl file"
+            "truncated, or not an .stl file"
         )
     meshes: list[SceneMesh] = []
     for solid in solids:
@@ -523,10 +525,10 @@ def read_ply_mesh(data: bytes, path: Path, options: ReadOptions) -> Content:
     # Types of the properties, before text is read as real numbers.
     types = {element.name: element.properties for element in header.elements}
     if counts.get("tristrips"):
-        raise MeshFileError("has triangle strips, which are not read: export it with faces")
+        raise MeshFileError("has triangle strips, which are not supported. Export it with faces")
     if not counts.get("face"):
         raise MeshFileError(
-            "is a point cloud, it has no faces: make a mesh of it by lidarpool scene points"
+            "is a point cloud without faces. Convert it to a mesh with lidarpool scene points"
         )
     rows = _ply_rows(header)
     vertices = _ply_vertices(rows)
@@ -548,7 +550,7 @@ def _ply_faces(rows: _PlyRows, vertices: Floats) -> Ints:
     numbers, sizes = rows["face"][name]
     corners = numbers.astype(np.int64)
     if not np.array_equal(corners, numbers):
-        raise ValueError("vertex indices of faces are not whole numbers")
+        raise ValueError("the vertex indices of faces must be integers")
     return triangulated(vertices, corners, sizes)
 
 
@@ -660,7 +662,7 @@ def _text_mistake(header: _PlyHeader) -> str | None:
     for number, line in enumerate(header.body.splitlines(), header.lines + 1):
         for word in line.split():
             if not _is_real(word):
-                return f"line {number} has '{_shown(word)}', and a number was expected"
+                return f"line {number} has '{_shown(word)}', but a number was expected"
     return None
 
 

@@ -95,7 +95,7 @@ def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
     """
     corners = np.concatenate(rings)
     if len(corners) > MAX_CORNERS:
-        raise ValueError(f"a face has {len(corners):,} corners and is not convex: triangulate it")
+        raise ValueError(f"a face has {len(corners):,} corners and is not convex. Triangulate it")
     check_corners(corners, len(vertices))
     points = vertices[corners] - vertices[corners[0]]  # so that large coordinates lose no digits
     outline = points[: len(rings[0])]

@@ -60,7 +60,7 @@ def read_pts(path: Path) -> list[CloudScan]:
                 following = chain([entry], lines)
             scans.append(_read_cloud(following, number, count))
     if not scans:
-        raise ValueError("it is empty: the number of points was expected")
+        raise ValueError("it is empty, but the number of points was expected")
     intensities = [scan.columns["intensity"] for scan in scans if "intensity" in scan.columns]
     if any((values < 0).any() for values in intensities):
         for values in intensities:
@@ -79,7 +79,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
         return CloudScan(np.zeros((0, 3)), {})
     first = next_line(lines)
     if first is None:
-        raise CutShortError(f"line {number} announces {count:,} points, and none follow")
+        raise CutShortError(f"line {number} announces {count:,} points, but none follow")
     names = names_of_cells(first, _NAMES)
     texts = (line for _, line in chain([first], lines))
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])

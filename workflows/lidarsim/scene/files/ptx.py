@@ -65,7 +65,7 @@ def read_ptx(path: Path) -> list[CloudScan]:
         while (entry := next_line(lines)) is not None:
             scans.append(_read_scan(entry, lines, size))
     if not scans:
-        raise ValueError("it is empty: the header of a .ptx was expected")
+        raise ValueError("it is empty, but a .ptx header was expected")
     return scans
 
 

@@ -214,7 +214,7 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
     if not valid.all():
         _, matrix, name, _ = placed[int(valid.argmin())]
         raise MeshFileError(
-            f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
+            f"places {name[:80]!r} by a matrix that is not a valid transform: {matrix.tolist()}"
         )
     ranks = rank(matrices[:, :3, :3]).tolist()
     for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
@@ -242,7 +242,7 @@ def bake_animation(
         If the animation has no duration, or the number of vertices changes.
     """
     if not times_s[-1] > times_s[0]:
-        raise MeshFileError("has an animation without a duration: give it two keys")
+        raise MeshFileError("has an animation without a duration. Add a second keyframe")
     content = Content(())
     pose_arrays = list[Floats]()
     count = len(times_s)

@@ -299,7 +299,7 @@ def stated_meters(
         return (meter, meter, meter), [note] if problem else []
     scale = _scale_of(system, positions)
     if scale.problem:
-        raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
+        raise LidarError(f"it {scale.problem}. {advice_to_project(scale.epsg)}.")
     units = system.units()
     if units is None:
         return (1.0, 1.0, 1.0), []
@@ -319,13 +319,13 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
     if system is None:
         return []
     if system.crs is not None and is_geocentric(system.crs):
-        raise LidarError(f"it is in {system.name}, geocentric: {advice_to_project(None)}.")
+        raise LidarError(f"it is in {system.name}, geocentric. {advice_to_project(None)}.")
     meter = system.horizontal_m
     if meter is None:
         return [f"states the coordinate system {system.name!r}, and is taken in meters"]
     scale = _scale_of(system, positions / meter)
     if scale.problem:
-        raise LidarError(f"it {scale.problem}: {advice_to_project(scale.epsg)}.")
+        raise LidarError(f"it {scale.problem}. {advice_to_project(scale.epsg)}.")
     notes = [scale.note] if scale.note else []
     if meter != 1.0:
         notes.append(f"is in {system.name}, and is taken in meters, as its format has them")
@@ -417,16 +417,16 @@ class Reprojection:
         need_registry("clouds are brought to another coordinate system")
         if system is None:
             raise LidarError(
-                f"it states no coordinate system, so it cannot be brought to EPSG:{epsg}: leave "
-                "out --epsg (in Python epsg=), or state its system first (pdal translate IN OUT "
+                f"it states no coordinate system, so it cannot be transformed to EPSG:{epsg}. "
+                "Remove --epsg (epsg= in Python), or assign a system first (pdal translate IN OUT "
                 "--readers.las.override_srs=EPSG:CODE)."
             )
         source = system.crs
         if source is None:
-            raise LidarError(f"its coordinate system {system.name!r} is not known to PROJ.")
+            raise LidarError(f"its coordinate system {system.name!r} is unknown to PROJ.")
         target = crs_of_code(epsg)
         if target is None:
-            raise LidarError(f"EPSG:{epsg} is not known to PROJ: give the code of another system.")
+            raise LidarError(f"EPSG:{epsg} is unknown to PROJ. Use the code of another system.")
         self._epsg = epsg
         self._target, _ = horizontal_part(target)
         self._is_geocentric = is_geocentric(source)
@@ -446,7 +446,7 @@ class Reprojection:
         if len(moved):
             x, y = np.median(moved[:, :2], axis=0).tolist()
             if problem := target_problem(self._epsg, x, y):
-                raise LidarError(f"it cannot be brought to {problem}.")
+                raise LidarError(f"it cannot be transformed to {problem}.")
 
     def apply(self, positions: Floats) -> Floats:
         """Return positions (n, 3) in meters of the chosen system, NaN for positions not finite.

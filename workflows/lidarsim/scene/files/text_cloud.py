@@ -123,11 +123,11 @@ def _check_text(start: bytes) -> None:
     Raises ValueError if not.
     """
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        raise ValueError("it is text in UTF-16: save it as UTF-8")
+        raise ValueError("it is encoded in UTF-16. Save it as UTF-8")
     if b"\0" in start:
-        raise ValueError("it is binary, and lines of text were expected")
+        raise ValueError("it is a binary file, but a text file was expected")
     if _begins_as_raster(start):
-        raise ValueError("it is a raster of heights, and no cloud: give it as a scene")
+        raise ValueError("it is an elevation raster, not a point cloud. Use it as a scene")
 
 
 # -- the head ------------------------------------------------------------------------------------
@@ -150,13 +150,13 @@ def _read_head(lines: Iterator[str]) -> _Head:
             is_remark = text.startswith(REMARKS)
         elif not text or text.startswith(REMARKS):
             if number > _MAX_HEAD_LINES:
-                raise ValueError(f"its first {_MAX_HEAD_LINES:,} lines have no points")
+                raise ValueError(f"its first {_MAX_HEAD_LINES:,} lines contain no points")
         elif text.isdecimal() and announced is None:
             announced = int(text)
         elif names is None and not _begins_with_numbers(text):
             raise ValueError(
-                f"line {number} is {printable(text)[:60]!r}, and x, y and z were expected, or a "
-                "header that names the columns"
+                f"line {number} is {printable(text)[:60]!r}, but x, y and z or a header with "
+                "column names were expected"
             )
         else:
             return _Head(names, names_line, is_remark, announced, line, number)
@@ -217,7 +217,7 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
     count = len(first_cells)
     if count < len("xyz"):
         raise ValueError(
-            f"line {head.first_line} has {plural(count, 'cell')}, and x, y and z were expected"
+            f"line {head.first_line} has {plural(count, 'cell')}, but x, y and z were expected"
         )
     if len(names) == count + 1 and not names[-1]:
         names = names[:-1]
@@ -246,7 +246,7 @@ def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, fl
     if _QUATERNION.issubset(words):
         raise ValueError(
             f"line {head.names_line} names a quaternion ({printable(', '.join(names))}): it is a "
-            "trajectory, and no cloud"
+            "trajectory, not a point cloud"
         )
     if not {_AXES.get(word) for word in words} >= {"x", "y", "z"}:
         raise ValueError(
@@ -286,8 +286,8 @@ def _numeric_cells(
     for axis, index in zip("xyz", axes, strict=True):
         if index not in numeric:
             raise ValueError(
-                f"line {head.first_line} has {printable(first_cells[index])[:40]!r} as {axis}, and "
-                "a number was expected"
+                f"line {head.first_line} has {printable(first_cells[index])[:40]!r} as {axis}, "
+                "but a number was expected"
             )
     return numeric
 
@@ -318,17 +318,17 @@ def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
     if reader.separator == "," and width >= _MIN_AMBIGUOUS and not reader.point_line:
         raise ValueError(
             "its numbers have no decimal points, and its commas may separate decimals as well as "
-            "columns: write decimal points, or name the columns in a header, as in x,y,z"
+            "columns. Write decimal points, or name the columns in a header, as in x,y,z"
         )
     if _are_poses(values):
         raise ValueError(
-            "its lines are poses: it is a trajectory, and no cloud; name the columns in a header "
-            "if it is a cloud"
+            "its lines are poses: it is a trajectory, not a point cloud. If it is a point cloud, "
+            "name its columns in a header"
         )
     counts_points = len(values) >= _MANY_POINTS and (np.diff(values[:, 0]) == 1).all()
     if width > 3 and counts_points and values[0, 0] in (0, 1):
         raise ValueError(
-            "its first column counts the points: name the columns in a header, as in id x y z"
+            "its first column numbers the points. Name the columns in a header, as in id x y z"
         )
 
 

@@ -69,7 +69,7 @@ class RowReader:
         if self.point_line and self.comma_line:
             raise ValueError(
                 f"line {self.point_line} has decimal points and line {self.comma_line} decimal "
-                "commas: write all numbers in one way"
+                "commas. Use the same format for all numbers"
             )
         return np.concatenate(blocks)
 
@@ -127,7 +127,7 @@ class RowReader:
             return float(text.replace("_", "no"))  # Python allows underscores in numbers
         except ValueError as error:
             raise ValueError(
-                f"line {line_number} has {printable(cell)[:_SHOWN]!r} as {self.names[index]}, and "
+                f"line {line_number} has {printable(cell)[:_SHOWN]!r} as {self.names[index]}, but "
                 "a number was expected"
             ) from error
 
