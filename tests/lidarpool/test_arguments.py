@@ -94,7 +94,7 @@ WRONG = {
     Campaign.load: [(3, "path must … but is 3"), ("a.yaml", "not exist")],
     Campaign.of_scenarios: [
         ("a.yaml", "paths must be a list of text, but is 'a.yaml'"),
-        ([], "name one"),
+        ([], "at least one"),
     ],
     Job: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
@@ -124,7 +124,7 @@ WRONG = {
         (0, 0, 0, 0, None, 1.5, "seed must … but is 1.5"),
     ],
     Optics: [("red", "wavelength_nm"), (905, None, None, "pulse_ns")],
-    Packets: [(3, "sensor must be a Sensor … but is 3"), (GRID, "has no packets")],
+    Packets: [(3, "sensor must be a Sensor … but is 3"), (GRID, "has no packet format")],
     Planning: [("a", "start must … but is 'a'"), ((0, 0), 5, "target must … but is 5")],
     Pose: [(1, "list of numbers"), ((0, 0, 1), "90", "yaw_deg must … but is '90'")],
     Rerun: [
@@ -185,7 +185,7 @@ WRONG = {
     Track: [("a", "b", "times_s must … but is 'a'"), ([0, 1], POINTS[:2], [[1]], "(1, 1)")],
     play: [
         (3, AT[0], "scanner must be a Scanner, but is 3"),
-        (SCANNER, AT[0], "has no packets"),
+        (SCANNER, AT[0], "has no packet format"),
         (SCANNER, 3, "trajectory must … but is 3"),
     ],
     load_sensor: [(3, "model must … but is 3"), ([1], "text, a path or None")],

@@ -557,9 +557,13 @@ def test_repeated_points_of_an_actor_that_has_left_have_no_box(drive):
 def test_the_first_sensor_of_nuscenes_is_lidar_top_and_a_note_says_so(drive, tmp_path):
     survey, scene = drive
     for names, channels, words in (
-        (("roof", "rear"), {"LIDAR_TOP", "rear"}, "'roof', is LIDAR_TOP in nuScenes: "),
+        (("roof", "rear"), {"LIDAR_TOP", "rear"}, "so 'roof' is renamed to 'LIDAR_TOP'"),
         (("LIDAR_TOP", "rear"), {"LIDAR_TOP", "rear"}, ""),
-        (("rear", "LIDAR_TOP"), {"LIDAR_TOP", "LIDAR_TOP_2"}, "and 'LIDAR_TOP' is LIDAR_TOP_2"),
+        (
+            ("rear", "LIDAR_TOP"),
+            {"LIDAR_TOP", "LIDAR_TOP_2"},
+            "'LIDAR_TOP' is renamed to 'LIDAR_TOP_2'",
+        ),
     ):
         sensors = [
             replace(carried, name=name) for carried, name in zip(survey.carried, names, strict=True)

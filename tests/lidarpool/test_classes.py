@@ -211,7 +211,7 @@ def test_nuscenes_has_labels_and_categories(saved, scene, sweeps):
     tables = tables_of(saved("nuscenes", replace(sweeps, classes={})))
     assert "lidarseg" not in tables and "index" not in tables["category"][0]
     many = dict(zip(range(1, 257), map(str, range(256)), strict=True))
-    with pytest.raises(LidarError, match=r"256 classes have names, but .* at most 255\. Remove"):
+    with pytest.raises(LidarError, match=r"256 classes have names"):
         saved("nuscenes", replace(sweeps, classes=many))
 
 

@@ -253,7 +253,7 @@ def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
 def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):
     place = Storage.at(tmp_path / "d")
     bare = Cloud(job(0).positions, {"scan": job(0).scan})
-    with pytest.raises(LidarError, match="kitti needs object, reflectivity, class"):
+    with pytest.raises(LidarError, match="kitti requires object, reflectivity and class"):
         DataSet(place, "kitti").write_job(JobRow(0, "0"), bare, sweeps)
     assert DataSet(place, "kitti").columns == ("scan", "object", "reflectivity", "class")
     assert DataSet(place, "folder").columns == ()

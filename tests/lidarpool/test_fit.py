@@ -553,7 +553,7 @@ def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
             replace(recording, read=lambda number: nothing),
             "contains no points, so there is nothing to fit",
         ),
-        (replace(recording, count=0), "has no sweeps"),
+        (replace(recording, count=0), "contains no sweeps"),
         (replace(recording, thinned=True, notes=("one of 5 hits",)), "one of 5 hits"),
         (
             replace(recording, read=lambda k: (*recording.read(k)[:1], {}, None)),

@@ -771,7 +771,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     ):
         with pytest.raises(LidarError, match=told):
             save_cloud(known, tmp_path / path, **more)
-    with pytest.raises(LidarError, match="mcap stores single sweeps, but the cloud has no sweeps"):
+    with pytest.raises(LidarError, match="mcap stores single sweeps, but"):
         save_cloud(bare, tmp_path / "x.mcap")
     with pytest.raises(
         LidarError, match="kitti requires scan, object, reflectivity and class, but"

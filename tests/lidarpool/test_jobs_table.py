@@ -111,9 +111,9 @@ def test_a_table_is_whole_or_not_there(tmp_path):
 
 def test_what_does_not_fit_is_refused(tmp_path):
     place = Storage.at(tmp_path)
-    with pytest.raises(LidarError, match=r"0007 has a value 'night'.*weather.rain"):
+    with pytest.raises(LidarError, match=r"0007 has a value for 'night'.*weather.rain"):
         write_table(place, NAMES[:2], lambda: [DONE])
-    with pytest.raises(LidarError, match=r"\[1\], a list"):
+    with pytest.raises(LidarError, match=r"\[1\] \(list\)"):
         write_table(place, ["a"], lambda: [JobRow(0, "0", values={"a": [1]})])
     with pytest.raises(LidarError, match="cannot be written"):
         write_table(Storage.at("/proc/none"), [], list)
@@ -144,7 +144,7 @@ def test_a_table_with_other_columns_is_refused(tmp_path, column):
     head = "number,name,split,error,scans,sweeps,rays,hits,points,sha256"
     row = "0,a,,,1,1,1,1,1,,3"
     (tmp_path / "jobs.csv").write_text(f"{head},{column}\n{row}\n")
-    with pytest.raises(LidarError, match=r"damaged near line 1 .*(not known|twice)"):
+    with pytest.raises(LidarError, match=r"damaged near line 1.*unknown"):
         list(read_table(Storage.at(tmp_path)))
 
 

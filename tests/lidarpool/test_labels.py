@@ -98,7 +98,7 @@ def test_the_scenario_of_the_page_labels_its_points():
 @pytest.mark.parametrize(
     ("materials", "notes"),
     [
-        ([], ["KITTI labels points by class, and all have class 0: give class: in "]),
+        ([], ["KITTI labels points by class, but all points have class 0. Set `class` in "]),
         ([{"objects": "*", "class": 4}], []),
     ],
 )

@@ -205,7 +205,7 @@ def test_the_panel_tells_stages_pace_and_what_is_waited_for(live):
     ]  # fmt: skip
     assert ["2 intersect", 50, 100] in told["stages"]
     live.on_progress(progress(6.0, 60, waits_for="<GPU>"), list)
-    assert "waits for slots of <GPU>" in news(live)["state"]
+    assert "waiting for <GPU> slots held" in news(live)["state"]
 
 
 def test_a_run_is_stopped_as_by_an_interrupt(live):

@@ -102,7 +102,7 @@ def test_a_cut_part_is_refused(storage, size):
 
 @pytest.mark.parametrize("columns", [(SCAN, *COLUMNS), (TABLE["x"],)])
 def test_another_number_of_rows_is_refused(storage, columns):
-    with pytest.raises(LidarError, match="do not fit together"):
+    with pytest.raises(LidarError, match="do not have"):
         columns_of(storage, 5, columns, ROWS + 1)
 
 

@@ -88,7 +88,7 @@ def test_several_scanners_share_a_page(hall):
         column = ask(view.url, "column", name="sensor")
         news = ask(view.url, "news")
         other = Scanner(hall, Sensor.grid(100, 4), name="side", backend="numpy")
-        with pytest.raises(LidarError, match="does not show the scanner 'side': give show"):
+        with pytest.raises(LidarError, match="does not show the scanner 'side'"):
             view.show(second, Pose((0, 0, 2)), scanner=other)
     assert state["points"] == len(first) + len(second)
     assert "range" not in {column["name"] for column in state["columns"]}
@@ -111,7 +111,7 @@ def test_faults_are_one_line(hall):
     with pytest.raises(urllib.error.URLError):
         urllib.request.urlopen(address, timeout=5)
     assert "iframe" not in view._repr_html_()
-    with pytest.raises(LidarError, match=r"different names, such as .* given: '', ''\."):
+    with pytest.raises(LidarError, match=r"different names, such as .*are '', ''"):
         show([scanner, scanner])
     with pytest.raises(LidarError, match=r"scanner must be a Scanner or a list, but is 'vlp16'"):
         show("vlp16")

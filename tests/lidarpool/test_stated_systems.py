@@ -177,7 +177,7 @@ def test_what_cannot_be_brought_is_refused(tmp_path):
         (3857, r"cannot be transformed to EPSG:3857 \(WGS.*, a world map projection"),
         (2263, r"cannot be transformed to EPSG:2263 \(.*, which is not in meters"),
         (32640, r"cannot be transformed to EPSG:32640 .*EPSG:32632 has true meters"),
-        (1025, "EPSG:1025 is not known to PROJ"),
+        (1025, "EPSG:1025 is unknown to PROJ"),
     ):
         with pytest.raises(LidarError, match=message):
             scene_of_points(path, epsg=epsg)
@@ -186,7 +186,7 @@ def test_what_cannot_be_brought_is_refused(tmp_path):
     bare = written(tmp_path / "b.las", ground("EPSG:3857"))
     np.savetxt(tmp_path / "b.xyz", ground("EPSG:3857"))
     for file in (bare, tmp_path / "b.xyz"):
-        with pytest.raises(LidarError, match=r"states no coordinate system.*leave out --epsg"):
+        with pytest.raises(LidarError, match=r"states no coordinate system.*Remove --epsg"):
             scene_of_points(file, epsg=32632)
 
 

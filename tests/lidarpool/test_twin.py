@@ -283,7 +283,7 @@ def test_rings_are_found_in_the_order_of_points(drive):
     sweeps = RecordedSweeps.of_recording(without_poses(drive, ring_by_ring))
     channels = len(np.unique(open_recording(drive, name="drive").read(0)[1]["channel"]))
     assert sweeps.ring_count == channels
-    assert f"shows {channels} rings" in sweeps.notes[0]
+    assert f"{channels} rings were determined" in sweeps.notes[0]
     rings = sweeps.read(3).ring
     assert (np.diff(rings) >= 0).all()
 
@@ -390,7 +390,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
         twin(replace(recording, frame_poses=lambda: unknown))
     trajectory = tmp_path / "poses.csv"
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
-    with pytest.raises(LidarError, match="has 2 poses, and drive has 12 sweeps without times"):
+    with pytest.raises(LidarError, match="contains 2 poses, but drive has 12 sweeps without times"):
         twin(recording, trajectory=trajectory)
 
 
@@ -476,7 +476,7 @@ def test_rings_are_found_by_elevations_in_any_order(street, survey):
     channel = part.columns["channel"][order]
     recording = Recording("drive", 4, lambda number: (points[number::4], {}, None))
     sweeps = RecordedSweeps.of_recording(recording)
-    assert "the elevations of its points show 24 rings" in sweeps.notes[0]
+    assert "the elevation angles of the points" in sweeps.notes[0]
     highest = channel.max()
     np.testing.assert_array_equal(sweeps.read(2).ring, highest - channel[2::4])
     moved = points + np.outer(np.linspace(0, 0.5, len(points)), [1, 0, 0])

@@ -143,9 +143,9 @@ def test_folders_are_no_files(tmp_path, name):
 def test_formats_that_are_not_read_say_what_to_do(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     path.write_text("anything")
-    assert f"a{suffix} is not read: " in refused(load_meshes, path)
+    assert f"a{suffix} cannot be read. " in refused(load_meshes, path)
     if suffix not in point_suffixes():
-        assert f"a{suffix} is not read: " in refused(scene_of_points, path)
+        assert f"a{suffix} cannot be read. " in refused(scene_of_points, path)
 
 
 @pytest.mark.parametrize(

@@ -371,7 +371,7 @@ def test_obj(tmp_path, backend, lines, face):
 @pytest.mark.parametrize(
     ("lines", "face", "says"),
     [
-        ("map_d gone.png", "f 1/1 2/2 3/3", "wire (its image 'gone.png' is not there)"),
+        ("map_d gone.png", "f 1/1 2/2 3/3", "wire (its image 'gone.png' does not exist)"),
         ("map_d ../x.png", "f 1/1 2/2 3/3", "wire (takes data from '../x.png', but only"),
         ("map_d broken.png", "f 1/1 2/2 3/3", "wire (broken.png cannot be decoded)"),
         ("map_d mask.png", "f 1 2 3", "wire (texture coordinates are missing)"),

@@ -415,7 +415,7 @@ def test_what_does_not_fit():
     with pytest.raises(LidarError, match="has 2 separate poses"):
         Survey(Sensor.grid(), poses=[(0, 0, 1), (1, 0, 1)], navigation=Navigation(imu=Imu()))
     survey = Survey(poses=[(0, 0, 1)], navigation=Navigation(imu=Imu()))
-    with pytest.raises(LidarError, match="single surveys"):
+    with pytest.raises(LidarError, match="not supported in campaigns"):
         CampaignSpec(lambda number, rng: Job(Scene.seed(), survey), 1).job(0)
     with pytest.raises(LidarError, match=r"rate_hz must be from 0.001 to 100000, but is 0"):
         Imu(rate_hz=0)

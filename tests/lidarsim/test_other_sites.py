@@ -74,7 +74,7 @@ def test_any_name_is_right_behind_a_proxy_whose_name_is_unknown():
 def test_what_browsers_say_of_a_request_decides(headers, is_refused):
     for changes_state in (False, True):
         words = refusal({"host": "127.0.0.2:8080"} | headers, NAMES, changes_state=changes_state)
-        assert words == ("requests from other websites are refused" if is_refused else "")
+        assert words == ("Requests from other websites are rejected." if is_refused else "")
 
 
 def test_a_link_of_another_website_leads_to_a_page_only():

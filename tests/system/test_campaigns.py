@@ -153,7 +153,7 @@ def test_a_note_says_which_sensor_is_lidar_top_of_nuscenes(client, tmp_path):
 
     run = Campaign(make_named, 3, keep="nuscenes").run(tmp_path / "ds", client=client)
     (note,) = run.notes
-    assert note.startswith("the first sensor, 'roof', is LIDAR_TOP in nuScenes")
+    assert "'roof' is renamed to 'LIDAR_TOP'" in note
     assert {sweep.sensor for sweep in sweeps(tmp_path / "ds")} == {"roof", "LIDAR_TOP"}
     assert [path.name for path in (tmp_path / "ds/samples").iterdir()] == ["LIDAR_TOP"]
 

@@ -82,7 +82,8 @@ def test_what_check_says_of_a_drive(town, lidarpool):
     assert re.search(r"144 scans \(4 sweeps\) along a trajectory, .* \(2 sensors\)", told)
     assert re.search(r"trajectory  1\.\d\d m in 0.200 s", told)
     assert re.search(
-        r"roof        Ouster OS1-32, 2,048 firings, 2.00 turns; in one .* moves 0\.\d+ m", told
+        r"roof        Ouster OS1-32, 2,048 firings, 2.00 turns; the platform moves 0\.\d+ m",
+        told,
     )
     assert "returns     strongest of each pulse\n" in told
     done = lidarpool("check", town / "drive.yaml", "--out", town / "out", "--json")

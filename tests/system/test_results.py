@@ -1,4 +1,4 @@
-"""What a result makes of itself in Python, and that another survey's is not replaced unasked."""
+"""What a result makes of itself in Python, and that others are not replaced unasked."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def result(cluster_client, scene) -> Result:
 
 @pytest.fixture
 def another(result) -> Result:
-    """The same points, as if another survey had given them."""
+    """The same points, as if a different survey had given them."""
     return replace(result, identity={**result.identity, "survey": "another"})
 
 
@@ -79,13 +79,13 @@ def test_a_report_does_not_replace_that_of_another_survey_unasked(result, anothe
     with pytest.raises(LidarError, match=r"contains the result of a different survey.*overwrite"):
         another.report(tmp_path)
     sparse = replace(another, survey=replace(another.survey, keep_every=7))
-    words = r"of another survey, cloud\.keep_every changed from \d to 7: .*overwrite"
+    words = r"of a different survey \(cloud\.keep_every changed from 5 to 7\).*overwrite"
     with pytest.raises(LidarError, match=words):
         sparse.report(tmp_path)
     another.report(tmp_path, only_cloud=True, overwrite=True)
     assert json.loads((tmp_path / "report.json").read_text())["identity"]["survey"] == "another"
     (tmp_path / "report.json").write_text("somebody's own")
-    with pytest.raises(LidarError, match="another survey"):
+    with pytest.raises(LidarError, match="a different survey"):
         another.report(tmp_path)
 
 

@@ -74,14 +74,14 @@ def refusal(
     site = headers.get("sec-fetch-site")
     follows_link = is_page and headers.get("sec-fetch-mode") == "navigate"
     if site is not None and site not in _OWN_SITES and not follows_link:
-        return "requests from other websites are refused"
+        return "Requests from other websites are rejected."
     origin = headers.get("origin")
     if origin is not None and not _is_of(origin, authorities):
-        return "requests from other websites are refused"
+        return "Requests from other websites are rejected."
     is_browser = headers.get("user-agent", "").lower().startswith(_BROWSER)
     says_nothing = is_browser and site is None and origin is None
     if changes_state and says_nothing and not _is_of(headers.get("referer", ""), authorities):
-        return "requests that change data must be same-origin"
+        return "Requests that change data must come from the same origin."
     return ""
 
 

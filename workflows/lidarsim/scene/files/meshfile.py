@@ -16,7 +16,14 @@ import numpy as np
 
 from ...base.arrays import Floats
 from ...base.elementary import cbrt
-from ...base.errors import CutShortError, LidarError, MissingFileError, prefixed, unreadable
+from ...base.errors import (
+    CutShortError,
+    LidarError,
+    MissingFileError,
+    as_sentence,
+    prefixed,
+    unreadable,
+)
 from ...base.extras import install_command
 from ...base.input_files import not_found, open_input, read_input
 from ...base.validation import checked
@@ -393,7 +400,7 @@ def _format_to_read(path: Path) -> MeshFormat:
     if row is not None and not row.advice:
         return row
     if row is not None:
-        raise LidarError(f"{path} is not read: {row.advice}.")
+        raise LidarError(f"{path} cannot be read. {as_sentence(row.advice)}")
     further = "".join(
         f"; {package} reads more: {install_command('lidarpool')}" for package in missing_packages()
     )
