@@ -58,10 +58,11 @@ mutants: dev  ## COUNT faults planted in the sources (default 20), and which of 
 soak: dev  ## 10,000 scans with a worker killed every few seconds; memory as a picture in $(OUT)/
 	$(BIN)/python -m tests.chaos.soak --picture $(OUT)/soak.png
 
-lint: dev docs  ## format check, lint, types, layers, names, documentation; prints lines per package
+lint: dev docs  ## format check, lint, types, spelling, layers, documentation; prints lines per package
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/codespell
 	$(BIN)/lint-imports
 	$(BIN)/python .ci/lines.py
 

@@ -140,7 +140,7 @@ class RayCaster:
 
     @property
     def on_device(self) -> bool:
-        """Whether hits can stay on a CUDA device, for `visit`."""
+        """Whether hits can remain on a CUDA device, as `visit` requires."""
         return self._engine.on_device
 
     @property
@@ -159,13 +159,13 @@ class RayCaster:
         return len(self._scene.mesh)
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Cast rays on bodies of this shape, and write nearer hits to `nearest`."""
+        """Cast rays at bodies of this shape, and write closer hits to `nearest`."""
         self.engine.cast_crossing(crossing, nearest)
 
     def device_nearest(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
     ) -> DeviceNearest:
-        """Put rays `start` to `stop` (n) of a scan on the device, without hits on bodies.
+        """Copy the rays `start` to `stop` of a scan to the device, without hits on bodies.
 
         `time_index` (n,) are the numbers of the rays' times; hits count before distance `end`,
         meters. BackendUnavailable if this backend has no device.
@@ -173,7 +173,7 @@ class RayCaster:
         return self.engine.device_nearest(scan, start, stop, time_index, end)
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
-        """Cast rays on bodies of this shape on the device, and write nearer hits to `nearest`.
+        """Cast rays at bodies of this shape on the device, and write closer hits to `nearest`.
 
         BackendUnavailable if this backend has no device.
         """
@@ -228,7 +228,7 @@ class RayCaster:
 
     @property
     def engine(self) -> Backend:
-        """The engine, after an update for all instances that have moved."""
+        """Engine, which is updated first if instances have moved."""
         with self._lock:
             if self._moved:
                 self._scene = self._scene.moved(self._transforms)

@@ -49,7 +49,7 @@ class Deforming:
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Cast rays on bodies of this shape, and write nearer hits to `nearest`.
+        """Cast rays at bodies of this shape, and write closer hits to `nearest`.
 
         Of equally close triangles the lowest is hit.
         """

@@ -116,7 +116,7 @@ class MeshFrames:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Instances and meshes in the form for backends.
+    """Instances and meshes in the representation that backends use.
 
     Attributes
     ----------
@@ -148,12 +148,12 @@ class Scene:
 
     @property
     def nested(self) -> bool:
-        """Whether rays must be transformed to the meshes' coordinates."""
+        """Whether rays must be transformed to the coordinates of the meshes."""
         return self.matrices is not None
 
     @cached_property
     def first_face(self) -> Ints:
-        """First row of each mesh's faces in a tally, and the number of rows: (meshes + 1,)."""
+        """First tally row of each mesh, followed by the number of rows. Shape (meshes + 1,)."""
         return np.cumsum([0, *(mesh.face_count for mesh in self.meshes)])
 
     @property
@@ -163,12 +163,12 @@ class Scene:
 
     @property
     def counters(self) -> Ints:
-        """First row of each instance's triangles in a tally, and the step between rows: (n, 2)."""
+        """First tally row of each instance, and the step between its rows. Shape (n, 2)."""
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
     def moved(self, transforms: Floats) -> Scene:
-        """Return the scene of the same instances with other transforms (n, 3, 4), checked.
+        """Return the scene with other transforms (n, 3, 4), which are validated.
 
         The scene must be nested.
         """
@@ -176,7 +176,7 @@ class Scene:
         return _nested_scene(self.meshes, self.mesh, self.mesh_frames, transforms)
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
-        """Return rows (k,) in a tally of triangles (k,) of instances (k,)."""
+        """Return the tally rows of triangles (k,) of instances (k,)."""
         return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
 
     def enter(

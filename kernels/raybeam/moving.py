@@ -93,7 +93,7 @@ class Moving:
         return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:
-        """Return a mask (m,) of the bodies (m,) that are present at times (m,)."""
+        """Return a mask of the bodies (m,) that are present at times (m,)."""
         first, last = self.presence[body].T
         return np.asarray((first <= times) & (times <= last))
 

@@ -92,7 +92,7 @@ class Pattern:
     def divided(
         self, sub_rays: SubRays, offsets: Floats | None = None, beam_indices: Ints | None = None
     ) -> Pattern:
-        """Return a copy with sub-rays, of all beams or of the rows (m,), without another check.
+        """Return a copy with sub-rays, for all beams or for the rows (m,).
 
         After its last row the pattern repeats. `offsets` (m, 2) are angles across and up of each
         beam, radians, added to the angles of its sub-rays.

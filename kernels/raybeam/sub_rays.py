@@ -35,7 +35,7 @@ class SubRays:
     def shares(
         self, subray: Indices | slice = slice(None), offsets: Floats | None = None
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the components of unit vectors ahead, across and up: (m,) each.
+        """Return the forward, lateral and vertical components of the unit vectors. (m,) each.
 
         `offsets` (2, m) are angles across and up, radians, added to the angles of each sub-ray.
         """
@@ -47,7 +47,7 @@ class SubRays:
         return straight, across * straight, up * straight
 
     def loop_table(self, offsets: Floats | None) -> Floats:
-        """Return the table that compiled loops read: shares, or angles, and starts.
+        """Return the table for compiled loops.
 
         It has 5 rows of whole vectors of 8 sub-rays. The last sub-ray is repeated to fill a vector.
 

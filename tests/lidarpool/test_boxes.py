@@ -562,7 +562,7 @@ def test_the_first_sensor_of_nuscenes_is_lidar_top_and_a_note_says_so(drive, tmp
         (
             ("rear", "LIDAR_TOP"),
             {"LIDAR_TOP", "LIDAR_TOP_2"},
-            "'LIDAR_TOP' is renamed to 'LIDAR_TOP_2'",
+            "and 'LIDAR_TOP' to 'LIDAR_TOP_2'",
         ),
     ):
         sensors = [

@@ -29,7 +29,7 @@ def starting_with(incomplete: str, names: Iterable[str]) -> Items:
 
 
 def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a sensor model, with or without its maker, or the name of a file."""
+    """Complete a sensor model, with or without its manufacturer, or a file name."""
     del ctx, param
     from lidarsim.base.model_names import model_names, plugin_model_names
 
@@ -46,7 +46,7 @@ def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def columns(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the last of several columns that commas separate."""
+    """Complete the last name in a comma-separated list of columns."""
     del ctx, param
     return _in_list(incomplete, OPTIONAL_COLUMNS)
 
@@ -97,7 +97,7 @@ def bridges(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def live(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete what --live shows, or the argument that follows if --live stands alone."""
+    """Complete the optional value of --live, or the next argument."""
     del param
     items = starting_with(incomplete, [PAGE, *VIEWERS])
     takes_file = any(isinstance(param, click.Argument) for param in ctx.command.params)

@@ -179,7 +179,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 @dataclass(eq=False, repr=False)
 class StoredCloud(CloudDisplay):
-    """The points of parts in (scan, ray) order, read in chunks, as a `CloudLike`."""
+    """Stored points of a run in (scan, ray) order, which are read in chunks."""
 
     storage: Storage  # storage of the parts
     names: Sequence[str]  # names of the parts, in scan order
@@ -205,33 +205,33 @@ class StoredCloud(CloudDisplay):
 
     @property
     def bounds(self) -> Floats:
-        """Lowest and highest coordinates, (2, 3), meters, or zeros without points."""
+        """Minimum and maximum coordinates in meters, or zeros without points. Shape (2, 3)."""
         if self.cells is None:
             return np.zeros((2, 3))
         return positions_of(self.cells, self.precision_m, self.origin)
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """The columns without positions, in the order of files."""
+        """Columns apart from the positions, in the order in which files store them."""
         columns = [c for c in self.columns if c not in AXES and c.name != WAVEFORM]
         return (SCAN, *columns)
 
     @property
     def recorded(self) -> bool:
-        """True if the points have waveforms."""
+        """Whether the points have waveforms."""
         return any(column.name == WAVEFORM for column in self.columns)
 
     def cloud_of(self, part: PartColumns, row_selection: Integers | slice = slice(None)) -> Cloud:
-        """Return the points of a part, or a selection of rows."""
+        """Return all points of a part, or the selected rows."""
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
-        """Yield the names of axes with coordinates, (n,), meters, of columns of a part."""
+        """Yield the name and the coordinates in meters for each axis of a part."""
         for i, axis in enumerate(AXES):
             yield axis.name, positions_of(columns[axis.name], self.precision_m, self.origin[i])
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the cloud in order, from row `first` on, in chunks of `points`.
+        """Yield the points in order from row `first`, in chunks of `points` points.
 
         LidarError if a part cannot be read.
         """
@@ -266,7 +266,7 @@ class StoredCloud(CloudDisplay):
         return row + int(counts[: scan - self.firsts[index]].sum())
 
     def sample(self, max_points: int, max_parts: int) -> Cloud:
-        """Read evenly spaced points, at most `max_points` of at most `max_parts` parts."""
+        """Read at most `max_points` evenly spaced points from at most `max_parts` parts."""
         filled = [i for i, rows in enumerate(self.rows) if rows]
         opened = [filled[i] for i in even_indices(len(filled), max_parts)]
         total = sum(self.rows[i] for i in opened)

@@ -51,7 +51,7 @@ def compare(
     distances_m: Sequence[float] = (0.05, 0.1, 0.2, 0.5),
     max_points: Annotated[int, Field(ge=1000)] = MAX_POINTS,
 ) -> Comparison:
-    """Compare two clouds or recordings of the same place.
+    """Compare two clouds or recordings of the same scene.
 
     B is the reference. Recordings of one sensor are compared sweep by sweep in the sensor frame.
     The comparison includes range images, returns that only A or B has, intensities, and distances

@@ -56,7 +56,7 @@ class Sweep:
         boxes: Boxes | None,
         index: int | EllipsisType = ...,
     ) -> Sweep:
-        """Return a sweep by its number in the job, with boxes and index of `SweepBoxes.select`."""
+        """Create the sweep with a given number from the points of a job."""
         positions, columns = points
         return cls(
             job=job.name,

@@ -31,7 +31,7 @@ _UNLIMITED = dict.fromkeys(
 
 @contextmanager
 def mapping(client: Client | None, count: int) -> Iterator[Map]:
-    """Yield a function that calls a function for each of some items, in order, in processes.
+    """Yield a function that maps a function over items in worker processes, in order.
 
     Parameters
     ----------

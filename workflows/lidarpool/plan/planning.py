@@ -40,7 +40,7 @@ class Search:
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Planning(Search):
-    """Search for a path in the plane from `start` to `target` that avoids all discs.
+    """Search for a 2D path from `start` to `target` that avoids all discs.
 
     The search uses `trials` independent particle swarms (`run_trial`).
 

@@ -112,7 +112,7 @@ class Plan:
 
     @property
     def collision_free(self) -> bool:
-        """Whether the path is outside all discs."""
+        """Whether the path does not enter any disc."""
         return self.clearance >= 0
 
     @property

@@ -147,7 +147,7 @@ class CampaignRun:
     def from_rows(
         cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **details: Any
     ) -> CampaignRun:
-        """Sum up the rows of a campaign, where by default all jobs are of an earlier run."""
+        """Summarize the rows of a campaign. By default, all jobs belong to an earlier run."""
         failed = []
         job_count = 0
         points = 0

@@ -48,7 +48,7 @@ class Link(NamedTuple):
 
 
 class Instance(NamedTuple):
-    """A model in a world or in another model."""
+    """Model that is placed in a world or in another model."""
 
     name: str
     body: Body

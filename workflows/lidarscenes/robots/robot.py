@@ -83,7 +83,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Links, and the joints between links, read by `load_robot`.
+    """Robot with links and joints, as read by `load_robot`.
 
     Values of joints are radians or meters. `joints` of the methods are a table (a file with a
     header), or a mapping: of a joint's name to its value, or, with time_s, to its values at these
@@ -114,7 +114,7 @@ class Robot:
 
     @property
     def summary(self) -> str:
-        """Numbers of links, moving joints and triangles, in words."""
+        """Description of the numbers of links, movable joints and triangles."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
         return f"{plural(len(self.links), 'link')}, {plural(triangles, 'triangle')}; " + (
@@ -130,7 +130,7 @@ class Robot:
 
     @cached_property
     def moving(self) -> tuple[str, ...]:
-        """Names of the joints that move."""
+        """Names of the movable joints."""
         return tuple(joint.name for joint in self.joints.values() if joint.moves)
 
     @shown_readably
@@ -143,7 +143,7 @@ class Robot:
         ignore: Sequence[str] = (),
         time_unit: TimeUnit | None = None,
     ) -> Trajectory:
-        """Return the trajectory of a link, by the trajectory of the root.
+        """Return the trajectory of a link, given the trajectory of the root link.
 
         `joints` are values of joints (`Robot`); `ignore` are names of columns of a table of
         joints to leave out, with * and ?; `time_unit` is as for `actors`.
@@ -170,7 +170,7 @@ class Robot:
         time_unit: TimeUnit | None = None,
         tell: Callable[[str], None] = _log.warning,
     ) -> tuple[Actor, ...]:
-        """Return an actor for each link that a joint moves, with the links fixed to the link.
+        """Return an actor for each link that is moved by a joint, including links fixed to it.
 
         Parameters
         ----------

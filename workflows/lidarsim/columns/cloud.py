@@ -44,7 +44,7 @@ class CloudLike(Protocol):
         """Yield the points in order, from row `first` on, in clouds of at most `points`."""
 
     def row_of(self, scan: int) -> int:
-        """Return the row of the first point of a scan, for points in the order of scans."""
+        """Return the row of the first point of a scan. Requires points in scan order."""
 
 
 class CloudDisplay:
@@ -176,7 +176,7 @@ class Cloud(CloudDisplay):
 
     @property
     def by_name(self) -> dict[str, AnyArray]:
-        """Coordinates and columns, {name: (n,)}, without waveforms."""
+        """Coordinates and columns by name, without waveforms."""
         axes = dict(zip("xyz", self.positions.T, strict=True))
         return axes | {column.name: self[column.name] for column in self.table}
 

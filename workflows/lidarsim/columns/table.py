@@ -98,7 +98,7 @@ class Column:
         return self.file_name or self.name
 
     def make(self, returns: Any) -> AnyArray:
-        """Return the values of this column for the returns of a batch: (n,), of the column's type.
+        """Return the values of this column for the returns of a batch. Shape (n,).
 
         LidarError if the source has a wrong number of values, or values that do not fit the type.
         """

@@ -275,7 +275,7 @@ class Material:
         )
 
     def check_leaves(self, name: str, voxels: bool) -> None:
-        """Check that the material suits an object `name`, which may have `voxels`.
+        """Check that the material can be used for an object.
 
         Raises
         ------

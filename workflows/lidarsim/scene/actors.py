@@ -135,7 +135,7 @@ class Actor:
         )
 
     def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return frames (k,) of the animation at times (k,), nanoseconds, and frames per second."""
+        """Return the animation frames at times (k,) in nanoseconds, and the frame rates."""
         seconds, rates = self.seconds(times_ns)
         animation = self.mesh.animation
         assert animation is not None
@@ -144,7 +144,7 @@ class Actor:
         return animation.frames(seconds), rates / animation.step_s
 
     def seconds(self, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return times (k,) in the animation, seconds, at times (k,), ns, and their rates (k,).
+        """Return the animation times in seconds at times (k,) in nanoseconds, and their rates.
 
         A rate is the seconds of animation that pass in a second of the survey.
         """
@@ -184,7 +184,7 @@ class Actor:
         return times_ns, np.append(0.0, np.cumsum(steps_m))
 
     def samples(self, duration_ns: float, count: int) -> ActorSamples:
-        """Return poses at `count` times, for drawings.
+        """Return `count` evenly spaced poses, for drawing the trajectory.
 
         Times are even over the part of a survey of `duration_ns` while the actor is present.
         """
@@ -195,7 +195,7 @@ class Actor:
         return ActorSamples(times_ns, positions, quaternions_of(rotations))
 
     def check(self, start_ns: float, stop_ns: float) -> None:
-        """Check that the trajectory covers times from start to stop, ns.
+        """Check that the trajectory covers an interval in nanoseconds.
 
         Raises LidarError if not.
         """

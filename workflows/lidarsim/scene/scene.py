@@ -237,7 +237,7 @@ class Scene:
     @classmethod
     @shown_readably
     def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
-        """Make a scene of the objects of mesh files.
+        """Create a scene from the objects of mesh files.
 
         If no object is static, the actors become static objects at their first pose, and `tell` is
         called with a line on the loss.
@@ -344,7 +344,7 @@ class Scene:
         return scene
 
     def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Scene:
-        """Return the same scene with instances, by their indices (m,), at other poses.
+        """Return the scene with some of its instances at other poses.
 
         A pose is the pose of the mesh's frame in local coordinates: positions (m, 3), meters, and
         rotations (m, 3, 3). The instances keep their scales.
@@ -369,7 +369,7 @@ class Scene:
 
     @property
     def surface_kinds(self) -> SurfaceKinds:
-        """Kinds of surfaces: a kind for each material of each object, actors last."""
+        """Surface kinds, one for each material of each object. Actors come last."""
         names = self.object_names
         static = [()] * len(self.names) if self.materials is None else self.materials.names
         moving = [
@@ -385,7 +385,7 @@ class Scene:
 
     @property
     def has_mixed_objects(self) -> bool:
-        """True if an object has faces of several materials."""
+        """Whether any object has faces with different materials."""
         static = () if self.materials is None else self.materials.names
         moving = (actor.mesh.materials for actor in self.actors)
         return any(len(names) > 1 for names in static) or any(
@@ -394,7 +394,7 @@ class Scene:
 
     @property
     def material_names(self) -> tuple[str, ...]:
-        """Distinct names of all materials of faces.
+        """Distinct names of all face materials.
 
         The column `material` contains indices into these names.
         """
@@ -402,7 +402,7 @@ class Scene:
 
     @property
     def face_materials(self) -> Ints32 | None:
-        """Indices of `faces` into `material_names`, (f,), -1 for none, or None without any name."""
+        """Index into `material_names` for each face, or -1. None if no material has a name."""
         if self.materials is None or not self.material_names:
             return None
         kinds = self.surface_kinds
@@ -416,7 +416,7 @@ class Scene:
 
     @property
     def masked(self) -> tuple[str, ...]:
-        """Names of the objects with masks, through which light passes in part, in order."""
+        """Names of the objects with opacity masks, in order."""
         owners = set()
         if (instances := self.instances) is not None:
             owners = set(instances.owners(lambda part: part.mask is not None).tolist())
@@ -426,7 +426,7 @@ class Scene:
 
     @property
     def colored(self) -> list[Colors]:
-        """Colors of the faces, of parts of instances and of actors' meshes, empty if all are gray.
+        """Colors of all faces, including instances and actors. Empty if all are gray.
 
         Only colors that exist are listed, in this order.
         """
@@ -437,7 +437,7 @@ class Scene:
 
     @property
     def has_colors(self) -> Bools:
-        """True for each object with a color, actors after the static objects: (objects,)."""
+        """Mask of the objects with a color, where actors come last. Shape (objects,)."""
         has_color = np.zeros(len(self.object_names), np.bool_)
         if (colors := self.colors) is not None:
             gray = np.array([image is GRAY for image in colors.images])
@@ -450,7 +450,7 @@ class Scene:
 
     @property
     def has_voxels(self) -> Bools:
-        """True for each object that is filled with voxels of leaves: (objects,), actors last."""
+        """Mask of the objects filled with leaf voxels, where actors come last. Shape (objects,)."""
         has_voxels = np.zeros(len(self.names) + len(self.actors), np.bool_)
         if (instances := self.instances) is not None:
             has_voxels[instances.owners(lambda part: part.voxels is not None)] = True
@@ -468,13 +468,13 @@ class Scene:
 
     @property
     def kept_triangles(self) -> int:
-        """Number of static triangles in memory: a part counts once for all its instances."""
+        """Number of static triangles in memory. Instances of the same mesh share its triangles."""
         parts = self.instances.mesh_parts if self.instances else ()
         return len(self.faces) + sum(len(part.faces) for part in parts)
 
     @property
     def counters(self) -> int:
-        """Number of hit counters: a counter for each triangle and for each instance.
+        """Number of hit counters, one for each triangle of each instance.
 
         The counters of instances follow the counters of `faces`; the counters of the actors'
         triangles come last.
@@ -568,7 +568,7 @@ class Scene:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lowest and highest corner of the static triangles, local, meters: (2, 3)."""
+        """Bounding box of the static triangles in local coordinates, in meters. Shape (2, 3)."""
         corners = self._face_bounds
         if self.instances:
             corners = np.concatenate([corners, self.instances.bounds.reshape(-1, 3)])
@@ -584,7 +584,7 @@ class Scene:
 
     @cached_property
     def object_bounds(self) -> Floats:
-        """Lowest and highest corner of each static object, local, meters: (objects, 2, 3).
+        """Bounding boxes of the static objects in local coordinates, in meters. (objects, 2, 3).
 
         An object without triangles has (+inf, -inf).
         """
@@ -600,7 +600,7 @@ class Scene:
 
     @cached_property
     def footprints(self) -> Floats:
-        """Circle around each static object, seen from above: x, y, radius: (objects, 3).
+        """Bounding circles of the static objects in the xy plane: x, y, radius. Shape (objects, 3).
 
         Local coordinates, meters.
 

@@ -68,7 +68,7 @@ class SceneInstance:
 
     @classmethod
     def from_matrices(cls, mesh: SceneMesh, transforms: Floats, name: str) -> list[SceneInstance]:
-        """Return instances of a mesh at matrices (n, 4, 4).
+        """Create instances of a mesh with transforms of shape (n, 4, 4).
 
         The matrices are validated together.
 
@@ -90,11 +90,11 @@ class SceneInstance:
 
     @property
     def matrix(self) -> Floats:
-        """The transform as a matrix, (4, 4)."""
+        """Transform as a matrix of shape (4, 4)."""
         return np.asarray(self.transform)
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
-        """Return a renamed instance whose frame is moved by p -> linear @ p + offset."""
+        """Return a renamed instance that is transformed by p -> linear @ p + offset."""
         position = applied(linear, self.matrix[:3, 3]) + offset
         return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), position), name)
 

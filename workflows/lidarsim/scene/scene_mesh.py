@@ -146,7 +146,7 @@ class SceneMesh:
 
     @cached_property
     def has_area(self) -> bool:
-        """True if rays can hit a triangle of the mesh, or if the mesh is animated."""
+        """Whether a triangle of the mesh has an area, or the mesh is animated."""
         blocks = (
             self.vertices[self.faces[i : i + 65536]] for i in range(0, len(self.faces), 65536)
         )
@@ -154,7 +154,7 @@ class SceneMesh:
         return self.animation is not None or any(np.cross(*e.swapaxes(0, 1)).any() for e in edges)
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
-        """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
+        """Return a renamed copy that is transformed by p -> linear @ p + offset."""
         faces = self.faces
         cutouts = self.cutouts
         colors = self.colors

@@ -82,7 +82,7 @@ class Beams:
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
     def turning(self, radians_per_ns: float) -> Beams:
-        """Return the beams for a head that keeps turning within a firing, counter-clockwise.
+        """Return the beams for a head that keeps rotating counterclockwise within a firing.
 
         Each beam is rotated by the head's angle at its time within the firing, so that casting need
         not rotate it.
@@ -110,10 +110,10 @@ class Head(Protocol):
         """Return the half-open range of the firings of a time step, without gaps between steps."""
 
     def times_ns(self, firings: Ints) -> Floats:
-        """Return the starts of firings (k,), nanoseconds since the head started: (k,)."""
+        """Return the start times of firings (k,) in nanoseconds since the head started."""
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Return the azimuths of the head at firings (k,), radians: (k,)."""
+        """Return the azimuths of the head at firings (k,), in radians."""
 
 
 Step = Annotated[float, about("degrees that the head turns in one time step", gt=0, le=360)]
@@ -182,12 +182,12 @@ class Spin:
 
     @property
     def period(self) -> int | None:
-        """Number of firings in a revolution, or None without a whole number."""
+        """Number of firings per revolution, or None if it is not an integer."""
         count = int(self.firings_per_turn)
         return count if count == self.firings_per_turn else None
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firings of a time step, counted on after 360°."""
+        """Return the half-open range of the firings in a time step."""
         # Rounded up, in whole numbers: fractions would take as long as a small scan.
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
@@ -202,7 +202,7 @@ class Spin:
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
     def within(self, start: float, share: float) -> Mirror:
-        """Return a head that fires in a part of each revolution only.
+        """Return a head that fires only in a part of each revolution.
 
         Time 0 and firing 0 are at the start of this part. A time step is the same share of the
         firings, and at least one.
@@ -237,7 +237,7 @@ class Spin:
 
     @property
     def radians_per_ns(self) -> float:
-        """Angular velocity of the head, radians a nanosecond, counter-clockwise."""
+        """Angular velocity of the head in radians per nanosecond, counterclockwise."""
         return 2 * np.pi * self.rate_hz / 1e9 * (-1 if self.clockwise else 1)
 
 

@@ -156,14 +156,14 @@ class Noise:
 
     @property
     def threshold(self) -> float:
-        """Threshold of detection: the energy at which half of the returns are detected, else 0."""
+        """Energy at which half of the returns are detected, or 0 without a threshold."""
         if self.detection_range_m is None:
             return 0.0
         return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     @property
     def full(self) -> float:
-        """Signal that saturates the receiver: no recorded pulse is higher."""
+        """Signal level at which the receiver saturates."""
         return inf if self.saturation is None else self.saturation * self.threshold
 
     @property
@@ -178,5 +178,5 @@ class Noise:
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def named(self, name: str) -> Noise:
-        """Return the noise of a sensor, whose name becomes part of all its random numbers."""
+        """Return the noise for a named sensor, whose name seeds its random numbers."""
         return replace(self, seed=named_seed(self.seed, name))

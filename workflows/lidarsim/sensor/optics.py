@@ -140,7 +140,7 @@ class Returns:
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
     def divergence(self, optics: Optics) -> float:
-        """Return the full angle of the beam, radians, for an oval beam of a circle of equal area.
+        """Return the full divergence angle of the beam, in radians.
 
         Raises
         ------
@@ -151,7 +151,7 @@ class Returns:
         return across if across == up else float(np.sqrt(across * up))
 
     def min_gap_m(self, optics: Optics) -> float:
-        """Return the smallest distance between two returns, meters: half of the pulse's length."""
+        """Return the minimum distance between two returns in meters, half of the pulse length."""
         return LIGHT_M_NS * self.length_ns(optics) / 2
 
     def beam(self, optics: Optics) -> Beam:
@@ -167,7 +167,7 @@ class Returns:
         return Beam.from_divergences(self.subrays, divergences, profile, self.exit_m(optics))
 
     def exit_m(self, optics: Optics) -> float:
-        """Return the width of the beam at the sensor, meters, or 0 if the width is unknown."""
+        """Return the width of the beam at the sensor in meters, or 0 if it is unknown."""
         return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
     def _divergences(self, optics: Optics) -> tuple[float, float]:
@@ -187,11 +187,11 @@ class Returns:
         return across / 1000, up / 1000
 
     def length_ns(self, optics: Optics) -> float:
-        """Return the length of the pulse, nanoseconds."""
+        """Return the length of the pulse in nanoseconds."""
         return optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
 
     def system_ns(self, optics: Optics) -> float:
-        """Return the standard deviation of the system waveform, ns.
+        """Return the standard deviation of the system waveform in nanoseconds.
 
         The system waveform is the convolution of the pulse and the receiver's response, which are
         both Gaussian.

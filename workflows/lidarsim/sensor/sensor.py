@@ -143,7 +143,7 @@ class Sensor:
     def with_packets(
         self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]
     ) -> Sensor:
-        """Return the sensor with ports and identifiers of packets in place of the model's.
+        """Return a copy of the sensor with other packet ports and identifiers.
 
         Raises
         ------
@@ -229,17 +229,17 @@ class Sensor:
 
     @property
     def gate_s(self) -> float:
-        """Time for which the receiver waits for returns of a pulse, seconds."""
+        """Time in seconds for which the receiver waits for returns of a pulse."""
         return 2e-9 * (self.max_range_m - self.min_range_m) / LIGHT_M_NS
 
     @property
     def channels(self) -> int:
-        """Number of beams, and of rays in a firing."""
+        """Number of beams, which is the number of rays per firing."""
         return len(self.beams)
 
     @property
     def ring_step(self) -> int | None:
-        """Rays between successive firings of a channel, for `raybeam.Pattern`. None if unknown."""
+        """Number of rays between consecutive firings of a channel, or None if unknown."""
         return self.channels
 
     @property
@@ -248,14 +248,14 @@ class Sensor:
         return self.head.period
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firings of a time step.
+        """Return the half-open range of the firings in a time step.
 
         Successive steps have no gap or overlap; numbers continue from revolution to revolution.
         """
         return self.head.firings(step)
 
     def revolutions(self, steps: ArrayLike) -> Ints:
-        """Return the numbers of the revolutions, or frames, that time steps (k,) start in: (k,).
+        """Return the index of the revolution or frame in which each time step (k,) starts.
 
         A head without `rate_hz`, such as a user's, makes a revolution in each step.
         """
@@ -268,14 +268,14 @@ class Sensor:
         return revolutions.astype(np.int64)
 
     def revolution_start_ns(self, number: int) -> float:
-        """Return the start of a revolution, or frame, nanoseconds since the head started."""
+        """Return the start of a revolution or frame in nanoseconds since the head started."""
         rate_hz = getattr(self.head, "rate_hz", None)
         if rate_hz is not None:
             return float(number * 1e9 / rate_hz)
         return float(self.head.times_ns(np.array([self.firings(number)[0]]))[0])
 
     def steps_of_revolution(self, number: int) -> range:
-        """Return the time steps of a revolution, or frame.
+        """Return the time steps of a revolution or frame.
 
         Examples
         --------
@@ -308,11 +308,11 @@ class Sensor:
         return bisect_left(range(upper + 1), number, lo=lower, key=revolution_of)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the unit directions of firings (k,), in the sensor frame: (k, channels, 3)."""
+        """Return the ray directions of firings (k,) in the sensor frame. Shape (k, channels, 3)."""
         return self._rotated(firings, self.ahead)
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return starts of the rays of firings (k,), sensor frame: (k, channels, 3), meters.
+        """Return the ray origins of firings (k,) in the sensor frame, in meters.
 
         None if all rays start at the sensor's center.
         """
@@ -322,7 +322,7 @@ class Sensor:
 
     @cached_property
     def ahead(self) -> Floats:
-        """Unit directions of the beams in the head frame, at azimuth 0: (channels, 3)."""
+        """Unit directions of the beams in the head frame at azimuth 0. Shape (channels, 3)."""
         beams = self.beams
         up, level = sin_cos(beams.elevation)
         sin, cos = sin_cos(beams.azimuth)
@@ -330,12 +330,12 @@ class Sensor:
 
     @cached_property
     def center(self) -> Floats | None:
-        """Common start of all beams in the head frame, (3,), meters, or None if starts differ."""
+        """Common origin of all beams in the head frame in meters, or None if they differ."""
         origin = self.beams.origin
         return origin[0] if (origin == origin[0]).all() else None
 
     def spins(self, firings: Ints) -> Floats | None:
-        """Return cosines and sines of the head's angles at firings (k,): (2, k).
+        """Return the cosines and sines of the head angles at firings (k,). Shape (2, k).
 
         Angles are about the z axis of the head frame; `axes` rotates it to the sensor frame. None
         if the rays are not beams that such a head rotates.
@@ -347,7 +347,7 @@ class Sensor:
 
     @property
     def axes(self) -> Floats | None:
-        """Rotation (3, 3) from the head frame to the sensor frame, or None for the identity."""
+        """Rotation matrix from the head frame to the sensor frame, or None for the identity."""
         return None
 
     def _rotated(self, firings: Ints, vectors: Floats) -> Floats:
@@ -366,17 +366,17 @@ class Sensor:
         return turned(rotated.reshape(-1, 3), self.axes).reshape(rotated.shape)
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the starts of firings (k,), nanoseconds since the start of the station: (k,)."""
+        """Return the start times of firings (k,) in nanoseconds since the start of the station."""
         return self.start_ns + self.head.times_ns(firings)
 
     def times_ns(self, firings: Ints) -> Ints:
-        """Return times of the rays of firings (k,), ns since the station's start: (k, channels)."""
+        """Return the ray times of firings (k,) in nanoseconds since the start of the station."""
         times = self.begins_ns(firings)[:, None] + self.beams.time_ns
         return np.rint(times).astype(np.int64)
 
     @property
     def lead_ns(self) -> float:
-        """Time of the first beam within a firing, nanoseconds."""
+        """Time of the first beam within a firing in nanoseconds."""
         return float(self.beams.time_ns.min())
 
 

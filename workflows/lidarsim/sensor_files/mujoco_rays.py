@@ -69,7 +69,7 @@ def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of arrays `theta` and `phi`.
+    """Read the rays from the arrays `theta` and `phi`.
 
     Returns None for other arrays and for Python files.
 

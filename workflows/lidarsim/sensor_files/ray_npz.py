@@ -37,7 +37,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of a file of this format, or None for arrays of another format.
+    """Read the rays from an .npz file, or return None if the arrays have another format.
 
     Raises
     ------

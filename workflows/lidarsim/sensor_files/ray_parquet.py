@@ -42,7 +42,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of a table.
+    """Read the rays from a Parquet table.
 
     Raises
     ------

@@ -65,7 +65,7 @@ def _matrices(rays: FiredRays) -> Floats:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Return the rays of arrays of this format, or None for other arrays.
+    """Read the rays from RGL arrays, or return None if the arrays have another format.
 
     Raises
     ------

@@ -38,7 +38,7 @@ _KIND_FIELDS: dict[str, tuple[str, ...]] = {
 @dataclass(frozen=True)
 @checked_fields
 class Fault:
-    """A fault of a sensor during an interval of time.
+    """Temporary fault of a sensor.
 
     The labels describe the true scene and list the active faults.
 
@@ -83,22 +83,22 @@ class Fault:
             )
 
     def words(self) -> dict[str, Any]:
-        """Return the fields that are not None, for labels: {field: value}."""
+        """Return the fields that are not None as a dict."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @property
     def span_ns(self) -> tuple[float, float]:
-        """Start and end of the fault, nanoseconds since the survey's start."""
+        """Start and end of the fault in nanoseconds since the start of the survey."""
         return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
 
     def during(self, starts_ns: Floats | Ints, stops_ns: Floats | Ints | None = None) -> Bools:
-        """Return whether the fault acts at times (n,), or in intervals to `stops_ns` (n,)."""
+        """Return a mask of the times or intervals during which the fault is active."""
         stops_ns = starts_ns if stops_ns is None else stops_ns
         begin, end = self.span_ns
         return np.asarray((stops_ns >= begin) & (starts_ns < end))
 
     def drops(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
-        """Return whether firings (n,) are in dropped packets, at any time.
+        """Return a mask of the firings (n,) that belong to dropped packets.
 
         `number` is the number of this fault in its survey, `seed` the seed of the sensor's noise.
         """
@@ -106,7 +106,7 @@ class Fault:
         return np.asarray(uniform(seed, PACKET, station, packets, number) < (self.share or 0.0))
 
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
-        """Return the shift of stamps at times (n,), nanoseconds."""
+        """Return the shift of the timestamps at times (n,) in nanoseconds."""
         return self.during(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
 
 

@@ -140,7 +140,7 @@ class ScanSpec:
         return (self.firings[1] - self.firings[0]) * self.channels
 
     def shifted(self, start_ns: int, ahead: int) -> ScanSpec:
-        """Return the scan with another start of the station, and other random numbers."""
+        """Return the scan with another station start and other random numbers."""
         spec = object.__new__(type(self))  # `replace` takes five times as long
         vars(spec).update(vars(self), start_ns=start_ns, ahead=ahead)
         return spec
@@ -478,44 +478,44 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def path(self) -> Trajectory:
-        """The trajectory, or the poses as stations."""
+        """Trajectory of the platform, or its poses as stations."""
         assert self.trajectory is not None  # the poses have a trajectory by default
         return self.trajectory
 
     @cached_property
     def carried(self) -> tuple[Mounted, ...]:
-        """The sensors with their mounts, for a survey with `sensor` too."""
+        """Sensors with their mounts, including a sensor that was passed as `sensor`."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @property
     def carrier(self) -> str:
-        """Name of the carrier, for the seeds of its instruments: the name of its first sensor."""
+        """Name of the first sensor, which seeds the instruments of the platform."""
         return self.carried[0].name
 
     @cached_property
     def returns_each(self) -> tuple[Returns, ...]:
-        """Returns that each sensor reports."""
+        """Return settings of each sensor."""
         return tuple(carried.returns or self.returns for carried in self.carried)
 
     @cached_property
     def noise_each(self) -> tuple[Noise, ...]:
-        """Noise of each sensor, with a seed by the sensor's name."""
+        """Noise of each sensor, seeded by the name of the sensor."""
         return tuple((carried.noise or self.noise).named(carried.name) for carried in self.carried)
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
-        """All columns that a part of the cloud stores."""
+        """All columns that are stored during the run."""
         columns = stored(optional_columns(self.columns))
         if self.waveform_samples:
             columns = (*columns, waveform_column(self.waveform_samples))
         return columns
 
     def extinction(self, sensor: Sensor) -> float:
-        """Return the extinction of the air at a sensor's wavelength, 1/m."""
+        """Return the extinction coefficient of the air at the wavelength of a sensor, in 1/m."""
         return self.extinction_at(sensor.optics.wavelength_nm)
 
     def air(self, number: int) -> Air:
-        """Return the air as a sensor sees it, by the sensor's number."""
+        """Return the properties of the air for a sensor with the given index."""
         optics = self.carried[number].sensor.optics
         divergence = self.returns_each[number].divergence(optics)
         overlap_m = self.noise_each[number].overlap_m
@@ -523,7 +523,7 @@ class Survey(CloudOptions, Weather):
         return Air(self.extinction_at(optics.wavelength_nm), exit_m, divergence, overlap_m)
 
     def mean_particles(self, number: int) -> float:
-        """Return the mean number of drops and flakes that a pulse of a sensor may return from."""
+        """Return the mean number of drops and flakes per pulse that can cause a return."""
         if not self.particles:
             return 0.0
         sensor = self.carried[number].sensor
@@ -534,7 +534,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def steps_each(self) -> tuple[int, ...]:
-        """Number of time steps of each sensor at a station."""
+        """Number of time steps of each sensor per station."""
         counts = []
         for carried in self.carried:
             if steps := carried.steps or self.steps:
@@ -594,20 +594,20 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def sweep_stops(self) -> Ints:
-        """Scan after the last scan of each sweep, ascending: int64 (sweeps,)."""
+        """Exclusive end of the scan range of each sweep, ascending. int64 of shape (sweeps,)."""
         firsts = np.concatenate([sweeps.firsts for sweeps in self.sweeps_each])
         return np.append(firsts[1:], self.scan_count)
 
     @property
     def sweep_count(self) -> int:
-        """Number of sweeps: revolutions, or frames of sensors whose heads do not rotate.
+        """Number of sweeps, which are revolutions, or frames of sensors without a rotating head.
 
         The last sweep of a sensor at a station may be a part of a revolution.
         """
         return sum(len(sweeps.firsts) for sweeps in self.sweeps_each)
 
     def sweeps_within(self, start: int, stop: int) -> int:
-        """Return the number of sweeps whose last scan is among scans `start` to `stop` - 1."""
+        """Return the number of sweeps that end within a range of scans."""
         before, until = np.searchsorted(self.sweep_stops, (start, stop), "right")
         return int(until - before)
 
@@ -622,7 +622,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def station_ns(self) -> int:
-        """Duration of a station, nanoseconds: until the last sensor is done."""
+        """Duration of a station in nanoseconds, until the last sensor has finished."""
         return max(
             round(firing_start_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
             for carried, steps in zip(self.carried, self.steps_each, strict=True)
@@ -630,13 +630,13 @@ class Survey(CloudOptions, Weather):
 
     @property
     def duration_ns(self) -> float:
-        """Time from the survey's start to the start of the last firing, nanoseconds."""
+        """Time from the start of the survey to the start of the last firing in nanoseconds."""
         pairs = zip(self.carried, self.steps_each, strict=True)
         last = max(_last_firing_ns(carried.sensor, steps) for carried, steps in pairs)
         return (self.path.stations - 1) * self.station_ns + last
 
     def scan(self, index: int) -> ScanSpec:
-        """Return scan `index`, counted in the order of sensors, stations and steps."""
+        """Return the scan with the given index. Scans are ordered by sensor, station and step."""
         sensor = bisect_right(self._firsts, index) - 1
         station, step = divmod(index - self._firsts[sensor], self.steps_each[sensor])
         lidar = self.carried[sensor].sensor
@@ -644,7 +644,7 @@ class Survey(CloudOptions, Weather):
         return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
 
     def faults_of(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
-        """Return the faults of certain kinds of a sensor: {index in `faults`: fault}."""
+        """Return the faults of a sensor that have one of the given kinds, by index in `faults`."""
         name = self.carried[sensor].name
         return {
             index: fault
@@ -653,7 +653,7 @@ class Survey(CloudOptions, Weather):
         }
 
     def sent_scan(self, index: int) -> ScanSpec:
-        """Return the scan that a sensor sends as scan `index`: an older scan of a frozen sensor.
+        """Return the scan that a sensor sends as scan `index`. A frozen sensor repeats an old one.
 
         A sweep that starts while the sensor is frozen repeats the last sweep that started before.
         The older scan follows from times alone, on whichever worker scans are cast.
@@ -685,7 +685,7 @@ class Survey(CloudOptions, Weather):
         return self.path.pose(spec.station, time).compose(self.carried[spec.sensor].mount)
 
     def begins_ns(self, index: int) -> float:
-        """Return the start of scan `index`, nanoseconds since the survey's start."""
+        """Return the start of scan `index` in nanoseconds since the start of the survey."""
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
         return spec.start_ns + firing_start_ns(sensor, spec.firings[0]) + sensor.lead_ns

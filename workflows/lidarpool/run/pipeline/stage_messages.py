@@ -170,7 +170,7 @@ Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """A scan in scan order, whose points are already stored.
+    """Scan of a survey whose points have been stored. Frames are delivered in scan order.
 
     Parameters
     ----------
