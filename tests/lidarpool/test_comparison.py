@@ -160,7 +160,7 @@ def test_distances_between_parallel_planes():
     score = compare(a, half, distances_m=[0.05]).figures["distances"]["f_scores"][0]
     assert (score["precision"], score["recall"]) == (0.5, 1.0)
     assert score["f1"] == pytest.approx(2 / 3)
-    assert told["ranges"] is None and "cloud A contains no sweeps" in told["notes"][0]
+    assert told["ranges"] is None and "cloud A has no sweeps" in told["notes"][0]
 
 
 # -- cells ----------------------------------------------------------------------------------------
@@ -242,8 +242,8 @@ def test_what_has_no_range_image_says_why():
             "cloud B are 5,423 km from the origin",
         ),
         (made, replace(made, positions=made.positions * [1, 1, 9]), "come from different sensors"),
-        (whole, whole, "cloud A contains no sweeps. All points are compared at once in world"),
-        (made, whole, "cloud B contains no sweeps"),
+        (whole, whole, "cloud A has no sweeps. All points are compared at once in world"),
+        (made, whole, "cloud B has no sweeps"),
     ):
         found = compare(a, b).figures
         assert found["ranges"] is None and found["distances"]["a_to_b"]["points"] == CELLS
@@ -399,7 +399,7 @@ def test_a_survey_that_moved_is_compared_with_a_map(written):
         found = compare(a, folder / "cloud.laz").figures
         assert found["distances"]["b_to_a"]["points"] == len(made)
         assert max(found["distances"][way]["max_m"] for way in ("a_to_b", "b_to_a")) < 1e-3
-        assert "cloud.laz contains no sweeps" in found["notes"][0]
+        assert "cloud.laz has no sweeps" in found["notes"][0]
     with pytest.raises(LidarError, match="does not contain the pose of the sensor"):
         compare(folder / "cloud.mcap", folder / "cloud.laz")
 
@@ -588,7 +588,7 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
     ):
         with pytest.raises(LidarError, match=says):
             compare(folder, folder, **options)
-    with pytest.raises(LidarError, match=r"contains no sweeps\. Omit `--sweep` and `--match`"):
+    with pytest.raises(LidarError, match=r"has no sweeps\. Omit `--sweep` and `--match`"):
         compare(made, folder, sweeps=[0])
     with pytest.raises(LidarError, match=r"'/point'\. Did you mean '/points'\? It contains"):
         open_recording(folder / "cloud.mcap", "/point")

@@ -150,7 +150,7 @@ CONTROLLER = (
             for by in ("skin", "morph")
         ],
         ({"here": f"<skew>45 1 0 0 0 1 0</skew>{HERE}"}, "contains <skew>"),
-        ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "by a matrix that is none"),
+        ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "by a matrix that is not a valid"),
         ({"primitive": f"<triangles>{V}<p>0 1 9</p></triangles>"}, "refer to vertices 0 to 9"),
         ({"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")}, "with 5 corners but"),
         ({"accessor": 'count="9" stride="3"'}, "id='p'> declares 9 x 3 numbers but contains 24"),

@@ -650,7 +650,7 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     ):
         build(Scenario.from_data({"scene": [entry | {"unit": "mm"}]}, folder=folder))
     with pytest.raises(
-        LidarError, match=r"is not read: it describes a robot\. Read it with load_robot"
+        LidarError, match=r"cannot be read\. It describes a robot\. Read it with load_robot"
     ):
         Scene.load(folder / "rover.urdf")
 
@@ -659,7 +659,7 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
     ("name", "way"),
     [
         ("a.mjcf", "MuJoCo reads its models from .xml"),
-        ("a.osm", "it is a map"),
+        ("a.osm", "It is a map"),
     ],
 )
 def test_other_robots_are_refused_with_what_becomes_of_them(tmp_path, name, way):
@@ -668,7 +668,7 @@ def test_other_robots_are_refused_with_what_becomes_of_them(tmp_path, name, way)
         Scenario.load(tmp_path / name),
         Scenario.from_data({"scene": name}, folder=tmp_path),
     ):
-        with pytest.raises(LidarError, match=f"{name} is not read: .*{way}"):
+        with pytest.raises(LidarError, match=f"{name} cannot be read. .*{way}"):
             build(scenario)
 
 

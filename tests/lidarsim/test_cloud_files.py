@@ -134,9 +134,9 @@ def test_many_lines_are_read_in_blocks_and_the_line_is_exact(tmp_path):
     [
         ("", "it is empty"),
         ("x,y,z\n", "it has no points after line 1"),
-        ("none\n", "line 1 is 'none', but x, y and z were expected, or a header"),
-        ("2\ncomment\nC 0 0 0\nH 1 1 1\n", "line 2 is 'comment', and x, y and z"),
-        ("a,b,c\n1,2,3\n", "line 1 is 'a,b,c', but x, y and z were expected, or a header"),
+        ("none\n", "line 1 is 'none', but x, y and z or a header"),
+        ("2\ncomment\nC 0 0 0\nH 1 1 1\n", "line 2 is 'comment', but x, y and z"),
+        ("a,b,c\n1,2,3\n", "line 1 is 'a,b,c', but x, y and z or a header"),
         ("x,y,z\n1,2,3\n1,2,a\n", "line 3 has 'a' as z, but a number was expected"),
         ("x,y,z\n1,2,3\n1,2,\n", "line 3 has '' as z, but a number was expected"),
         ("x y z\n1 2 3\n1 2 1_0\n", "line 3 has '1_0' as z"),
@@ -154,8 +154,8 @@ def test_many_lines_are_read_in_blocks_and_the_line_is_exact(tmp_path):
         ),
         ("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0.6 0.8\n", "its lines are poses: it is a trajectory"),
         ("1 0 0 5 0 1 0 6 0 0 1 7\n", "its lines are poses: it is a trajectory"),
-        ("1 5 6 7\n2 5 6 7\n3 5 6 7\n", "its first column counts the points"),
-        ("ncols 3\nnrows 2\n1 2 3\n4 5 6\n", "it is a raster of heights, and no cloud"),
+        ("1 5 6 7\n2 5 6 7\n3 5 6 7\n", "its first column numbers the points"),
+        ("ncols 3\nnrows 2\n1 2 3\n4 5 6\n", "it is an elevation raster, not a point cloud"),
         ("//X Y Z\n1\n1 2 3\n4 5 6\n", "1 point announced, and 2 lines there"),
         ("x y z\n1 2 3\n".encode("utf-16"), "it is encoded in UTF-16. Save it as UTF-8"),
         (b"1 2 3\n\0\0", "it is a binary file, but a text file was expected"),
@@ -221,7 +221,9 @@ def test_what_is_wrong_in_pts(tmp_path, content, message):
 
 def test_pts_with_fewer_points_is_cut_short(tmp_path):
     for content in ("3\n1 2 3\n4 5 6\n", "1\n1 2 3\n4\n"):
-        with pytest.raises(CutShortError, match=r"line . announces . points, and (2|none) follow"):
+        with pytest.raises(
+            CutShortError, match=r"line . announces . points, (and|but) (2|none) follow"
+        ):
             read_all(tmp_path, "a.pts", content)
 
 
@@ -363,9 +365,9 @@ def test_bin_has_four_floats_and_of_nuscenes_five(tmp_path):
     assert columns_of(scan) == {"intensity": [0.5, 0.25]}
     scan = read(tmp_path, "a.pcd.bin", rows.tobytes())
     assert columns_of(scan) == {"intensity": [0.5, 0.25], "channel": [4, 31]}
-    with pytest.raises(ValueError, match=r"a\.bin has 40 bytes, and whole rows of 16 .*intensity"):
+    with pytest.raises(ValueError, match=r"a\.bin has 40 bytes, but a multiple of 16 .*intensity"):
         read(tmp_path, "a.bin", rows.tobytes())
-    with pytest.raises(ValueError, match=r"a\.pcd\.bin has 32 bytes, and whole rows of 20"):
+    with pytest.raises(ValueError, match=r"a\.pcd\.bin has 32 bytes, but a multiple of 20"):
         read(tmp_path, "a.pcd.bin", rows[:, :4].tobytes())
     with pytest.raises(ValueError, match="has other numbers than rings"):
         read(tmp_path, "a.pcd.bin", np.resize(rows[:, :4], (4, 5)).tobytes())

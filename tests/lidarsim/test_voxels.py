@@ -159,7 +159,7 @@ def test_unknown_voxels_are_empty_and_told_of(tmp_path):
             "has a density of -0.4 m²/m³ in voxel 1 0 1, but densities must be from 0 to 10000",
         ),
         ("1 0 1 0.4", "1 0 1 1e9", r"has a density of 1e\+09 m²/m³ in voxel 1 0 1"),
-        ("1 0 1 0.4", "1 0 1 leaf", "line 10 has 'leaf' as PadBVTotal, and a number"),
+        ("1 0 1 0.4", "1 0 1 leaf", "line 10 has 'leaf' as PadBVTotal, but a number"),
         ("45.5 12\n1 0 1 0.4", "45.5\n1 0 1", "has 5 of 6 numbers"),
     ],
 )

@@ -265,7 +265,7 @@ def _samples(returns: BatchPoints | DevicePoints) -> Floats32:
     steps = np.arange(sample_count) / max(sample_count - 1, 1)
     last = np.maximum(returns.counts - 1, 0)
     rows = starts[:, None] + np.floor(steps * last[:, None]).astype(np.int64)
-    valid = (np.arange(sample_count) < returns.counts[:, None]) & (returns.counts[:, None] > 0)
+    valid = np.arange(sample_count) < returns.counts[:, None]
     samples = np.full((len(returns.specs), sample_count, 3), np.nan, np.float32)
     if len(returns):
         samples[valid] = returns.positions_of(rows[valid])

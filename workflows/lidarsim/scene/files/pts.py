@@ -84,7 +84,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
     texts = (line for _, line in chain([first], lines))
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
     if count is not None and len(values) < count:
-        raise CutShortError(f"line {number} announces {count:,} points, and {len(values):,} follow")
+        raise CutShortError(f"line {number} announces {count:,} points, but {len(values):,} follow")
     return CloudScan(values[:, :3], point_columns(values, names))
 
 
