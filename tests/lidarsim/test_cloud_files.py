@@ -369,7 +369,7 @@ def test_bin_has_four_floats_and_of_nuscenes_five(tmp_path):
         read(tmp_path, "a.bin", rows.tobytes())
     with pytest.raises(ValueError, match=r"a\.pcd\.bin has 32 bytes, but a multiple of 20"):
         read(tmp_path, "a.pcd.bin", rows[:, :4].tobytes())
-    with pytest.raises(ValueError, match="has other numbers than rings"):
+    with pytest.raises(ValueError, match="must be a ring number"):
         read(tmp_path, "a.pcd.bin", np.resize(rows[:, :4], (4, 5)).tobytes())
 
 
