@@ -682,7 +682,7 @@ def test_a_job_that_fails_leaves_and_the_other_goes_on(two, how):
         assert two.fails() == "Stage intersect failed: 3"
     else:
         two.until(striking(two, how, 23))
-        assert two.fails().startswith("scan 23 kills")
+        assert two.fails().startswith("3 workers in a row died")
     two.end()  # nothing is left of the first either
     assert two.ended[1] is None
 

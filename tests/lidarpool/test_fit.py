@@ -460,7 +460,7 @@ def test_ranges_that_drift_are_refused():
         ranges = np.linalg.norm(points, axis=1, keepdims=True)
         return points * (1 + 0.003 * number / ranges), columns, pose
 
-    with pytest.raises(LidarError, match=r"ranges that drift: .* in 6 sweeps"):
+    with pytest.raises(LidarError, match=r"ranges that drift: .* over 6 sweeps"):
         fit(replace(steady, read=longer))
 
 

@@ -260,7 +260,7 @@ def test_points_are_where_they_were_fired_whatever_their_times_count_from(
         np.testing.assert_allclose(
             aligned.read(number).origins[:, 0], position(fired(number)[2]), atol=0.005
         )
-    is_noted = any("come from another clock" in note for note in sweeps.notes)
+    is_noted = any("from a different clock" in note for note in sweeps.notes)
     assert is_noted == (times is of_another_clock)
 
 

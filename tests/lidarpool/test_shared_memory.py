@@ -58,7 +58,7 @@ def test_another_process_loads_it_as_long_as_the_owner_lives():
     )  # fmt: skip
     handle = SharedHandle(*eval(owner.stdout.readline()))
     loaded = handle.load()
-    with pytest.raises(OSError, match="another file"):
+    with pytest.raises(OSError, match="a different file"):
         handle._replace(name="lidarpool-0123456789abcdef").load()
     owner.communicate("")
     with pytest.raises(OSError, match="No such file"):

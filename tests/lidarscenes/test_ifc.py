@@ -684,7 +684,7 @@ def test_garbled_files_are_read_or_refused(house, forked, tmp_path):
 def test_a_process_that_wants_too_much_ends_itself_only(house, monkeypatch):
     monkeypatch.setattr(reader, "MIN_MEMORY_BYTES", 60 * 2**20)
     with pytest.raises(
-        LidarError, match=r"\(ifcopenshell exited with .*, possibly because it needs more than"
+        LidarError, match=r"ifcopenshell exited with .*, possibly because it needs more than"
     ):
         load_meshes(house)
 

@@ -248,9 +248,9 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.ply", PLY.replace("element face 2", "element face 0"), "point cloud"),
         ("m.ply", PLY + "3 0 2 3\n", "more than announced"),
         ("m.ply", PLY.replace("double x", "double u"), "have no x"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "are not whole numbers"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "must be integers"),
         ("m.ply", PLY.replace("double z", "half z"), "line .* is 'property half z', and format, "),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 b 3"), "line 15 has 'b', and a number"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 b 3"), "line 15 has 'b', but a number"),
         ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "a list of face has the length -3"),
         ("m.ply", PLY.replace("3 0 2 3", ""), "is cut short: 2 rows of face announced"),
         ("m.ply", "plain text\n", "first line is not 'ply'"),
@@ -258,12 +258,13 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.ply", PLY.replace("element face", "element tristrips"), "triangle strips"),
         ("m.ply", PLY.partition("end_header")[0], "is cut short: .*no line end_header"),
         ("m.part", "LASF", "has the ending .part"),
-        ("m.gltf", "[" * 100_000, "no valid JSON"),
+        ("m.gltf", "[" * 100_000, "not contain valid JSON"),
         *[
             (
                 f"m{suffix}",
                 content,
-                "cannot be read|cut short|no triangles|is not glTF|no valid JSON|pip install|"
+                "cannot be read|cut short|truncated|no triangles|is not glTF|not contain valid JSON|"
+                "pip install|"
                 "is not an AMAPVox",
             )
             for suffix in endings()

@@ -590,7 +590,7 @@ WRONG = {
         lambda s: Scanner(FAR, GRID, precision_m=1e-6).sweep((2990, 0, 1)),
         "precision_m is 1e-06, which is too fine for points 2",
     ),
-    "threads": (lambda s: Scanner(Scene.seed(), GRID, threads=0), "threads is 0"),
+    "threads": (lambda s: Scanner(Scene.seed(), GRID, threads=0), "threads must be at least 1"),
     "names": (
         lambda s: Scanner(Scene.seed(), Mounted(GRID, name="left"), name="right"),
         "name is 'right'. Use Mounted(sensor, name=",

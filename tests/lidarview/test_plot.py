@@ -190,7 +190,7 @@ def test_pictures_that_there_are_not(coordinates, pictures, left_out, unplanned,
     result = make(tmp_path / "result", replace(unplanned, coordinates=coordinates))
     plot(result, *SMALL, "--out", tmp_path / "out")
     assert names(tmp_path / "out") == pictures
-    with pytest.raises(LidarError, match=f"no picture '{left_out}'"):
+    with pytest.raises(LidarError, match=f"The picture '{left_out}' cannot be drawn"):
         plot(result, "--only", left_out)
 
 

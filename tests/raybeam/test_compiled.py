@@ -138,7 +138,7 @@ def test_a_damaged_loop_is_compiled_again_with_a_note(package, function, caplog,
     assert not notes(caplog)
     assert compilations(function) == 1
     assert notes(caplog) == [
-        f"Compiled loops in {file.parent} are damaged and are compiled again. The first is "
+        f"Compiled loops in {file.parent} are damaged and will be compiled again. The first one is "
         f"{file.name}."
     ]
     assert compilations(function) == 0  # what was compiled is kept

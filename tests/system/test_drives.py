@@ -139,9 +139,9 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster):
     report = json.loads((out / "report.json").read_text())
     assert (report["scans"], report["sweeps"]) == (144, 4)
     assert list(report["parameters"]["sensors"]) == ["roof", "nose"]
-    assert "144 scans (4 sweeps) along a trajectory of 0.2 s sent" in (
-        out / "report.html"
-    ).read_text("utf-8")
+    assert "144 scans (4 sweeps) along a trajectory of 0.2 s" in (out / "report.html").read_text(
+        "utf-8"
+    )
     points = report["points_by_object"]
     assert points["Pedestrian"] > 0 and points["Oncoming car"] > 0
     cloud = read_cloud(out / "cloud.ply")

@@ -150,7 +150,7 @@ def test_a_worker_that_cannot_import_the_plugin_is_named(tmp_path, monkeypatch, 
         client.run(sys_path_without, str(folder))
     assert outcome.code == 2
     [line] = outcome.err.splitlines()
-    told = "'alone' of the plug-in alone-cloud 0.1 cannot be imported (no library)"
+    told = "'alone' of the plug-in alone-cloud 0.1 cannot be imported: no library"
     assert "The worker at " in line and told in line
 
 
