@@ -263,7 +263,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
             (
                 f"m{suffix}",
                 content,
-                "cannot be read|cut short|truncated|no triangles|is not glTF|not contain valid JSON|"
+                "cannot be read|cut short|truncated|no triangles|is not glTF|valid JSON|"
                 "pip install|"
                 "is not an AMAPVox",
             )

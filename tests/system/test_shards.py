@@ -199,7 +199,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     made = content(out)
     whole = content(campaigns("folder") / "one")
     notes = made.pop("report.json")["notes"]
-    assert notes[0].startswith("made again: job 0001")
+    assert notes[0].startswith("jobs run again: job 0001")
     del whole["report.json"]
     assert made == whole
 
@@ -468,7 +468,7 @@ def test_a_campaign_that_has_grown_is_merged_into_the_same_place(parts, tmp_path
         for number in (2, 3):  # jobs 7 and 8; the first shard has none of them
             run = campaign.run(parts[number - 1], client=client, resume=True, shard=(number, 3))
             assert run.done == 3
-    with pytest.raises(LidarError, match=r"^missing: 1 shard, 3/3"):
+    with pytest.raises(LidarError, match=r"^These shards are missing: 3/3"):
         merge([parts[1]], out)
     merge([parts[1], parts[2]], out)
     assert content(out) == content(tmp_path / "one")
@@ -642,10 +642,10 @@ def _some_of_a_survey(survey: Path, shards: list[Path]) -> None:
         merge(shards[:2], survey / "some")
     with pytest.raises(LidarError, match="part-2 is one of the shards, which must not be changed"):
         merge(shards, shards[0])
-    with pytest.raises(LidarError, match="part-2 holds a shard of a survey: give another"):
+    with pytest.raises(LidarError, match="part-2 contains a shard of a survey"):
         merge(shards[1:], shards[0])
     report = merge(shards[:2], survey / "some", partial=True)
-    assert "missing: 1 shard, 1/3" in report["notes"] and report["planning"] is None
+    assert "these shards are missing: 1/3" in report["notes"] and report["planning"] is None
     killed(survey / "some", shards, ("take", 3))
     merge(shards, survey / "some")
     assert content(survey / "some") == content(survey / "all")
@@ -658,7 +658,7 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
         part.unlink()
         part.write_bytes(data)
         with pytest.raises(
-            LidarError, match=f"^These files are missing or damaged: .*{part.name}; run their"
+            LidarError, match=f"^These files are missing or damaged: .*{part.name}. Run their"
         ):
             merge(shards, survey / "repaired")
     part.unlink()
@@ -708,7 +708,7 @@ def test_the_first_shard_plans_though_it_has_no_scans(tmp_path, lidarpool, slots
     parts = [tmp_path / f"part-{number}" for number in (1, 2, 3)]
     for number, part in enumerate(parts, 1):
         assert lidarpool(*run, "--shard", f"{number}/3", "--out", part).code == 0
-    with pytest.raises(LidarError, match=r"^missing: 1 shard, 1/3: give"):
+    with pytest.raises(LidarError, match=r"^These shards are missing: 1/3\. Specify"):
         merge(parts[1:], tmp_path / "all")
     report = merge(parts, tmp_path / "all")
     assert report["planning"]["trials"] == 3 and "report.html" not in report["files"]
