@@ -667,7 +667,7 @@ def _a_damaged_shard_of_a_survey(survey: Path, shards: list[Path], one: dict[str
     assert content(survey / "repaired") == one
     (survey / "elsewhere").mkdir()
     (survey / "s.yaml").rename(survey / "elsewhere/s.yaml")
-    with pytest.raises(LidarError, match=r"s\.yaml, of which these shards are, does not exist"):
+    with pytest.raises(LidarError, match=r"s\.yaml, the scenario of these shards, does not exist"):
         merge(shards, survey / "moved")
     merge(shards, survey / "moved", scenario=survey / "elsewhere/s.yaml")
     change(survey / "elsewhere/s.yaml", "steps: 25", "steps: 26")
