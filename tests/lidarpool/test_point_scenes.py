@@ -518,7 +518,7 @@ def test_cut_files_are_refused(tmp_path, name):
         ("a.xyz", "nan 2 3\n" * 50, "but has 0"),
         ("a.xyz", "x y z\n" * 50, "cannot be read: line 2 has 'x' as x, but a number"),
         ("a.asc", "ncols 3\n" * 50, "cannot be read: it is an elevation raster"),
-        ("a.pts", "50\n1 2 3\n", "is cut short: line 1 announces 50 points, and 1 follow"),
+        ("a.pts", "50\n1 2 3\n", "is cut short: line 1 announces 50 points, but 1 follow"),
         ("a.bin", "no floats", r"cannot be read: a\.bin has 9 bytes, but a multiple of 16"),
         ("a.xyz", "1 2 1e30\n" * 50, "farther than anything"),
         ("a.glb", "glTF", "point clouds must have one"),
