@@ -37,7 +37,8 @@ class RangeImages:
     elevation_deg: Floats  # (r,): medians of the points
     step_deg: float  # width of a column
     start_deg: float  # azimuth of the first column
-    # (2, 4, r, c): range, intensity, azimuth and elevation, degrees, in A and in B; NaN if unknown
+    # (2, 4, r, c): range, intensity, azimuth and elevation in degrees, in A and in B, NaN if
+    # unknown; of paired rays (2, 2, r, c): range and intensity
     images: Floats
     hidden_shares: tuple[float, float]  # shares of points behind others in their cells
     notes: tuple[str, ...]
