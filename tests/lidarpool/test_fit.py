@@ -604,6 +604,9 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     times_s = opened.read(1)[1]["time"]
     assert 0 <= times_s.min() < 0.002 and times_s.max() == pytest.approx(0.1, abs=0.002)
     assert [*opened.times()][1] == pytest.approx(1e8, abs=4e6)  # three packets
+    # Each packet has 12 blocks of 32 points, those of the unfinished last sweep included.
+    sizes = [len(opened.read_points(number).points) for number in range(opened.count)]
+    assert sum(sizes) == 76 * 4 * 12 * 32 and sizes[-1] > 0
     other = [
         (time_ns, MACS + IPV4 + ip_packet(data, source=(10, 0, 0, 7)))
         for time_ns, data in [*round_room()][:120]

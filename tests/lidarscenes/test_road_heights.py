@@ -545,3 +545,18 @@ def test_roads_that_turn_inside_their_lanes_are_read(tmp_path):
     path = tmp_path / "a.xodr"
     path.write_text(text)
     assert sum(len(mesh.faces) for mesh in load_meshes(path, tell=[].append)) < 5000
+
+
+def test_a_road_continues_straight_beyond_the_end_of_its_cubic(tmp_path):
+    # At a parameter of 60, the cubic has reached (27, 36), 45 m from its start.
+    shape = (
+        '<paramPoly3 aU="0" bU="0.45" cU="0" dU="0" aV="0" bV="0.6" cV="0" dV="0" '
+        'pRange="arcLength"/>'
+    )
+    mesh = lane_meshes(load(tmp_path, document(road(length=60, shape=shape))))[0]
+    along = mesh.vertices[:, :2] @ [0.6, 0.8]
+    across = mesh.vertices[:, :2] @ [-0.8, 0.6]
+    assert along.min() == pytest.approx(0, abs=TOLERANCE_M)
+    assert along.max() == pytest.approx(60, abs=TOLERANCE_M)
+    assert across.min() == pytest.approx(-3.5, abs=TOLERANCE_M), "the lane to the right"
+    assert across.max() == pytest.approx(0, abs=TOLERANCE_M)

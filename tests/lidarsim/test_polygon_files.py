@@ -273,6 +273,8 @@ def test_warped_polygons_lose_no_triangle(count):
         assert len(faces) == count - 2
         parts = area_vectors(vertices, faces)
         np.testing.assert_allclose(parts.sum(axis=0), area_vector(vertices), atol=1e-9)
+        far = vertices + [5e5, 5e6, 100.0]
+        np.testing.assert_array_equal(cut(far), faces, "the same far from the origin")
         lost += len(with_holes(vertices, [np.arange(count)])) < count - 2
     assert lost > 20, "the clipper alone fills them"
 

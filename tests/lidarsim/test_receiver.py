@@ -328,6 +328,24 @@ def test_a_sign_blooms_over_the_angle_where_its_stray_light_passes_the_threshold
     assert (found["cause"] == SURFACE).sum() == (off == 0).sum()
 
 
+def test_stray_light_comes_from_the_nearest_point_of_a_slanted_sign():
+    corners = np.array([[20, -3, -0.5], [26, 3, -0.5], [26, 3, 0.5], [20, -3, 0.5]], float)
+    slanted = SceneMesh("S", corners, [[0, 1, 2], [0, 2, 3]])
+    noise = Noise(detection_range_m=FAR, stray_light=3e-5)
+    sensor, ahead = window(step_deg=0.2)
+    found = cast([slanted], sensor, noise=noise, materials=SIGN, columns=COLUMNS)
+    bloom = found["cause"] == BLOOMING
+    assert bloom.sum() > 200
+    share = np.linspace(0, 1, 4001)[:, None]
+    ends = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    edges = np.concatenate([start + share * (stop - start) for start, stop in ends])
+    distance = np.linalg.norm(edges, axis=1)
+    nearest = (ahead[found["ray"][bloom]] @ (edges / distance[:, None]).T).argmax(axis=1)
+    assert np.ptp(distance[nearest]) > 3, "from many points of the edges"
+    # The light starts a little inside of the edge.
+    assert found["range"][bloom] == pytest.approx(distance[nearest], abs=0.08)
+
+
 def test_a_sign_that_is_hidden_does_not_bloom():
     noise = Noise(detection_range_m=FAR, stray_light=3e-6)
     sensor, _ = window()
@@ -433,6 +451,17 @@ def test_a_sensor_that_turns_alike_is_seen_by_each_ray_its_delay_farther_away():
     assert found["intensity"][there] == pytest.approx(1 / 9, rel=0.01), "of a wall at 30 m"
     assert set(found["object"][there].tolist()) == {-1}
     assert (found["cause"] == SURFACE).sum() == 400
+
+
+@pytest.mark.parametrize("elevation", [0.3, -0.5])
+def test_light_is_seen_by_beams_that_look_up_and_down(elevation):
+    beams = Beams(np.array([elevation]))
+    one, other = (replace(spinning(start), beams=beams) for start in (0.0, 200.0))
+    found, *_ = two(one, other, [ring()])
+    there = found["cause"] == CROSSTALK
+    assert there.sum() == 400, "one of each pulse"
+    delay_m = 200 * 0.299792458 / 2
+    assert found["range"][there] == pytest.approx(30 / math.cos(elevation) + delay_m, abs=0.01)
 
 
 @pytest.mark.parametrize("delay", [1000.0, 100_000.0])

@@ -112,6 +112,13 @@ def test_a_table_states_its_conventions_and_what_it_lacks(tmp_path):
     assert np.allclose(direction, [*expected, np.sin(elevation)], atol=1e-10)
 
 
+def test_a_list_without_a_cycle_repeats_after_another_interval(tmp_path):
+    rows = [f"{1000 * k},{10 * k},0" for k in range(4)]
+    (tmp_path / "a.csv").write_text("\n".join(["time_offset_ns,azimuth_deg,elevation_deg", *rows]))
+    sensor = load_sensor(calibration=tmp_path / "a.csv")
+    assert sensor.times_ns(np.arange(9))[:, 0].tolist() == [1000 * k for k in range(9)]
+
+
 def read_as_the_plug_in_does(path):
     """Times and directions as livox_laser_simulation has them: yaw, and pitch from the zenith."""
     first, *lines = path.read_text().splitlines()

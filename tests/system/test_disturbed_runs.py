@@ -52,6 +52,8 @@ def test_frames_come_in_order_and_every_scan_once(
     places = {(record.stage, record.partition) for record in result.records}
     long = {(stage, "LIDAR") for stage in ("generate", "sort", "collect")}
     assert places == {("intersect", "GPU"), *long}
+    cast = [record.items for record in result.records if record.stage == "intersect"]
+    assert len(cast) > 2 and sum(cast) == SURVEY.scan_count
     assert left_over(client) == ([], [], [])
 
 
