@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from lidarsim import LidarError, Survey
 from lidarsim.scene.files import coordinate_systems
 from lidarsim.scene.files.coordinate_systems import (
+    area_of_use,
     crs_of_code,
     crs_of_text,
     ground_scale,
@@ -178,3 +179,39 @@ def test_zones_of_coordinates_that_are_taken_for_another_system():
     assert suggested_epsg(crs_of_code(31467), 5e5, 5.4e6) is None  # not a zone in the Atlantic
     problem = scale_problem("EPSG:31467", 5e5, 5.4e6)
     assert problem.startswith("whose area of use (Germany") and "scale" not in problem
+
+
+@needs_registry
+@pytest.mark.parametrize("epsg", [3035, 6933, 3577])
+@pytest.mark.parametrize("turns", [(0.1, 0.9), (0.5, 0.2), (0.8, 0.8)])
+def test_equal_area_projections_keep_areas_where_they_distort_shapes(epsg, turns):
+    area = area_of_use(crs_of_code(epsg))
+    longitude = area.west + turns[0] * area.width
+    latitude = area.south + turns[1] * (area.north - area.south)
+    scale = ground_scale(crs_of_code(epsg), *place(epsg, longitude, latitude)[:2])
+    assert scale.longest > 1.002 > 0.998 > scale.shortest
+    assert scale.shortest * scale.longest == pytest.approx(1, abs=1e-5)
+
+
+@needs_registry
+def test_areas_may_cross_the_date_line():
+    area = area_of_use(crs_of_code(3460))  # Fiji
+    assert area.west > 170 and area.east < -170
+    assert area.width == pytest.approx(area.east + 360 - area.west)
+    middle = (area.south + area.north) / 2
+    for longitude, inside in [
+        (area.west - 0.1, False),
+        (area.west + 0.1, True),
+        (180.0, True),
+        (-180.0, True),
+        (area.east - 0.1, True),
+        (area.east + 0.1, False),
+        (0.0, False),
+    ]:
+        assert area.reaches(longitude, middle) is inside, longitude
+        assert area.reaches(longitude, middle, 0.2) is (inside or longitude != 0.0)
+    assert not area.reaches(180.0, area.north + 0.1)
+    # A degree of arc is two degrees of longitude at a latitude of 60.
+    north = area_of_use(crs_of_code(25833))
+    assert north.reaches(north.west - 1.9, 60.0, 1.0)
+    assert not north.reaches(north.west - 2.1, 60.0, 1.0)

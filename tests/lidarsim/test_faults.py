@@ -336,6 +336,7 @@ PACKETS = {"share": 0.1, "packet": 9}
         ("share and packet. Remove by_s", {"kind": "dropped_packets", **PACKETS, "by_s": 1}),
         (("to_s must be greater than from_s .2., "
           "but is 1"), {"kind": "frozen", "from_s": 2, "to_s": 1}),
+        ("to_s must be greater than from_s", {"kind": "frozen", "from_s": 2, "to_s": 2}),
         ("least, largest", {"kind": "dirt", "transmission": 1, "elevation_deg": [2, 1]}),
         ("transmission must be from 0 to 1.*, but is 2", {"kind": "dirt", "transmission": 2}),
     ],

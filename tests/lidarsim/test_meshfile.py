@@ -236,6 +236,7 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m.obj", "v 1 2\nf 1 1 1\n", "line 1 is 'v 1 2', and three numbers"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "line 6 is '3 0 1 7', .*0 to 2"),
         ("m.off", "OFF # a b\n\n3 1 0\n0 0 0\n1 0 z\n0 1 0\n3 0 1 2\n", "line 5 is '1 0 z', "),
+        ("m.off", "# mine\n\nOFF\n3 1 0\n0 0 0\n1 0 z\n0 1 0\n3 0 1 2\n", "line 6 is '1 0 z', "),
         ("m.off", "OFF\n3 one 0\n", "line 2 is '3 one 0', and the numbers of vertices and faces"),
         ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut short: .*2 faces announced"),
         ("m.off", "OFF\n3 1 0\n0 0 0 1 0 0\n0 1 0\n3 0 1 2\n", "each in a line of its own"),
