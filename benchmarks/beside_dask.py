@@ -196,7 +196,7 @@ def _seconds_of(of_process: psutil.Process) -> float:
 
 
 def compare(work: Work, clusters: Clusters, count: int, pairs: int) -> dict[str, float]:
-    """Return the medians of each side, in microseconds an item, and the median ratios."""
+    """Return the median costs of each side in microseconds per item, and the median ratios."""
     work.ours(min(count, 50))  # both have done everything once
     work.theirs(min(count, 50))
     ours: list[Cost] = []

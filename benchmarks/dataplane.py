@@ -375,7 +375,7 @@ def medians(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def report(figures: dict[str, Any], sizes: Sizes) -> None:
-    """Print the figures of all rounds."""
+    """Print the medians of all rounds."""
     print(
         f"{figures['points']:,.0f} points, {sizes.casting} casting and {sizes.collectors} "
         f"collectors, medians of {sizes.rounds}"

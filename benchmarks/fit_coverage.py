@@ -45,7 +45,7 @@ def street() -> Scene:
 
 
 def box(name: str, lower_m: Any, upper_m: Any) -> SceneMesh:
-    """Make a box between two corners, meters."""
+    """Create a box between two corners, in meters."""
     x, y, z = np.transpose([lower_m, upper_m]).astype(float)
     corners = np.array([(a, b, c) for a in x for b in y for c in z])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

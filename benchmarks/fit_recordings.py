@@ -61,7 +61,7 @@ def deviations(ranges: Any) -> Any:
 
 
 class Comparison(NamedTuple):
-    """Recorded and simulated sweeps of the second half of a recording, by source."""
+    """Statistics of recorded and simulated sweeps in the second half of a recording, by source."""
 
     deviations_mm: dict[str, Any]  # (n,) each
     lost: dict[str, float]  # shares of pulses

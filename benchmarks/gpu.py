@@ -153,7 +153,7 @@ def figure_at(results: dict[str, Any], path: str) -> float | None:
 
 
 def table(results: dict[str, Any]) -> list[str]:
-    """Return the lines of the table of docs/performance.md."""
+    """Return the lines of the table in docs/performance.md."""
     lines = ["| measurement | result |", "|---|---|"]
     for name, digits, paths in ROWS:
         values = [figure_at(results, path) for path in paths]
@@ -217,7 +217,7 @@ def page(results: dict[str, Any]) -> str:
 
 
 def measured(name: str, sizes: Sizes, folder: str) -> Iterator[dict[str, Any]]:
-    """Measure a section in this process; yield its rows after each new row."""
+    """Measure a section in this process, and yield all rows so far after each new row."""
     module, seconds = SECTIONS[name]
     rows: dict[str, Any] = {}
     clocks_before = clocks()

@@ -28,7 +28,7 @@ def placed(name: str, mesh: Faces, origin: Any = (0, 0, 0)) -> Placed:
 
 
 def scenes(sizes: Sizes) -> Iterator[Placed]:
-    """Yield 20 scenes: of all sizes, nested, masked, far from the origin, and degenerate."""
+    """Yield 20 scenes: small, large, nested, masked, far from the origin, and degenerate."""
     vertices, faces = six_objects()
     center = np.array([0, 0, 2.0])
     yield placed("six objects", (vertices, faces), center)

@@ -40,7 +40,7 @@ _ROOM = 4e9  # bytes
 
 
 def survey(sizes: Sizes, seconds: float = 10.0) -> Survey:
-    """Return a drive of an OS1-128 at 10 m/s along the street."""
+    """Return a survey in which an OS1-128 drives along the street at 10 m/s."""
     positions = np.array([[-5.0, -1.8, 2.0], [5.0, -1.8, 2.0]]) * (seconds, 1, 1)
     sensor = Sensor.grid(sizes.rays // 128, 128, step_deg=360)
     drive = Track([0, seconds], positions)
@@ -121,7 +121,7 @@ def split_times(cupy: Any, rig: Rig) -> Iterator[Split]:
 
 
 def columns(session: Session) -> Rows:
-    """Yield points per second into host memory: a plain survey, large batches, ten actors."""
+    """Yield rates of points in host memory, such as with larger batches or with ten actors."""
     sizes = session.sizes
     bus = to_pinned(session)
     scene = city(sizes.cities[-1])
@@ -283,7 +283,7 @@ def _share(sizes: Sizes, barrier: Any, rates_queue: Any) -> None:
 
 
 def run(session: Session) -> Rows:
-    """Run surveys on a local cluster, from rays to parts on the disk; yield their rates."""
+    """Run surveys on a local cluster, from rays to parts on disk, and yield their rates."""
     from lidarpool import simulate
 
     # It turns ten times a second, once at least.

@@ -165,7 +165,7 @@ def brute_force(session: Session, caster: RayCaster, directions: Float) -> dict[
 
 
 def moving(session: Session) -> Rows:
-    """Yield rates with a pose per firing and with motion, beside a pose per revolution."""
+    """Yield rates for one pose per revolution, for one pose per firing, and with motion."""
     caster = RayCaster(*city(session.sizes.cities[-1]), backend="cuda")
     beams = 128
     directions = beam_directions(beams, session.sizes.rays * session.sizes.poses)
@@ -210,7 +210,7 @@ def forest(trees: int, leaves: int, masked: bool) -> list[Instance]:
 
 
 def instances(session: Session) -> Rows:
-    """Yield rates in a forest of instances, and at a single tree, opaque and masked."""
+    """Yield rates for a forest of instances and for a single tree, both opaque and masked."""
     scan = revolutions(session, revolution(session.sizes.rays))
     for masked in (False, True):
         start = time.perf_counter()

@@ -59,7 +59,7 @@ def _serve(main: Callable[..., Any], connection: Connection, *arguments: Any) ->
 
 @contextmanager
 def process(main: Callable[..., Any], *arguments: Any) -> Iterator[tuple[psutil.Process, str]]:
-    """Run `main` in a new process; yield the process and the address it sends when ready."""
+    """Run `main` in a new process, and yield the process and the address that it reports."""
     context = multiprocessing.get_context("spawn")
     parent_end, child_end = context.Pipe()
     child = context.Process(target=_serve, args=(main, child_end, *arguments), daemon=True)

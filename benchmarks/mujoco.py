@@ -75,7 +75,7 @@ def herd(robots: int, cells: int) -> str:
 
 
 def build(name: str, xml: str, sites: list[str]) -> World:
-    """Compile a model; hills are waves."""
+    """Compile a model, and fill its height fields with waves."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(xml)

@@ -122,7 +122,7 @@ def distances(bag: Path, expected: list[Any], *, deskew: bool) -> Distances:
 
 
 def measured(model: str, sweeps: int, triangles: int) -> dict[bool, Distances]:
-    """Simulate a drive, write its bag and play the bag: {whether deskewed: distances}."""
+    """Return odometry errors for the bag of a simulated drive, with and without deskewing."""
     survey = survey_of(model, sweeps)
     cloud = cloud_of(survey, city(triangles))
     expected = true_points(survey, cloud)

@@ -100,7 +100,7 @@ def ratio(row: dict[str, Any], engine: str, base: str) -> float:
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the rates of a job."""
+    """Print the ray-casting rates of all engines for a job."""
     print(f"\n{row['scene']}, {row['triangles']:,} triangles, {row['rays']:,} {row['order']} rays")
     peer = best_peer(row)
     for name, entry in row["engines"].items():

@@ -23,11 +23,11 @@ class Open3D(Engine):
     chunk = 1 << 17
 
     def missing(self) -> str:
-        """Return how to install Open3D, or an empty string."""
+        """Return the command that installs Open3D, or an empty string if it is installed."""
         return "" if importlib.util.find_spec("open3d") else "pip install open3d-cpu"
 
     def prepare(self, job: Job) -> Cast:
-        """Build Open3D's scene and the chunks of rays; return a function that casts the chunks."""
+        """Build an Open3D scene and chunks of rays, and return a function that casts the chunks."""
         import open3d
 
         scene = _open3d_scene(job, self.threads)

@@ -20,22 +20,22 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Mesh and rays to cast at the mesh.
+    """A mesh, and the rays to cast at it.
 
     Attributes
     ----------
     name
-        Of the scene.
+        Name of the scene.
     vertices, faces
-        float64 (v, 3), int32 (f, 3).
+        float64 (v, 3) and int32 (f, 3): vertices and triangles of the mesh.
     origins
-        float64 (p, 3): from each of them all rays are cast.
+        float64 (p, 3): origins of the rays. All rays are cast from each origin.
     directions
-        float64 (n, 3), unit vectors, in the sensor's axes.
+        float64 (n, 3): directions of the rays as unit vectors in the sensor frame.
     rotation
-        float64 (3, 3): the sensor's axes in the scene.
+        float64 (3, 3): rotation from the sensor frame to the scene.
     order
-        "coherent", as a lidar fires them, or "shuffled".
+        Order of the rays: "coherent", as in the firing order of a lidar, or "shuffled".
     """
 
     name: str
@@ -48,7 +48,7 @@ class Job:
 
     @property
     def rays(self) -> int:
-        """Number of rays from all origins."""
+        """Total number of rays from all origins."""
         return len(self.origins) * len(self.directions)
 
     def shuffled(self) -> Job:

@@ -223,7 +223,7 @@ def figures(rays: Rays, simulated_m: Floats) -> dict[str, float]:
 
 
 def meshes(place: Place, reflectances: Reflectances | None) -> tuple[SceneMesh, list[SceneMesh]]:
-    """Return the surfels that return light, with colors, and those that return nothing, if any."""
+    """Return a mesh of the reflecting surfels, with colors, and a mesh of the others, if any."""
     dark = place.surfels.dark
     lit = place.surfels.part(~dark).mesh
     if reflectances is not None:

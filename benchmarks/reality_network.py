@@ -33,14 +33,14 @@ _KINDS = ("recorded", "simulated", "next")
 
 
 class Sweep(NamedTuple):
-    """Points of a sweep, as the network reads them."""
+    """Points of a sweep in the form that the network reads."""
 
     points: Floats  # (n, 3): sensor frame, meters
     intensity: Floats  # (n,): 0 to 1
     standing: Bools  # (n,)
 
     def write(self, file: Path) -> None:
-        """Write the file of KITTI that the network reads."""
+        """Write the points as a KITTI file, which the network reads."""
         rows = np.column_stack([self.points, self.intensity])
         rows.astype(np.float32).tofile(file)
 

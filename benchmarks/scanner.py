@@ -102,7 +102,7 @@ class LidarpoolScans:
         return len(hits)
 
     def ranges(self, poses: Float) -> Any:
-        """Make range images."""
+        """Return a range image for each pose."""
         return self.scanner.ranges(poses)
 
     def noise(self, poses: Float) -> Any:
@@ -120,7 +120,7 @@ class LidarpoolScans:
 
 
 class Open3D:
-    """Open3D's scene, with rays made in NumPy."""
+    """Open3D scene whose rays are computed with NumPy."""
 
     def __init__(self, scene: Scene, scans: LidarpoolScans) -> None:
         import open3d
@@ -137,7 +137,7 @@ class Open3D:
         self.origins = None if origins is None else np.array(origins, np.float32)
 
     def ranges(self, poses: Float) -> Any:
-        """Make range images."""
+        """Return a range image for each pose."""
         count = len(self.rays)
         matrices = poses.astype(np.float32)
         rotations = matrices[:, :3, :3].transpose(0, 2, 1)
@@ -232,7 +232,7 @@ def ratio(row: dict[str, Any], method: str, base: str = "cast") -> float:
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the times of a case."""
+    """Print the execution times of a case."""
     print(
         f"\n{row['case']} by {row['backend']}: {row['rays']:,} rays from {row['poses']:,} poses, "
         f"{row['triangles']:,} triangles"

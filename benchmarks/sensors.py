@@ -61,14 +61,14 @@ def bend(rate_deg: float = 30.0) -> Track:
 
 
 def surveys(name: str, share: float) -> dict[str, Survey]:
-    """Make the surveys of a model by case; actors are part of the scene.
+    """Return the surveys of a sensor model by case, without actors, which belong to the scene.
 
     Parameters
     ----------
     name
-        Of the model.
+        Name of the sensor model.
     share
-        Of a turn.
+        Share of a revolution that is cast.
     """
     sensor = load_sensor(name, step_deg=360 * share)
     first, stop = sensor.firings(0)
@@ -251,7 +251,7 @@ def ratio(row: dict[str, Any], case: str, base: str, stage: int = 0) -> float:
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the times of a model on a backend."""
+    """Print the execution times of a sensor model on a backend."""
     print(
         f"\n{row['model']} by {row['backend']}: {row['rays']:,} rays in {row['firings']:,} "
         f"firings, {row['triangles']:,} triangles"

@@ -31,7 +31,7 @@ MESH = "city.glb"
 
 
 def poses(count: int) -> list[tuple[float, float, float]]:
-    """Return positions along streets, at the height of a car's roof."""
+    """Return random positions in the city, at the height of a car roof."""
     from lidarscenes.procedural.city import city
 
     lower_m, upper_m = city(TRIANGLES).bounds
@@ -90,7 +90,7 @@ def scan_count(rays: int) -> int:
 
 
 def scenario(rays: int, folder: Path) -> Path:
-    """Write mesh and scenario of the same survey; return the scenario's path."""
+    """Write the mesh and scenario of the same survey, and return the path of the scenario."""
     from lidarscenes.procedural.city import city
     from lidarscenes.writers.scene_file import write_scene
 
@@ -168,7 +168,7 @@ def main() -> None:
 
 
 def compare(folder: Path) -> None:
-    """Print how many points of both clouds agree, and the distances between them."""
+    """Print the share of points that agree in both clouds, and the distances between them."""
     from lidarpool import read_cloud
 
     script_cloud, our_cloud = (

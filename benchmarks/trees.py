@@ -67,7 +67,7 @@ def compile_kernels(folder: Path) -> ctypes.CDLL:
 
 
 def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> dict[str, float]:
-    """Cast a job's rays; return the counters per ray, and the share of hits."""
+    """Cast the rays of a job, and return the counters per ray and the share of hits."""
     directions = np.ascontiguousarray((job.directions @ job.rotation.T).T)
     n = directions.shape[1]
     distance = np.empty(n)
@@ -143,7 +143,7 @@ def _lay_out_limited(mesh: LocalMesh, cluster_limits: tuple[int, int]) -> Layout
 
 
 def show(row: dict[str, Any]) -> None:
-    """Print the counts of a scene as a row of the table."""
+    """Print the counts for a scene as a table row."""
     cells = [row["scene"], f"{row['triangles']:,}"]
     cells += [" / ".join(f"{row[name][kind]:.2f}" for name in TREES) for kind in KINDS]
     cells.append(f"{row['ours']['nodes'] / row['sweep']['nodes']:.2f}")

@@ -1,7 +1,7 @@
-"""Partitions that grow with their work: `python examples/adaptive.py`.
+"""Start and stop workers as the work of their partitions changes: `python examples/adaptive.py`.
 
-Jobs of this cluster are processes of this machine; with `dask_jobqueue.SLURMCluster` and others
-they are jobs of a queue.
+In this example, jobs are processes on this machine. With `dask_jobqueue.SLURMCluster` and similar
+classes, they are jobs in a queue.
 """
 
 from dask_jobqueue.local import LocalCluster

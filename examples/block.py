@@ -22,27 +22,27 @@ from lidarscenes.procedural.plants import SPECIES, tree
 
 Array = NDArray[np.float64]
 
-# Middle of the block, EPSG:25832.
+# Center of the block in EPSG:25832.
 EAST = 691_000.0
 NORTH = 5_334_000.0
-# Of the street around the block, meters.
+# Dimensions of the street around the block, in meters.
 HALF = 100.0
 CORNER = 14.0
 WIDTH = 8.0
-LIFT = 0.04  # of the street above the hills
+LIFT = 0.04  # height of the street above the hills
 TREES = 500
 CARS = 100
 SECONDS = 12
-STREET_AT = 0.5  # of the file's steps, seconds
+STREET_AT = 0.5  # time step of the traffic file, seconds
 
 
 def height(x: Array, y: Array) -> Array:
-    """Height of the hills."""
+    """Return the height of the hills."""
     return np.asarray(512 + 1.6 * np.sin(x / 47) + 1.1 * np.cos(y / 39))
 
 
 def ring(distance_m: Array, aside: Array | float = 0.0) -> tuple[Array, Array, Array]:
-    """Points on the street's middle line, counter-clockwise: x, y, and the direction of travel."""
+    """Return x, y and heading of points along the center line, counterclockwise."""
     straight = 2 * (HALF - CORNER)
     arc = np.pi / 2 * CORNER
     side, along_side = np.divmod(distance_m % (4 * (straight + arc)), straight + arc)
@@ -50,7 +50,7 @@ def ring(distance_m: Array, aside: Array | float = 0.0) -> tuple[Array, Array, A
     straight_m = np.minimum(along_side, straight) - straight / 2
     x = straight_m + (CORNER + aside) * np.sin(arc_angle)
     y = -HALF + CORNER - (CORNER + aside) * np.cos(arc_angle)
-    # Each side is the first one, turned.
+    # Each side is a rotated copy of the first side.
     angle = side * np.pi / 2
     c = np.cos(angle)
     s = np.sin(angle)
@@ -61,7 +61,7 @@ LENGTH = 4 * (2 * (HALF - CORNER) + np.pi / 2 * CORNER)
 
 
 def raster(path: Path) -> None:
-    """Write the hills, 200 x 200 pixels of 2 m."""
+    """Write the hills as a raster of 200 x 200 pixels of 2 m."""
     coordinates = np.arange(-199.0, 200, 2)
     heights = height(coordinates[None, :], coordinates[::-1, None])
     transform = from_origin(EAST - 200, NORTH + 200, 2, 2)
@@ -73,15 +73,15 @@ def raster(path: Path) -> None:
 
 
 def traffic(path: Path) -> None:
-    """Write floating car data, as SUMO does: two opposite lanes, without accidents."""
+    """Write floating car data in SUMO's format: two opposite lanes without collisions."""
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]
     cars = np.arange(CARS)
     ahead = cars % 2 == 0
     begin = (cars // 2) * LENGTH / (CARS / 2)
-    speed = np.where(ahead, 1.5, -1.2)  # it is dense
+    speed = np.where(ahead, 1.5, -1.2)  # slow, because the traffic is dense
     for time in np.arange(0, SECONDS + STREET_AT, STREET_AT):
         lines.append(f'  <timestep time="{time:.2f}">')
-        # On the right: outside, if it goes counter-clockwise.
+        # Cars drive on the right, so cars that go counterclockwise are in the outer lane.
         x, y, yaw = ring(begin + speed * time, np.where(ahead, WIDTH / 4, -WIDTH / 4))
         yaw = np.where(ahead, yaw, yaw + np.pi)
         for car in cars:
@@ -97,7 +97,7 @@ def traffic(path: Path) -> None:
 
 
 def street_image() -> Image.Image:
-    """Paint 12 m of the street, 2 cm a pixel: asphalt, edge lines, and a dashed middle line."""
+    """Paint 12 m of the street at 2 cm per pixel: asphalt, edge lines, and a dashed center line."""
     image = np.random.default_rng(1).choice([78.0, 86.0, 94.0], (400, 600), p=[0.1, 0.8, 0.1])
     for edge in (14, 380):
         image[edge : edge + 6] = 235
@@ -106,7 +106,7 @@ def street_image() -> Image.Image:
 
 
 def crossing_image() -> Image.Image:
-    """Paint a crossing: half-meter bars."""
+    """Paint a crosswalk with bars of half a meter."""
     image = np.full((400, 200), 84, np.uint8)
     for begin in range(20, 380, 50):
         image[begin : begin + 25, 15:185] = 238
@@ -114,7 +114,7 @@ def crossing_image() -> Image.Image:
 
 
 def facade_image() -> Image.Image:
-    """Paint a window and its wall, 3 x 3 m."""
+    """Paint a window and the wall around it, 3 x 3 m."""
     rng = np.random.default_rng(2)
     image = (
         np.array([176, 128, 100]) + rng.choice([-14, 0, 10], (150, 150, 1), p=[0.15, 0.7, 0.15])
@@ -126,7 +126,7 @@ def facade_image() -> Image.Image:
 
 
 class Block:
-    """A stage with meshes, textures and point instancers, in meters and Z-up."""
+    """OpenUSD stage with meshes, textures and point instancers, in meters and z-up."""
 
     def __init__(self, path: Path) -> None:
         self.stage = Usd.Stage.CreateInMemory()
@@ -136,7 +136,7 @@ class Block:
         self.stage.SetDefaultPrim(UsdGeom.Xform.Define(self.stage, "/Block").GetPrim())
 
     def mesh(self, name: str, points: Array, corners: Array, uv: Array | None = None) -> Usd.Prim:
-        """Add polygons (n, k) of points (p, 3), perhaps with texture coordinates (p, 2)."""
+        """Add polygons (n, k) of points (p, 3), optionally with texture coordinates (p, 2)."""
         mesh = UsdGeom.Mesh.Define(self.stage, f"/Block/{name}")
         mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
         mesh.CreateFaceVertexIndicesAttr(corners.ravel().tolist())
@@ -150,7 +150,7 @@ class Block:
         return mesh.GetPrim()
 
     def color(self, prim: Usd.Prim, colors: list[tuple[float, ...]]) -> None:
-        """Color a mesh, or each of its polygons, in linear light."""
+        """Set the color of a mesh, or of each of its polygons (linear RGB)."""
         primvar = UsdGeom.Gprim(prim).CreateDisplayColorPrimvar(
             UsdGeom.Tokens.uniform if len(colors) > 1 else UsdGeom.Tokens.constant
         )
@@ -159,7 +159,7 @@ class Block:
         primvar.SetIndices([table.index(color) for color in colors])
 
     def texture(self, prim: Usd.Prim, image: Image.Image, name: str) -> None:
-        """Give a mesh an image, which is written beside the scene."""
+        """Apply an image to a mesh as a texture, and save the image next to the scene."""
         image.save(self.path.with_name(name), optimize=True)
         base = f"/Block/Looks/{Path(name).stem.replace('-', '_')}"
         material = UsdShade.Material.Define(self.stage, base)
@@ -186,7 +186,7 @@ class Block:
         UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
 
     def strip(self, name: str, begin: float, end: float, step: float, lift: float) -> Usd.Prim:
-        """Add a piece of the street; u counts 12 m along the street."""
+        """Add a section of the street. The texture of `Street` repeats every 12 m."""
         distance_m, aside = np.meshgrid(
             np.arange(begin, end + step / 2, step), np.linspace(-WIDTH / 2, WIDTH / 2, 5),
             indexing="ij",
@@ -203,7 +203,7 @@ class Block:
 
 
 def building(corner: Array, size: Array) -> tuple[Array, Array, Array]:
-    """Walls of a house with a window every 3 m, and a flat roof without: points, corners, uv."""
+    """Return points, corners and texture coordinates of a house with a window every 3 m."""
     x, y, z = size
     outline = np.array([[0, 0], [x, 0], [x, y], [0, y], [0, 0]])
     points = []
@@ -225,7 +225,7 @@ def building(corner: Array, size: Array) -> tuple[Array, Array, Array]:
 
 
 def block(path: Path) -> None:
-    """Write the city block, its origin in the middle of the street's square."""
+    """Write the city block, with its origin at the center of the square enclosed by the street."""
     stage = Block(path)
     stage.texture(stage.strip("Street", 0, LENGTH, 1.0, LIFT), street_image(), "block-street.png")
     for number in range(4):
@@ -242,7 +242,7 @@ def block(path: Path) -> None:
         stage.texture(house, facade_image(), "block-facade.png")
         occupied.append((x - 4, y - 4, x + size[0] + 4, y + size[1] + 4))
     for number, (yaw_deg, aside) in enumerate([(0, 16), (90, 20), (180, 18), (270, 22)]):
-        # Beyond the street.
+        # Houses on the other side of the street.
         points, corners, uv = building(np.zeros(3), np.array([90, 12, 9 + 3 * number]))
         angle = np.radians(yaw_deg)
         x = points[:, 0] - 45
@@ -257,7 +257,7 @@ def block(path: Path) -> None:
 
 
 def trees(stage: Block, rng: np.random.Generator, occupied: list[tuple[float, ...]]) -> None:
-    """Add an avenue along both sides of the street, and a park between the houses."""
+    """Add rows of trees along both sides of the street, and a park between the houses."""
     instancer = UsdGeom.PointInstancer.Define(stage.stage, "/Block/Trees")
     maple = maple_tree(stage)
     x, y = np.array(tree_positions(rng, occupied)).T
@@ -285,7 +285,7 @@ def maple_tree(stage: Block) -> Usd.Prim:
 def tree_positions(
     rng: np.random.Generator, occupied: list[tuple[float, ...]]
 ) -> list[tuple[float, float]]:
-    """Return x and y of all trees: the avenue, then random free positions."""
+    """Return x and y of all trees, first along the street and then at random free positions."""
     distance_m = np.arange(0, LENGTH, LENGTH / 80)
     avenue = [ring(distance_m, side)[:2] for side in (WIDTH / 2 + 3.5, -WIDTH / 2 - 3.5)]
     avenue_x, avenue_y = (np.concatenate(axis) for axis in zip(*avenue, strict=True))

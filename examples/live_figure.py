@@ -1,11 +1,11 @@
-"""The live figure of the MATLAB example: triangles colored by their number of hits, frame by frame.
+"""Draw the live figure of the MATLAB example, with triangles colored by number of hits.
 
-    python examples/live_figure.py                 # a window, at a tenth of the scanner's rate
-    python examples/live_figure.py figure.png      # the last state of the figure, as a picture
+    python examples/live_figure.py                 # open a window, at a tenth of the scanner's rate
+    python examples/live_figure.py figure.png      # save the final figure as an image
 
 `frame.hit_counts()` returns the number of hits per triangle, which the MATLAB example calls
-numHits.
-It requires that the survey keeps every hit, so this script thins out the points that it draws.
+`numHits`. The method requires that the survey keeps every hit, so this script draws only a subset
+of the points.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from lidarpool import Scene, Survey, simulate
 
-PACE = 0.1  # of the scanner's rate, at which it turns ten times a second
+PACE = 0.1  # relative to the scanner's rate of ten revolutions per second
 KEPT = 5  # every fifth hit is drawn as a point
 
 
 class LiveFigure:
-    """The scene, its triangles colored by hits, points and the position of the sensor.
+    """Figure of the scene with colored triangles, points and the sensor position.
 
-    The gray scene is drawn once. A frame only draws what has been hit, so that it takes some ten
-    milliseconds.
+    The gray scene is drawn only once. Each frame draws only the triangles that have been hit, which
+    takes about ten milliseconds.
     """
 
     def __init__(self, scene: Scene, position: tuple[float, float, float]) -> None:
@@ -57,7 +57,7 @@ class LiveFigure:
         self.background = self.figure.canvas.copy_from_bbox(self.figure.bbox)
 
     def on_frame(self, frame) -> None:
-        """Draw a frame: `simulate` calls this in scan order, at the pace."""
+        """Draw a frame. `simulate` calls this method in scan order, at the given pace."""
         self.num_hits += frame.hit_counts()
         self.points = np.concatenate([self.points, frame.points().positions[::KEPT]])
         hit = np.flatnonzero(self.num_hits)
@@ -73,7 +73,7 @@ class LiveFigure:
         canvas.flush_events()
 
     def save(self, path: str) -> None:
-        """Write the figure as a picture."""
+        """Save the figure as an image."""
         self.hit.set_animated(False)
         self.cloud.set_animated(False)
         self.figure.savefig(path, dpi=150)

@@ -1,9 +1,10 @@
 """Create pedestrian.glb, an adult of 1.75 m who walks at 1.4 m/s: `python make_pedestrian.py`.
 
-Tubes of ellipses along the limbs, bent by a skin of 15 joints. The animation "Walk" is one cycle of
-two steps. Feet roll from heel to ball without sliding, knees follow from where hips and feet are,
-and arms swing against the legs. x is ahead and z up below the root, which turns them to glTF's
-axes.
+The body consists of tubes with elliptical cross-sections along the limbs, which a skin with 15
+joints deforms. The animation "Walk" is one cycle of two steps. Feet roll from heel to ball without
+sliding, the positions of hips and feet determine the knee angles, and the arms swing opposite to
+the legs. Below the root node, x points forward and z points up. The root node rotates these axes
+to those of glTF.
 """
 
 import json
@@ -15,17 +16,17 @@ import numpy as np
 
 SPEED_M_S = 1.4
 CYCLE_S = 1.05
-KEYS = 36  # of the animation
-STANCE = 0.62  # share of the cycle
-LEG = 0.43  # length of thigh and shank, meters
+KEYS = 36  # key frames of the animation
+STANCE = 0.62  # share of the cycle during which a foot is on the ground
+LEG = 0.43  # length of the thigh and of the shank, meters
 ANKLE_M = 0.08  # height
-# Of a foot, ahead of its ankle, meters.
+# Positions on a foot, forward of its ankle, meters.
 HEEL = -0.05
 BALL = 0.13
-STRIKE_M = 0.27  # where heels strike, ahead of the hips
+STRIKE_M = 0.27  # where a heel strikes the ground, forward of the hips
 HIP_M = 0.90  # height of the hips
-LIFT_M = 0.08  # by which a foot in the air is lifted
-# Joints: name, parent, place in the figure as it is modeled. L is at positive y.
+LIFT_M = 0.08  # height by which a foot is lifted
+# Joints: name, parent, and position in the rest pose. Joints with L are at positive y.
 JOINTS = [("hips", None, (0, 0, 0.94)), ("spine", "hips", (0, 0, 1.08)),
           ("head", "spine", (0, 0, 1.5))]  # fmt: skip
 for _side, _y in (("L", 1), ("R", -1)):
@@ -41,7 +42,7 @@ NAMES = [name for name, *_ in JOINTS]
 
 
 class Figure:
-    """Vertices, triangles, and up to two joints of each vertex with their weights."""
+    """Vertices and triangles of the body, with up to two weighted joints for each vertex."""
 
     def __init__(self) -> None:
         self.points = []
@@ -50,10 +51,10 @@ class Figure:
         self.weights = []
 
     def tube(self, rings, held, across=16, along=2) -> None:
-        """Add a closed tube through rings: middle x, y, z and two half axes.
+        """Add a closed tube through rings, each given by the center x, y, z and two semi-axes.
 
-        `held` gives two joints and the weight of the second by the coordinate `along`, the axis
-        that the ellipses are at right angles to.
+        The ellipses are perpendicular to the axis `along`. `held` maps the coordinate along this
+        axis to two joints and the weight of the second joint.
         """
         first = len(self.points)
         angles = 2 * np.pi * np.arange(across) / across
@@ -88,7 +89,7 @@ class Figure:
 
 
 def blend(*stops):
-    """Return a function that gives joints by a falling coordinate; stops are (name, end, reach)."""
+    """Return a function from a coordinate to joints. Stops are (name, end, reach), descending."""
 
     def held(coordinate):
         for (joint, below, reach), (next_joint, *_) in pairwise(stops):
@@ -101,7 +102,7 @@ def blend(*stops):
 
 
 def figure() -> Figure:
-    """Model the body, standing."""
+    """Return the body in its rest pose, standing."""
     person = Figure()
     torso = [
         (0.84, 0.07, 0.10),
@@ -167,7 +168,7 @@ def figure() -> Figure:
 
 
 def rotations(angle, axis=1):
-    """Return quaternions x, y, z, w of rotations about an axis."""
+    """Return the quaternions (x, y, z, w) of rotations about an axis."""
     quaternions = np.zeros((*np.shape(angle), 4))
     quaternions[..., axis], quaternions[..., 3] = (
         np.sin(np.asarray(angle) / 2),
@@ -177,16 +178,17 @@ def rotations(angle, axis=1):
 
 
 def times(p, q):
-    """Return products of quaternions."""
+    """Return the products of quaternions."""
     (a, b, c, d), (e, f, g, h) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
     return np.stack([d * e + a * h + b * g - c * f, d * f - a * g + b * h + c * e,
                      d * g + a * f - b * e + c * h, d * h - a * e - b * f - c * g], -1)  # fmt: skip
 
 
 def ankle(phase):
-    """Return ahead and up of an ankle from hips and ground, and pitch, toes up, of its foot.
+    """Return the position of an ankle and the pitch of its foot at a phase of the cycle.
 
-    The phase is 0 where the heel strikes.
+    The position consists of the distance forward of the hips and the height above the ground. The
+    pitch is positive if the toes point up. The phase is 0 when the heel strikes the ground.
     """
     phase = np.asarray(phase) % 1
 
@@ -200,7 +202,7 @@ def ankle(phase):
         x = STRIKE_M - HEEL + pivot - traveled - (pivot * np.cos(pitch) + ANKLE_M * np.sin(pitch))
         return np.stack([x, ANKLE_M * np.cos(pitch) - pivot * np.sin(pitch), pitch])
 
-    # In the air: on a cubic from where and how the foot leaves to where and how it strikes.
+    # In the air, the foot follows a cubic that matches position and velocity at both ends.
     step = 1e-4
     air = 1 - STANCE
     u = np.clip((phase - STANCE) / air, 0, 1)
@@ -220,10 +222,10 @@ def ankle(phase):
 
 
 def walk(phase):
-    """Return rotations of joints, and positions of the hips, at phases (k,): {joint: (k, …)}."""
+    """Return joint rotations and hip positions at phases (k,), as {joint: (k, …)}."""
     cycle = 2 * np.pi * phase
-    swing = np.cos(cycle)  # of the left leg, ahead
-    yaw = np.radians(6) * -swing  # turns the left hip ahead
+    swing = np.cos(cycle)  # forward swing of the left leg
+    yaw = np.radians(6) * -swing  # moves the left hip forward
     height = HIP_M + 0.018 * np.cos(2 * (cycle - 2 * np.pi * 0.32))
     sway = 0.02 * np.sin(cycle)
     lean = rotations(np.radians(3) + 0 * yaw)
@@ -251,7 +253,7 @@ def walk(phase):
 
 
 class Buffer:
-    """Binary chunk of a glTF file, with the views and accessors of the stored arrays."""
+    """Binary chunk of a glTF file, with the buffer views and accessors of its arrays."""
 
     def __init__(self) -> None:
         self.views = []
@@ -259,7 +261,7 @@ class Buffer:
         self.data = b""
 
     def store(self, array, kind, **extra) -> int:
-        """Append an array; return the index of its accessor."""
+        """Append an array and return the index of its accessor."""
         array = np.ascontiguousarray(array)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes}
         self.views.append(view)
@@ -272,7 +274,7 @@ class Buffer:
 
 
 def skeleton() -> list[dict]:
-    """Return the nodes: the root, the body and the joints."""
+    """Return the nodes of the root, the body and the joints."""
     positions = {name: np.array(position, float) for name, _, position in JOINTS}
     nodes = [{"name": "Pedestrian", "children": [1, 2], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]},
              {"name": "Body", "mesh": 0, "skin": 0}]  # fmt: skip
@@ -285,7 +287,7 @@ def skeleton() -> list[dict]:
 
 
 def walk_animation(buffer: Buffer) -> dict:
-    """Store the keys of a cycle; return the animation."""
+    """Store the key frames of a cycle and return the animation."""
     phase = np.linspace(0, 1, KEYS + 1)
     times = np.array(CYCLE_S * phase, "f")
     keys = buffer.store(times, "SCALAR", min=[0.0], max=[float(times[-1])])
@@ -301,7 +303,7 @@ def walk_animation(buffer: Buffer) -> dict:
 
 
 def glb(person: Figure) -> bytes:
-    """Pack figure, skin and animation into a file."""
+    """Return a glTF file that contains the figure, its skin and its animation."""
     buffer = Buffer()
     bound = np.tile(np.eye(4, dtype="f"), (len(JOINTS), 1, 1))
     bound[:, 3, :3] = [-np.array(position, float) for _, _, position in JOINTS]

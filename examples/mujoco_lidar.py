@@ -1,4 +1,4 @@
-"""A MuJoCo robot drives through falling balls, and its lidar scans while everything moves."""
+"""Simulate the lidar of a MuJoCo robot that drives through falling balls."""
 
 import numpy as np
 
@@ -41,7 +41,7 @@ def world(balls: int = 12) -> str:
 
 
 def main() -> None:
-    """Simulate half a second; save the last sweep as balls.ply."""
+    """Simulate half a second and save the last sweep to balls.ply."""
     model = mujoco.MjModel.from_xml_string(world())
     data = mujoco.MjData(model)
     data.qvel[0] = SPEED_M_S

@@ -1,4 +1,4 @@
-"""A lidar in Newton scans falling boxes. The boxes move between the firings of a sweep."""
+"""Simulate a lidar that scans falling boxes in Newton, while the boxes move during each sweep."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ SIZE_M = 0.6
 
 
 def model_of_boxes(positions):
-    """Return a model of boxes above the ground."""
+    """Return a Newton model of boxes above the ground."""
     builder = newton.ModelBuilder()
     builder.add_ground_plane()
     for position in positions.tolist():
@@ -28,7 +28,7 @@ def model_of_boxes(positions):
 
 
 def main() -> None:
-    """Simulate half a second; save the last sweep as boxes.ply."""
+    """Simulate half a second and save the last sweep to boxes.ply."""
     positions = np.random.default_rng(7).uniform((2, -3, 1), (8, 3, 4), (12, 3))
     model = model_of_boxes(positions)
     solver = newton.solvers.SolverXPBD(model)
@@ -36,7 +36,7 @@ def main() -> None:
     next_state = model.state()
     collisions = newton.CollisionPipeline(model)
     contacts = collisions.contacts()
-    # Frames of Newton's boxes are at their centers, of `box` in the middle below.
+    # The origin of a Newton box is its center, that of `box` is the center of its bottom face.
     mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).moved("Box", np.eye(3), np.array([0, 0, -0.3]))
     follower = Follower(
         [mesh] * len(positions),
@@ -52,7 +52,7 @@ def main() -> None:
         collisions.collide(state, contacts)
         solver.step(state, next_state, model.control(), contacts, STEP_S)
         state, next_state = next_state, state
-        poses = state.body_q.numpy().astype(np.float64)  # positions, and quaternions x, y, z, w
+        poses = state.body_q.numpy().astype(np.float64)  # positions and quaternions (x, y, z, w)
         rotations = matrices(poses[:, 3:] / np.linalg.norm(poses[:, 3:], axis=1, keepdims=True))
         bodies = affine(rotations, poses[:, :3])
         for cloud in follower.step(number * STEP_S, lidar, bodies):

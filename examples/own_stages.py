@@ -1,8 +1,9 @@
 """Run a four-stage pipeline and 100 independent trials on one pool, with your own functions.
 
-The partitions are those of MATLAB's example: a worker for each GPU, four workers for the pipeline,
-and the rest for other work. While stage 1 generates scans, each scan becomes a short task on the
-GPU partition. Replace the bodies of the functions and keep the pipes between them.
+The pool is partitioned as in MATLAB's example: one worker per GPU, four workers for the pipeline,
+and the remaining workers for other tasks. While stage 1 generates scans, each scan is processed in
+a short task on the GPU partition. To use this program as a template, replace the bodies of the
+functions and keep the pipes between them.
 
     python examples/own_stages.py
 """
@@ -16,19 +17,19 @@ from poolpart import Pipe, Pool
 
 SCANS = 36
 RAYS = 500
-ROOM = np.array([8.0, 6.0, 3.0])  # meters, around the sensor in its middle
+ROOM = np.array([8.0, 6.0, 3.0])  # size in meters; the sensor is in the center
 TRIALS = 100
 
 
 def generate(scans):
-    """Stage 1: the parameters of each scan, here the direction of the sensor's head in degrees."""
+    """Generate the parameters of each scan, here the azimuth of the sensor head (stage 1)."""
     for scan in range(SCANS):
         scans.put((scan, 360 / SCANS * scan))
     scans.close()
 
 
 def intersect(item, hits, frames):
-    """Stage 2, a task on the GPU partition: where the rays of a scan meet the walls of the room."""
+    """Intersect the rays of a scan with the walls, in a task on the GPU partition (stage 2)."""
     scan, azimuth_deg = item
     azimuth = math.radians(azimuth_deg)
     elevations = np.radians(np.linspace(-45, 45, RAYS))
@@ -46,7 +47,7 @@ def intersect(item, hits, frames):
 
 
 def sort_frames(frames, shown):
-    """Stage 3: the frames in the order of the scans, also if several workers intersect."""
+    """Sort the frames into scan order, because several workers may intersect scans (stage 3)."""
     waiting = {}
     following = 0
     for scan, frame in frames:
@@ -58,12 +59,12 @@ def sort_frames(frames, shown):
 
 
 def collect(hits):
-    """Stage 4, in two collectors at once: the points of the scans that come to this one."""
+    """Return the points of the scans that this collector receives, one of two (stage 4)."""
     return dict(hits)
 
 
 def plan(trial):
-    """Return the length of the shorter way around a pillar, by a point chosen at random."""
+    """Return the length of a path around a pillar through a random point."""
     beside = np.random.default_rng(trial).uniform(-3, 3)
     if abs(beside) < 1:  # within the pillar
         return math.inf
@@ -81,11 +82,11 @@ def main():
         lengths = other.map(plan, range(TRIALS), ordered=False)
         with shown.listen(lambda frame: print(f"scan {frame[0]}: {frame[1]:.2f} m on average")):
             best = min(lengths)
-            casting.result()  # all scans were cast: nothing else comes
+            casting.result()  # all scans have been cast, so no more items follow
             hits.close()
             frames.close()
         for stage in stages:
-            stage.result()  # raises the error of a stage that has failed
+            stage.result()  # raises the error if the stage has failed
         points = {}
         for collector in collectors:
             points |= collector.result()

@@ -1,4 +1,4 @@
-"""A lidar in PyBullet scans falling boxes. The boxes move between the firings of a sweep."""
+"""Simulate a lidar that scans falling boxes in PyBullet, while the boxes move during each sweep."""
 
 import numpy as np
 
@@ -9,13 +9,13 @@ except ImportError as error:
 
 from lidarpool import Follower, Noise, box, load_sensor, save_cloud
 
-STEP_S = 1 / 240  # of PyBullet, by default
+STEP_S = 1 / 240  # default time step of PyBullet
 DURATION_S = 0.55
 SIZE_M = 0.6
 
 
 def matrix(position, quaternion):
-    """Return the matrix (4, 4) of a pose of PyBullet, from the body's frame to the world."""
+    """Return the matrix (4, 4) of a PyBullet pose, from the body frame to the world frame."""
     result = np.eye(4)
     result[:3, :3] = np.reshape(bullet.getMatrixFromQuaternion(quaternion), (3, 3))
     result[:3, 3] = position
@@ -23,14 +23,14 @@ def matrix(position, quaternion):
 
 
 def main() -> None:
-    """Simulate half a second; save the last sweep as boxes.ply."""
+    """Simulate half a second and save the last sweep to boxes.ply."""
     bullet.connect(bullet.DIRECT)
     bullet.setGravity(0, 0, -9.81)
     bullet.createMultiBody(0, bullet.createCollisionShape(bullet.GEOM_PLANE))
     shape = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[SIZE_M / 2] * 3)
     positions = np.random.default_rng(7).uniform((2, -3, 1), (8, 3, 4), (12, 3))
     boxes = [bullet.createMultiBody(5, shape, basePosition=p) for p in positions.tolist()]
-    # Frames of PyBullet's boxes are at their centers, of `box` in the middle below.
+    # The origin of a PyBullet box is its center, that of `box` is the center of its bottom face.
     mesh = box("Box", (SIZE_M, SIZE_M, SIZE_M)).moved("Box", np.eye(3), np.array([0, 0, -0.3]))
     follower = Follower(
         [mesh] * len(boxes),

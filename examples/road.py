@@ -17,11 +17,11 @@ PIXEL_M = 0.05
 ASPHALT = (88, 88, 90)
 WHITE = (236, 236, 230)
 YELLOW = (222, 176, 40)
-TURN = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])  # from Z-up to Y-up
+TURN = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])  # from z-up to y-up
 
 
 def markings() -> Image.Image:
-    """Paint the road from above: edge lines, a dashed middle line, and a crossing."""
+    """Paint the road from above: edge lines, a dashed center line, and a crosswalk."""
     image = np.full((round(WIDTH_M / PIXEL_M), round(LENGTH_M / PIXEL_M), 3), ASPHALT, np.uint8)
     for edge in (8, -12):
         image[edge : edge + 4] = WHITE
@@ -34,14 +34,14 @@ def markings() -> Image.Image:
 
 
 def slab(lower: tuple[float, ...], upper: tuple[float, ...], color: list[float]) -> trimesh.Trimesh:
-    """Make a box of a color, linear light."""
+    """Return a box with a uniform color (linear RGB)."""
     box = trimesh.creation.box(bounds=[lower, upper])
     box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*color, 1.0]))
     return box
 
 
 def road() -> trimesh.Scene:
-    """Make the road, with a pavement on each side and a parked van."""
+    """Return the road with a sidewalk on each side and a parked van."""
     x = LENGTH_M / 2
     y = WIDTH_M / 2
     corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]

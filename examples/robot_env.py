@@ -1,4 +1,4 @@
-"""A Gymnasium environment: a robot drives to a goal between columns, using only its lidar."""
+"""Define a Gymnasium environment in which a robot uses only its lidar to drive to a goal."""
 
 import math
 
@@ -13,7 +13,7 @@ from lidarpool import Noise, Pose, Scanner, Scene, Sensor
 
 RAYS = 64
 FAR_M = 15.0  # range of the lidar
-RADIUS_M = 0.4  # of the robot
+RADIUS_M = 0.4  # radius of the robot
 STEP_S = 0.1
 MAX_STEPS = 400
 START = (25.0, 25.0)
@@ -21,16 +21,18 @@ GOAL = (-30.0, -20.0)
 
 
 class RobotEnv(gymnasium.Env):
-    """Observes 64 ranges and the goal; acts by speed, 0 to 2 m/s, and rate of turning.
+    """Environment of a robot that avoids columns on its way to a goal.
 
-    The reward is the way towards the goal, in meters; an episode ends at the goal or a wall.
+    An observation contains 64 ranges, and the distance and direction of the goal. An action
+    consists of the speed (0 to 2 m/s) and the yaw rate. The reward is the distance covered toward
+    the goal, in meters. An episode ends when the robot reaches the goal or hits a surface.
     """
 
     def __init__(self, scene=None):
         sensor = Sensor.grid(RAYS, 1, step_deg=360, max_range_m=FAR_M)
         self.scanner = Scanner(scene or Scene.seed(), sensor, noise=Noise(range_m=0.02), threads=1)
         self.action_space = gymnasium.spaces.Box(np.float32([0, -1.5]), np.float32([2, 1.5]))
-        # Ranges, distance to the goal, and its direction as cosine and sine.
+        # Ranges, distance to the goal, and cosine and sine of the direction of the goal.
         minimum = np.zeros(RAYS + 3, np.float32)
         minimum[-2:] = -1
         maximum = np.full(RAYS + 3, FAR_M, np.float32)
@@ -42,7 +44,7 @@ class RobotEnv(gymnasium.Env):
         self.position = np.array(START) + self.np_random.uniform(-1, 1, 2)
         self.yaw = self.np_random.uniform(-math.pi, math.pi)
         self.steps = 0
-        # Noise of another episode: a sweep's number chooses its random numbers.
+        # The sweep number determines the random numbers, so each episode has different noise.
         self.number = int(self.np_random.integers(1_000_000))
         return self._observed(), {}
 
@@ -77,7 +79,7 @@ if __name__ == "__main__":
     observation, _ = env.reset(seed=1)
     total = 0.0
     finished = False
-    while not finished:  # towards the goal, and away from the nearest surface
+    while not finished:  # toward the goal, and away from the nearest surface
         nearest = observation[:RAYS].argmin() * 2 * math.pi / RAYS
         yaw_rate = (
             math.atan2(observation[-1], observation[-2])

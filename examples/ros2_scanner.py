@@ -1,7 +1,7 @@
-"""A ROS 2 node that publishes the points of a simulated lidar ten times per second.
+"""Publish the points of a simulated lidar ten times per second, as a ROS 2 node.
 
-It takes the sensor's pose from the topic `pose` and publishes on `points`, in the sensor's axes,
-with the fields of Velodyne's driver:
+The node subscribes to the sensor pose on the topic `pose`. It publishes the points on the topic
+`points`, in the sensor frame and with the fields of the Velodyne driver:
 
     python ros2_scanner.py --ros-args -p scene:=hall.glb -p sensor:=velodyne/vlp16
 """
@@ -15,8 +15,8 @@ from lidarsim.motion.rotations import matrices
 
 FRAME = "lidar"
 RATE_HZ = 10
-STEP = 22  # bytes of a point
-# Name, NumPy's type, ROS's type, and place in the 22 bytes of a point.
+STEP = 22  # bytes per point
+# Name, NumPy type, ROS type, and offset within the 22 bytes of a point.
 FIELDS = (
     ("x", "<f4", 7, 0),
     ("y", "<f4", 7, 4),
@@ -33,7 +33,7 @@ def scanner_of(scene, model):
 
 
 def message_of(cloud, begin_ns, header, kinds):
-    """Make a PointCloud2 of a sweep; `kinds` is sensor_msgs.msg."""
+    """Return a sweep as a PointCloud2 message; `kinds` is the module sensor_msgs.msg."""
     names, types, _, offsets = zip(*FIELDS, strict=True)
     row = {"names": names, "formats": types, "offsets": offsets, "itemsize": STEP}
     points = np.zeros(len(cloud), np.dtype(row))

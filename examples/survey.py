@@ -1,4 +1,4 @@
-"""Run the survey of the demo from Python: a local cluster, a cloud on disk, a planned path."""
+"""Run the demo survey from Python on a local cluster, and save the cloud."""
 
 from lidarpool import Planning, Scene, Survey, save_cloud, simulate
 

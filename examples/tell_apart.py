@@ -2,8 +2,8 @@
 
     python tell_apart.py [FOLDER | stream]
 
-It makes a data set of 30 cities, or streams them from their workers, learns from some, and draws
-what it says of another."""
+The script creates a data set of 30 cities, or streams the sweeps from the workers. It trains the
+network on some of the cities, evaluates it on the others, and draws the classes of one sweep."""
 
 import sys
 from itertools import pairwise
@@ -18,16 +18,16 @@ from lidarscenes.procedural.city import city
 
 CLASSES = ("ground", "building", "car", "tree or lamp")  # 1 to 4 in the column `class`
 COLORS = ListedColormap(("#aab2bb", "#4477aa", "#ee7733", "#44aa77"))
-SIDES = (0.4, 2.0)  # of cells around a point, meters
-WIDTHS = (64, 32)  # of the hidden layers
-BATCH = 1024  # points
+SIDES = (0.4, 2.0)  # side lengths of the cells around a point, meters
+WIDTHS = (64, 32)  # widths of the hidden layers
+BATCH = 1024  # points per batch
 EPOCHS = 6
-RATE = 2e-3  # of learning
+RATE = 2e-3  # learning rate
 RNG = np.random.default_rng(1)
 
 
 def street(number, rng):
-    """Make a job: three sweeps in a city of its own."""
+    """Return a job of three sweeps in a separate city."""
     values = {"cars": int(rng.integers(40, 110)), "trees": int(rng.integers(10, 100))}
     scene = city(40_000, seed=number, **values)
     values["visibility_km"] = round(float(np.exp(rng.uniform(np.log(0.1), np.log(10)))), 3)
@@ -38,7 +38,7 @@ def street(number, rng):
             lp.Pose(tuple(position), yaw_deg=float(rng.uniform(-180, 180)))
             for position in positions
         ],
-        materials=[  # of the entries for an object, the first counts
+        materials=[  # the first matching entry applies
             lp.Material(["Saloon*", "Estate*", "Panel van*"], 0.5, semantic_class=3),
             lp.Material("building-*", 0.4, semantic_class=2),
             lp.Material(["ground", "pavement"], 0.3, semantic_class=1),
@@ -51,7 +51,7 @@ def street(number, rng):
 
 
 def features(sweep):
-    """Return the inputs of the network for each point, (n, 17)."""
+    """Return the inputs of the network for each point. Shape (n, 17)."""
     points = sweep.points.astype(float)
     range_m = np.linalg.norm(points, axis=1)
     z = points[:, 2]
@@ -63,10 +63,10 @@ def features(sweep):
 
 
 def column_features(points, side):
-    """Return heights of points in their column of air: above the ground, and below the top."""
+    """Return the heights of points above the lowest and below the highest point near them."""
     z = points[:, 2]
     cell = np.floor(points[:, :2] / side).astype(int)
-    cell -= cell.min(axis=0) - 1  # with a cell around all others
+    cell -= cell.min(axis=0) - 1  # leaves a border of empty cells
     rows, columns = cell.max(axis=0) + 2
     cell = cell @ (columns, 1)
     lowest = np.full(rows * columns, np.inf)
@@ -80,7 +80,7 @@ def column_features(points, side):
 
 
 def surface_features(points, side):
-    """Return normals and roughness, from the covariance of the points in a cube."""
+    """Return features of normals and roughness from the covariance of the points in each cube."""
     _, cube = np.unique(np.floor(points / side), axis=0, return_inverse=True)
     count = np.bincount(cube)
     mean = np.stack([np.bincount(cube, axis) / count for axis in points.T], axis=1)
@@ -94,7 +94,7 @@ def surface_features(points, side):
 
 
 def sweeps_of(folder, split):
-    """Sweeps of a split: of the data set, which is made first, or just as they are cast."""
+    """Return the sweeps of a split, streamed or from a data set, which is created if needed."""
     campaign = lp.Campaign(street, 30, seed=1, splits={"train": 0.7, "test": 0.3})
     if folder == "stream":
         return campaign.stream(split=split)
@@ -104,7 +104,7 @@ def sweeps_of(folder, split):
 
 
 def read(folder, split, share):
-    """Features and classes of a random share of the points of a split."""
+    """Return features and classes of a random share of the points in a split."""
     point_features = []
     classes = []
     for sweep in sweeps_of(folder, split):
@@ -115,17 +115,18 @@ def read(folder, split, share):
 
 
 class Network:
-    """Layers of rectified linear units; the highest of its outputs (n, 4) is the class."""
+    """Neural network with ReLU layers, which predicts the class with the highest output (n, 4)."""
 
     def __init__(self, features):
         self.mean = features.mean(axis=0)
         self.scale = features.std(axis=0)
         widths = (features.shape[1], *WIDTHS, len(CLASSES))
         self.weights = [RNG.normal(0, np.sqrt(2 / a), (a + 1, b)) for a, b in pairwise(widths)]
-        self.slopes = [(np.zeros_like(w), np.zeros_like(w)) for w in self.weights]  # and squares
+        # Running means of the gradients and of their squares.
+        self.slopes = [(np.zeros_like(w), np.zeros_like(w)) for w in self.weights]
 
     def layers(self, features):
-        """Yield the inputs of each layer, with a 1 for its bias, and the outputs of the last."""
+        """Yield the inputs of each layer, with a 1 for its bias, then the network outputs."""
         inputs = (features - self.mean) / self.scale
         for weights in self.weights:
             yield (inputs := np.column_stack([inputs, np.ones(len(inputs))]))
@@ -137,11 +138,11 @@ class Network:
         return [*self.layers(features)][-1].argmax(axis=1)
 
     def learn(self, features, classes, weight, step, steps):
-        """Take a step of Adam (Kingma and Ba, 2015) down the weighted cross-entropy."""
+        """Minimize the weighted cross-entropy by a step of Adam (Kingma and Ba, 2015)."""
         *inputs, outputs = self.layers(features)
         error = np.exp(
             outputs - np.logaddexp.reduce(outputs, axis=1, keepdims=True)
-        )  # shares, less 1
+        )  # the probability of each class
         error[np.arange(len(features)), classes] -= 1
         error *= (weight / weight.sum())[:, None]
         for k in reversed(range(len(inputs))):
@@ -157,7 +158,8 @@ class Network:
 def main(folder="cities"):
     point_features, classes = read(folder, "train", 0.4)
     network = Network(point_features)
-    rare = 1 / np.sqrt(np.bincount(classes))  # else it would learn nothing but ground and walls
+    # Without these weights, ground and walls would dominate the training.
+    rare = 1 / np.sqrt(np.bincount(classes))
     for step in range(steps := EPOCHS * len(point_features) // BATCH):
         rows = RNG.integers(len(point_features), size=BATCH)
         network.learn(point_features[rows], classes[rows], rare[classes[rows]], step + 1, steps)

@@ -11,10 +11,10 @@ from poolpart import Pipe, Pool, n_workers, per_gpu, rest
 from poolpart.fetch import fetch_available
 
 SIZE = 30 * 40 * 3  # bytes of a thumbnail
-WINDOW = 8  # thumbnails under way
+WINDOW = 8  # thumbnails in flight
 
 
-def decode(number):  # noise: put your own functions in place of these
+def decode(number):  # returns noise; replace decode and shrink with your own functions
     return np.random.default_rng(number).integers(0, 256, (240, 320, 3), np.uint8)
 
 
@@ -23,10 +23,10 @@ def shrink(picture):
 
 
 def write(keys, written, path):
-    with path.open("ab", buffering=0) as file:  # where a writer may have died, with its keys
+    with path.open("ab", buffering=0) as file:  # an earlier writer may have died with its keys
         written.put([file.truncate(file.tell() // SIZE * SIZE) // SIZE, "again"])
         for number, key in keys:
-            if number == file.tell() // SIZE:  # else it is on its way again
+            if number == file.tell() // SIZE:  # otherwise, the thumbnail is sent again
                 thumbnails = fetch_available(get_client(), [key])  # none if its worker has died
                 file.write(b"".join(thumbnails.values()))
                 written.put([file.tell() // SIZE, "" if thumbnails else "again"])

@@ -1,4 +1,4 @@
-"""A Gymnasium vector environment: MuJoCo robots drive between columns, using their lidars."""
+"""Define a Gymnasium vector environment of MuJoCo robots that drive between columns by lidar."""
 
 import numpy as np
 
@@ -13,12 +13,12 @@ except ImportError as error:
 from lidarpool import MujocoScanner, Sensor
 
 LIDAR = Sensor.grid(90, 4, vertical_fov_deg=20, step_deg=360, max_range_m=12)
-STEPS = 25  # of MuJoCo in a step of the environments
+STEPS = 25  # MuJoCo steps per environment step
 COLUMNS = np.random.default_rng(1).uniform(-0.6, 0.6, (49, 2)) + np.argwhere(np.ones((7, 7))) * 4
 
 
 def world(robots: int) -> str:
-    """Return the MJCF of a hall of columns, with robots that do not hinder each other."""
+    """Return the MJCF of a hall with columns, and robots that do not collide with each other."""
     geoms = [f'<geom type="cylinder" size=".3 1" pos="{x:.2f} {y:.2f} 1"/>' for x, y in COLUMNS]
     for k in (-2, 26):
         geoms += [f'<geom type="box" size=".1 14 1" pos="{k} 12 1"/>']
@@ -34,9 +34,11 @@ def world(robots: int) -> str:
 
 
 class LidarVectorEnv(gymnasium.vector.VectorEnv):
-    """Observes velocities and ranges (channels, firings); acts by speed and rate of turning.
+    """Environment of robots that drive in a hall and avoid columns.
 
-    The reward is the distance driven, in meters; an episode ends at a column or a wall.
+    An observation contains the velocities and the ranges (channels, firings). An action consists
+    of the speed and the yaw rate. The reward is the distance driven, in meters. An episode ends
+    when the robot hits a column or a wall.
     """
 
     def __init__(self, num_envs=8):
@@ -76,7 +78,7 @@ class LidarVectorEnv(gymnasium.vector.VectorEnv):
         return self._observed(), reward, ended, np.zeros_like(ended), infos
 
     def _place(self, chosen):
-        """Place the chosen robots between columns."""
+        """Place the selected robots at random positions between columns."""
         cells = self.np_random.integers(0, 6, (self.num_envs, 2)) * 4 + 2
         yaws = self.np_random.uniform(-np.pi, np.pi, (self.num_envs, 1))
         self.data.qpos.reshape(-1, 3)[chosen] = np.hstack([cells, yaws])[chosen]
@@ -92,7 +94,7 @@ if __name__ == "__main__":
     envs = LidarVectorEnv()
     observation, _ = envs.reset(seed=1)
     total = np.zeros(envs.num_envs)
-    for _ in range(60):  # away from the nearest surface
+    for _ in range(60):  # steer away from the nearest surface
         nearest = observation["lidar"].min(axis=1)
         bearing = nearest.argmin(axis=1) * 2 * np.pi / LIDAR.period
         yaw_rate = np.clip(-1.5 * np.sin(bearing) / nearest.min(axis=1), -2, 2)

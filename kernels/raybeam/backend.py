@@ -19,7 +19,7 @@ from .scan import Collector, Scan
 
 
 class BackendUnavailable(RuntimeError):  # noqa: N818 - a state, not a mishap
-    """The requested backend cannot be used on this machine; the message states the reason."""
+    """Raised when the requested backend cannot be used; the message states the reason."""
 
 
 @dataclass(frozen=True)

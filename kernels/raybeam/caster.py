@@ -27,7 +27,7 @@ class RayCaster:
 
     Both sides of a triangle can be hit. A ray in the plane of a triangle does not hit it. A ray
     through an edge or a vertex hits every adjacent triangle, so closed meshes do not leak. The
-    results for a ray are bit-identical in every batch.
+    result for a ray is bit-identical, regardless of the other rays in the batch.
 
     Parameters
     ----------
@@ -39,17 +39,17 @@ class RayCaster:
     backend
         "cuda", "tiles", "numpy", or "auto" for the first of these three that can be used.
     threads
-        Maximum number of CPU threads; None for the default of the backend.
+        Maximum number of CPU threads; None for the backend's default.
     device
         Index of the CUDA device; None for the current device. Other backends ignore it.
 
     Raises
     ------
     ValueError
-        If the mesh is not finite, has a wrong shape, has faces with missing vertices, or has no
-        area.
+        If the arrays have wrong shapes or contain values that are not finite, if faces refer to
+        missing vertices, or if the mesh has no area.
     BackendUnavailable
-        If the requested backend cannot be used; the message says what to install.
+        If the requested backend cannot be used. The message states what to install.
 
     Examples
     --------
@@ -79,16 +79,16 @@ class RayCaster:
         threads: int | None = None,
         device: int | None = None,
     ) -> RayCaster:
-        """Create a ray caster for instances of meshes, numbered from 0 in the order given.
+        """Create a ray caster for instances of meshes, numbered from 0 in the given order.
 
-        Each mesh has a single acceleration structure, so memory and build time depend on the
-        meshes and hardly on the number of instances. A single instance without a transform is
-        equivalent to its mesh.
+        Each mesh has a single acceleration structure, so memory use and build time depend on the
+        meshes, and hardly on the number of instances. A caster for a single instance without a
+        transform is equivalent to a caster for its mesh.
 
         Parameters
         ----------
         instances
-            Instances of meshes; at least one.
+            Instances of meshes. At least one is required.
         backend, threads, device
             As for `RayCaster`.
 
@@ -98,7 +98,7 @@ class RayCaster:
             If there are no instances, or if a transform is not an invertible, finite (3, 4) or
             (4, 4) matrix. The message contains the index of the instance.
         BackendUnavailable
-            If the requested backend cannot be used; the message says what to install.
+            If the requested backend cannot be used. The message states what to install.
 
         Examples
         --------
@@ -159,32 +159,33 @@ class RayCaster:
         return len(self._scene.mesh)
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Cast rays at bodies of this shape, and write closer hits to `nearest`."""
+        """Cast rays at bodies with this shape, and record closer hits in `nearest`."""
         self.engine.cast_crossing(crossing, nearest)
 
     def device_nearest(
         self, scan: Scan, start: int, stop: int, time_index: Ints32, end: float
     ) -> DeviceNearest:
-        """Copy the rays `start` to `stop` of a scan to the device, without hits on bodies.
+        """Copy rays `start` to `stop` of a scan to the device, initially without hits on bodies.
 
-        `time_index` (n,) are the numbers of the rays' times; hits count before distance `end`,
-        meters. BackendUnavailable if this backend has no device.
+        `time_index` (n,) contains the index of the time of each ray. Only hits at a distance of
+        less than `end` meters are recorded. Raises BackendUnavailable if this backend does not use
+        a device.
         """
         return self.engine.device_nearest(scan, start, stop, time_index, end)
 
     def cast_bodies(self, bodies: TimedBodies, nearest: DeviceNearest) -> None:
-        """Cast rays at bodies of this shape on the device, and write closer hits to `nearest`.
+        """Cast rays at bodies with this shape on the device, and record closer hits in `nearest`.
 
-        BackendUnavailable if this backend has no device.
+        Raises BackendUnavailable if this backend does not use a device.
         """
         self.engine.cast_bodies(bodies, nearest)
 
     def move(self, number: int | ArrayLike, transform: ArrayLike) -> None:
         """Set new transforms of instances for all subsequent casts.
 
-        Only the acceleration structure over the instances is rebuilt, once before the next cast.
-        The results are the same as those of a new caster. Do not call this method while a cast
-        is in progress.
+        Only the acceleration structure over the instances is rebuilt, which happens once before the
+        next cast. The results are the same as those of a new caster. Do not call this method while
+        a cast is in progress.
 
         Parameters
         ----------
@@ -228,7 +229,7 @@ class RayCaster:
 
     @property
     def engine(self) -> Backend:
-        """Engine, which is updated first if instances have moved."""
+        """Ray-casting engine, updated with the current transforms if instances have moved."""
         with self._lock:
             if self._moved:
                 self._scene = self._scene.moved(self._transforms)
@@ -253,7 +254,7 @@ class RayCaster:
             (n, 3), of any length greater than zero.
         t_min, t_max
             Minimum and maximum distance of hits in meters, both inclusive. With a `t_min` of 0, a
-            ray that starts on a surface hits it at the distance 0.
+            ray that starts on a surface hits it at distance 0.
 
         Raises
         ------
@@ -292,11 +293,11 @@ class RayCaster:
             Rays in the sensor frame, which are validated once. The cuda backend stores and rotates
             the directions on the device.
         positions
-            (3,) or (k, 3), in meters; or poses from `check_poses`, which replace the arguments
-            below.
+            (3,) or (k, 3), in meters; or poses from `check_poses`, which replace `rotations`,
+            `rays_per_pose` and `motion`.
         rotations
-            (3, 3) or (k, 3, 3): rotations from the sensor frame to mesh coordinates; None if their
-            axes are parallel.
+            (3, 3) or (k, 3, 3): rotations from the sensor frame to mesh coordinates; None if the
+            axes of the two frames are parallel.
         window
             Rows ``start <= row < stop`` of the pattern to cast; None for all rows. The pattern
             repeats beyond its end, so row r is row ``r % len(pattern)``.
@@ -307,18 +308,19 @@ class RayCaster:
         t_min, t_max
             Minimum and maximum distance of hits in meters, both inclusive.
         keep_every
-            Store the first and then every n-th hit of each group, in ray order.
+            Store the first hit of each group and then every n-th hit, in ray order.
         groups
-            Indices of the first ray of each group, ascending and starting at 0, for scans that are
-            cast together. None for a single group.
+            Index of the first ray of each group, in ascending order and starting at 0, for several
+            scans that are cast together. None for a single group.
         tally
             Whether to count the hits on each triangle, including hits that are not stored.
         motion
-            Motion of the lidar within each pose, if its rays have different delays.
+            Motion of the lidar while the rays that share a pose are fired, if these rays have
+            different delays.
         room
             Output array for the origins and directions of all rays, as returned by `pattern_rays`:
-            float64 (6, rays), contiguous, or (3, rays) for the directions only. None for no
-            output.
+            float64 (6, rays), contiguous, or (3, rays) for the directions only. None if they are
+            not needed.
 
         Raises
         ------
@@ -371,19 +373,20 @@ class RayCaster:
             Function that is called with the stored hits of consecutive parts of the scan, in ray
             order, on the device of the caster. The arrays remain valid after the call.
         counters
-            Table and length of the scan's tally. The table is int64 (instances, 2): hits of
-            triangle t of instance i count in row ``table[i, 0] + table[i, 1] * t``. None for the
-            rows of `ScanReturns.tally`.
+            Table and length of the scan's tally. The table is int64 (instances, 2): hits on
+            triangle t of instance i are counted in row ``table[i, 0] + table[i, 1] * t`` of the
+            tally. None for the rows of `ScanReturns.tally`.
         other_hits
-            Hits that replace farther hits of the caster. They count as an additional instance
-            after the last: with a tally, the table of the counters needs a row for it.
+            Hits that replace more distant hits of the caster. They are assigned to an additional
+            instance after the last one. With a tally, the table in `counters` must have a row for
+            this instance.
 
         Returns
         -------
         hits
             int64 (g,): number of hits in each group, including hits that are not stored.
         counted
-            Indices of the counters that are not 0 and their number of hits, int64 (k,) each; None
+            Indices of the counters that are not 0, and their numbers of hits, int64 (k,) each; None
             without a tally.
 
         Raises

@@ -48,8 +48,8 @@ _log = logging.getLogger(__name__)
 # and 30 and 5 s while the machine was busy.
 COMPILING = "compiling the ray-casting loops, which takes about 20 s the first time"
 COMPILING_EACH_TIME = (
-    "compiling the ray-casting loops, which takes about 20 s in each process. Set NUMBA_CACHE_DIR "
-    "to a writable folder to keep them"
+    "compiling the ray-casting loops, which takes about 20 s in each process. To cache the "
+    "compiled loops, set NUMBA_CACHE_DIR to a writable folder"
 )
 _TOLD_AFTER_S = 1.0  # a single loop that has changed is compiled sooner
 _compiling_s = [0.0]  # what this process has waited for loops that were not compiled

@@ -75,7 +75,8 @@ class CudaBackend(Backend):
     def missing(cls) -> str:
         """Return why CuPy or CUDA cannot be used and the remedy, or "" if they can be used."""
         if importlib.util.find_spec("cupy") is None:
-            return f"CuPy is not installed; run {install_command('cupy-cuda12x')}, or cupy-cuda13x"
+            command = install_command("cupy-cuda12x")
+            return f"CuPy is not installed; run {command} (or cupy-cuda13x)"
         try:
             import cupy
         except ImportError as error:
@@ -83,7 +84,7 @@ class CudaBackend(Backend):
         try:
             count = cupy.cuda.runtime.getDeviceCount()
         except cupy.cuda.runtime.CUDARuntimeError as error:
-            return f"CuPy does not find a CUDA device ({error})"
+            return f"CuPy cannot find a CUDA device ({error})"
         if not count:
             return "no CUDA device is available"
         try:
@@ -91,10 +92,10 @@ class CudaBackend(Backend):
         except RuntimeError as error:
             reason = str(error).partition("\n")[0]
             command = install_command("cupy-cuda13x[ctk]")
-            return f"CuPy does not find a compiler ({reason}); run {command}, or 12x"
+            return f"CuPy cannot find a compiler ({reason}); run {command} (or cupy-cuda12x[ctk])"
         if not _headers():
             command = install_command("cupy-cuda13x[ctk]")
-            return f"CuPy does not find the CUDA headers; run {command}, or 12x"
+            return f"CuPy cannot find the CUDA headers; run {command} (or cupy-cuda12x[ctk])"
         return ""
 
     @classmethod

@@ -49,9 +49,9 @@ class Deforming:
         return np.stack([self.vertices.min(axis=(0, 1)), self.vertices.max(axis=(0, 1))])
 
     def cast_crossing(self, crossing: Crossing, nearest: Nearest) -> None:
-        """Cast rays at bodies of this shape, and write closer hits to `nearest`.
+        """Cast rays at bodies with this shape, and record closer hits in `nearest`.
 
-        Of equally close triangles the lowest is hit.
+        Ties are resolved in favor of the lowest triangle index.
         """
         from . import deforming_loops as loops
 

@@ -59,9 +59,9 @@ _TREE = named_tuple_type(
 
 @compiled("void(f8[:, :, ::1], i8[:, ::1], i4[::1], i4[:, ::1], f8, f4[:, :, :, ::1])")
 def fit(vertices, faces, order, child, pad, boxes):  # type: ignore[no-untyped-def]
-    """Write the boxes of all nodes from each frame to the next to `boxes`, for a `DeformingTree`.
+    """Compute the boxes of all nodes of a `DeformingTree` between each frame and the next.
 
-    Boxes are larger than the triangles by `pad`, meters.
+    The boxes are written to `boxes`. They extend beyond the triangles by `pad`, in meters.
     """
     for i in range(len(boxes)):
         for node in range(len(child) - 1, -1, -1):  # children come after their parents

@@ -17,7 +17,7 @@ Counted = tuple[Ints, Ints]
 
 @dataclass(frozen=True)
 class Hits:
-    """Closest hit of each ray, with a row for each ray, including rays that miss.
+    """Closest hit of each ray, with one row per ray, including rays that miss.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class Hits:
         its direction; inf for a miss.
     triangle
         int32 (n,): index of the triangle in the `faces` of its mesh; -1 for a miss. Ties are
-        resolved in favor of the lowest instance, and within it of the lowest triangle index.
+        resolved in favor of the lowest instance index, and then of the lowest triangle index.
     u, v
         float64 (n,): barycentric weights of the second and third vertex of the triangle. The weight
         of the first vertex is ``1 - u - v``. 0 for a miss.
@@ -51,12 +51,13 @@ class Hits:
 
 @dataclass(frozen=True)
 class ScanReturns:
-    """Result of a scan: the stored hits in ray order, and the counts of all hits.
+    """Result of a scan, with the stored hits in ray order and the counts of all hits.
 
     Attributes
     ----------
     ray
-        uint32 (k,): index of the ray, ascending, starting at 0 for the first ray of the window.
+        uint32 (k,): index of the ray, where 0 is the first ray of the window. The indices are in
+        ascending order.
     distance
         float64 (k,): as in `Hits`, in meters.
     triangle
@@ -66,7 +67,7 @@ class ScanReturns:
     tally
         int64 (face_count,): number of hits on each triangle, summed over its instances and
         including hits that are not stored. The rows are the triangles of all meshes, in the order
-        in which instances first use the meshes. None if not requested.
+        in which instances first use the meshes. None if the tally was not requested.
     instance
         int32 (k,): as in `Hits`.
     """

@@ -74,7 +74,7 @@ class Instance:
         The mesh. Any number of instances can share a mesh with very little additional memory.
     transform
         (3, 4), or (4, 4) with the last row 0, 0, 0, 1: transform from mesh to scene coordinates, in
-        meters. It may rotate, translate, mirror, shear and scale, also non-uniformly. None for the
+        meters. It may rotate, translate, mirror, shear and scale, even non-uniformly. None for the
         identity.
     """
 
@@ -116,26 +116,29 @@ class MeshFrames:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Instances and meshes in the representation that backends use.
+    """Instances and meshes in the representation used by backends.
 
     Attributes
     ----------
     meshes
-        Each mesh once, in the order of its first use by an instance.
+        The distinct meshes, in the order in which instances first use them.
     mesh
-        intp (n,): number of each instance's mesh.
+        intp (n,): index of the mesh of each instance.
     frame
-        Local coordinates of the scene: the mesh's, if the scene is plain.
+        Local frame of the scene. In a plain scene, it is the frame of the mesh.
     matrices
-        float64 (n, 12): rows of the (3, 4) matrix from the scene's local coordinates to the
-        mesh's. None if the scene is plain: a single mesh without a transform.
+        float64 (n, 12): (3, 4) matrix of each instance, row by row, which transforms from the local
+        coordinates of the scene to those of the mesh. None if the scene is plain, that is, a single
+        mesh without a transform.
     boxes
-        float64 (n, 2, 3): lower and upper corner of each instance, local to the scene.
+        float64 (n, 2, 3): lower and upper corner of the bounding box of each instance, in local
+        coordinates of the scene.
     to_scene
-        float64 (n, 3, 4): matrix from the mesh's local coordinates to the scene's. The inverse of
-        `matrices` up to rounding; None if the scene is plain.
+        float64 (n, 3, 4): matrix of each instance, which transforms from the local coordinates of
+        the mesh to those of the scene. It is the inverse of `matrices`, except for rounding. None
+        if the scene is plain.
     mesh_frames
-        Frames of the meshes of the instances; None if the scene is plain.
+        Frame of the mesh of each instance. None if the scene is plain.
     """
 
     meshes: tuple[LocalMesh, ...]
@@ -153,7 +156,7 @@ class Scene:
 
     @cached_property
     def first_face(self) -> Ints:
-        """First tally row of each mesh, followed by the number of rows. Shape (meshes + 1,)."""
+        """First tally row of each mesh, followed by the number of all rows. Shape (meshes + 1,)."""
         return np.cumsum([0, *(mesh.face_count for mesh in self.meshes)])
 
     @property
@@ -168,34 +171,35 @@ class Scene:
         return np.stack([first, np.ones_like(first)], axis=1)
 
     def moved(self, transforms: Floats) -> Scene:
-        """Return the scene with other transforms (n, 3, 4), which are validated.
+        """Return a copy of the scene with new transforms of shape (n, 3, 4).
 
-        The scene must be nested.
+        The scene must be nested, and the transforms must already have been validated.
         """
         assert self.mesh_frames is not None
         return _nested_scene(self.meshes, self.mesh, self.mesh_frames, transforms)
 
     def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
-        """Return the tally rows of triangles (k,) of instances (k,)."""
+        """Return the tally row of each triangle (k,) in its instance (k,)."""
         return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
 
     def enter(
         self, instance: Indices, origins: Floats, directions: Floats
     ) -> tuple[Floats, Floats, Floats]:
-        """Transform rays to the coordinates of the meshes of instances (m,), in a nested scene.
+        """Transform each ray to the mesh coordinates of its instance (m,), in a nested scene.
 
         Parameters
         ----------
         origins, directions
-            (m, 3), local to the scene; directions of about unit length.
+            (m, 3), in local coordinates of the scene. The directions have approximately unit
+            length.
 
         Returns
         -------
         origins, directions
-            (m, 3), local to the mesh; unit directions.
+            (m, 3), in local coordinates of the mesh. The directions have unit length.
         length
-            (m,): length of each direction before it was made a unit vector. A distance in the
-            scene is a distance in the mesh divided by this length.
+            (m,): length of each direction before it was normalized. A distance in the scene is the
+            distance in the mesh divided by this length.
         """
         assert self.matrices is not None
         rows = np.ascontiguousarray(self.matrices[instance].T).reshape(3, 4, -1)
@@ -252,7 +256,7 @@ def check_transforms(numbers: Integers, transforms: ArrayLike) -> Floats:
     if values.ndim != 3 or len(values) != len(numbers):
         raise ValueError(
             f"{len(numbers)} instances require transforms of shape ({len(numbers)}, 3, 4) or "
-            f"({len(numbers)}, 4, 4), but the shape is {values.shape}."
+            f"({len(numbers)}, 4, 4), but got shape {values.shape}."
         )
     matrices = _matrices(numbers, values)
     _check_regular(numbers, matrices)
@@ -276,8 +280,8 @@ def _matrices(numbers: Integers, values: AnyArray) -> Floats:
     """
     if values.dtype.kind not in "fiu" or values.shape[1:] not in ((3, 4), (4, 4)):
         raise ValueError(
-            f"The transform of instance {numbers[0]} must be real numbers of shape (3, 4) or "
-            f"(4, 4), but has the type {values.dtype} and the shape {values.shape[1:]}."
+            f"The transform of instance {numbers[0]} must be an array of real numbers with shape "
+            f"(3, 4) or (4, 4), but has dtype {values.dtype} and shape {values.shape[1:]}."
         )
     matrices = values.astype(np.float64)
     if values.shape[1] == 4:

@@ -138,7 +138,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     )
     index = np.flatnonzero(has_area).astype(np.int32)
     if not len(index):
-        raise ValueError("The mesh contains only triangles without an area.")
+        raise ValueError("The mesh contains only triangles with zero area.")
     face_count = len(rows)
     if len(index) < face_count:
         corners = corners[has_area]
@@ -178,8 +178,8 @@ def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
     rows = np.asarray(faces)
     if rows.ndim != 2 or rows.shape[1] != 3 or not len(rows) or rows.dtype.kind not in "iu":
         raise ValueError(
-            "faces must be integers (vertex indices) of shape (f, 3) with f > 0, but have the type "
-            f"{rows.dtype} and the shape {rows.shape}."
+            "faces must be an integer array (vertex indices) with shape (f, 3) and f > 0, but has "
+            f"dtype {rows.dtype} and shape {rows.shape}."
         )
     if len(rows) >= 2**28:  # positions in the tree have 31 bits; a leaf takes 3 of them
         raise ValueError(f"The mesh has {len(rows):,} triangles, but the limit is {2**28 - 1:,}.")

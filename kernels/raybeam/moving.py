@@ -60,9 +60,9 @@ class Moving:
         Function of body indices (m,) and times (m,) that returns poses (12, m): positions in
         meters, and rotation matrices from the body frame, row by row.
     frames
-        Function of the indices (m,) of deforming bodies and times (m,) that returns the frame of
-        the shape of each body, float64 (m,). Frame 1.5 is halfway between frames 1 and 2 of a
-        `Deforming` mesh. None without deforming bodies.
+        Function of body indices (m,) and times (m,) that returns the frame number of the shape of
+        each body, float64 (m,). It is only called for deforming bodies. Frame 1.5 is halfway
+        between frames 1 and 2 of a `Deforming` mesh. None if there are no deforming bodies.
     """
 
     shapes: tuple[RayCaster | Deforming, ...]
@@ -79,7 +79,7 @@ class Moving:
 
     @cached_property
     def middle(self) -> Floats:
-        """Centers of the bounding boxes in the frames of the shapes, in meters. (s, 3)."""
+        """Centers of the bounding boxes in the frames of the shapes, in meters. Shape (s, 3)."""
         return np.asarray(self.boxes.mean(axis=1))
 
     @cached_property
@@ -93,7 +93,7 @@ class Moving:
         return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
 
     def is_present(self, body: Ints, times: Floats) -> Bools:
-        """Return a mask of the bodies (m,) that are present at times (m,)."""
+        """Return whether each body (m,) is present at its time (m,)."""
         first, last = self.presence[body].T
         return np.asarray((first <= times) & (times <= last))
 

@@ -60,14 +60,13 @@ def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpac
     uv = np.asarray(opacity.uv)
     if mask.dtype != np.bool_ or mask.ndim != 2 or not mask.size:
         raise ValueError(
-            "mask must be a non-empty bool array of shape (h, w), but has the type "
-            f"{mask.dtype} and the shape {mask.shape}."
+            "mask must be a non-empty bool array with shape (h, w), but has dtype "
+            f"{mask.dtype} and shape {mask.shape}."
         )
     if uv.dtype.kind not in "fiu" or uv.shape != (face_count, 3, 2):
         raise ValueError(
-            f"uv must be real numbers of shape ({face_count}, 3, 2), for three corners per face, "
-            "but "
-            f"has the type {uv.dtype} and the shape {uv.shape}."
+            f"uv must be an array of real numbers with shape ({face_count}, 3, 2), that is, three "
+            f"corners per face, but has dtype {uv.dtype} and shape {uv.shape}."
         )
     invalid = np.flatnonzero(~(np.abs(uv) < _MAX_COORDINATE).all(axis=(1, 2)))
     if len(invalid):

@@ -26,7 +26,7 @@ _ROUGH = 0.1
 
 
 class Pattern:
-    """Rays that are cast repeatedly, for example a revolution of a lidar.
+    """Set of rays that is cast repeatedly, for example one revolution of a lidar.
 
     Rays are validated and normalized once, and a backend can keep a copy on its device.
 
@@ -38,15 +38,15 @@ class Pattern:
         (n, 3), or (3,) for all rays: start of each ray in the sensor frame, relative to the sensor
         position, in meters. None if all rays start at the sensor position.
     sub_rays
-        Sub-rays of each direction. They replace the directions as rays, one beam after the other,
-        and are computed during the cast. None for a single ray per direction.
+        Sub-rays of each direction, which are cast instead of the direction itself, one beam after
+        the other. They are computed during the cast. None for a single ray per direction.
     offsets
         (n, 2): angles across and up, in radians, that are added to the angles of the sub-rays of
         each direction.
     step
         Number of rows between consecutive firings of a channel, that is, between neighboring rays
         in a ring. It is the number of channels if each firing contains all channels, and 1 if the
-        rays are stored ring by ring. By default it is estimated, which can fail for steps above
+        rays are stored ring by ring. By default, it is estimated, which can fail for steps above
         256. A wrong step makes casting slower but does not affect the results.
 
     Raises
@@ -92,10 +92,10 @@ class Pattern:
     def divided(
         self, sub_rays: SubRays, offsets: Floats | None = None, beam_indices: Ints | None = None
     ) -> Pattern:
-        """Return a copy with sub-rays, for all beams or for the rows (m,).
+        """Return a copy with sub-rays, for all beams or for the beams `beam_indices` (m,).
 
-        After its last row the pattern repeats. `offsets` (m, 2) are angles across and up of each
-        beam, radians, added to the angles of its sub-rays.
+        Beam indices beyond the last row wrap around. `offsets` (m, 2) contains the angles across
+        and up, in radians, that are added to the angles of the sub-rays of each beam.
         """
         _ = self.step  # guessed here for all copies: takes as long as 5,000 rays
         pattern = copy(self)
@@ -133,7 +133,7 @@ class Pattern:
 
     @cached_property
     def step(self) -> int:
-        """Number of rows between consecutive firings of a channel, passed or estimated."""
+        """Number of rows between consecutive firings of a channel, as passed or estimated."""
         if self._step is not None:
             return self._step
         return _repetition(self._directions) or _least_difference(self._directions)

@@ -70,7 +70,7 @@ def pattern_rays(
     if first < 0 or (len(ray) and (int(ray.min()) < 0 or not len(pattern))):
         raise ValueError(
             f"Rays {ray.min() if len(ray) else 0} to {stop} from row {start} are outside a pattern "
-            f"with {len(pattern)} rows. Numbers and rows start at 0."
+            f"with {len(pattern)} rows. Ray and row numbers start at 0."
         )
     poses = check_poses(positions, rotations, rays_per_pose, stop, motion)
     return checked_rays(pattern, first, ray, poses)

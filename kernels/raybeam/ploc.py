@@ -136,7 +136,7 @@ class _Nodes:
 
 
 def build(lower: Floats32, upper: Floats32) -> BinaryTree:
-    """Build a tree over n boxes, n at least 1.
+    """Build a binary tree over n boxes, where n is at least 1.
 
     Parameters
     ----------

@@ -163,7 +163,7 @@ def check_poses(
     for table in (position_rows, matrices):
         if table is not None and len(table) not in (1, count):
             raise ValueError(
-                "positions and rotations must have the same length, or one of them must have the "
+                "positions and rotations must have the same length, or one of them must have "
                 f"length 1, but their lengths are {len(position_rows)} and "
                 f"{0 if matrices is None else len(matrices)}."
             )
@@ -173,8 +173,7 @@ def check_poses(
     if rays_of_pose < 1 or count * rays_of_pose < ray_count:
         raise ValueError(
             f"{count:,} poses with {rays_of_pose:,} rays each do not cover {ray_count:,} rays. "
-            "Pass "
-            "more poses, a larger rays_per_pose, or a smaller window."
+            "Pass more poses, a larger rays_per_pose, or a smaller window."
         )
     return Poses(
         _repeated(by_component(position_rows), count),
@@ -199,9 +198,8 @@ def _check_motion(motion: PoseMotion, pose_count: int, ray_count: int) -> PoseMo
         array = by_component(np.asarray(getattr(motion, name), dtype=np.float64))
         if array.shape != shape or not np.isfinite(array).all():
             raise ValueError(
-                f"PoseMotion.{name} must contain finite numbers of shape {shape} for "
-                f"{pose_count:,} "
-                f"poses with {ray_count:,} rays each, but has the shape {array.shape}."
+                f"PoseMotion.{name} must be an array of finite numbers with shape {shape} for "
+                f"{pose_count:,} poses with {ray_count:,} rays each, but has shape {array.shape}."
             )
         arrays.append(array)
     return PoseMotion(*arrays)

@@ -76,9 +76,8 @@ def check_origins(origins: ArrayLike, ray_count: int) -> AnyArray:
     rows = real_rows("origins", origins)
     if len(rows) not in (1, ray_count):
         raise ValueError(
-            f"origins must have the length 1 or the length of directions, which is {ray_count}, "
-            "but "
-            f"has the length {len(rows)}."
+            f"origins must have length 1 or the same length as directions, which is {ray_count}, "
+            f"but has length {len(rows)}."
         )
     refuse_rows("Origin", rows, finite_rows, "finite")
     return rows
@@ -149,9 +148,8 @@ def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> An
     if rows.dtype.kind not in "fiu" or not rows.ndim or rows.shape[1:] != shape:
         expected = ", ".join(map(str, shape))
         raise ValueError(
-            f"{name} must be real numbers of shape (n, {expected}), but has the type {rows.dtype} "
-            "and "
-            f"the shape {rows.shape}."
+            f"{name} must be an array of real numbers with shape (n, {expected}), but has dtype "
+            f"{rows.dtype} and shape {rows.shape}."
         )
     return rows
 
@@ -203,7 +201,7 @@ def _refuse_directions(table: AnyArray) -> None:
         "Direction",
         table,
         lambda block: finite_rows(block) & block.any(axis=1),
-        "a finite vector other than zero",
+        "finite and nonzero",
     )
 
 

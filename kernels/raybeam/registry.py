@@ -12,9 +12,9 @@ BACKENDS: tuple[type[Backend], ...] = (CudaBackend, TileBackend, NumpyBackend)
 
 
 def available_backends() -> dict[str, str]:
-    """Return the state of all backends by name, fastest first.
+    """Return the availability of all backends by name, fastest first.
 
-    The state is "" if a backend can be used; otherwise it is the reason and a remedy.
+    The value is "" if a backend can be used. Otherwise, it states the reason and a remedy.
 
     Examples
     --------

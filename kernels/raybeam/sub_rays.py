@@ -35,9 +35,10 @@ class SubRays:
     def shares(
         self, subray: Indices | slice = slice(None), offsets: Floats | None = None
     ) -> tuple[Floats, Floats, Floats]:
-        """Return the forward, lateral and vertical components of the unit vectors. (m,) each.
+        """Return the forward, lateral and vertical components of the sub-ray directions.
 
-        `offsets` (2, m) are angles across and up, radians, added to the angles of each sub-ray.
+        The components of the unit vectors have shape (m,) each. `offsets` (2, m) contains the
+        angles across and up, in radians, that are added to the angles of each sub-ray.
         """
         across, up = self.angles[subray].T
         if offsets is not None:
@@ -47,12 +48,14 @@ class SubRays:
         return straight, across * straight, up * straight
 
     def loop_table(self, offsets: Floats | None) -> Floats:
-        """Return the table for compiled loops.
+        """Return the table of sub-rays for compiled loops.
 
-        It has 5 rows of whole vectors of 8 sub-rays. The last sub-ray is repeated to fill a vector.
+        The table has 5 rows. Each row is padded to whole vectors of 8 sub-rays by repeating the
+        last sub-ray.
 
-        Rows are shares ahead, across and up, and starts across and up. With `offsets` the shares
-        differ by beam: rows 1 and 2 are then angles.
+        The rows contain the forward, lateral and vertical components, and the starts across and up.
+        With `offsets`, the components differ between beams, so rows 1 and 2 contain the angles
+        instead.
         """
         rows = np.zeros((5, len(self)))
         rows[:3] = self.shares()

@@ -96,7 +96,7 @@ def load(context: Any, pointer: Any, index: Any) -> Any:
 
 @intrinsic
 def store(context: Any, pointer: Any, index: Any, value: Any) -> Any:
-    """Write a vector from an index on."""
+    """Store a vector in consecutive elements, starting at an index."""
 
     def generate(context: Any, builder: Any, kinds: Any, arguments: Any) -> Any:
         pointer, index, value = arguments

@@ -315,9 +315,9 @@ class Adaptation(SchedulerPlugin):
         return {job: [*members[job]] for job in idle[:number]}
 
     async def close_idle(self, workers: Sequence[Any]) -> bool:
-        """Close workers that get no more tasks.
+        """Close workers that no longer receive tasks.
 
-        Returns False, and lets them get tasks again, if a worker was busy after all.
+        If a worker turns out to be busy, let all of them receive tasks again, and return False.
         """
         addresses = [worker.address for worker in workers]
         requests = (call(self.scheduler, address, _is_busy) for address in addresses)
@@ -356,10 +356,10 @@ def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
 async def look(
     jobs: Mapping[str, Mapping[str, Sequence[str]]], dask_scheduler: Any = None
 ) -> dict[str, Advice]:
-    """Close idle workers, then return which jobs to start and to forget, by partition.
+    """Close idle workers, then return which jobs to start and which to forget, by partition.
 
-    `jobs` is {partition: {job: names of its workers}}. Partitions with a fixed number of jobs have
-    no advice.
+    `jobs` maps each partition to its jobs, and each job to the names of its workers. Partitions
+    with a fixed number of jobs are not in the result.
     """
     adaptation = _adaptation_of(dask_scheduler)
     if adaptation is None:
@@ -387,10 +387,10 @@ async def look(
 async def look_at_groups(
     reports: Mapping[str, GroupReport], dask_scheduler: Any = None
 ) -> dict[str, GroupAdvice]:
-    """Close idle workers, then return the sizes that groups of workers shall have, by partition.
+    """Close idle workers, then return the target sizes of the worker groups, by partition.
 
-    Closed workers are named again until a report says that they were removed: an earlier answer may
-    not have arrived.
+    Closed workers are listed again until a report confirms their removal, because an earlier
+    response may have been lost.
     """
     adaptation = _adaptation_of(dask_scheduler)
     if adaptation is None:

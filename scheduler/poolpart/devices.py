@@ -24,28 +24,29 @@ _own: dict[str, int | None] = {}  # {address of a worker of this process: its de
 
 @telling_departure()
 def own_device() -> int | None:
-    """Return the CUDA device that the worker of this task should use, or None if it has no device.
+    """Return the index of the CUDA device for this task's worker, or None if the worker has no GPU.
 
-    The number refers to the devices that are visible to the worker. The workers are distributed
-    over the devices: each worker takes the first device in its list that the fewest other workers
-    use, first in its partition and then in the cluster. A worker keeps its device until it ends, so
-    all of its tasks receive the same number, and only the first call takes time.
+    The index refers to the devices that are visible to the worker. Workers are distributed evenly
+    over the devices: each worker is assigned the device with the fewest workers of its partition.
+    Ties are resolved in favor of the device with the fewest workers of the whole cluster, and then
+    in favor of the lowest index. A worker keeps its device until it exits, so all of its tasks
+    receive the same index, and only the first call takes time.
 
     Raises
     ------
     WorkerLeft
-        If the worker is leaving.
+        If the worker is leaving the cluster.
     ValueError
         If the function is called outside of a task.
     PoolError
-        If poolpart is not installed in the environment of the scheduler, or if the first call on a
+        If poolpart is not installed in the scheduler's environment, or if the first call on a
         worker is made in a coroutine. In the latter case, call the function in a thread.
 
     Notes
     -----
     dask-cuda rotates `CUDA_VISIBLE_DEVICES` from worker to worker, so that device 0 differs between
-    workers. Workers of a plain `dask worker` list the same devices in the same order. This function
-    supports both cases.
+    workers. Workers started by a plain `dask worker` command list the same devices in the same
+    order. This function supports both cases.
 
     Examples
     --------
@@ -66,11 +67,11 @@ def own_device() -> int | None:
 
 @telling_departure()
 def own_device_share() -> float:
-    """Return the share of the device memory that the worker of this task may use, between 0 and 1.
+    """Return the fraction of the device memory that this task's worker may use, between 0 and 1.
 
-    The share is 1 if no other worker uses the device. Workers of the same partition and host that
-    see the same number of devices share the devices evenly. Workers count as soon as they have
-    joined.
+    The fraction is 1 if no other worker shares the device. Workers of a partition that run on the
+    same host and see the same number of devices share them evenly. A worker is counted as soon as
+    it has joined the cluster, even before it uses its device.
 
     Raises
     ------

@@ -53,7 +53,7 @@ def ask(client: Client, question: Callable[..., Any], **arguments: Any) -> Any:
 async def _answer(
     question: Callable[..., Any], arguments: Mapping[str, Any], dask_scheduler: Any = None
 ) -> tuple[Any, str]:
-    """Return the result of a question and "", or None and the message of a PoolError."""
+    """Return a request's result and "", or None and the message of a PoolError."""
     # Raised here, the error would be in the scheduler's log with a traceback.
     with steward_of(dask_scheduler) as steward:
         try:
@@ -72,28 +72,28 @@ async def declare(
     known_partitions: Collection[str],
     own_partitions: Collection[str],
 ) -> tuple[dict[str, str], list[WorkerInfo]]:
-    """Make all new partitions or none, and follow their rules afterwards.
+    """Create all new partitions or none, and apply their rules to workers that join later.
 
     Parameters
     ----------
     steward
         The scheduler's steward.
     rules
-        {partition: its rule}.
+        Rules by partition name.
     pool
-        {name of a worker to choose from: the worker as the client saw it, with its GPUs}.
+        Workers to choose from by name, as the client saw them, including their GPUs.
     known_partitions
-        Partitions that the client knew when it sent the request. It may make them again.
+        Partitions that the client knew when it sent the request. It may create them again.
     own_partitions
-        Partitions that were made from the same pool: workers that they have are not missed.
+        Partitions that were created from the same pool. Their workers are not reported as missing.
 
     Returns
     -------
     notes
-        {partition: remark for users, possibly empty}: on the choice of workers, and on what this
-        version of Dask lacks.
+        Notes for users by partition name, possibly empty, about the selected workers and about
+        features that this version of Dask lacks.
     remainder
-        Workers of the pool that no rule has chosen.
+        Workers of the pool that no rule has selected.
 
     Raises
     ------
@@ -168,8 +168,8 @@ def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
                 f'`--resources "{name}=1"`.'
             )
     return (
-        f"Workers were started with the resource {name!r}, and the rule does not select all of "
-        f"them. Workers that are not selected: {names_of(members)}. {use}, pass a rule that "
+        f"The rule does not select all workers that were started with the resource {name!r}. "
+        f"Workers that are not selected: {names_of(members)}. {use}, pass a rule that "
         "selects all of these workers, such as `rest()`, or choose another name. A partition with "
         f"another name and `minimum=0` can take workers from {name!r}, for example with "
         f"`partition.resize(1, source={name!r})`."
@@ -241,7 +241,7 @@ async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> l
 async def resize(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
-    """Give a partition a number of workers, and return the names of the workers that moved."""
+    """Resize a partition to a number of workers, and return the names of the moved workers."""
     check_count(f"the number of workers of partition {name!r}", count, minimum=0)
     steward.adopt(name)
     rule = steward.rules[name]
@@ -329,9 +329,10 @@ def _destination(steward: Steward, name: str) -> str | None:
 async def _move(
     steward: Steward, seats: Sequence[Seat], target: str | None, timeout_s: float
 ) -> list[str]:
-    """Move workers into a partition or, with None, out of all, and return their names.
+    """Move workers to a partition, or out of all partitions if `target` is None.
 
-    Workers whose tasks do not end in time stay where they are, and raise a PoolError.
+    Returns the names of the workers. Raises PoolError if tasks of a worker do not end in time. Such
+    a worker stays where it is.
     """
     origins = {seat: (seat.partition, seat.slots) for seat in seats}
     for seat in seats:
@@ -423,8 +424,8 @@ async def dissolve(
     if late := await steward.arrive(present, max(timeout_s, _RETURN_S)):
         raise PoolError(
             f"Some workers did not respond while {_in_words(dissolved)} "
-            f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {names_of(late)}. They are "
-            "restored as soon as they respond."
+            f"{'was' if len(dissolved) == 1 else 'were'} dissolved: {names_of(late)}. Their "
+            "original resources are restored as soon as they respond."
         )
     return dissolved
 

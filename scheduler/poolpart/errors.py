@@ -2,12 +2,12 @@
 
 
 class PoolError(RuntimeError):
-    """The pool or a partition cannot be used as requested."""
+    """Raised when the pool or a partition cannot be used as requested."""
 
 
 class PipeClosed(Exception):  # noqa: N818 - like StopIteration: an end, not an error
-    """The pipe is closed and, for a consumer, also empty."""
+    """Raised when the pipe is closed and, for a consumer, also empty."""
 
 
 class PipeFailed(RuntimeError):  # noqa: N818 - reads as what happened to the pipe
-    """The pipe has failed. The message contains the reason."""
+    """Raised when the pipe has failed. The message contains the reason."""

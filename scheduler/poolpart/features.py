@@ -25,7 +25,7 @@ class Feature:
         return frozenset()
 
     async def settle(self) -> None:
-        """Wait, for a bounded time, until workers know what has begun and ended."""
+        """Wait, for a limited time, until workers know what has started and stopped."""
 
     def end_all(self, scheduler: Any) -> None:
         """End with the last partition that has a rule."""
@@ -58,6 +58,6 @@ def names_with_features(scheduler: Any) -> frozenset[str]:
 
 
 async def features_settled() -> None:
-    """Wait, for a bounded time, until workers know which features have begun and ended."""
+    """Wait, for a limited time, until workers know which features have started and stopped."""
     for feature in FEATURES:
         await feature.settle()

@@ -67,7 +67,7 @@ def expect(scheduler: Any, worker: Any, name: str | None) -> None:
 
 
 def lower(scheduler: Any, name: str) -> None:
-    """Lower a fence, and remove the rule with the last fence."""
+    """Lower a fence, and uninstall the scheduler plugin if no fences remain."""
     fences: Fences | None = scheduler.plugins.get(NAME)
     if fences is None or name not in fences.names:
         return

@@ -82,7 +82,7 @@ async def _take(client: Client, address: str, held: list[str], patience_s: float
 async def _unless_silent(
     client: Client, address: str, request: Coroutine[Any, Any, T], patience_s: float
 ) -> T | None:
-    """Await a request to a worker, or return None if the worker is silent for `patience_s`."""
+    """Await a request to a worker, or return None if it does not respond in `patience_s`."""
     answer_task = asyncio.ensure_future(request)
     try:
         # Giving up a worker that answers would discard the data so far, and the next call would be

@@ -273,11 +273,11 @@ class Stage:
 
 
 class Results(Iterator[Any]):
-    """Iterator of the results of a function for many items, as returned by `Partition.map`.
+    """Iterator over the results of a function for many items, as returned by `Partition.map`.
 
-    The first tasks start immediately. Further items are taken, sent and fetched while results are
-    read. Close or delete the iterator to stop early. It has a length if all iterables have one.
-    `done` is the number of results that have been read.
+    The first tasks start immediately. While results are read, further items are submitted and their
+    results are fetched. Close or delete the iterator to stop early. It has a length if all
+    iterables have a length. `done` is the number of results that have been read.
 
     Examples
     --------
@@ -372,7 +372,7 @@ class Results(Iterator[Any]):
         )
 
     def close(self) -> None:
-        """Cancel waiting tasks and discard results that have not been read."""
+        """Cancel pending tasks and discard unread results."""
         self._closed = True
         self._failed = None
         for held in (self._ready, self._undelivered, self._unfinished):

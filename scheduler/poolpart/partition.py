@@ -40,11 +40,11 @@ _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
 
 
 class Partition:
-    """Workers of a cluster that declare the resource `name`, and an interface to run tasks on them.
+    """Group of workers that declare the resource `name`, with methods to run tasks on them.
 
-    Each task of a partition takes a slot of the resource, and therefore only runs on these
-    workers. The members are the workers that declare the resource at the moment. This includes
-    restarted workers and workers that have joined with the resource.
+    Each task of a partition occupies a slot of the resource, and therefore runs only on these
+    workers. The members are the workers that currently declare the resource, including restarted
+    workers and workers that joined later.
 
     Parameters
     ----------
@@ -53,26 +53,28 @@ class Partition:
     client
         Client of the cluster. By default, a task uses the client of its worker.
     note
-        Remark about the partition, for example that the pool has no GPUs. The division that
-        creates the partition logs the note as a warning.
+        Note about the partition, for example that the pool has no GPUs. It is logged as a warning
+        when a division creates the partition.
     by_rule
-        Whether a division of the pool created the partition, so that it can be dissolved.
+        Whether the partition was created by a division of the pool, and can therefore be dissolved.
 
     Notes
     -----
     If no worker declares the resource and none is expected, the first task logs a warning that
     lists the existing partitions. The task waits until a worker with the resource joins.
 
-    Dask sends the functions of a script with each task and creates the global variables of the
-    script anew each time. Store values that are expensive to build in a module, or as an attribute
-    of ``distributed.get_worker()``.
+    Dask pickles the functions of a script with each task, and creates the global variables that
+    they use anew each time. Store values that are expensive to build in a module, or as an
+    attribute of ``distributed.get_worker()``.
 
-    A partition can be an argument of a task. In the task, it uses the client of the worker.
+    A partition can be passed to a task as an argument. In the task, it uses the client of the
+    worker.
 
     If a task of a partition submits tasks with a `Client`, these tasks belong to the same
-    partition, and each of them takes a slot. The submitting task lends its own slot while it waits
-    for results. Release a `threading.Lock` before such a wait. Otherwise, a task that borrows the
-    slot may wait for the lock, which causes a deadlock. A `distributed.Lock` may be held.
+    partition, and each of them occupies a slot. The submitting task lends its own slot to other
+    tasks while it waits for results. Release a `threading.Lock` before such a wait. Otherwise, a
+    task that borrows the slot may wait for the lock, which causes a deadlock. A `distributed.Lock`
+    can be held during the wait.
 
     Examples
     --------
@@ -127,17 +129,16 @@ class Partition:
         return table_of_partition(lambda: self.client, repr(self), self.name)
 
     def stats(self) -> PartitionStats:
-        """Return the load of the partition and the counts of its finished tasks, for all clients.
+        """Return the partition's current load and counts of finished tasks, for all clients.
 
-        In a divided pool, tasks are counted since the division. In a partition that the workers
-        were started with, they are counted since a client submitted its first task through
-        `Partition`, or since this method was first called. `PartitionStats.since` contains this
-        time.
+        In a divided pool, counting begins with the division. In a partition that the workers were
+        started with, it begins when a client submits its first task through `Partition`, or when
+        this method is first called. `PartitionStats.since` contains the time when counting began.
 
         Raises
         ------
         PoolError
-            If poolpart is not installed in the environment of the scheduler.
+            If poolpart is not installed in the scheduler's environment.
 
         Examples
         --------
@@ -148,15 +149,15 @@ class Partition:
         return stats[0]
 
     def tasks(self) -> TaskTable:
-        """Return the individual tasks of the partition, for all clients.
+        """Return a table of the tasks of the partition, for all clients.
 
         The table contains all unfinished tasks, and the last 1,000 tasks that have finished since
-        counting began. See `stats` for when counting begins.
+        counting began. See `stats` for the time when counting begins.
 
         Raises
         ------
         PoolError
-            If poolpart is not installed in the environment of the scheduler.
+            If poolpart is not installed in the scheduler's environment.
 
         Examples
         --------
@@ -189,35 +190,36 @@ class Partition:
             `Client.submit`, such as `key` or `workers`, pass it by position or use
             `functools.partial`.
         key
-            Key of the task. By default, each call has a new key, so equal calls run separately.
+            Key of the task. By default, a new key is generated for each call, so identical calls
+            run separately.
         priority
             Priority of the task. Tasks with a higher priority run first.
         retries
             Maximum number of times that the task runs again after an error.
         slots
-            Number of slots of one worker that the task takes while it runs. A task of a partition
-            lends its slots while it waits for other tasks.
+            Number of slots that the task occupies on a worker while it runs. The task lends its
+            slots to other tasks of the partition while it waits for results.
         workers
             Name or address of the member that runs the task, or a list of them. Names are resolved
-            to addresses when the task arrives at the scheduler. If these workers leave or restart,
-            the task waits forever.
+            to addresses when the task reaches the scheduler. If these workers leave or restart, the
+            task waits forever.
 
         Returns
         -------
         Future
-            Its `result` raises `PoolError` if the partition was dissolved, if none of its workers
-            has enough slots, or if a worker in `workers` belongs to another partition. If the
-            partition has no workers, the task waits for one.
+            Its `result` method raises `PoolError` if the partition was dissolved, if none of its
+            workers has enough slots, or if a worker in `workers` belongs to another partition. If
+            the partition has no workers, the task waits for one.
 
         Raises
         ------
         ValueError
             If `slots` is below 1.
         PoolError
-            If the function is a coroutine function, or if an option of Dask is passed that the
-            partition sets itself. The first task of a client also raises the errors of `result`. It
-            waits for a response of the scheduler, unless the client is asynchronous. Later tasks do
-            not wait.
+            If the function is a coroutine function, or if a Dask option is passed that the
+            partition sets itself. Unless the client is asynchronous, its first call waits for a
+            response from the scheduler, and also raises the errors described for `result`. Later
+            calls do not wait.
 
         Examples
         --------
@@ -279,15 +281,16 @@ class Partition:
         empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> Results:
-        """Call a function for each item and return an iterator of the results.
+        """Call a function for each item and return an iterator over the results.
 
-        The number of items may be infinite, because items are taken and results are fetched while
-        the results are read. The number of tasks in flight is limited. Several small items share a
-        task, depending on their duration and size.
+        The iterables may be infinite, because items are submitted only while results are read, and
+        the number of tasks in flight is limited. Small items are grouped into tasks according to
+        their duration and size.
 
         If an iterable is the result of another map, workers fetch its results directly from each
         other, even if the partitions differ. The data does not pass through the client or the
-        scheduler. This applies to one unread map among the iterables.
+        scheduler. Only one of the iterables can be chained in this way: the first map whose results
+        have not been read yet.
 
         Parameters
         ----------
@@ -295,44 +298,45 @@ class Partition:
             Function that is called with one item of each iterable, until the shortest iterable
             ends.
         ordered
-            Whether to return results in the order of the items (True) or as they complete (False).
+            Whether to return results in the order of the items (True) or of completion (False).
         window
-            Maximum number of tasks in flight. By default, the number is chosen such that workers do
-            not wait for the client: two tasks for each slot, or, if tasks are short, as many as
-            take one second. The number doubles if workers and client have waited for each other,
-            for example if the client computes between results, up to 512 tasks and 64 MiB of items
-            and results. It adapts to the number of slots.
+            Maximum number of tasks in flight. By default, the number is chosen so that workers do
+            not have to wait for the client: two tasks for each slot or, if tasks are short, one
+            second of work for each slot. The number doubles if workers and client have waited for
+            each other, for example because the client computes between results. It is limited to
+            512 tasks and 64 MiB of items and results, and adapts to the number of slots.
         chunk
-            Number of items per task. By default, as many as take a tenth of a second (longer if
-            there are many slots) and have 1 MiB. Pass 1 if the durations of items vary
-            considerably, or if items must not wait for others.
+            Number of items per task. By default, a task contains as many items as take about a
+            tenth of a second (longer if there are many slots), but at most 1 MiB of items and
+            results. Pass 1 if processing times vary considerably, or if items must not wait for
+            others.
         priority
             Priority of the tasks. Tasks with a higher priority run first.
         retries
-            Minimum number of times that a failed item is run again.
+            Minimum number of times that a failed item is retried.
         slots
-            Number of slots of one worker that each task takes.
+            Number of slots that each task occupies on a worker.
         return_exceptions
-            Whether to return errors of `function` as results at their position. A map over this map
-            receives them as arguments. An item that kills its workers still ends the map.
+            Whether to return the errors of `function` in place of its results. A map over this map
+            receives the errors as arguments. An item that kills its workers still ends the map.
         empty_s
-            Maximum time in seconds to wait if the partition has no workers, and none is starting,
-            queued or added by `adapt`. Pass `math.inf` to wait forever.
+            Maximum time in seconds to wait while the partition has no workers, and no worker is
+            starting, queued or requested by `adapt`. Pass `math.inf` to wait forever.
         kwargs
-            Keyword arguments of each call. Use `functools.partial` for arguments with the name of
-            an option. Scatter large arguments and pass the futures.
+            Keyword arguments that are passed to each call. Use `functools.partial` for arguments
+            that have the name of an option. Scatter large arguments and pass the futures.
 
         Returns
         -------
         Results
-            Iterator of the results. If `function` raises an error, the iterator first returns the
+            Iterator over the results. If `function` raises an error, the iterator first returns the
             earlier results, and then raises the error with a note that names the item. It raises
             `PoolError` if the partition is dissolved or has no workers for `empty_s` seconds, and
             `CancelledError` after `Client.restart`. To stop early, close or delete the iterator,
             which cancels waiting tasks. If all iterables have a length, so does the iterator, and
             progress bars such as ``tqdm(partition.map(…))`` work. `Results.done` is the number of
-            results that were read. ``client.gather`` of the iterator returns an iterator of the
-            same results.
+            results that have been read. Passing the iterator to ``client.gather`` returns an
+            iterator over the same results.
 
         Raises
         ------
@@ -404,44 +408,44 @@ class Partition:
         empty_s: float = WAIT_S,
         **kwargs: Any,
     ) -> int | concurrent.futures.Future[int]:
-        """Run a task that calls a function, for each item of a pipe or an iterable.
+        """Run a task for each item of a pipe or an iterable.
 
-        This method returns after the pipe was closed, or the iterable has ended, and all tasks have
-        finished. The number of tasks in flight is limited. Further items wait in the pipe, so
-        producers wait if it is full. If the worker of an item dies, the item is run on another
-        worker. Several calls of `for_each` may share a pipe.
+        This method returns when the pipe has been closed or the iterable is exhausted, and all
+        tasks have finished. The number of tasks in flight is limited. Further items remain in the
+        pipe, so producers wait if it is full. If a worker dies while it processes an item, the item
+        is processed again on another worker. Several calls to `for_each` can share a pipe.
 
-        Pipes that the function puts items into remain open. Close them after this method has
-        returned or, with ``wait=False``, after its future has a result.
+        This method does not close the pipes that the function puts items into. Close them after
+        this method has returned or, with ``wait=False``, after its future has finished.
 
         Parameters
         ----------
         items, function
             Pipe or iterable, and the function that is called with each item. If an item is a
             future, the function receives its result. The return value of the function is discarded,
-            but the function may put items into another pipe. The next item of an iterable is taken
-            when a slot is free for it, and errors of tasks are raised after that.
-            ``as_completed(futures)`` is an iterable of futures in order of completion.
+            but the function may put items into another pipe. The next item of an iterable is read
+            only when a slot is free for it, and task errors are not raised before that. To process
+            futures in order of completion, pass ``as_completed(futures)``.
         wait
             If False, return a future immediately. A thread of this process submits the tasks.
         window
-            Maximum number of tasks in flight. By default, two for each slot. If slots become idle
-            before this process can submit further tasks, the number increases, up to 16 for each
-            slot. It adapts to the number of slots.
+            Maximum number of tasks in flight. By default, it is two for each slot, and increases to
+            up to 16 for each slot if slots become idle before this process can submit further
+            tasks. It adapts to the number of slots.
         priority, retries, slots
             Options of each task, as in `submit`.
         empty_s
-            Maximum time in seconds that tasks wait for a partition without workers, as in `map`.
+            Maximum time in seconds that tasks wait while the partition has no workers, as in `map`.
         kwargs
-            Keyword arguments of each call. Use `functools.partial` for arguments with the name of
-            an option.
+            Keyword arguments that are passed to each call. Use `functools.partial` for arguments
+            that have the name of an option.
 
         Returns
         -------
         int or concurrent.futures.Future
-            Number of items, or, with ``wait=False``, a future of this number. ``future.cancel()``
-            cancels the tasks that have not started and lets the pipe fail, so that producers end.
-            It returns False if everything has finished. The tasks continue if the future is
+            Number of items or, with ``wait=False``, a future for this number. ``future.cancel()``
+            cancels the tasks that have not started and makes the pipe fail, so that its producers
+            end. It returns False if all tasks have finished. The tasks continue if the future is
             deleted.
 
         Raises
@@ -453,8 +457,8 @@ class Partition:
             The pipe fails with this error.
         Exception
             The first error of the function, with a note that names the item. The pipe fails with
-            the error, so that producers end, and tasks that have not started are canceled. With
-            ``wait=False``, the future raises these errors.
+            the same error, so that its producers end, and tasks that have not started are canceled.
+            With ``wait=False``, the future raises these errors.
 
         Examples
         --------
@@ -477,34 +481,36 @@ class Partition:
         *,
         running: Literal["continue", "restart"] = "continue",
     ) -> dict[Any, str]:
-        """Cancel tasks of this partition and return what happened to each of them.
+        """Cancel tasks of this partition and return the outcome for each task.
 
         Parameters
         ----------
         futures
-            Future of a task, or several futures. Futures that were canceled before are accepted.
+            Future of a task, or several futures. Futures that have already been canceled are
+            accepted.
         running
-            What to do with tasks that are running. Dask does not stop them. They keep their slots
-            until their functions return, and the functions can check `cancelled`. With "restart",
-            the nanny restarts a worker that only runs these tasks, and the worker returns to the
-            partition. A worker is never restarted if it has another task, an actor, or a result
-            that no other worker has, or if it does not respond within 5 s, for example because a
-            function holds the interpreter lock. The call returns after at most 80 s, even if a
-            restarted worker has not rejoined.
+            How to handle tasks that are already running. With "continue", they keep their slots
+            until their functions return, because Dask does not stop running functions. The
+            functions can check `cancelled` to return early. With "restart", the nanny restarts each
+            worker that runs only these tasks, and the worker returns to the partition. A worker is
+            not restarted if it has another task, an actor, or the only copy of a result, or if it
+            does not respond within 5 s, for example because a function holds the global interpreter
+            lock. The call returns after at most 80 s, even if a restarted worker has not rejoined.
 
         Returns
         -------
         dict
-            Mapping of keys to texts that begin with one of the following words. ``cancelled``: the
-            task will not run. ``ended``: it had ended before, and its result is gone. ``running:
-            …``: it is still running, or may run on a worker that does not respond. The text names
-            the worker and the reason why it was not restarted. ``restarted: …``: its worker was
-            restarted. ``kept: …``: another client needs its result.
+            Mapping of task keys to strings that begin with one of the following words.
+            ``cancelled``: the task will not run. ``ended``: the task had already finished, and its
+            result was released. ``running: …``: the task is still running, or may be running on a
+            worker that does not respond. The string names the worker and the reason why it was not
+            restarted. ``restarted: …``: the task's worker was restarted. ``kept: …``: another
+            client needs the task's result.
 
         Raises
         ------
         ValueError
-            If `running` has another value.
+            If `running` is neither "continue" nor "restart".
         PoolError
             If a task belongs to another partition. In this case, no task is canceled.
 
@@ -537,17 +543,18 @@ class Partition:
     # -- collections and data ----------------------------------------------------------
 
     def compute(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
-        """Compute Dask collections on these workers: arrays, dataframes, bags or delayed values.
+        """Compute Dask collections (arrays, dataframes, bags or delayed values) on these workers.
 
-        Each of their tasks takes a slot. Rechunks and shuffles also stay on these workers. If a
-        client still holds a result of a collection, Dask returns it and does not compute it again.
+        Each task of a collection occupies a slot. Rechunking and shuffling also stay on these
+        workers. If a client still holds the result of a collection, Dask returns that result and
+        does not compute it again.
 
         Parameters
         ----------
         collections
             Collection, or a list of collections.
         slots
-            Number of slots that each task takes.
+            Number of slots that each task occupies.
         options
             Further options of `Client.compute`, such as ``sync=True`` to return the result instead
             of a future. To keep results on these workers, use ``with partition:`` and ``persist``.
@@ -555,7 +562,7 @@ class Partition:
         Returns
         -------
         Future or list of Future
-            Future of each result.
+            A future for each collection.
 
         Examples
         --------
@@ -567,7 +574,7 @@ class Partition:
         return self.client.compute(collections, resources=self._taking(slots), **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
-        """Send data to the memory of these workers and return futures.
+        """Scatter data into the memory of these workers and return futures.
 
         Scattered data cannot be recomputed if its worker dies.
 
@@ -636,26 +643,26 @@ class Partition:
     ) -> list[str]:
         """Move workers into this partition while tasks run, and return their names.
 
-        A worker first finishes its running tasks of the former partition. Its waiting tasks are
-        moved to other members of that partition. If the rule of this partition is `n_workers`, the
-        number of the rule increases as well. After a worker was lost, use `resize` to return to the
-        former size.
+        A worker first finishes the tasks of its former partition that are already running. Its
+        waiting tasks are moved to other members of that partition. If the rule of this partition is
+        `n_workers`, the number in the rule increases accordingly. To restore the former size after
+        a worker was lost, use `resize`.
 
         Parameters
         ----------
         workers
             Number of workers to move.
         source
-            Name of the partition that provides the workers. By default, workers without a partition
-            and workers of the partition with the rule `rest` are used.
+            Name of the partition to move workers from. By default, workers without a partition and
+            workers of the partition with the rule `rest` are used.
         timeout_s
             Maximum time in seconds to wait until the workers are free.
 
         Raises
         ------
         PoolError
-            If the source has too few workers beyond its minimum, or if tasks do not finish in time.
-            In the latter case, the workers stay in their partition.
+            If the source cannot provide enough workers without falling below its minimum, or if
+            tasks do not finish in time. In the latter case, the workers stay in their partition.
 
         Examples
         --------
@@ -669,18 +676,18 @@ class Partition:
     def resize(
         self, workers: int, *, source: str | None = None, timeout_s: float = 60.0
     ) -> list[str]:
-        """Set the number of workers of this partition, and return the names of moved workers.
+        """Set the number of workers in this partition, and return the names of the workers moved.
 
-        Workers are moved in as with `grow`, or out as with `shrink`.
+        Workers are moved into the partition as by `grow`, or out of it as by `shrink`.
 
         Parameters
         ----------
         workers
-            Number of workers that the partition should have. If its rule is `n_workers`, the rule
-            requests this number from now on. Other rules do not change, and continue to assign
-            workers that join later.
+            New number of workers. If the rule of the partition is `n_workers`, it requests this
+            number from now on. Other rules do not change, and continue to assign workers that join
+            later.
         source
-            Name of the partition that provides workers, as in `grow`.
+            Name of the partition to move workers from, as in `grow`.
         timeout_s
             Maximum time in seconds to wait until the workers are free.
 
@@ -693,11 +700,12 @@ class Partition:
 
         Notes
         -----
-        A worker that its nanny restarts keeps its place for half a minute, and counts as a member.
-        If a worker is lost permanently, the rule `n_workers` still requests the former number,
-        which `stats` reports as `target`. The next worker that joins the cluster fills the place,
-        and so does a worker of the remainder that joined after the division. Other present workers
-        do not fill it automatically. ``resize(2)`` moves workers in until there are two. `grow` and
+        While its nanny restarts a worker, the worker's place in the partition is reserved for half
+        a minute, and the worker counts as a member. If a worker is lost permanently, the rule
+        `n_workers` still requests the original number, which `stats` reports as `target`. The
+        vacant place is filled by the next worker that joins the cluster, or by a worker of the
+        remainder that joined after the division. Other existing workers do not fill it
+        automatically. ``resize(2)`` moves workers in until the partition has two. `grow` and
         `shrink` change the target by the number of workers that they move, so they do not fill the
         place either.
 
@@ -713,8 +721,9 @@ class Partition:
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
         """Move workers out of this partition while tasks run, and return their names.
 
-        The workers with the lowest load are moved to the partition with the rule `rest`, or belong
-        to no partition if there is none. They first finish their tasks, as described for `grow`.
+        The workers with the lowest load are moved to the partition with the rule `rest`. If no
+        partition has this rule, they no longer belong to any partition. They first finish their
+        tasks, as described for `grow`.
 
         Raises
         ------
@@ -733,13 +742,14 @@ class Partition:
     # -- workers that come and go ------------------------------------------------------
 
     def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
-        """Set the range for the number of jobs of an adaptive partition.
+        """Set the minimum and maximum number of jobs for an adaptive partition.
 
-        Jobs are started for tasks that are ready to run but have no slot, checked once per second,
-        and for slots that clients request with `want`. A job that was not needed for `idle_s`
-        seconds is ended, or canceled while it waits in the queue. A worker is kept while it has a
-        task (even if the task has seceded), an actor, or a result that no other worker has. A lost
-        worker is replaced while there is work. Two equal numbers set a fixed number of jobs.
+        Once per second, jobs are started for tasks that are ready to run but have no slot, and for
+        slots that clients request with `want`. A job that has not been needed for `idle_s` seconds
+        is ended or, if it is still queued, canceled. A worker is kept as long as it has a task
+        (even if the task has seceded), an actor, or the only copy of a result. A lost worker is
+        replaced as long as there is work. For a fixed number of jobs, pass the same number as
+        `minimum` and `maximum`.
 
         Parameters
         ----------
@@ -751,8 +761,8 @@ class Partition:
         Raises
         ------
         PoolError
-            If neither `start_partitions` nor `scale_groups` starts the workers, or if a number is
-            invalid.
+            If the workers are not started by `start_partitions` or `scale_groups`, or if a number
+            is invalid.
 
         Examples
         --------
@@ -769,10 +779,10 @@ class Partition:
     def want(self, slots: int) -> bool:
         """Request slots for this client, and return whether the partition is adaptive.
 
-        Use this method in a program that selects a worker for each task, so that none of its tasks
-        wait for a worker. While slots are requested, jobs are started and kept as if tasks waited
-        for them. The request ends with ``want(0)`` or when the client closes. Tasks that wait for a
-        slot do not need a request.
+        This method is intended for programs that assign each task to a specific worker, so that
+        their tasks never wait for a slot. While slots are requested, jobs are started and kept as
+        if tasks were waiting for the slots. The request ends with ``want(0)`` or when the client
+        closes. Tasks that wait for a slot do not need a request.
 
         Raises
         ------
@@ -789,7 +799,7 @@ class Partition:
         return bool(on_scheduler(self.client, want, name=self.name, **asking))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
-        """Dissolve this partition, as `Pool.dissolve` does for all partitions."""
+        """Dissolve this partition, in the same way as `Pool.dissolve` dissolves all partitions."""
         ask_to_dissolve(self.client, [self.name], timeout_s)
 
 

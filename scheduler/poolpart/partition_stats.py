@@ -24,7 +24,7 @@ def size_in_words(workers: int, target: int | None, slots: int) -> str:
 
 @dataclass(frozen=True)
 class StageStats:
-    """Tasks of a stage, that is, tasks with a common key prefix.
+    """Statistics of a stage, which comprises all tasks with the same key prefix.
 
     For most tasks, the prefix is the name of the function. Tasks of `Partition.map` have the suffix
     ``-map``.
@@ -36,22 +36,22 @@ class StageStats:
     queued
         Number of tasks that wait for a worker, or for a slot of a worker.
     running
-        Number of running tasks. The scheduler is not notified when a task starts, so it counts as
-        many tasks of a worker as the worker has slots.
+        Number of running tasks. The scheduler is not notified when a task starts, so it assumes
+        that a worker runs as many of its tasks as it has slots.
     done
         Number of successful runs, including those whose results were lost and recomputed.
     failed
-        Number of tasks that raised an error, or were given up after too many workers had died.
-        Their dependents, which never ran, do not count.
+        Number of tasks that raised an error, or that Dask stopped retrying after too many workers
+        had died. Their dependents, which never ran, are not counted.
     seconds
-        Running time of finished tasks in seconds, including failed tasks, but without runs that
-        were lost.
+        Total running time of finished tasks in seconds, including failed tasks but excluding lost
+        runs.
     queued_seconds
-        Time in seconds that these tasks waited for a worker or a slot after their inputs were
+        Total time in seconds that these tasks waited for a worker or a slot after their inputs were
         available.
     lost
-        Number of runs that were lost because their worker died. Dask runs these tasks again. A
-        task that is given up after too many workers have died counts as failed instead.
+        Number of runs that were lost because their worker died. Dask runs these tasks again. A task
+        that Dask stops retrying after too many workers have died is counted as failed instead.
     """
 
     waiting: int = 0
@@ -75,10 +75,10 @@ class StageStats:
 
 @dataclass(frozen=True, repr=False)
 class PartitionStats(StageStats):
-    """Current and finished tasks of a partition.
+    """Statistics of a partition, with its workers, slots, and current and finished tasks.
 
-    Finished tasks are counted since the cluster was divided, a client submitted its first task to a
-    partition, statistics were first requested, or the page was opened, whichever came first.
+    Counting of finished tasks begins when the cluster is divided, a client submits its first task
+    to a partition, statistics are first requested, or the page is opened, whichever comes first.
 
     Parameters
     ----------
@@ -88,9 +88,9 @@ class PartitionStats(StageStats):
         Current number of workers.
     target
         Number of workers that the rule requests, or None if the rule, such as `rest`, does not
-        request a number. It is greater than `workers` after a worker was lost.
+        request a number. It is greater than `workers` if a worker has been lost.
     slots, busy
-        Number of slots of these workers, and number of slots in use.
+        Total number of slots of these workers, and number of slots in use.
     exclusive
         Whether other tasks are kept off the workers.
     stages

@@ -57,77 +57,78 @@ _LINGER_S = 0.002  # `get` waits so long for more items, which saves requests
 
 
 class Pipe:
-    """Bounded first-in-first-out pipe between tasks that can be closed and can fail.
+    """Bounded first-in, first-out pipe between tasks, which can be closed and can fail.
 
     The creator of the pipe calls `create`, passes the pipe to the tasks at both ends, and finally
-    calls `delete`. A ``with`` block calls both methods. The pipe is also deleted when the client of
-    its creator closes or dies. A pickled pipe is small. Any number of producers and consumers may
-    share a pipe, in any process and thread, and threads may share the same object. With several
-    `producers`, the pipe is closed after each of them has called `close`.
+    calls `delete`. A ``with`` block calls both methods. The pipe is also deleted when its creator's
+    client closes or dies. A pickled pipe is small, because it does not contain the items. Any
+    number of producers and consumers can share a pipe across processes and threads, and threads can
+    share the same `Pipe` object. With several `producers`, the pipe is closed once each of them has
+    called `close`.
 
     Parameters
     ----------
     name
         Name of the pipe, which must be unique on the cluster. Include a random part.
     capacity
-        Maximum number of queued items. `put` waits while the pipe contains as many.
+        Maximum number of queued items. While the pipe is full, `put` waits.
     client
         Client to use. By default, a task uses the client of its worker.
     producers
         Number of producers. Each producer calls `close` when it has finished.
     fails_with_tasks
-        Whether the pipe fails if a task that has it as an argument is lost. Pass False if the
-        program submits lost tasks again.
+        Whether the pipe fails if a task that received it as an argument is lost. Pass False if the
+        program resubmits lost tasks.
 
     Notes
     -----
     **Failures.** After `fail`, every `put` raises `PipeFailed`. `get` first returns the items that
-    this object has already taken, and then raises the error. Waiting calls raise it within a
-    second. If a pipe does not exist or was deleted, all methods raise `PipeFailed`, including
-    `close` and `fail`. If the scheduler has died, calls raise `OSError` after Dask's
-    ``distributed.comm.timeouts.connect``. If it does not respond, they raise `OSError` after five
-    minutes.
+    this object has already fetched, and then raises the error. Calls that are waiting raise the
+    error within a second. If a pipe does not exist or was deleted, all methods raise `PipeFailed`,
+    including `close` and `fail`. If the scheduler has died, calls raise `OSError` after the Dask
+    timeout ``distributed.comm.timeouts.connect``. If the scheduler does not respond, they raise
+    `OSError` after five minutes.
 
-    An open pipe also fails if a task that uses it is lost, because the other end would wait
-    forever. This applies to tasks of `Partition.submit` and `Partition.for_each` that have the pipe
-    as an argument, directly or in a list. The pipe fails if such a task fails after all retries, or
-    if it is canceled before it has used the pipe, for example because no future of it was kept.
-    Canceling does not stop a running task, so the task can continue to use the pipe. If
-    `Partition.cancel` restarts its worker, the pipe fails, unless the task is a consumer. A task
-    that Dask runs again because its worker has died does not affect the pipe. A task that returns
-    without calling `close` does not affect it either, because other producers may follow. After
-    `Client.restart`, all open pipes of the cluster fail.
+    An open pipe also fails if a task that uses it is lost, because the tasks at the other end would
+    otherwise wait forever. This applies to tasks that receive the pipe as an argument of
+    `Partition.submit` or `Partition.for_each`, directly or in a list. The pipe fails if such a task
+    fails after all retries, or if it is canceled before it has used the pipe, for example because
+    its future was not kept. Canceling does not stop a running task, so the task can continue to use
+    the pipe. If `Partition.cancel` restarts the task's worker, the pipe fails, unless the task is a
+    consumer. A task that Dask runs again because its worker has died does not affect the pipe.
+    Neither does a task that returns without calling `close`, because other producers may follow.
+    After `Client.restart`, all open pipes of the cluster fail.
 
-    **Items in flight.** A consumer takes all queued items, up to about `capacity`, in one request.
-    `get` and iteration return them one by one. At most ``capacity * (1 + consumers)`` items are in
-    flight. If items are slow to process and there are several consumers, choose a small capacity,
-    so that no consumer holds items while another one is idle.
+    **Items in flight.** A consumer fetches all queued items, up to about `capacity`, in one
+    request. `get` and iteration return them one by one. At most ``capacity * (1 + consumers)``
+    items are in flight. If items are slow to process and there are several consumers, choose a
+    small capacity, so that no consumer holds unprocessed items while another consumer is idle.
 
-    **Lost items.** The items that an object has taken are lost if its process dies or the object is
-    deleted, for example if a task leaves the loop with `break` and returns. To process each item
-    exactly once, record the items that have arrived, and put missing items again. If an item cannot
-    be unpickled, its error is raised when it would be returned, and the item is lost, but later
-    items are not. If a wait is interrupted, for example by Ctrl-C, no item is lost: an item that
-    arrives within the next second is kept in the object for its next `get`. If an event loop no
-    longer awaits a thread (`asyncio.to_thread`), the thread continues to wait, and its item is
-    lost. Pass `timeout_s` in this case.
+    **Lost items.** Items that a `Pipe` object has fetched but not yet returned are lost if its
+    process dies or the object is deleted, for example if a task leaves the loop with `break` and
+    returns. To process each item exactly once, record which items have arrived, and put missing
+    items again. If an item cannot be unpickled, the error is raised in place of the item, which is
+    lost. Later items are not affected. If a wait is interrupted, for example by Ctrl-C, no item is
+    lost: an item that arrives within the next second is kept in the object for its next `get`. If
+    an event loop stops awaiting a thread (`asyncio.to_thread`), the thread continues to wait, and
+    the item that it receives is lost. To limit this wait, pass `timeout_s`.
 
     **Order.** Each object returns items in the order in which they were put. Threads that share an
-    object receive them in any order.
+    object receive the items in any order.
 
     **Queue and Variable.** Any client can use Dask's ``Queue(pipe.name)`` and
-    ``Variable(pipe.name)``. The queue contains the items of the pipe, with the same order and
-    capacity, and its `put` and `get` also raise `PipeClosed` and `PipeFailed`. Unlike `Pipe.get`,
-    `Queue.get` loses an item if its client is killed while it waits, because the scheduler cannot
-    determine which client has sent the request. If the pipe ends before ``Queue.get(batch=5)`` has
-    received five items, it raises an error, and the items that it has received are lost. Use
-    ``batch=True``, which does not wait.
+    ``Variable(pipe.name)``. The queue contains the items of the pipe in the same order and has the
+    same capacity. Its `put` and `get` methods also raise `PipeClosed` and `PipeFailed`. Unlike
+    `Pipe.get`, `Queue.get` loses an item if its client is killed while it waits, because the
+    scheduler cannot determine which client has sent the request. If the pipe ends before
+    ``Queue.get(batch=5)`` has received five items, it raises an error, and the items that it has
+    received are lost. Use ``batch=True``, which does not wait.
 
     The variable contains the state, a `poolpart.pipe_states.PipeState`.
-    ``variable.set({**variable.get(), "closed": True})`` closes the pipe. Setting a value that
-    cannot follow from the current state raises `ValueError`. So does a value that is based on an
-    outdated state. In this case, read the variable and set it again. ``Variable.delete``, or
-    releasing the last reference to the queue, deletes the pipe.
+    ``variable.set({**variable.get(), "closed": True})`` closes the pipe. Setting a value that is
+    not a valid successor of the current state raises `ValueError`, and so does a value that is
+    based on an outdated state. In the latter case, read the variable and set it again. Calling
+    ``Variable.delete``, or releasing the last reference to the queue, deletes the pipe.
 
     Examples
     --------
@@ -212,7 +213,7 @@ class Pipe:
         return self
 
     def delete(self) -> None:
-        """Delete the pipe and all queued items on the scheduler, if the pipe exists."""
+        """Delete the pipe and its queued items from the scheduler, if the pipe exists."""
         forget_pipes(self.client, [self.name])
 
     def __enter__(self) -> Pipe:
@@ -288,16 +289,16 @@ class Pipe:
         return int(self._change()["answer"])
 
     def close(self) -> None:
-        """Close the pipe for a producer.
+        """Close the pipe on behalf of a producer.
 
-        When the last producer has closed the pipe, it accepts no more items, and consumers end
-        after they have taken the remaining items. With several `producers`, each task counts once,
-        even if it runs again. Outside of tasks, each call counts.
+        Once all producers have closed the pipe, it accepts no more items, and consumers end after
+        they have received the remaining items. With several `producers`, each task counts as one
+        producer, even if it runs again. Outside of tasks, each call counts as one producer.
         """
         self._change(producer=_producer())
 
     def fail(self, reason: str) -> None:
-        """Let the pipe fail, so that every `put` and `get` at both ends raises `PipeFailed`.
+        """Make the pipe fail, so that every `put` and `get` at both ends raises `PipeFailed`.
 
         If the pipe has already failed, the first reason is kept.
 
@@ -316,17 +317,18 @@ class Pipe:
         Parameters
         ----------
         item
-            Plain data such as numbers, strings, bytes, lists and dicts. It travels through the
-            scheduler, so it should be small. Put the key of a task instead of its future.
+            Plain data such as numbers, strings, bytes, lists and dicts. Items pass through the
+            scheduler, so they should be small. Instead of a future, put the key of its task.
         timeout_s
-            Maximum wait in seconds.
+            Maximum time to wait, in seconds.
         unbounded
-            Whether to ignore the capacity, for producers that limit their items themselves.
+            Whether to ignore the capacity. This is intended for producers that limit the number of
+            items themselves.
 
         Raises
         ------
         PipeClosed
-            If the pipe was closed.
+            If the pipe is closed.
         PipeFailed
             If the pipe has failed. The message contains the reason.
         TimeoutError
@@ -337,11 +339,11 @@ class Pipe:
     def put_many(
         self, items: Iterable[Any], timeout_s: float | None = None, *, unbounded: bool = False
     ) -> None:
-        """Add several items in order, up to `capacity` items per request, and wait like `put`.
+        """Add several items in order, and wait while the pipe is full.
 
-        The iterable may be infinite. Up to `capacity` items are read before they are sent. If an
-        error is raised, for example because `timeout_s` was too short, some of the items may
-        already be in the pipe.
+        The iterable may be infinite. Up to `capacity` items at a time are read and sent in one
+        request. This method raises the same errors as `put`. If an error is raised, for example
+        because `timeout_s` was too short, some of the items may already be in the pipe.
         """
         deadline = _deadline(timeout_s)
         source = iter(items)
@@ -359,7 +361,7 @@ class Pipe:
     # -- consumers ---------------------------------------------------------------------
 
     def poll(self, timeout_s: float = 0.0) -> tuple[Any, bool]:
-        """Take the next item if there is one in time, like MATLAB's ``[item, ok] = poll(queue)``.
+        """Return the next item if one arrives in time, like MATLAB's ``[item, ok] = poll(queue)``.
 
         Unlike this method, `get` raises `TimeoutError` if there is no item, and `PipeClosed` at the
         end of the pipe.
@@ -367,15 +369,15 @@ class Pipe:
         Parameters
         ----------
         timeout_s
-            Maximum wait in seconds. By default, this method does not wait.
+            Maximum time to wait, in seconds. By default, this method does not wait.
 
         Returns
         -------
         item
-            The item, or None.
+            The item, or None if there is none.
         ok
-            Whether there was an item. If the pipe is closed and empty, False is returned without
-            waiting.
+            Whether there was an item. If the pipe is closed and empty, this method returns False
+            without waiting.
 
         Raises
         ------
@@ -391,7 +393,7 @@ class Pipe:
         return None, False
 
     def drain(self) -> list[Any]:
-        """Take all queued items, possibly none, without waiting.
+        """Remove and return all queued items, possibly none, without waiting.
 
         Raises
         ------
@@ -402,15 +404,15 @@ class Pipe:
         return self._unpack(self._remove())
 
     def get_all(self, timeout_s: float | None = None, *, linger_s: float = 0.0) -> list[Any]:
-        """Take all queued items, and wait until there is at least one.
+        """Remove and return all queued items, after waiting until there is at least one.
 
         Parameters
         ----------
         timeout_s
-            Maximum wait in seconds.
+            Maximum time to wait, in seconds.
         linger_s
-            Maximum wait in seconds for further items after the first one, at most 1. A full pipe
-            ends this wait.
+            Maximum time to wait for further items after the first one, in seconds, at most 1. The
+            wait ends early if the pipe is full.
 
         Raises
         ------
@@ -429,10 +431,10 @@ class Pipe:
             self._raise_at_end(reply, deadline, timeout_s)
 
     def get(self, timeout_s: float | None = None) -> Any:
-        """Take the next item, and wait until there is one.
+        """Remove and return the next item, after waiting until there is one.
 
-        After the first item, it waits up to 2 ms for further items. It raises the same errors as
-        `get_all`.
+        After the first item has arrived, this method waits up to 2 ms for further items, which the
+        next calls return. It raises the same errors as `get_all`.
         """
         deadline = _deadline(timeout_s)
         while True:
@@ -510,10 +512,11 @@ class Pipe:
                 yield self.get()
 
     def listen(self, function: Callable[[Any], Any]) -> Listener:
-        """Start to call a function in this process for each item, until the pipe ends.
+        """Start calling a function in this process for each item, until the pipe ends.
 
-        The function is called in the order of the items, in one thread. The listener is an ordinary
-        consumer of the pipe, so it does not receive items that other consumers take.
+        The function is called in a single background thread, in the order of the items. The
+        listener is an ordinary consumer of the pipe, so it does not receive items that other
+        consumers take.
 
         Parameters
         ----------
@@ -524,9 +527,9 @@ class Pipe:
         Returns
         -------
         Listener
-            Its `join` waits for the end of the pipe and of the last call, and raises the error of
-            the function. Its `close` stops listening. At the end of a ``with`` block, the listener
-            is joined, or closed if the block raises an error.
+            Its `join` method waits until the pipe has ended and the last call has returned, and
+            raises the function's error, if any. Its `close` method stops listening. At the end of a
+            ``with`` block, the listener is joined, or closed if the block raises an error.
 
         Examples
         --------

@@ -275,7 +275,7 @@ class Pipes(SchedulerPlugin):
         # deleted, and so did a producer whose consumer was gone.
         if finish == "erred":
             blamed = task.exception_blame or task
-            error = blamed.exception_text or "the workers that ran it died"
+            error = blamed.exception_text or "the workers that ran the task died"
             self._fail_soon(names, f"Task {task.key!r}, which uses the pipe, failed: {error}.")
         elif finish == "forgotten" and task.key in self._released:
             reason = (
@@ -412,27 +412,27 @@ class Pipes(SchedulerPlugin):
         limit: int = sys.maxsize,
         task: str = "",
     ) -> Replies:
-        """Take items of pipes, after a wait for an item, or for the end of a pipe or a task.
+        """Take items from pipes after waiting for an item or for the end of a pipe or a task.
 
         Parameters
         ----------
         names
             Pipes to take from.
         asker
-            Id of the client. A client that has left gets no items.
+            ID of the client. A client that has left receives no items.
         seconds
-            Longest wait.
+            Maximum wait.
         linger_s
-            Longest wait for further items after the first, within `seconds`.
+            Maximum wait for further items after the first one, within `seconds`.
         keys
-            Tasks whose end ends the wait.
+            Tasks whose end also ends the wait.
         puts
-            Items by pipe, which are put before the wait, whatever the capacity of the pipe.
+            Items by pipe, which are put before the wait regardless of the capacity of the pipe.
         limit
-            Number of items to take of each pipe; with 0, the request waits for the end of a pipe
-            or a task.
+            Number of items to take from each pipe. If it is 0, the request waits for the end of a
+            pipe or a task.
         task
-            Key of the task that asks, or "" outside tasks.
+            Key of the requesting task, or "" outside tasks.
         """
         for name, items in (puts or {}).items():
             self.put([name], asker, items, unbounded=True, seconds=0.0)

@@ -32,12 +32,12 @@ logger = logging.getLogger(__name__)
 
 
 class Pool:
-    """Workers of a Dask cluster that can be divided into partitions.
+    """Pool of Dask workers that can be divided into partitions.
 
     `Pool.from_client` returns all workers of a cluster. `partition` creates a partition, and
-    returns it together with a pool of the remaining workers. `divide` creates several partitions by
-    rules. A pool is a view of the running cluster: workers that join later belong to it, and each
-    use requests the current state from the scheduler.
+    returns it together with a pool of the remaining workers. `divide` creates several partitions
+    according to rules. A pool is a view of the running cluster: it includes workers that join
+    later, and each access requests the current state from the scheduler.
 
     If workers were started with ``--resources "GPU=1"``, the cluster is already divided, and
     ``pool["GPU"]`` returns the partition. At the end of a ``with pool:`` block, the partitions that
@@ -67,16 +67,16 @@ class Pool:
 
     @classmethod
     def from_client(cls, client: Client, declaring: Set[str] | None = None) -> Pool:
-        """Return a pool of all workers of the client's cluster.
+        """Return a pool of all workers in the client's cluster.
 
-        Workers that join later belong to the pool as well.
+        The pool also includes workers that join later.
 
         Parameters
         ----------
         client
             Client of the cluster.
         declaring
-            Names of resources. If given, the pool only contains workers that declare one of them.
+            Names of resources. If given, the pool contains only workers that declare one of them.
             Other workers are not contacted and do not need this package.
 
         Raises
@@ -108,27 +108,28 @@ class Pool:
         idle_s: float = math.inf,
         **options: Any,
     ) -> Pool:
-        """Start a cluster on this machine, with partitions and a client.
+        """Start a cluster with partitions on this machine, and return its pool.
 
-        At the end of a ``with`` block, the cluster is closed, even if tasks are running. The
-        workers are processes. A script does not need a main guard.
+        At the end of a ``with`` block, the cluster is closed, even if tasks are running. Each
+        worker is a separate process. Scripts do not need an ``if __name__ == "__main__":`` guard.
 
         Parameters
         ----------
         partitions
-            Mapping of each name to (number of workers, slots of each worker). A worker has as many
-            threads as slots.
+            Mapping of each partition name to (number of workers, slots per worker). A worker has as
+            many threads as slots.
         idle_s
-            Time in seconds after which the cluster is also closed if there is no task, no result
-            that a client holds, and no pipe. A warning is logged, and the pool can no longer be
-            used.
+            Time in seconds after which an idle cluster is closed. The cluster is idle if it has no
+            tasks, no results that a client holds, and no pipes. When it is closed, a warning is
+            logged, and the pool can no longer be used.
         options
-            Further options of `poolpart.deploy.local_cluster`.
+            Further options for `poolpart.deploy.local_cluster`.
 
         Raises
         ------
         PoolError
-            If there would be no workers, if a number is invalid, or if the workers do not start.
+            If `partitions` requests no workers, if a number is invalid, or if the workers do not
+            start.
 
         Examples
         --------
@@ -191,8 +192,8 @@ class Pool:
     def workers(self) -> tuple[WorkerInfo, ...]:
         """Workers that currently belong to the pool, with their GPUs.
 
-        The remainder of a division contains the workers without a partition. Only workers that have
-        joined since the last access are asked for their GPUs.
+        If the pool is the remainder of a division, these are the workers without a partition. Only
+        workers that have joined since the last access are queried for their GPUs.
         """
         if self._belongs is not None:
             present = [worker for worker in all_workers(self.client) if self._belongs(worker)]
@@ -212,9 +213,9 @@ class Pool:
     def partitions(self) -> dict[str, Partition]:
         """Return all partitions of the cluster by name, including those without workers.
 
-        These are the partitions that were created by a division, adaptive partitions, and the
-        partitions that workers were started with. A partition of the last kind has a `note` if the
-        numbers of slots and threads of a worker differ.
+        These are the partitions that a division has created, adaptive partitions, and the
+        partitions that workers were started with. A partition of the last kind has a `note` if a
+        worker's number of slots differs from its number of threads.
 
         Examples
         --------
@@ -233,14 +234,15 @@ class Pool:
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
         """Check that partitions have enough slots before tasks are submitted.
 
-        In plain Dask, a task waits forever without a message if no worker declares its resource.
+        In plain Dask, if no worker declares the resource of a task, the task waits forever without
+        a message.
 
         Parameters
         ----------
         slots
-            Required number of slots by partition.
+            Required number of slots of each partition, by name.
         purpose
-            Purpose of the slots by partition, which is included in the error message.
+            Purpose of the slots of each partition, by name. It is included in the error message.
 
         Raises
         ------
@@ -299,18 +301,19 @@ class Pool:
             )  # what came first counts
 
     def divide(self, rules: Mapping[str, Rule]) -> dict[str, Partition]:
-        """Divide this pool by rules, which remain in force after this client has closed.
+        """Divide this pool into partitions according to rules.
 
-        Each rule selects from the workers that the previous rules have left. The scheduler keeps
-        the rules: it assigns workers that join later, first to partitions with missing workers, and
-        starts waiting tasks on them. A restarted worker returns to its partition, and its place is
-        kept for half a minute. An adaptive cluster keeps the workers that a partition needs for its
-        minimum.
+        Each rule selects from the workers that the previous rules have not selected. The rules
+        remain in force after this client has closed: the scheduler assigns workers that join later,
+        first to partitions with missing workers, and sends waiting tasks to them. A restarted
+        worker returns to its partition, where its place is reserved for half a minute. An adaptive
+        cluster keeps the workers that a partition needs for its minimum.
 
         Parameters
         ----------
         rules
-            Rule of each partition by name: `per_gpu`, `per_host`, `n_workers`, `named` or `rest`.
+            Mapping of partition names to rules (`per_gpu`, `per_host`, `n_workers`, `named` or
+            `rest`).
 
         Returns
         -------
@@ -349,10 +352,11 @@ class Pool:
     ) -> tuple[Partition, Pool]:
         """Create a partition from workers of this pool.
 
-        Pass exactly one selector, which selects from the current workers of the pool. The selected
-        workers declare the Dask resource `name`, also after their nanny has restarted them. Pending
-        tasks that request the resource are sent to them. Workers of other partitions are not
-        selected. Workers that join later are selected by the same rule, as with `divide`.
+        Pass exactly one of the selectors `max_workers_per_gpu`, `max_workers_per_host`, `n_workers`
+        and `workers`. It selects from the current workers of the pool that do not belong to another
+        partition. The selected workers declare the Dask resource `name`, even after their nanny has
+        restarted them. Pending tasks that request the resource are sent to them. Workers that join
+        later are selected by the same rule, as with `divide`.
 
         Parameters
         ----------
@@ -425,8 +429,8 @@ class Pool:
         Raises
         ------
         PoolError
-            If poolpart is not installed in the environment of the scheduler, or if the scheduler
-            has no HTTP server.
+            If poolpart is not installed in the scheduler's environment, or if the scheduler has no
+            HTTP server.
 
         Examples
         --------
@@ -436,7 +440,7 @@ class Pool:
         return partitions_page(self.client)
 
     def pipes(self) -> list[str]:
-        """Return the names of all pipes of the cluster, created by any client.
+        """Return the names of all pipes in the cluster, whichever client created them.
 
         Dask's ``Queue(name)`` contains the items of a pipe, and ``Variable(name)`` its state.
         """
@@ -450,13 +454,14 @@ class Pool:
         """Dissolve all partitions that any client has created on this cluster.
 
         Workers declare their original resources again. Rules, statistics and the page are removed,
-        and exclusive partitions end. Results that a client holds are kept. If such a result is
-        lost, any worker may recompute it. Partitions that workers were started with remain.
+        and exclusive workers accept other tasks again. Results that a client holds are kept. If
+        such a result is lost, any worker may recompute it. Partitions that workers were started
+        with remain.
 
         Parameters
         ----------
         timeout_s
-            Maximum time in seconds to wait for the tasks of the partitions.
+            Maximum time in seconds to wait for the tasks of the partitions to finish.
 
         Returns
         -------

@@ -23,11 +23,12 @@ class Rule:
     slots
         Number of tasks that each worker runs at the same time. By default, its number of threads.
     minimum
-        Minimum number of workers. Creating the partition with fewer workers is an error, and moving
-        workers never leaves it with fewer.
+        Minimum number of workers. A partition cannot be created with fewer workers, and moving
+        workers to other partitions never leaves it with fewer.
     exclusive
-        Whether to keep other tasks off the workers: tasks without a partition, collections, and
-        tasks of other users. Tasks that a worker already has finish on it.
+        Whether to keep other tasks off the workers, which are tasks without a partition,
+        collections, and tasks of other users. Other tasks that are already assigned to a worker
+        still finish there.
     """
 
     slots: int | None = None
@@ -41,17 +42,17 @@ class Rule:
                 check_count(f"`{name}` of the rule `{type(self).__name__}`", value, lower_bound)
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Select workers from the available ones, and prefer those that come first.
+        """Select workers from the available workers, preferring those that come first.
 
-        The base class selects none. It is the rule of partitions whose members were started with
-        the resource.
+        The base class selects no workers. It is the rule of partitions whose members were started
+        with the resource.
         """
         return []
 
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Return whether to add a worker to the members, where `everyone` lists all workers."""
+        """Return whether to add a worker to the members, given all workers (`everyone`)."""
         return len(self.choose([*members, worker])) > len(self.choose(members))
 
     @property
@@ -60,7 +61,7 @@ class Rule:
         return None
 
     def slots_of(self, worker: WorkerInfo) -> int:
-        """Return the number of slots that a worker has as a member."""
+        """Return the number of slots that a worker has in the partition."""
         return self.slots or worker.nthreads
 
 
@@ -97,7 +98,7 @@ class per_gpu(Rule):  # noqa: N801 - reads as a function, like the rules below
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
     ) -> bool:
-        """Return whether the worker has a spare GPU, or whether no worker has a GPU."""
+        """Return whether to add a worker, which must have a GPU if any worker has one."""
         if not worker.gpus and any(candidate.gpus for candidate in everyone):
             return False
         same_kind = [member for member in members if bool(member.gpus) == bool(worker.gpus)]
@@ -129,7 +130,7 @@ class per_host(Rule):  # noqa: N801
 
 @dataclass(frozen=True)
 class n_workers(Rule):  # noqa: N801
-    """Select a number of workers on any host.
+    """Select the given number of workers, regardless of their hosts.
 
     If the cluster has fewer workers, but at least `minimum`, workers that join later are added.
 
@@ -147,7 +148,7 @@ class n_workers(Rule):  # noqa: N801
 
     @property
     def target(self) -> int:
-        """The number of workers."""
+        """Number of workers that the rule requests."""
         return self.workers
 
 
@@ -174,7 +175,7 @@ class Named(Rule):
 
 @dataclass(frozen=True)
 class rest(Rule):  # noqa: N801
-    """Select all workers that no earlier rule selects, possibly none.
+    """Select all workers that no other rule has selected, possibly none.
 
     Only one rule of a division can be `rest`.
 
@@ -343,7 +344,7 @@ def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) 
     present = ", ".join(repr(worker.name) for worker in pool[:9])
     ending = ", …." if len(pool) > 9 else "."
     names = ", ".join(map(repr, rule.names))
-    return f"The rule names {names}, but the pool contains {present}{ending}{advice}"
+    return f"The rule selects {names}, but the pool contains {present}{ending}{advice}"
 
 
 def partition_for(

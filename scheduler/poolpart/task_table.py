@@ -18,14 +18,14 @@ _HEAD = ("state", "key", "function", "worker", "slots", "queued", "started", "se
 
 
 class TaskRow(NamedTuple):
-    """Task of a partition.
+    """Task of a partition, as a row of a `TaskTable`.
 
     Parameters
     ----------
     state
         "waiting" for results of other tasks, "queued" for a worker or for a slot of a worker,
         "running", "done" or "failed". The scheduler is not notified when a task starts, so it
-        counts as many tasks of a worker as running as the worker has slots.
+        assumes that a worker runs as many of its tasks as it has slots.
     key
         Key of the task and of its future.
     function
@@ -35,15 +35,16 @@ class TaskRow(NamedTuple):
     slots
         Number of slots of the partition that the task takes while it runs.
     queued
-        Time when all inputs were available and the task waited for a slot, or None. Also None if
-        the task existed before counting began.
+        Time when all inputs were available and the task began to wait for a slot. None if this has
+        not happened yet, or if the task existed before counting began.
     started, finished
-        Times when the task started and finished, according to the clock of the scheduler, or None.
-        The start of a running task is unknown until the first heartbeat of its worker.
+        Times when the task started and finished according to the scheduler's clock, or None. The
+        start of a running task is unknown until the first heartbeat of its worker.
     error
-        Error of a failed task in one line, or "".
+        Error of a failed task on a single line, or "" for other tasks.
     seconds
-        Running time in seconds, up to now for a running task, or None if the start is unknown.
+        Running time in seconds, or None if the start is unknown. For a running task, the time until
+        now.
     """
 
     state: str
@@ -61,9 +62,10 @@ class TaskRow(NamedTuple):
 class TaskTable(tuple[TaskRow, ...]):
     """Table of the tasks of a partition.
 
-    Unfinished tasks are listed first, by state, followed by finished tasks, newest first.
+    Unfinished tasks are listed first, grouped by state. They are followed by the finished tasks,
+    newest first.
 
-    `since` is the time in UTC when counting began. Tasks that had finished before are missing.
+    `since` is the time in UTC when counting began. Tasks that finished earlier are not included.
 
     Examples
     --------
@@ -74,9 +76,9 @@ class TaskTable(tuple[TaskRow, ...]):
 
     @classmethod
     def from_rows(cls, rows: Iterable[TaskRow], since: datetime | None = None) -> TaskTable:
-        """Return a table of rows, sorted by state.
+        """Create a table from rows, sorted by state.
 
-        Rows with the same state, and rows of finished tasks, keep their order.
+        Rows with the same state keep their order, and so do all rows of finished tasks.
         """
         table = cls(sorted(rows, key=lambda row: min(STATES.index(row.state), _ENDED)))
         table.since = since

@@ -23,22 +23,22 @@ _LOOK_S = 2.0  # between looks for silent workers
 
 @dataclass(frozen=True)
 class WorkerInfo:
-    """Description of a worker of a cluster.
+    """Description of a worker in a cluster.
 
     Parameters
     ----------
     name, address, host
-        Name, address and host of the worker. If its nanny restarts the worker, a name that was set
-        explicitly remains the same, while the address and a default name, which is derived from the
-        address, change.
+        Name, address and host of the worker. When its nanny restarts a worker, an explicitly set
+        name stays the same. The address changes, and with it the default name, which is derived
+        from the address.
     nthreads
         Number of threads.
     memory
         Memory limit in bytes, or 0 if there is none.
     gpus
-        UUIDs of the CUDA devices that the worker may use, by ordinal.
+        UUIDs of the CUDA devices that the worker may use, in the order of the device indices.
     resources
-        Dask resources that the worker declares, by name.
+        Quantities of the Dask resources that the worker declares, by name.
     """
 
     name: str
@@ -51,16 +51,16 @@ class WorkerInfo:
 
     @property
     def partitions(self) -> frozenset[str]:
-        """Names of the partitions of the worker, which are the resources with at least one slot."""
+        """Names of the worker's partitions, which are the resources with at least one slot."""
         return frozenset(name for name, slots in self.resources.items() if slots)
 
     def with_gpus(self, gpus: Iterable[str]) -> WorkerInfo:
-        """Return a copy with other GPUs."""
+        """Return a copy of this description with the given GPUs."""
         return replace(self, gpus=tuple(gpus))
 
     @classmethod
     def from_identity(cls, address: str, identity: Mapping[str, Any]) -> WorkerInfo:
-        """Return a worker from its description on the scheduler."""
+        """Create a description from the information that the scheduler has about a worker."""
         return cls(
             name=str(identity["name"]),
             address=address,

@@ -42,4 +42,4 @@ def test_sweeps_follow_one_another_and_the_end_is_told(new_tab):
         finally:
             over.set()
             thread.join()
-    tab.wait_for(lambda text: "The server of this page has stopped." in text)
+    tab.wait_for(lambda text: "The server for this page has stopped." in text)

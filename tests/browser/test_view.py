@@ -195,7 +195,7 @@ def test_a_question_that_fails_is_named(view, new_tab):
 
     with page_server(answer, port=0) as page:
         tab = opened(new_tab, page)
-        words = 'The server could not answer "surface" (500 Internal Server Error).'
+        words = 'The request "surface" failed (500 Internal Server Error).'
         tab.wait_for(lambda text: words in text)
         assert drawn(tab) == COUNT
 
@@ -694,7 +694,7 @@ def test_the_page_says_that_its_server_has_ended(view, new_tab):
         tab = opened(new_tab, page)
         tab.wait_for(lambda _: drawn(tab) == COUNT)
     tab.key("ArrowRight")
-    tab.wait_for(lambda text: "server of this page has stopped" in text)
+    tab.wait_for(lambda text: "server for this page has stopped" in text)
 
 
 def test_actors_deform_with_the_time(view, new_tab, tmp_path):

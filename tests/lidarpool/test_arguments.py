@@ -212,7 +212,7 @@ WRONG = {
     ],
     sweeps: [
         (3, "location must … but is 3"),
-        ("nowhere", "nowhere does not exist. Specify the folder of a data set"),
+        ("nowhere", "nowhere does not exist. Specify the output folder of a campaign"),
     ],
     to_dask: [
         (3, "points must … but is 3"),

@@ -511,11 +511,9 @@ def test_actors_are_compensated_in_both_coordinates(coordinates):
 
 def test_formats_without_sweeps_refuse_to_move_the_points_of_actors():
     for name in ("laz", "parquet", "pcap"):
-        with pytest.raises(
-            LidarError, match=f"{name} does not have the option `compensated_actors"
-        ):
+        with pytest.raises(LidarError, match=f"{name} does not support `compensated_actors"):
             Format(name, compensated_actors=True)
-    with pytest.raises(LidarError, match="kitti does not have the option `pose_rate_hz`"):
+    with pytest.raises(LidarError, match="kitti does not support `pose_rate_hz`"):
         Format("kitti", pose_rate_hz=10)
     assert "time" in Format("kitti", compensated_actors=True).needs
 

@@ -121,7 +121,7 @@ def test_page_shows_what_failed_and_why(card):
     page = (folder / "report.html").read_text()
     assert page.startswith("<!DOCTYPE html>")
     assert "1 failed job" in page and "no &lt;b&gt;surface&lt;/b&gt; | in range" in page
-    assert "1 job of the campaign is missing in the table" in page
+    assert "1 job of the campaign is missing from the table" in page
     assert page.count("<svg viewBox") == 3 and "var(--picture-ink" in page
     assert "campaign.yaml --retry-failed" in page
 
@@ -215,7 +215,7 @@ def test_an_earlier_report_goes_first(tmp_path):
 
 @pytest.mark.parametrize("split", ["../x", "a/b", "-", "a\nb"])
 def test_splits_are_names_of_files(tmp_path, split):
-    with pytest.raises(LidarError, match="is not a valid name for a split"):
+    with pytest.raises(LidarError, match="is not a valid split name"):
         write(Storage.at(tmp_path), [row(0, split=split)])
 
 

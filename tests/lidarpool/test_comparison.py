@@ -204,8 +204,8 @@ def test_the_first_of_several_returns_counts():
 @pytest.mark.parametrize(
     ("numbers", "note"),
     [
-        (np.arange(RINGS) + 1, "ring n of A is ring n - 1 of B"),
-        (RINGS - 1 - np.arange(RINGS), "ring n of A is ring 15 - n of B"),
+        (np.arange(RINGS) + 1, "ring n of A corresponds to ring n - 1 of B"),
+        (RINGS - 1 - np.arange(RINGS), "ring n of A corresponds to ring 15 - n of B"),
         (
             np.arange(RINGS) * 7 % RINGS,
             "the rings of the two clouds are numbered in different orders",
@@ -229,7 +229,7 @@ def test_what_has_no_range_image_says_why():
         (
             replace(made, columns=ringless),
             made,
-            "cloud A has no column with rings, such as ring or channel",
+            "cloud A has no ring column, such as `ring` or `channel`",
         ),
         (
             made,
@@ -242,7 +242,7 @@ def test_what_has_no_range_image_says_why():
             "cloud B are 5,423 km from the origin",
         ),
         (made, replace(made, positions=made.positions * [1, 1, 9]), "come from different sensors"),
-        (whole, whole, "cloud A has no sweeps. All points are compared at once in world"),
+        (whole, whole, "cloud A has no sweeps, so all points are compared at once in world"),
         (made, whole, "cloud B has no sweeps"),
     ):
         found = compare(a, b).figures
@@ -260,10 +260,7 @@ def test_of_many_points_and_cells_some_are_compared(monkeypatch):
     assert "2,000 points and cells" in found["notes"][0]
     whole = Cloud(cloud().positions, {})
     thin = compare(whole, whole, max_points=3000).figures
-    assert (
-        thin["a"]["points"] == 3000
-        and "11,520 points, of which 26 % are compared" in thin["notes"][1]
-    )
+    assert thin["a"]["points"] == 3000 and "26 % of the 11,520 points" in thin["notes"][1]
     assert "from 2,000 points of each cloud" in thin["notes"][3]
     assert thin["distances"]["a_to_b"]["points"] == 2000
 
@@ -478,8 +475,8 @@ def test_a_thinned_result_has_no_lost_returns(written, tmp_path):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     (tmp_path / "report.json").write_text(json.dumps({"parameters": {"keep_every": 5}}))
     found = compare(tmp_path, folder).figures
-    assert found["ranges"]["no_return"] is None and "one of 5 hits" in found["notes"][0]
-    assert "one of 5 hits" in repr(compare(tmp_path, folder))
+    assert found["ranges"]["no_return"] is None and "only one in every 5 hits" in found["notes"][0]
+    assert "only one in every 5 hits" in repr(compare(tmp_path, folder))
 
 
 @pytest.mark.parametrize("scans_in_rings", [True, False])
@@ -580,7 +577,7 @@ def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
     for options, says in (
         (
             {"sweeps": [3]},
-            r"There is no pair 3 of sweeps\. Pairs are numbered from 0, and there are 3",
+            r"Sweep pair 3 does not exist\. Pairs are numbered from 0 to 2",
         ),
         ({"sensor_a": "roof"}, r"does not contain 'roof'\. Its sensors have no names"),
         ({"sensor_b": "/points"}, "does not contain '/points'"),
@@ -640,7 +637,7 @@ def test_a_ring_that_only_one_sees_is_noted():
     there = np.ones((RINGS, COLUMNS), bool)
     there[3] = False
     notes = compare(cloud(there=there), cloud()).figures["notes"]
-    assert "only one of the clouds has returns of 1 ring" in str(notes)
+    assert "1 ring has returns in only one of the clouds" in str(notes)
 
 
 def test_maps_of_georeferenced_clouds_have_short_numbers():

@@ -222,7 +222,7 @@ WRONG = {
     "some heights": (
         TREE | {"table": "some.csv"},
         ("its column 'z' contains '' in line 5. Each row must have a number in this column. "
-         "Otherwise, ignore the column."),
+         "Correct the value, or ignore the column."),
     ),
     "angle": (
         TREE | {"table": "yaw.csv"},

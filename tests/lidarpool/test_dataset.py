@@ -253,7 +253,9 @@ def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
 def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):
     place = Storage.at(tmp_path / "d")
     bare = Cloud(job(0).positions, {"scan": job(0).scan})
-    with pytest.raises(LidarError, match="kitti requires object, reflectivity and class"):
+    with pytest.raises(
+        LidarError, match="kitti requires the columns object, reflectivity and class"
+    ):
         DataSet(place, "kitti").write_job(JobRow(0, "0"), bare, sweeps)
     assert DataSet(place, "kitti").columns == ("scan", "object", "reflectivity", "class")
     assert DataSet(place, "folder").columns == ()
@@ -261,7 +263,7 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
     half = replace(sweeps, scans=sweeps.scans[:4], begins_ns=sweeps.begins_ns[:3])
     with pytest.raises(LidarError, match="not in scan order, or come from a different"):
         DataSet(place, "kitti").write_job(JobRow(0, "0"), job(0), half)
-    with pytest.raises(LidarError, match=r"Job 5 of .* is incomplete: its \.jobs/5\.json"):
+    with pytest.raises(LidarError, match=r"Job 5 of .* is incomplete, because \.jobs/5\.json"):
         DataSet(place, "kitti").finish([JobRow(5, "5")])
     assert not (tmp_path / "d" / INDEX_FILE).exists()
     (tmp_path / "file").write_text("")

@@ -249,7 +249,7 @@ def test_the_unit_of_a_long_object_is_asked_for(tmp_path, file, length, noted):
     (tmp_path / file).write_bytes(capsule.export(file_type=file[-3:]))
     built = build(Scenario.load(tmp_path / file))
     notes = " ".join(advice(built))
-    assert "was recognized as an object" in notes and ("possibly mm, or pass" in notes) == noted
+    assert "was recognized as an object" in notes and ("possibly mm), or pass" in notes) == noted
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj"])

@@ -38,11 +38,11 @@ def test_nothing_is_wrong_without_a_gpu():
         ),
         (
             {"machine": {"available_memory_gib": 0.4, "disk_gib": {}}},
-            "0.4 GiB of memory are",
+            "0.4 GiB of memory is",
         ),
         (
             {"machine": {"available_memory_gib": 9, "disk_gib": {"/tmp": 0.2}}},
-            "0.2 GiB are free on the disk",
+            "only 0.2 GiB of free space",
         ),
         ({"second_copy": "There are two copies"}, "There are two copies"),
         ({"open3d": "it lacks libGL", "gpus": ["GPU-1"]}, "it lacks libGL"),
@@ -125,7 +125,7 @@ def test_a_copy_that_hides_an_editable_installation_is_reported(install):
     assert installed_copies.second_copy() == ""
     checkout, site = install(in_site=PACKAGES, editable=True)
     assert installed_copies.second_copy() == (
-        f"There are two copies of lidarpool: it is imported from {site}, so that changes in "
+        f"There are two copies of lidarpool: it is imported from {site}, so changes in "
         f"{checkout} have no effect. Uninstall lidarpool, lidarsim, poolpart and raybeam, then run "
         + install_command("lidarpool")
     )

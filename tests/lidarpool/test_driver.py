@@ -652,7 +652,7 @@ def test_a_scene_that_kills_whoever_casts_it_is_told_after_a_few_deaths(run, adv
         return run.ended
 
     run.until(strike)
-    assert run.fails().startswith("3 casting workers in a row died in their first batch")
+    assert run.fails().startswith("3 casting workers in a row died while casting their first batch")
     assert len(deaths) <= 10
 
 

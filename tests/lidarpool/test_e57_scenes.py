@@ -156,7 +156,7 @@ def test_a_zero_quaternion_is_no_rotation_with_a_note(path):
     scans = [{"fields": wall(), "pose": pose(10.0, (0.0, 0.0, 0.0, 0.0)), "name": "hall"}]
     scene, notes = scene_and_notes(path, scans)
     np.testing.assert_allclose(scene.bounds[:, 0], 15, atol=1e-6)
-    expected = "has a zero quaternion in the pose of scan 1 ('hall'). The scan is not rotated"
+    expected = "has a zero quaternion in the pose of scan 1 ('hall'), so the scan is not rotated"
     recording = open_recording(path)
     assert notes == [expected] and recording.notes == (f"{path} {expected}",)
     np.testing.assert_array_equal(recording.poses([0])[0][:3, :3], np.eye(3))
@@ -220,8 +220,7 @@ def test_scans_with_other_limits_have_the_same_scale(path, first, second):
     for side in (x < 10, x > 10):
         assert set(red[side].tolist()) == {GRAY, 255}
     assert notes == [
-        "states the scale of its intensities in intensityLimits. The intensities were scaled to "
-        "the range 0 to 1"
+        "specifies intensityLimits, so its intensities were scaled to the range 0 to 1"
     ]
     read = [open_recording(path).read_points(number).intensities for number in range(2)]
     np.testing.assert_allclose(*read, atol=1e-6)
@@ -252,7 +251,7 @@ def test_scans_with_and_without_limits_are_noted(path):
     ]
     _, notes = scene_and_notes(path, scans)
     assert notes == [
-        "has scans with and without intensityLimits. Their intensities are used as stored"
+        "has scans with and without intensityLimits, so their intensities are used as stored"
     ]
 
 

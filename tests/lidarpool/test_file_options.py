@@ -28,13 +28,13 @@ def refused(**entry):
 def test_options_are_named_with_the_formats_that_have_them():
     entry = {"file": "a.obj", "sag_m": 0.1, "storeys": ["Attic"], "keyframe": "home"}
     assert refused(**entry, groups=[0]) == (
-        "scenario: scene.files[0]: a.obj has no sag_m, an option of .xodr; no storeys, an option "
-        "of .ifc .ifczip; no keyframe and groups, options of .xml: leave out sag_m, storeys, "
+        "scenario: scene.files[0]: a.obj does not support sag_m (an option of .xodr), storeys (an "
+        "option of .ifc .ifczip), keyframe and groups (options of .xml). Remove sag_m, storeys, "
         "keyframe and groups."
     )
     assert refused(file="a.urdf", geometry="visual") == (
-        "scenario: scene.files[0]: a.urdf has no geometry, an option of .sdf .world: leave out "
-        "geometry."
+        "scenario: scene.files[0]: a.urdf does not support geometry (an option of .sdf .world). "
+        "Remove geometry."
     )
 
 
@@ -61,7 +61,7 @@ def test_faults_of_options(entry, message):
 
 def test_a_misspelt_option_in_python(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(LidarError, match=r"no opactiy: leave out opactiy. Did you mean 'opacity'"):
+    with pytest.raises(LidarError, match=r"Remove opactiy. Did you mean 'opacity'"):
         Scene.load(tmp_path / "a.obj", opactiy="mask")
     with pytest.raises(LidarError, match="unit cannot be 'mile'"):
         Scene.load(tmp_path / "a.obj", unit="mile")

@@ -232,7 +232,7 @@ def test_compensated_points_are_at_the_start_of_the_sweep_without_times(
 @pytest.mark.parametrize("compensated", [False, True])
 def test_pcd_and_bags_say_which_frame_their_points_have(tmp_path, compensated):
     made = Drive("velodyne/vlp16")
-    words = "sensor's axes at the " + ("start of the sweep" if compensated else "firing of each")
+    words = "sensor frame at the " + ("start of the sweep" if compensated else "time of firing")
     save_cloud(made.cloud(), tmp_path / "bag", format="rosbag2", compensated=compensated)
     written = load_yaml((tmp_path / "bag/metadata.yaml").read_text())
     assert words in written["rosbag2_bagfile_information"]["custom_data"]["lidarpool"]
@@ -256,7 +256,7 @@ def test_ply_and_parquet_say_which_frame_their_points_have(tmp_path, coordinates
     cloud = Drive("velodyne/vlp16").cloud(coordinates)
     save_cloud(cloud, tmp_path / "cloud.ply", precision_m=1e-6)
     head = (tmp_path / "cloud.ply").read_bytes().split(b"end_header")[0]
-    assert (b"comment points in the sensor's axes at the firing" in head) == (
+    assert (b"comment points in the sensor frame at the time of firing" in head) == (
         coordinates == "sensor"
     )
     assert len(read_cloud(tmp_path / "cloud.ply")) == len(cloud)
@@ -272,7 +272,7 @@ def test_samples_for_training_are_in_the_sensors_axes_and_say_so(tmp_path, coord
     made = Drive("velodyne/vlp16")
     world = made.cloud()
     cloud = made.cloud(coordinates)
-    words = "start of the sweep" if coordinates == "world" else "firing of each"
+    words = "start of the sweep" if coordinates == "world" else "time of firing"
     save_cloud(cloud, tmp_path / "tars", format="webdataset")
     save_cloud(cloud, tmp_path / "images", format="images")
     (shard,) = (tmp_path / "tars").rglob("*.tar")
@@ -290,7 +290,7 @@ def test_samples_for_training_are_in_the_sensors_axes_and_say_so(tmp_path, coord
             placed = np.stack([image[axis].T[returned] for axis in "xyz"], axis=1)
             np.testing.assert_array_equal(image["pose"], arrays["pose"])
         np.testing.assert_array_equal(placed, arrays["points"])
-        assert f"sensor's axes at the {words}" in said
+        assert f"sensor frame at the {words}" in said
         pose = arrays["pose"]
         in_world = placed @ pose[:3, :3].T + pose[:3, 3]
         alike = np.allclose(in_world, points.positions, atol=5e-5)
@@ -422,7 +422,7 @@ def test_what_contradicts_a_frame_is_noted():
     for one in (Format("laz"), Format("kitti"), Format("mcap", compensated=True)):
         (note,) = one.contradictions("sensor")
         assert "cloud.coordinates" in note
-    with pytest.raises(LidarError, match="kitti does not have the option `compensated`"):
+    with pytest.raises(LidarError, match="kitti does not support `compensated`"):
         Format("kitti", compensated=True)
 
 
@@ -597,7 +597,7 @@ def test_scan_angles_are_from_nadir_across_the_flight_with_roll(tmp_path, head, 
     assert 20 < np.abs(scan_angle).max() < 24  # 14 of the mirror and 8 of roll
     np.testing.assert_array_equal(exact["azimuth"], cloud.azimuth)
     (frame,) = (vlr for vlr in exact.header.vlrs if vlr.record_id == 3)
-    assert ("world" if coordinates == "world" else "firing of each") in str(frame.record_data)
+    assert ("world" if coordinates == "world" else "time of firing") in str(frame.record_data)
 
 
 @pytest.mark.extended

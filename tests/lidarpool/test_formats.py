@@ -157,7 +157,7 @@ def test_las_has_fields_of_its_own_and_the_rest_in_extra_bytes(written, cloud, n
     assert (las.header.point_format.id, str(las.header.version)) == (6, "1.4")
     assert las.header.global_encoding.wkt  # without which PDAL refuses it
     told = {column.name: column.description for column in las.point_format.extra_dimensions}
-    assert told["range"] == "m distance from the beam's"  # 32 bytes at most, whole words
+    assert told["range"] == "m distance from the beam origin"  # 32 bytes at most, whole words
     np.testing.assert_allclose(las.xyz, cloud.positions, atol=1e-6)
     np.testing.assert_allclose(las.gps_time, cloud.time / 1e9, atol=1e-12)
     np.testing.assert_allclose(las.intensity / 65_535, cloud.intensity, atol=1e-5)
@@ -437,7 +437,7 @@ def test_the_full_scale_can_be_set(cloud, sweeps, tmp_path):
     save_cloud(cloud, tmp_path / "a.las", intensity_full_scale=2.5)
     las = laspy.read(tmp_path / "a.las")
     np.testing.assert_allclose(las.intensity / 65_535 * 2.5, cloud.intensity, atol=2e-5)
-    with pytest.raises(LidarError, match="e57 does not have the option `intensity_full_scale`"):
+    with pytest.raises(LidarError, match="e57 does not support `intensity_full_scale`"):
         Format("e57", intensity_full_scale=1.0)
     with pytest.raises(LidarError, match="intensity_full_scale"):
         Format("las", intensity_full_scale=0.0)
@@ -527,9 +527,13 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     cloud, sweeps, tmp_path, monkeypatch
 ):
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
-    with pytest.raises(LidarError, match=r"kitti requires reflectivity and class, .*output\.write"):
+    with pytest.raises(
+        LidarError, match=r"kitti requires the columns reflectivity and class, which.*output\.write"
+    ):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
-    with pytest.raises(LidarError, match="mcap with the layout ouster requires signal, time"):
+    with pytest.raises(
+        LidarError, match="mcap with the layout ouster requires the columns signal, time"
+    ):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     (tmp_path / "cloud.laz").write_text("mine")
     with pytest.raises(LidarError, match=r"exists.* `--overwrite`"):
@@ -758,7 +762,11 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
 
     before = sorted(tmp_path.rglob("*"))
     for told, path, more in (
-        (r"does not belong to a format\. Use .ply, .las, .*, or specify a format", "x.xyz", {}),
+        (
+            r"does not belong to any supported format\. Use .ply, .las, .*, or set `format`",
+            "x.xyz",
+            {},
+        ),
         ("Unknown cloud format 'xyz'. The available names are ply, las, ", "x", {"format": "xyz"}),
         ("layout must be 'velodyne', .* but is 'sick'", "x.mcap", {"layout": "sick"}),
         (r"is a folder\. Remove it, or use another path", "kitti", {"format": "kitti"}),
@@ -774,7 +782,7 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     with pytest.raises(LidarError, match="mcap stores single sweeps, but"):
         save_cloud(bare, tmp_path / "x.mcap")
     with pytest.raises(
-        LidarError, match="kitti requires scan, object, reflectivity and class, but"
+        LidarError, match="kitti requires the columns scan, object, reflectivity and class, which"
     ):
         save_cloud(
             Cloud(cloud.positions, {}, sweeps=lambda: sweeps), tmp_path / "x", format="kitti"

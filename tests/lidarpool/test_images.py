@@ -243,7 +243,9 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
     sweeps.save(tmp_path / "sweeps.npz")
     with pytest.raises(LidarError, match="they can only be written during the run"):
         Format("images").write(tmp_path / "i", cloud, Sweeps.load(tmp_path / "sweeps.npz"))
-    with pytest.raises(LidarError, match="requires ray and range, but the cloud has"):
+    with pytest.raises(
+        LidarError, match="requires the columns ray and range, which the cloud does"
+    ):
         Cloud = type(cloud)  # noqa: N806
         bare = Cloud(cloud.positions, {"scan": cloud.scan, "channel": cloud.channel})
         Format("images").write(tmp_path / "i", bare, sweeps)

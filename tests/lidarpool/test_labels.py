@@ -29,7 +29,7 @@ def table_below(heading):
 
 
 def test_the_table_of_labels_is_that_of_the_registry():
-    page = table_below("What each format holds")
+    page = table_below("Labels in each format")
     assert page.keys() == FORMATS.keys()
     for name, row in FORMATS.items():
         thing, semantic_class, boxes = page[name]

@@ -49,13 +49,13 @@ def top_of(path, **options):
     [
         (6, {"withheld": marks(1)}, "300 withheld points"),
         (1, {"withheld": marks(1)}, "300 withheld points"),
-        (6, {"classification": marks(7, 2)}, "300 points of noise"),
-        (3, {"classification": marks(7, 2)}, "300 points of noise"),
-        (7, {"classification": marks(18, 2)}, "300 points of noise"),
+        (6, {"classification": marks(7, 2)}, "300 noise points"),
+        (3, {"classification": marks(7, 2)}, "300 noise points"),
+        (7, {"classification": marks(18, 2)}, "300 noise points"),
         (
             6,
             {"classification": marks(7, 2), "withheld": np.arange(900) % 6 == 0},
-            r"150 withheld points and 150 points of noise",
+            r"150 withheld points and 150 noise points",
         ),
     ],
 )
@@ -63,16 +63,16 @@ def test_scenes_and_comparisons_leave_them_out(tmp_path, suffix, point_format, c
     path = written(tmp_path / f"a{suffix}", point_format, **columns)
     top, notes = top_of(path)
     assert top == 100 and sum(left_out in note for note in notes) == 1
-    assert "--keep-noise (in Python keep_noise=True)" in notes[0]
+    assert "use --keep-noise (keep_noise=True in Python)" in notes[0]
     top, notes = top_of(path, keep_noise=True)
-    assert top == 500 and not any("left out" in note for note in notes)
+    assert top == 500 and not any("keep_noise" in note for note in notes)
     ground = written(tmp_path / "ground.las", points=GROUND)
     figures = compare(path, ground).figures
     assert figures["distances"]["a_to_b"]["mean_m"] < 1e-6
     assert sum(left_out in note for note in figures["notes"]) == 1
     figures = compare(path, ground, keep_noise=True).figures
     assert figures["distances"]["a_to_b"]["mean_m"] > 100
-    assert not any("left out" in note for note in figures["notes"])
+    assert not any("keep_noise" in note for note in figures["notes"])
 
 
 @pytest.mark.parametrize(
@@ -88,15 +88,15 @@ def test_scenes_and_comparisons_leave_them_out(tmp_path, suffix, point_format, c
 def test_other_flags_and_classes_are_points(tmp_path, point_format, columns):
     path = written(tmp_path / "a.las", point_format, **columns)
     top, notes = top_of(path)
-    assert top == 500 and not any("left out" in note for note in notes)
+    assert top == 500 and not any("keep_noise" in note for note in notes)
 
 
 def test_views_leave_them_out(tmp_path):
     path = written(tmp_path / "a.laz", classification=marks(7, 2))
     view = open_view(path)
-    assert len(view.points) == 600 and "300 points of noise (classes 7 and 18)" in view.note
+    assert len(view.points) == 600 and "300 noise points (classes 7 and 18)" in view.note
     everything = open_view(path, keep_noise=True)
-    assert len(everything.points) == 900 and "left out" not in everything.note
+    assert len(everything.points) == 900 and "skipped" not in everything.note
     for keep_noise, count in ((False, 600), (True, 900)):
         recording = open_recording(path, keep_noise=keep_noise)
         positions, columns, _ = recording.sample(100_000)
@@ -107,9 +107,9 @@ def test_views_leave_them_out(tmp_path):
 
 def test_a_file_of_nothing_else_is_refused(tmp_path):
     path = written(tmp_path / "a.las", withheld=np.ones(900))
-    with pytest.raises(LidarError, match=r"has 0: 900 withheld points are left out"):
+    with pytest.raises(LidarError, match=r"has 0: 900 withheld points were skipped"):
         scene_of_points(path)
-    with pytest.raises(LidarError, match=r"contains no points, .*900 withheld points are left out"):
+    with pytest.raises(LidarError, match=r"contains no points, .*900 withheld points were skipped"):
         compare(path, path)
     with pytest.raises(LidarError, match=r"contains no points\..*900 withheld"):
         open_view(path)
@@ -122,7 +122,7 @@ def test_the_commands_have_the_option(tmp_path, monkeypatch):
         out = f"{tmp_path}/{top}.glb"
         arguments = ["points", str(path), out, *options]
         done = runner.invoke(scene_command, arguments, catch_exceptions=False)
-        assert ("300 withheld points are left out" in done.output) == (top == 100)
+        assert ("300 withheld points were skipped" in done.output) == (top == 100)
         scene = Scene.load(out)
         assert round((scene.bounds + scene.origin)[1, 2]) == top
     monkeypatch.setattr(Comparison, "save", lambda *_: [tmp_path / "compare.html"])
@@ -156,7 +156,7 @@ def test_columns_of_converted_las_count_alike(tmp_path, name, value, is_left_out
     path = with_columns(tmp_path / "a.ply", [name], marks(value))
     top, notes = top_of(path)
     assert top == (100 if is_left_out else 500)
-    assert any("left out" in note for note in notes) == is_left_out
+    assert any("skipped" in note for note in notes) == is_left_out
     assert top_of(path, keep_noise=True)[0] == 500
     recording = open_recording(path)
     assert len(recording.read_points(0)) == (600 if is_left_out else 900)
@@ -172,5 +172,5 @@ def test_numbers_of_what_is_left_out():
     assert usable_points({"x": np.zeros(3)}) == (None, LeftOut())
     assert LeftOut().note() == ""
     assert LeftOut(1, 0).note() == (
-        "1 withheld point is left out: --keep-noise (in Python keep_noise=True) keeps it"
+        "1 withheld point was skipped. To keep it, use --keep-noise (keep_noise=True in Python)"
     )

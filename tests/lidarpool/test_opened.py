@@ -170,7 +170,7 @@ def test_a_large_cloud_is_shown_by_a_sample_until_it_is_read(exported, monkeypat
     view = growing_view(tmp_path / name)
     (tmp_path / name).write_bytes(content[: len(content) // 2])
     view.answer("points", asked, bool)
-    assert "is cut short" in growth_of(view)["error"]
+    assert "is truncated" in growth_of(view)["error"]
 
 
 def test_more_points_of_a_large_cloud_are_shown_while_it_is_read(exported, monkeypatch):
@@ -302,7 +302,7 @@ def test_text_of_points_is_a_cloud_and_a_raster_of_heights_is_a_scene(tmp_path):
     assert len(view.points) == 12 and not view.preview
     assert view.points.values("intensity", slice(None)).max() == 6
     with pytest.raises(
-        LidarError, match=r"If it is a point cloud, make a mesh of it by lidarpool "
+        LidarError, match=r"If it is a point cloud, convert it to a mesh with lidarpool "
     ):
         Scene.load(tmp_path / "scan.asc")
     pytest.importorskip("rasterio", reason="rasterio is an extra")
@@ -400,7 +400,7 @@ def test_several_files_of_different_formats_are_one_view(exported, monkeypatch):
     view = open_views([folder / "cloud.las", folder / "nuscenes"])
     assert len(view.points) == 2 * len(cloud) and view.results == ["cloud.las", "nuscenes"]
     monkeypatch.setattr(bags, "_MAX_DISTANCE_NS", -1)
-    with pytest.raises(LidarError, match=r"cloud.mcap has points in the axes of its sensors"):
+    with pytest.raises(LidarError, match=r"cloud.mcap contains points in sensor coordinates"):
         open_views([folder / "cloud.las", folder / "cloud.mcap"])
 
 
@@ -441,9 +441,9 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
     next((tmp_path / "lost" / "samples").rglob("*.bin")).unlink()
     for name, words in (
         ("cut", "poses.txt has no row for frames 1 to 2. It has 1 row, and row k"),
-        ("bad", r"poses.txt: line 1 has 11 cells, and 12 were expected \(m00, m01"),
+        ("bad", r"poses.txt: line 1 has 11 cells, but 12 were expected \(m00, m01"),
         ("uncalibrated", "calib.txt: line 1 has 'x' as m00, but a number was expected"),
-        ("long", "They are probably nanoseconds. Write seconds to times.txt"),
+        ("long", "They are probably nanoseconds. Specify the times in times.txt in seconds"),
         ("cut.bin", "cut.bin"),
         ("cut.tar", "cut.tar"),
         ("cut.parquet", "cut.parquet"),
@@ -457,7 +457,10 @@ def test_what_is_not_read_says_what_to_give(exported, tmp_path, monkeypatch):
             "empty",
             r"is not supported\. Specify a result, data set, cloud, recording, scenario or mesh",
         ),
-        ("run.rrd", r"is not supported\. It is a Rerun recording\. Open it with the command rerun"),
+        (
+            "run.rrd",
+            r"is not supported\. It is a Rerun recording\. Open it with the `rerun` command",
+        ),
         ("gt.osi", r"is not supported\. It is an OSI trace\. Use it as the traffic of a scenario"),
         ("osi.mcap", "osi.mcap: it has no ROS 2 messages. Record PointCloud2, or set an OSI trace"),
         ("none.ply", "none.ply contains no points"),

@@ -341,7 +341,7 @@ def test_the_host_vehicle_carries_the_sensors(tmp_path, vehicle, host):
     with pytest.raises(
         LidarError,
         match=(
-            r"does not state its host vehicle, set an identity\. Available "
+            r"does not state its host vehicle, set `trajectory.vehicle` to an identity\. Available "
             r"names: 0, 7, 9\."
         ),
     ):

@@ -108,7 +108,7 @@ def test_what_cannot_be_packets_is_refused_before_a_file_is_written(tmp_path):
     grids = replace(sweeps.fired, sensors=(Sensor.grid(), Sensor.grid()))
     for points, of_survey, says in (
         (lacking, sweeps, "Packets require reflectivity, but the cloud does"),
-        (cloud, unknown, r"all rays and returns of a survey. Run it with keep_every 1"),
+        (cloud, unknown, r"all rays and returns of a survey. Run the survey with keep_every 1"),
         (cloud, replace(sweeps, fired=grids), r"has no packet format.* vlp16"),
     ):
         with pytest.raises(LidarError, match=says) as raised:

@@ -143,8 +143,8 @@ def test_stations_are_in_world_coordinates_and_stand_on_pavements():
         ({"coverage": 95.0}, "coverage must be .* but is 95.0"),
         ({"spacing_m": 0.001}, "larger spacing"),
         ({"sensor": Sensor.grid(max_range_m=0.5)}, "Nothing is visible"),
-        ({"scene": Scene.from_meshes(POLES), "spacing_m": 3.0}, "The scene has no floor"),
-        ({"scene": Scene.from_meshes(POLES[:1])}, "The floor has no space"),
+        ({"scene": Scene.from_meshes(POLES), "spacing_m": 3.0}, "No floor was found"),
+        ({"scene": Scene.from_meshes(POLES[:1])}, "No free space was found on the floor"),
     ],
 )
 def test_what_cannot_be_is_refused(given, says):
@@ -233,7 +233,7 @@ def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
         ),
         (
             ["hall.glb", "--cloud", "scan.npy", "--within", "0"],
-            "`--within` is 0; it must be greater",
+            "`--within` must be greater than 0, but is 0",
         ),
         (["hall.glb"], "`--sensor` is required, because hall.glb does not specify a sensor model"),
     ],

@@ -106,7 +106,7 @@ def test_positions_are_double_where_single_precision_errs_by_a_twentieth(
             "sensor",
             ["scan", "material"],
             [
-                "points in the sensor's axes at the firing of each: motion is not compensated",
+                "points in the sensor frame at the time of firing (motion is not compensated)",
                 "class 3 road",
                 "class 12 Stra\\xdfe",
                 "material 0 brick",

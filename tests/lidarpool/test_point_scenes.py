@@ -180,7 +180,7 @@ def test_far_clouds_keep_their_digits(tmp_path):
         again = Scene.load(write_scene(tmp_path / name, scene))
         difference = again.vertices + again.origin - (scene.vertices + scene.origin)
         assert np.abs(difference).max() < 1e-6
-    with pytest.raises(LidarError, match=r"steps of 0.5 m .* Write a .glb or .obj"):
+    with pytest.raises(LidarError, match=r"to 0\.5 m at.* Write a .glb or .obj"):
         write_scene(tmp_path / "b.ply", scene)
 
 
@@ -408,8 +408,8 @@ def test_negative_intensities_of_an_unknown_scale_are_noted(tmp_path):
     notes = []
     red, x = reds(scene_of_points(path, voxel_m=1e-3, tell=notes.append))
     assert (red[x > 2] == 188).all() and set(red[x < 2].tolist()) == {0, 255}
-    note = "has intensities from -25 to 5 on an unknown scale: -25 counts as 0"
-    assert notes == [f"{path} {note}"]
+    scale = "has intensities from -25 to 5 on an unknown scale"
+    assert notes == [f"{path} {scale}. They were shifted so that -25 becomes 0"]
 
 
 def test_all_clouds_of_a_pts_have_the_same_scale(tmp_path):
@@ -491,11 +491,11 @@ def test_missing_intensities_are_an_error(tmp_path, name, words):
 def test_columns_without_names_are_noted(tmp_path):
     notes = []
     scene_of_points(written(tmp_path / "a.xyz", plane()), voxel_m=0.1, tell=notes.append)
-    assert len(notes) == 1 and notes[0].endswith("and that were skipped: column_4")
+    assert len(notes) == 1 and notes[0].endswith("which were skipped: column_4")
     rows = "\n".join(f"wall {x} {y} {z} 7" for x, y, z in plane())
     (tmp_path / "b.csv").write_text("kind,x,y,z,gps\n" + rows.replace(" ", ","))
     scene_of_points(tmp_path / "b.csv", voxel_m=0.1, tell=notes.append)
-    assert len(notes) == 2 and notes[1].endswith("and that were skipped: gps, kind")
+    assert len(notes) == 2 and notes[1].endswith("which were skipped: gps, kind")
 
 
 @pytest.mark.parametrize("name", ["a.ply", "text.ply", "a.pcd", "text.pcd", "a.las", "a.laz"])
@@ -504,7 +504,7 @@ def test_cut_files_are_refused(tmp_path, name):
     data = path.read_bytes()
     for share in (0, 0.01, 0.5, 0.98):
         path.write_bytes(data[: int(share * len(data))])
-        expected = f"is cut short: |{path}: it is empty" if share < 0.001 else "is cut short: "
+        expected = f"is truncated: |{path}: it is empty" if share < 0.001 else "is truncated: "
         with pytest.raises(LidarError, match=expected):
             scene_of_points(path)
 
@@ -518,7 +518,7 @@ def test_cut_files_are_refused(tmp_path, name):
         ("a.xyz", "nan 2 3\n" * 50, "but has 0"),
         ("a.xyz", "x y z\n" * 50, "cannot be read: line 2 has 'x' as x, but a number"),
         ("a.asc", "ncols 3\n" * 50, "cannot be read: it is an elevation raster"),
-        ("a.pts", "50\n1 2 3\n", "is cut short: line 1 announces 50 points, but 1 follow"),
+        ("a.pts", "50\n1 2 3\n", "is truncated: line 1 declares 50 points, but 1 follow"),
         ("a.bin", "no floats", r"cannot be read: a\.bin has 9 bytes, but a multiple of 16"),
         ("a.xyz", "1 2 1e30\n" * 50, "farther than anything"),
         ("a.glb", "glTF", "point clouds must have one"),

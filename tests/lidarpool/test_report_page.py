@@ -401,7 +401,7 @@ def test_the_density_is_that_of_the_ground_from_above(write, each):
     assert told["median"] == pytest.approx(each, rel=0.08)
     assert 0.85 * whole < told["mean"] < whole < told["median"]
     assert 30 <= told["median"] * told["cell_m"] ** 2 < 30 * 4 * 1.1
-    assert f"median of the cells of {told['cell_m']:.3g} m that contain points" in text
+    assert f"median of all {told['cell_m']:.3g} m cells that contain points" in text
 
 
 def test_clouds_of_other_densities_have_other_numbers(write):
@@ -461,7 +461,7 @@ STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
         ({"plan": Planning((0, 0), (10, 0), trials=1, particles=5, iterations=1)}, "no obstacle"),
         (
             {"tasks": [*records(), STRAY]},
-            "A task of the stage trial ran on GPU-0, which is not in the partition OTHER.",
+            "A task of stage trial ran on GPU-0, which is not in partition OTHER.",
         ),
         ({}, "are not recorded"),
         ({"cloud": RANGED}, "0.5 to 98.7 m"),
@@ -487,8 +487,11 @@ def test_notes_begin_with_a_capital_unless_with_a_name(write, note, shown):
 
 
 def test_a_name_that_looks_like_a_word_keeps_its_first_letter():
-    note = "out keeps one of 5 hits"
-    assert sentence(note) == "Out keeps one of 5 hits" and sentence(note, ["out"]) == note
+    note = "out contains only one in every 5 hits"
+    assert (
+        sentence(note) == "Out contains only one in every 5 hits"
+        and sentence(note, ["out"]) == note
+    )
 
 
 def test_without_planning(write):

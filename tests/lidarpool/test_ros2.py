@@ -194,7 +194,7 @@ def test_messages_of_all_types_are_read(dds):
         ((), {"ROS_DOMAIN_ID": "233"}, "ROS_DOMAIN_ID is '233'; it must be a number from 0 to 232"),
         ((), {"ROS_DOMAIN_ID": "one"}, "ROS_DOMAIN_ID is 'one'"),
         ((), {"ROS_DOMAIN_ID": "9" * 5000}, "ROS_DOMAIN_ID is '9999.*; it must be a number"),
-        (("127.0.0.1:7400",), {}, "The host 127.0.0.1:7400 of `--to` does not exist"),
+        (("127.0.0.1:7400",), {}, "The host 127.0.0.1:7400 of `--to` cannot be resolved"),
         (("239.255.0.1",), {}, "239.255.0.1 of `--to` is a multicast address"),
         (("::1",), {}, "--to ::1: no such host"),
     ],
@@ -234,7 +234,7 @@ def test_a_domain_whose_ports_are_taken_is_one_line(dds):
         (["--as", "ros2", "--layout", "sick"], "'sick' is not one of"),
         (
             ["--as", "ros2", "--layout", "hesai", "--organized"],
-            "does not have the option `organized`",
+            "does not support `organized`",
         ),
         (["--as", "packets", "--layout", "hesai"], "--layout is not for --as packets"),
     ],

@@ -314,7 +314,7 @@ def test_fields_of_several_numbers_and_of_the_same_name():
     assert [*columns] == ["x", "y", "z", "n_0", "n_1", "n_2", "ring", "ring_2"]
     assert columns["z"].tolist() == [3, 6] and columns["n_1"].tolist() == [8, 11]
     assert columns["ring"].tolist() == [0, 0] and columns["ring_2"].tolist() == [5, 5]
-    with pytest.raises(ValueError, match="its field 'n' has 4,000,000,000 numbers from byte 12 on"):
+    with pytest.raises(ValueError, match="'n' has 4,000,000,000 numbers starting at byte 12"):
         point_columns(point_cloud(rows, [*axes, ("n", 12, 7, 4_000_000_000)]))
     for datatype, count in ((0, 1), (9, 1), (7, 0)):
         says = f"its field 'n' has datatype {datatype} and count {count}, but a PointField has"
@@ -443,9 +443,9 @@ def test_layouts_of_the_table_are_those_of_the_module():
 
 
 def test_what_cannot_be_organized_is_one_line(tmp_path):
-    with pytest.raises(LidarError, match="The layout hesai does not have the option `organized`"):
+    with pytest.raises(LidarError, match="The layout hesai does not support `organized`"):
         Format("mcap", "hesai", organized=True)
-    with pytest.raises(LidarError, match="laz does not have the option `organized`"):
+    with pytest.raises(LidarError, match="laz does not support `organized`"):
         Format("laz", organized=True)
     cloud = cast("velodyne/vlp16")
     without = Cloud(
@@ -453,7 +453,7 @@ def test_what_cannot_be_organized_is_one_line(tmp_path):
         {name: column for name, column in cloud.columns.items() if name != "ray"},
         sweeps=cloud.sweeps,
     )
-    with pytest.raises(LidarError, match=r"requires ray, but the cloud has no such column"):
+    with pytest.raises(LidarError, match=r"requires the column ray, which the cloud does not"):
         save_cloud(without, tmp_path / "c.mcap", organized=True)
     unknown = Cloud(
         cloud.positions, cloud.columns, sweeps=lambda: replace(cloud.sweeps(), fired=None)

@@ -513,9 +513,10 @@ def test_formats_that_contradict_the_frame_of_points_are_in_the_advice(scenario)
     )
     las, kitti = (note for note in advice(build(read)) if "class" not in note)
     assert (
-        "expect points in one coordinate system" in las and "Set `cloud.coordinates: world`" in las
+        "expect all points in a single coordinate system" in las
+        and "Set `cloud.coordinates: world`" in las
     )
-    assert "KITTI stores points compensated for motion" in kitti
+    assert "KITTI stores motion-compensated points" in kitti
     assert advice(build(scenario("scene: seed\noutput: {write: [laz, pcd]}"))) == []
 
 
@@ -550,8 +551,8 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
     ]
     faces = "so its poses are level and face the direction of travel"
     turns = (
-        ". At a corner between straight lines, they turn from 1 m before to 1 m after the corner. "
-        "For a path without corners, set `interpolation: smooth`"
+        ". At a corner between straight lines, the poses turn from 1 m before to 1 m after the "
+        "corner. For a path without corners, set `interpolation: smooth`"
     )
     for points, actors, notes in (
         (legs, [], [f"the trajectory of the platform has no angles, {faces}{turns}"]),
@@ -568,19 +569,19 @@ def test_what_is_assumed_of_trajectories_without_angles_is_in_the_advice(scenari
 def test_sensors_that_have_another_name_in_a_format_are_in_the_advice(scenario):
     sensors = "scene: seed\nsensors: {roof: {}, rear: {mount: [-1, 0, 0]}}\n"
     (note,) = advice(build(scenario(sensors + "output: {write: [nuscenes, pcd]}")))
-    assert note.startswith("nuScenes expects the name 'LIDAR_TOP' for the first sensor")
+    assert note.startswith("nuScenes expects the first sensor to be named 'LIDAR_TOP'")
     assert advice(build(scenario("scene: seed\noutput: {write: [nuscenes]}"))) == []
 
 
 @pytest.mark.parametrize(
     ("weather", "noise", "noted"),
     [
-        ("visibility_km: 0.06", "", "returns none, because `noise.detection_range_m` is"),
+        ("visibility_km: 0.06", "", "causes no returns, because `noise.detection_range_m` is"),
         ("visibility_km: 0.06", "detection_range_m: 90", None),
         (
             "visibility_km: 0.06, fog_lidar_ratio_sr: null",
             "detection_range_m: 90",
-            "returns none, because `weather.fog_lidar_ratio_sr` is null",
+            "causes no returns, because `weather.fog_lidar_ratio_sr` is null",
         ),
         ("visibility_km: 23", "", None),  # the returns of haze are too faint to be detected
         ("", "", None),
@@ -749,9 +750,9 @@ def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, e
 @pytest.mark.parametrize(
     ("size", "generator", "entry", "says"),
     [
-        ((8, 3, 6), "Blender", "hall.glb", "hall.glb was turned from Y-up to Z-up, as glTF asks"),
-        ((8, 6, 2), "Blender", "hall.glb", "8 m wide, 6 m high and 2 m thick now"),
-        ((8, 3, 6), "https://github.com/mikedh/trimesh", "hall.glb", "trimesh wrote it"),
+        ((8, 3, 6), "Blender", "hall.glb", "rotated from Y-up to Z-up, as glTF requires"),
+        ((8, 6, 2), "Blender", "hall.glb", "is now 8 m wide, 6 m high and 2 m thick"),
+        ((8, 3, 6), "https://github.com/mikedh/trimesh", "hall.glb", "written by trimesh"),
         ((8, 6, 2), "lidarpool", "hall.glb", ""),
         ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "y"}, ""),
         ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "z"}, ""),
@@ -766,16 +767,16 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
     told = [note for note in advice(build(made)) if "up_axis" in note]
     assert len(told) == bool(says)
     if says:
-        assert says in told[0] and "give {file: …, up_axis: z}; set" in told[0]
+        assert says in told[0] and "set {file: …, up_axis: z}. To silence" in told[0]
 
 
 def test_notes_say_settings_as_in_a_scenario_or_as_in_python(tmp_path, caplog):
     mesh_file(tmp_path / "hall.glb", (8, 6, 2), 0, generator="Blender", version="2.0")
     made = Scenario.from_data({"scene": {"files": ["hall.glb"]}}, folder=tmp_path)
-    assert any("give {file: …, up_axis: z}; set" in note for note in advice(build(made)))
+    assert any("set {file: …, up_axis: z}. To silence" in note for note in advice(build(made)))
     assert not caplog.messages
     Scene.load(tmp_path / "hall.glb")
-    assert 'give Scene.load(path, up_axis="z"); set up_axis to' in caplog.messages[0]
+    assert 'Scene.load(path, up_axis="z"). To silence' in caplog.messages[0]
 
 
 def test_a_start_is_a_time_of_yaml_or_text(scenario):
@@ -799,7 +800,7 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         (3857, [0, 0, 0], r"Pseudo-Mercator\), a world map projection"),
         (3395, [1_000_000, 6_000_000, 0], "a world map projection"),
         (2056, [0, 0, 0], r"The scene is at x 0, y 0, outside the area of use of EPSG:2056"),
-        (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*EPSG:32617 has true meters"),
+        (5070, [1_627_222, 355_426, 0], r"0\.988 to 1\.01 m long.*Use EPSG:32617, which is true"),
         (2263, [0, 0, 0], "which is not in meters"),
         (4326, [8, 47, 0], "which is not in meters"),
     ],

@@ -96,12 +96,10 @@ def test_columns_of_parquet_that_are_no_numbers_are_not_read(tmp_path):
     ones = np.ones(3)
     parquet(path, {"x": ones, "y": ones, "z": ones, "words": ["a" * 99] * 3, "list": [[1]] * 3})
     recording = open_recording(path)
-    assert recording.notes == (
-        f"{path} has columns that are not numeric and were skipped: list, words",
-    )
+    assert recording.notes == (f"{path} has non-numeric columns, which were skipped: list, words",)
     assert set(recording.read(0)[1]) == set()
     parquet(path, {"x": ones, "y": ["1"] * 3, "z": ones})
-    assert "it has coordinates that are not numbers: y" in refused(open_recording, path)
+    assert "its coordinate columns are not numeric: y" in refused(open_recording, path)
 
 
 def test_a_data_set_of_parquet_is_limited_by_its_files(tmp_path, strict):

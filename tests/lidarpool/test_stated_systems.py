@@ -124,7 +124,7 @@ def test_clouds_are_brought_to_true_meters(tmp_path, case):
     np.testing.assert_allclose((upper - lower)[:2], SIDE_M, atol=0.1)
     height_m = HEIGHT_M * 0.3048 if case == "compound" else HEIGHT_M
     assert lower[2] == pytest.approx(height_m, abs=1e-3)
-    assert notes[0].startswith("was brought from ") and notes[0].endswith(" to EPSG:32632")
+    assert notes[0].startswith("was transformed from ") and notes[0].endswith(" to EPSG:32632")
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_angles_and_geocentric_coordinates(tmp_path, system, records, words):
     (lower, upper), notes = bounds_of(path, epsg=32632)
     np.testing.assert_allclose(lower, ground("EPSG:32632").min(axis=0), atol=0.05)
     np.testing.assert_allclose(upper, ground("EPSG:32632").max(axis=0), atol=0.05)
-    assert ("states no unit of heights" in notes[-1]) == (system == "EPSG:4326")
+    assert ("does not state a unit for heights" in notes[-1]) == (system == "EPSG:4326")
 
 
 def test_feet_are_converted_on_the_way(tmp_path):
@@ -176,7 +176,7 @@ def test_what_cannot_be_brought_is_refused(tmp_path):
     for epsg, message in (
         (3857, r"cannot be transformed to EPSG:3857 \(WGS.*, a world map projection"),
         (2263, r"cannot be transformed to EPSG:2263 \(.*, which is not in meters"),
-        (32640, r"cannot be transformed to EPSG:32640 .*EPSG:32632 has true meters"),
+        (32640, r"cannot be transformed to EPSG:32640 .*Use EPSG:32632, which is true"),
         (1025, "EPSG:1025 is unknown to PROJ"),
     ):
         with pytest.raises(LidarError, match=message):
@@ -195,18 +195,18 @@ def test_a_given_unit_counts_and_is_noted(tmp_path):
     path = written(tmp_path / "a.las", points, wkt("EPSG:3857"))
     (lower, upper), (note,) = bounds_of(path, unit="m")
     np.testing.assert_allclose(upper - lower, np.ptp(points, axis=0), atol=0.1)
-    assert "EPSG:3857" in note and "taken in m of true length, as you say" in note
+    assert "EPSG:3857" in note and "As specified, its coordinates are read in m" in note
     notes = compare(path, path, unit_a="m", unit_b="m").figures["notes"]
-    assert sum("as you say" in note for note in notes) == 2
+    assert sum("As specified" in note for note in notes) == 2
     degrees = written(tmp_path / "b.las", ground("EPSG:4326"), wkt("EPSG:4326"))
-    assert "of angles" in open_recording(degrees, unit="m").notes[0]
+    assert "has angular coordinates" in open_recording(degrees, unit="m").notes[0]
 
 
 def test_a_wide_cloud_says_what_is_wrong_at_its_edges(tmp_path):
     points = np.column_stack([STEPS * 70_000 + (-500_000, 4_000_000), np.zeros(len(STEPS))])
     path = written(tmp_path / "a.las", points, wkt("EPSG:32632"), step_m=0.01)
     (note,) = open_recording(path).notes
-    assert "so wide that lengths of EPSG:32632 (WGS 84 / UTM zone 32N) are wrong by" in note
+    assert "so large that lengths in EPSG:32632 (WGS 84 / UTM zone 32N) are wrong by" in note
 
 
 def test_without_rasterio_names_and_codes_count(tmp_path, monkeypatch):
@@ -230,8 +230,8 @@ def test_without_rasterio_names_and_codes_count(tmp_path, monkeypatch):
     for name in ("zone", "zone by code", "grid"):
         assert open_recording(paths[name]).notes == ()
     (note,) = open_recording(paths["equal areas"]).notes
-    assert "whose scale is taken as true" in note and 'pip install -e ".[geo]"' in note
-    with pytest.raises(LidarError, match=r"by rasterio: .*\.\[geo\]"):
+    assert "whose scale is assumed to be true" in note and 'pip install -e ".[geo]"' in note
+    with pytest.raises(LidarError, match=r"requires rasterio, .*\.\[geo\]"):
         scene_of_points(paths["wkt"], epsg=32632)
 
 
@@ -278,7 +278,7 @@ def test_a_scene_keeps_the_system_of_its_cloud(tmp_path, suffix):
     file = tmp_path / f"place{suffix}"
     arguments = ["points", str(cloud), str(file), "--voxel-m", "0.3"]
     noted = CliRunner().invoke(command, arguments, catch_exceptions=False).stderr
-    assert f"{file} keeps the coordinate system of {cloud}, EPSG:25832" in noted
+    assert f"{file} uses the coordinate system of {cloud}, EPSG:25832" in noted
     scene = Scene.load(file)
     assert scene.epsg == 25832
     assert Scene.load(write_scene(tmp_path / "again.glb", scene)).epsg == 25832
@@ -337,7 +337,7 @@ def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
             read(path)
     (lower, _), notes = bounds_of(path, epsg=32632)
     np.testing.assert_allclose(lower, ground("EPSG:32632").min(axis=0), atol=0.05)
-    assert "was brought from EPSG:3857" in notes[0]
+    assert "was transformed from EPSG:3857" in notes[0]
     true_one = e57_with(monkeypatch, tmp_path / "b.e57", "EPSG:32632", ground("EPSG:32632"))
     assert bounds_of(true_one)[1] == [] and open_recording(true_one).notes == ()
     assert open_view(true_one).epsg == 32632
@@ -347,7 +347,8 @@ def test_an_e57_may_state_its_system(tmp_path, monkeypatch):
     with pytest.raises(LidarError, match=r"whose meter is 0\.67.*--epsg 32632"):
         open_recording(by_proj)
     vague = e57_with(monkeypatch, tmp_path / "c.e57", "site 7", ground("EPSG:32632"))
-    assert "states the coordinate system 'site 7', and is taken in meters" in bounds_of(vague)[1][0]
+    note = bounds_of(vague)[1][0]
+    assert "states the coordinate system 'site 7', but its coordinates are read in meters" in note
 
 
 def test_the_command_brings_a_cloud_to_another_system(tmp_path):
@@ -368,7 +369,7 @@ def test_coordinates_of_another_system_are_told(tmp_path):
     local = written(tmp_path / "a.las", points - lowest, wkt("EPSG:25832"))
     _, notes = bounds_of(local)
     assert (
-        "has coordinates, x 1,014.5, y 1,014.5, outside the area of use of EPSG:25832" in notes[0]
+        "has coordinates (x 1,014.5, y 1,014.5) outside the area of use of EPSG:25832" in notes[0]
     )
     swapped = written(tmp_path / "b.las", points, wkt("EPSG:31467"))
     with pytest.raises(LidarError, match=r"EPSG:31467.*area of use \(Germany.*wrong") as refused:

@@ -194,7 +194,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
 
     told(
         lambda: lidarpool.sweeps(tmp_path / "nowhere"),
-        "nowhere does not exist. Specify the folder of a data set",
+        "nowhere does not exist. Specify the output folder of a campaign",
     )
     first = lidarpool.sweeps(place)
     points = place / "sequences/00/velodyne/000000.bin"

@@ -319,7 +319,7 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     points[1]["position"] = [x + 30, y + 5, 0]
     points.insert(1, {"time_s": 4, "position": [x + 10, y + 5, 0.3]})
     assert build(read(points, duration_s=3)).survey.path.duration_ns == 3e9
-    with pytest.raises(LidarError, match=r"leaves its surfaces \(Ramp\)"):
+    with pytest.raises(LidarError, match=r"leaves the surfaces that it follows \(Ramp\)"):
         build(read(points))
     with pytest.raises(LidarError, match=r"`trajectory\.beyond` is only allowed for actors"):
         read(points, beyond="hold")
@@ -377,7 +377,7 @@ def test_unusable_data_is_refused(tmp_path, text, told):
         (
             '<vehicle id="' + "1" * 20_000_000 + '"/>',
             2**25,
-            "it has a tag or comment of more than 16.00 MiB",
+            "it contains a tag or comment longer than 16.00 MiB",
         ),
         (
             "".join(f"<vehicle id='{i}' x='0' y='0' angle='0'/>" for i in range(2_000)),
@@ -497,7 +497,7 @@ def test_what_is_wrong_with_a_carrier_of_the_traffic_is_told(tmp_path):
         ),
         ({"vehicle": "a.1"}, "from 0 to 1, 3 to 4 s. Set `trajectory.start_s`"),
         ({"vehicle": "a.1", "start_s": 2}, "from 0 to 1, 3 to 4 s. Set `trajectory.start_s`"),
-        ({"vehicle": "p", "offset_s": 1}, r"cannot be combined with `trajectory\.offset_s`"),
+        ({"vehicle": "p", "offset_s": 1}, r"not with `trajectory\.offset_s`"),
         ({"vehicle": "p", "file": "a.tum"}, "Set exactly one of file, points and vehicle"),
         ({"vehicle": ""}, "vehicle"),
     ):

@@ -67,7 +67,10 @@ def test_one_that_is_not_paused_will_do_and_the_other_is_named_once(look):
     look(61, ("GPU", "paused"), *ALL)
     [note] = look.watching.notes
     assert look.told == [note]
-    assert "paused worker w0 of partition GPU, whose memory limit is 150.00 MiB" in note
+    assert (
+        "paused worker w0 of partition GPU, because its memory is nearly full (limit: 150.00 MiB)"
+        in note
+    )
 
 
 def test_what_runs_already_goes_on_where_workers_are_paused(look):

@@ -195,8 +195,8 @@ def test_an_origin_that_is_added_twice_is_told_wherever_it_ends(epsg):
     [twice] = placed_at((300_000, 4_000_000), origin=[290_000, 4_010_000], **epsg)
     assert twice == (
         "`world.origin` (x 290,000, y 4,010,000) is added to the coordinates of the scene's files, "
-        "although these are already close to it (x 300,000, y 4,000,000). If they are world "
-        "coordinates, remove `world.origin`."
+        "although these coordinates are already close to it (x 300,000, y 4,000,000). If they are "
+        "world coordinates, remove `world.origin`."
     )
 
 

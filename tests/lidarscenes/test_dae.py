@@ -150,7 +150,7 @@ CONTROLLER = (
             for by in ("skin", "morph")
         ],
         ({"here": f"<skew>45 1 0 0 0 1 0</skew>{HERE}"}, "contains <skew>"),
-        ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "by a matrix that is not a valid"),
+        ({"here": f"<scale>nan 1 1</scale>{HERE}"}, "with a matrix that is not a valid"),
         ({"primitive": f"<triangles>{V}<p>0 1 9</p></triangles>"}, "refer to vertices 0 to 9"),
         ({"primitive": PARTS["primitive"].replace("<vcount>4", "<vcount>5")}, "with 5 corners but"),
         ({"accessor": 'count="9" stride="3"'}, "id='p'> declares 9 x 3 numbers but contains 24"),
@@ -177,5 +177,5 @@ def test_a_cut_file_never_loses_triangles_in_silence(tmp_path):
     whole = DAE.format(**PARTS).strip()
     for cut in range(1, len(whole), 40):
         path.write_text(whole[:-cut])
-        with pytest.raises(LidarError, match=r"cut short|cannot be read"):
+        with pytest.raises(LidarError, match=r"truncated|cannot be read"):
             load_meshes(path)

@@ -249,8 +249,8 @@ def test_above_a_world_only_folders_with_a_configuration_are_models(tmp_path):
         with pytest.raises(LidarError) as caught:
             load(deep, world(part))
         assert (
-            f"is in {tmp_path / 'private'}, which has no model.config. Name the folder that "
-            "contains it as assets."
+            f"is in {tmp_path / 'private'}, which has no model.config. Set `assets` to "
+            "the folder that contains it."
         ) in str(caught.value)
         assert load(deep, world(part), assets=tmp_path)[0]
     (deep / "link.dae").symlink_to(tmp_path / "private" / "house.dae")
@@ -262,7 +262,7 @@ def test_above_a_world_only_folders_with_a_configuration_are_models(tmp_path):
         assert load(deep, world(mesh.format(name)), assets=tmp_path)[0]
     write(tmp_path / "private" / "package.xml", "<package/>")
     assert load(deep, world(mesh.format("package://private/house.dae")))[0]
-    with pytest.raises(LidarError, match="as assets"):
+    with pytest.raises(LidarError, match="Set `assets` to"):
         load(deep, world(mesh.format("model://private/house.dae")))
 
 
@@ -274,7 +274,7 @@ def test_beside_a_folder_of_worlds_models_have_a_configuration_or_are_of_a_packa
     for uri in ("../private/house.dae", "private/house.dae", "model://own/house.dae"):
         assert load(tmp_path / "worlds", world(mesh.format(uri)))[0]
     text = world(mesh.format("model://private/house.dae"))
-    with pytest.raises(LidarError, match=r"which has no model\.config\. Name the folder"):
+    with pytest.raises(LidarError, match=r"which has no model\.config\. Set `assets` to"):
         load(tmp_path / "worlds", text)
     write(tmp_path / "package.xml", "<package/>")
     assert load(tmp_path / "worlds", text)[0]
@@ -305,7 +305,7 @@ def test_missing_things_are_named_and_the_rest_is_there(tmp_path):
         load(tmp_path, world(include("model://crate")))
     objects, _, _ = load(tmp_path, world(*parts), geometry="collision")
     assert list(objects) == ["n/d"]
-    with pytest.raises(LidarError, match=r"an option of \.sdf \.world: leave out geometry"):
+    with pytest.raises(LidarError, match=r"an option of \.sdf \.world\)\. Remove geometry"):
         Scene.load(write(tmp_path / "m.dae", DAE), geometry="collision")
     with pytest.raises(LidarError, match="geometry: collision"):
         load(tmp_path, world(model("n", link("d", shape(SHAPE, "collision")))))
@@ -477,7 +477,7 @@ BROKEN = {
         model("a", link("l", pose="<pose rotation_format='quat_xyzw'>1 2 3 0 0 0 0</pose>"))
     ),
     "must be 6 finite numbers": world(model("a", link("l", pose="<pose>1 2 3 0 0 x</pose>"))),
-    "<visibility_flags> is '-1'; it must be a whole number from 0 to 4294967295": world(
+    "<visibility_flags> is '-1'; it must be an integer from 0 to 4294967295": world(
         model("a", link(inside=shape("<box/>", more="<visibility_flags>-1</visibility_flags>")))
     ),
     "the frame 'x' is not defined": world(
@@ -498,14 +498,14 @@ BROKEN = {
     ),
     "it declares XML entities": "<!DOCTYPE s [<!ENTITY a 'b'>]>" + world(model("a", link())),
     "uses the XML entity 'a'": world(model("&a;", link())),
-    "is cut short: its last element, <world>, is not closed": sdf("<world name='w'>").replace(
+    "is truncated: its last element, <world>, is not closed": sdf("<world name='w'>").replace(
         "</sdf>", ""
     ),
     "line 1 contains </sdf> without a matching start tag": sdf("<world name='w'>"),
     "line 2 contains an invalid tag": "<sdf>\n<world name=w></world></sdf>",
     "nested more than 200 levels deep": "<sdf>" + "<a>" * 300,
     "root element is <robot>": "<robot/>",
-    "has the format of Gazebo before version 1.9": "<gazebo version='1.0'/>",
+    "uses the file format of Gazebo before version 1.9": "<gazebo version='1.0'/>",
     "it contains no elements": "just text",
 }
 
@@ -703,7 +703,7 @@ def test_elements_of_lidars_that_are_not_read_are_listed(tmp_path):
     )
     text = (tmp_path / "out" / "scenario.yaml").read_text()
     kind = "sensor 'robot::mast::b' has the unknown type 'gpu_lidr'. Did you mean"
-    for words in (listed, "the bias of the noise", kind):
+    for words in (listed, "the mean of the noise bias", kind):
         assert words in output and words in text
     text = ROBOT.replace("<lidar>", "<lidr>").replace("</lidar>", "</lidr>")
     with pytest.raises(LidarError, match=r"neither <lidar> nor <ray>\. Did you mean 'lidr'"):

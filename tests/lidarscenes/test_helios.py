@@ -388,7 +388,7 @@ def test_reflectances_are_those_of_spectra_at_the_wavelength(imported, known):
         parts["../spectra/loam.txt"] = "Name: loam\n\n1.0\t20.0\n2.0\t40.0 \n"
     made, _, _ = imported(device, legs('pulseFreq_hz="1000"'), parts=parts)
     assert [m.reflectance for m in scenario_of(made).materials] == [0.3, None] * known
-    assert ("the missing spectrum 'loam'" in " ".join(made.left_out)) != known
+    assert ("the spectrum 'loam', which is missing" in " ".join(made.left_out)) != known
 
 
 def test_a_trajectory_of_its_own_is_followed(imported):
@@ -612,7 +612,10 @@ def test_rasters_of_heights_are_scene_files(imported, tmp_path):
         (('x="3" y="4"', 'x="0" y="0"'), "all legs have the same position"),
         (('movePerSec_m="10"', 'movePerSec_m="0"'), "leg 0: movePerSec_m is 0; it must be above 0"),
         (("<scannerSettings ", '<scannerSettings template="none" '), "no <scannerSettings> 'none'"),
-        (('pulseFreq_hz="1000"', 'pulseFreq_hz="0"'), "leg 0: S/1 has no pulseFreq_hz above 0"),
+        (
+            ('pulseFreq_hz="1000"', 'pulseFreq_hz="0"'),
+            "leg 0: S/1 must have a pulseFreq_hz above 0",
+        ),
         (('pulseFreq_hz="1000"', 'active="false"'), "no leg has an active scanner"),
         (("#plane", "#tripod"), "leg 0: neither the platform nor the head moves"),
         (('pulseFreq_hz="1000"', 'headRotatePerSec_deg="9"'), "supported only for rotating optics"),
@@ -654,7 +657,9 @@ def test_files_outside_of_the_folders_of_a_survey_are_refused(
         name = str(outside) if target == "{outside}" else name
     file = root / ("parts/ground.obj" if named == "g.mtl" else "deep/fly.xml")
     file.write_text(file.read_text().replace(named, name))
-    with pytest.raises(LidarError, match=r"names the file .*, which is not in its folder") as told:
+    with pytest.raises(
+        LidarError, match=r"refers to the file .*, which is neither in its folder"
+    ) as told:
         import_checked(root / "deep" / "fly.xml", tmp_path / "out")
     assert repr(name) in str(told.value) and not (tmp_path / "out").exists()
 

@@ -223,7 +223,7 @@ def test_storeys_are_selected_by_name(house, forked, tmp_path):
     ):
         Scene.load(house, storeys=["Upper floor", "Attic"])
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(LidarError, match=r"no storeys, an option of \.ifc \.ifczip: leave out"):
+    with pytest.raises(LidarError, match=r"storeys \(an option of \.ifc \.ifczip\)\. Remove"):
         Scene.load(tmp_path / "a.obj", storeys=["Upper floor"])
 
 
@@ -264,7 +264,7 @@ def test_units_are_those_of_the_project(forked, tmp_path, schema, prefix, unit_m
     (mesh,) = load_meshes(path, materials=True, tell=notes.append)
     assert mesh.bounds[:, 0] == pytest.approx([4, 6])
     assert mesh.materials.names == ("Concrete",)
-    assert ["states no length unit" in note for note in notes] == [True] * (prefix == "")
+    assert ["does not specify a length unit" in note for note in notes] == [True] * (prefix == "")
 
 
 def test_a_map_conversion_is_noted_and_not_applied(forked, tmp_path):
@@ -635,7 +635,7 @@ def test_broken_files_are_refused_in_a_line(house, forked, tmp_path):
         ("solid ice", "it does not start with ISO-10303-21"),
         (text[: len(text) // 2], "the end of the file is missing"),
         (text.replace("'IFC4'", "'IFC9'"), "IFC9"),
-        (two_storeys_without_elements(text), "contains no elements with a shape"),
+        (two_storeys_without_elements(text), "contains no elements with geometry"),
     ):
         path.write_text(broken)
         with pytest.raises(LidarError) as caught:

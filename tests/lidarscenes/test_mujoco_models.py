@@ -169,9 +169,9 @@ def test_a_scenario_takes_the_options(room):
         ({"groups": [5]}, r"can detect in the groups \(5,\)"),
         (
             {"file": "meshes/wedge.obj"},
-            "wedge.obj has no keyframe, groups and exclude, options of .xml",
+            r"support keyframe, groups and exclude \(options of .xml\)",
         ),
-        ({"geometry": "collision"}, "room.xml has no geometry, an option of .sdf .world"),
+        ({"geometry": "collision"}, r"not support geometry \(an option of .sdf .world\)"),
     ):
         with pytest.raises(LidarError, match=message):
             changed = {**data, "scene": {"files": [{**entry, **change}]}}
@@ -206,7 +206,7 @@ def test_rangefinders_become_sensors_that_measure_as_in_mujoco(room):
     out = room.parent / "out"
     result = CliRunner().invoke(import_, [str(room), "--out", str(out)])
     assert result.exit_code == 0, result.output
-    assert "rangefinder hits on geoms of group 3 (to get them, set groups in" in result.output
+    assert "rangefinder hits on geoms of group 3 (to include them, set groups in" in result.output
     scenario = yaml.safe_load((out / "scenario.yaml").read_text())
     assert [*scenario["sensors"]] == ["robot", "depth", "lens", "arm"]
     assert scenario["sensors"]["arm"]["max_range_m"] == 4.5
@@ -302,7 +302,7 @@ def test_files_of_named_folders_are_read(tmp_path):
     (tmp_path / "models" / "link.xml").symlink_to(tmp_path / "other.xml")
     for name in ("../other.xml", "link.xml", f"{tmp_path}/other.xml"):
         path = write(tmp_path / "models" / "m.xml", world(f'<include file="{name}"/>'))
-        with pytest.raises(LidarError, match=r"name a folder that holds that file as assets"):
+        with pytest.raises(LidarError, match=r"Set assets to the folder that contains that file"):
             load(path)
         objects, notes = load(path, assets=tmp_path)
         assert [*objects] == ["body 1"] and not notes

@@ -249,7 +249,7 @@ def test_tolerance_of_curves(tmp_path):
         radii = np.hypot(middles[..., 0], middles[..., 1] - 50)
         assert np.abs(radii - [[50], [54]]).max() <= sag
     assert counts[0.001] > 2.5 * counts[0.01] > 6 * counts[0.1]
-    with pytest.raises(LidarError, match=r"has no sag_m, an option of \.xodr: leave out sag_m"):
+    with pytest.raises(LidarError, match=r"support sag_m \(an option of \.xodr\)\. Remove sag_m"):
         Scene.load(_obj(tmp_path), sag_m=0.01)
 
 
@@ -589,7 +589,7 @@ def test_stretched_meters_are_noted_with_the_scale_that_helps(tmp_path, system):
     load(tmp_path, document(roads, header=header), notes)
     (note,) = notes
     assert "whose meter is 0.67" in note
-    scale, again = re.search(r"here: scale \[(0\.67\d+), (0\.67\d+), 1\] makes", note).groups()
+    scale, again = re.search(r"here \(scale \[(0\.67\d+), (0\.67\d+), 1\] corrects", note).groups()
     assert scale == again and float(scale) == pytest.approx(0.678, abs=1e-3)
     assert "world.epsg" not in note
 
@@ -618,7 +618,7 @@ ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<A/>", "not OpenDRIVE"),
+        ("<A/>", "not an OpenDRIVE file"),
         (document(road(), header='<header revMajor="2"/>'), "OpenDRIVE 2, but only"),
         (document(road(length=-5)), "length -5, which must not be negative"),
         (document(road(length="nan")), "length 'nan', which is not a number"),
@@ -630,17 +630,17 @@ ENTITY = '<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]>'
         ),
         (document(road()).replace("planView", "view"), "without geometry"),
         (document(road(shape='<arc curvature="1e99"/>')), "would unpack to"),
-        (document(road(shape='<paramPoly3 pRange="normalized"/>')), "with zero length"),
+        (document(road(shape='<paramPoly3 pRange="normalized"/>')), "has zero length"),
         (document(road(section(right=lane(-1, width(4) + TINY_DASHES)))), "would unpack to"),
         # Its samples are more than its triangles, which would fit.
         (
             document(road(LANES, shape='<arc curvature="0.01"/>', offset=BENDS)),
             "would unpack to at least 2[67].* MiB",
         ),
-        (document(road(section(right=lane(-1, width(4)) * 2))), "two lanes of the same id"),
+        (document(road(section(right=lane(-1, width(4)) * 2))), "two lanes have the same id"),
         (document(road(section(right=lane(-1)))), "no triangles"),
         (ENTITY + "<OpenDRIVE/>", "declares the XML entity"),
-        (document(road())[:-30], "is cut short: its XML ends inside an element in line"),
+        (document(road())[:-30], "is truncated: its XML ends inside an element in line"),
     ],
 )  # fmt: skip
 def test_broken_files(tmp_path, text, message):

@@ -216,21 +216,21 @@ def test_mesh_files_of_packages(tmp_path, packages):
         # In meters by its unit; with the axes of the file, as RViz takes it.
         robot = leg_of(package / "urdf", name)
         assert robot.meshes["leg"].bounds[1].tolist() == [1, 0, 3], name
-    outside = f"is outside the package, {package}. Name a folder that contains the mesh as assets"
-    missing = "was not found. Name the folder '{}', or a folder that contains it, as assets"
+    outside = f"is outside the package, {package}. Set `assets` to a folder that contains the mesh"
+    missing = "was not found. Set `assets` to the folder '{}' or a folder that contains it"
     for name, words in (
         ("../../../secret.dae", outside),
         ("../meshes/link.dae", outside),
         ("package://my_robot/../../secret.dae", outside),
         (f"file://{tmp_path}/secret.dae", outside),
-        ("package://../secret.dae", "names no package. Write package://NAME/FILE, or a path"),
+        ("package://../secret.dae", "specify a package. Write package://NAME/FILE, or a path"),
         ("package:///leg.dae", "relative to the folder 'urdf' of the .urdf"),
         ("package://", "relative to the folder 'urdf' of the .urdf"),
         (
             "model:///other/meshes/leg.dae",
-            "and name the folder 'other', or a folder that contains it",
+            "and set `assets` to the folder 'other' or a folder that contains it",
         ),
-        ("package:///other//leg.dae", "names no package. Write package://other/leg.dae, and"),
+        ("package:///other//leg.dae", "specify a package. Write package://other/leg.dae, and"),
         ("package://unknown/leg.dae", missing.format("unknown")),
         ("package://private/leg.dae", missing.format("private")),  # no package
         ("../meshes/arm.dae", "does not exist"),
@@ -251,7 +251,7 @@ def test_without_a_package_mesh_files_are_in_the_folder_of_the_robot_or_in_asset
         with pytest.raises(LidarError) as caught:
             leg_of(urdf, name)
         assert (
-            f"is outside the folder of the .urdf file, {urdf}. Name a folder that contains"
+            f"is outside the folder of the .urdf file, {urdf}. Set `assets` to a folder that "
             in str(caught.value)
         )
         assert leg_of(urdf, name, assets=packages).meshes
@@ -271,7 +271,7 @@ def test_a_scenario_names_the_assets_of_a_robot(tmp_path, packages):
         if "assets" in entry["files"][0]:
             assert build(scenario).scene.names == ("r/leg",)
         else:
-            with pytest.raises(LidarError, match="as assets"):
+            with pytest.raises(LidarError, match="Set `assets` to"):
                 build(scenario)
     actor = {"name": "R", "file": file | {"assets": "ws"}, "at": [3, 0, 0]}
     scenario = Scenario.from_data(
@@ -658,7 +658,7 @@ def test_a_robot_alone_stands_still_with_its_joints_at_zero(folder):
 @pytest.mark.parametrize(
     ("name", "way"),
     [
-        ("a.mjcf", "MuJoCo reads its models from .xml"),
+        ("a.mjcf", "MuJoCo models must have the extension .xml"),
         ("a.osm", "It is a map"),
     ],
 )

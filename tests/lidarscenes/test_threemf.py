@@ -91,7 +91,7 @@ def test_colors_of_base_materials_and_color_groups(tmp_path):
     assert mesh.colors.corners.tolist() == expected + gray
     assert notes == [
         f"{path} contains textures, which are not supported, or lacks colors. As a result, "
-        "2 triangles became gray."
+        "2 triangles are gray."
     ]
     assert load_meshes(path)[0].colors is None
     (leaf,) = load(tmp_path)

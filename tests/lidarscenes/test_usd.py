@@ -94,7 +94,7 @@ def test_polygons_places_and_names(tmp_path):
     [
         (METERS, {}, [2, 3, 0], []),
         ('metersPerUnit = 1\nupAxis = "Y"', {}, [2, 0, 3], ["to Z-up, as the file states"]),
-        ("", {}, [0.02, 0, 0.03], ["Centimeters, the default", "to Z-up, the default of OpenUSD"]),
+        ("", {}, [0.02, 0, 0.03], ["Centimeters, the OpenUSD", "to Z-up, the OpenUSD default"]),
         ("", {"unit": "m", "up_axis": "z"}, [2, 3, 0], []),
     ],
 )  # fmt: skip
@@ -143,7 +143,7 @@ def test_what_is_not_shown_is_left_out_and_counted(tmp_path):
     assert lines == [
         "m.usda contains prims that were skipped: 1 invisible, 1 BasisCurves, "
         "1 with the purpose proxy or guide.",
-        "m.usda contains 1 subdivision mesh. Subdivision is not supported, and the coarse mesh is "
+        "m.usda contains 1 subdivision mesh. Subdivision is not supported, so the coarse mesh is "
         "used.",
     ]
 
@@ -228,17 +228,17 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     path = write(tmp_path / "m.usda", prim("Ground"), prim("Balloon", text=QUAD + grows), camera)
     _, lines = told(path)
     assert lines == [
-        "m.usda contains 1 object whose motion is not supported because it is a deformation or a "
-        "motion of instances. The first frame is used."
+        "m.usda contains 1 object with unsupported motion, such as deformation or moving "
+        "instances. The first frame is used."
     ]
     # Copies and actors of a scenario are of meshes that stand, and a scene of what moves only.
     path = write(tmp_path / "m.usda", prim("Car", text=QUAD + DRIVE), stage=STAGE)
     objects, lines = told(path)
-    assert lines == ["m.usda moves Car: taken where they are at first, and still"]
+    assert lines == ["m.usda moves Car, but all objects are treated as static at their first pose"]
     assert bounds(objects)[0, 0] == 1
     built = build(Scenario.load(path))
     assert not built.scene.actors and built.scene.bounds[0, 0] == 1
-    assert "nothing stands in the scene" in advice(built)[0]
+    assert "a scene requires at least one static object" in advice(built)[0]
     uneven = Transform.from_parts(scale=(1, 2, 1))
     with pytest.raises(LidarError, match="'Car' moves, and its placement scales it unevenly"):
         Scene.load(path, transform=uneven)
@@ -259,7 +259,7 @@ def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
         files = [{"file": "scenes/m.usda"} | more]
         return build(Scenario.from_data({"scene": {"files": files}}, folder=tmp_path)).scene.names
 
-    with pytest.raises(LidarError, match=r"name a folder .* as assets"):
+    with pytest.raises(LidarError, match=r"Set assets to the folder"):
         names()
     assert names(assets="assets") == names(assets=".") == ("A", "B")
     write(scenes / "m.usda", outer, prim("C", "", "", "references = @../q.usda@</Quad>"))
@@ -401,7 +401,7 @@ def test_what_moves_too_far_away_is_left_out(tmp_path):
     notes = []
     objects = load_objects(path, tell=notes.append)
     assert [mesh.name for mesh in objects.static] == ["Quad"] and not objects.actors
-    assert any("(7.5e+08 m from the origin), which are left out: Fallen" in note for note in notes)
+    assert any("(7.5e+08 m from the origin), which were skipped: Fallen" in note for note in notes)
 
 
 def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
@@ -409,7 +409,7 @@ def test_what_stands_is_bent_at_the_first_time_also_between_samples(tmp_path):
     objects, lines = told(path)
     np.testing.assert_allclose(objects[0].vertices, evaluated(path, 7.3), atol=1e-6)
     assert lines == [
-        "m.usda contains animated skeletons, which are static here. To animate an actor, set "
+        "m.usda contains animated skeletons, which are treated as static. To animate an actor, set "
         "animation: NAME."
     ]
     text = path.read_text()
@@ -458,7 +458,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
         ("timeCodesPerSecond = 0", None, "", "contains no animations. Export it with"),
         ("", QUAD, "", "contains no animations. Export it with animations, or remove animation"),
         ("", QUAD + 'token visibility.timeSamples = {0: "inherited", 24: "invisible"}', "",
-         "m.usda has other vertices in pose 60: leave out animation"),
+         "m.usda has a different number of vertices in pose 60. Remove animation"),
     ],
 )  # fmt: skip
 def test_unusable_animations_are_refused_in_a_line(tmp_path, stage, text, name, message):
@@ -581,7 +581,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     ]
     _, lines = told(write(folder / "m.usda", prim("Quad"), *missing))
     assert lines == [
-        "m.usda refers to content that does not exist or cannot be read and was skipped: "
+        "m.usda refers to content that is missing or cannot be read, which was skipped: "
         "'bad.usda', 'https:/example.com/x.usd', 'no.usda'."
     ]
     with pytest.raises(LidarError, match=r"no triangles. It refers to .*: 'no\.usda'"):
@@ -889,7 +889,7 @@ def test_packed_images_and_shapes(folder):
         (IMAGE, "asset inputs:file = @no.png@\nfloat4 inputs:fallback = (1, 0, 0, 1)",
          "UsdPreviewSurface", [255, 0, 0], "does not exist"),
         (IMAGE, "asset inputs:file = @../out.png@", "UsdPreviewSurface", GRAY,
-         "outside the scene's folder; name the folder that"),
+         "outside the scene's folder; set assets to a folder that"),
         (IMAGE, "asset inputs:file = @t.<UDIM>.png@", "UsdPreviewSurface", GRAY, "UDIM tiles"),
         ("", "", "MyShader", GRAY, "M (its shader MyShader is not supported)"),
         (IMAGE.replace("T.outputs:rgb", "X.outputs:result"), "", "UsdPreviewSurface", GRAY,
@@ -921,5 +921,5 @@ def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, color, why):
 def test_pipes_that_a_scene_names_are_not_waited_for(tmp_path, text):
     os.mkfifo(tmp_path / "f.usda")
     (tmp_path / "m.usda").write_text(text)
-    with pytest.raises(LidarError, match=r"it names 'f\.usda', which is not a regular file"):
+    with pytest.raises(LidarError, match=r"it refers to 'f\.usda', which is not a regular file"):
         load_meshes(tmp_path / "m.usda")

@@ -91,7 +91,7 @@ BOMBS = {
     "objects.3mf": (model(b"<object id='2'/>" * 300_000), "would unpack to 256"),
     "lzma.3mf": (model(b" " * 10_000_000, method=zipfile.ZIP_LZMA), "a method other than Deflate"),
     "colors.3mf": (model(b"<base/>" * 3_000_000), "would unpack to 256"),
-    "attribute.3mf": (model(b"<a b='%s'/>" % (b"1" * 20_000_000)), "a tag or comment of more"),
+    "attribute.3mf": (model(b"<a b='%s'/>" % (b"1" * 20_000_000)), "a tag or comment longer"),
     "entities.3mf": (None, "declares the XML entity"),
     "count.gltf": (gltf({"bufferView": 0, "count": 60_000_000}), "would unpack to 457.76 MiB"),
     "sparse.gltf": (
@@ -105,7 +105,7 @@ BOMBS = {
             nodes=[{"mesh": 0}, *({"children": [i] * 11} for i in range(4))],
             roots=[4],
         ),
-        "places 14,641 objects of 7,320,500,000 triangles",
+        "places 14,641 objects with a total of 7,320,500,000 triangles",
     ),
     "draco.gltf": (draco(), "would unpack to 46.35 GiB"),
     "entities.dae": (entities("COLLADA"), "declares the XML entity"),
@@ -116,7 +116,7 @@ BOMBS = {
         + b"\3\0\1\2"
         + bytes(10**5)
         + b"\1",
-        "more than announced",
+        "more than declared",
     ),
     "laughs.yaml": (LAUGHS, "would unpack to"),
     "merged.yaml": (LAUGHS.replace(b"[1,1,1,1,1,1,1,1,1,1]", b"{x: 1}").replace(b"[*", b"{<<: [*")

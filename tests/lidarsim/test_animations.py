@@ -198,7 +198,7 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
     ("edit", "name", "message"),
     [
         (lambda h: None, "Moev", r"m.gltf has no animation 'Moev' \(Did you mean 'Move'\?\)\.$"),
-        (lambda h: None, "Walk", r"has no animation 'Walk' \(there are Move\)\.$"),
+        (lambda h: None, "Walk", r"has no animation 'Walk' \(the animations are Move\)"),
         (lambda h: h.pop("animations"), "", "Export it with animations, or remove"),
         (lambda h: h["skins"][0].update(joints=[]), "Move", "has a skin without joints"),
         (lambda h: h["accessors"][h["skins"][0]["inverseBindMatrices"]].update(count=1), "Move",
@@ -206,7 +206,7 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
         (lambda h: h["accessors"][-2].update(count=1), "Move", "without a duration"),
         (lambda h: h["nodes"][2].update(matrix=np.eye(4).ravel().tolist()), "Move",
          "node 2 is animated but has a matrix"),
-        (lambda h: h["animations"][0]["samplers"][0].update(input=0), "Move", "be ascending"),
+        (lambda h: h["animations"][0]["samplers"][0].update(input=0), "Move", "finite and increasing"),
         (lambda h: h["animations"][0]["channels"][0]["target"].update(node=9), "Move",
          "refers to index 9 of its nodes"),
         (lambda h: h["animations"][0].update(channels=[]), "Move", "not move any node"),
@@ -214,7 +214,7 @@ def test_a_wheel_of_a_file_turns_as_animated_even_if_it_shrinks_to_nothing(tmp_p
         (lambda h: h["animations"][0]["samplers"][0].update(interpolation="EASE"), "", "'EASE'"),
         (lambda h: (h["animations"][0]["samplers"][0].update(interpolation="CUBICSPLINE"),
                     h["accessors"][-1].update(type="SCALAR", count=12)), "Move",
-         "keys of a translation have 1 numbers, not 3"),
+         "keyframes of a translation must have 3 numbers, but have 1"),
         (lambda h: h["animations"][0]["channels"][0]["target"].update(node=0, path="weights"),
          "Move", "node 0 has 3 animated weights"),
     ],
@@ -286,7 +286,7 @@ def test_a_chain_of_many_joints(tmp_path):
 
 def test_only_gltf_has_animations(tmp_path):
     path = write(tmp_path / "m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    with pytest.raises(LidarError, match=r"has no animation, an option of \.glb \.gltf"):
+    with pytest.raises(LidarError, match=r"support animation \(an option of \.glb \.gltf"):
         load_objects(path, animation="Walk")
 
 
@@ -603,7 +603,9 @@ def test_wheels_turn_by_speed_over_radius():
         np.testing.assert_allclose(velocity[:, wheel][..., [0, 2]] - [5, 0], expected, atol=0.3)
     flat = replace(parts[1], name="wheel_flat", vertices=parts[1].vertices * [1, 1, 0.5])
     rolling([*parts, flat], ["wheel*"], notes.append)
-    assert notes == ["wheel_flat is not round about y (0.6 m long, 0.3 m high) and does not rotate"]
+    assert notes == [
+        "wheel_flat is not round about its y axis (0.6 m long, 0.3 m high) and does not rotate"
+    ]
     oval = replace(parts[1], name="wheel_oval", vertices=parts[1].vertices * [1, 1, 0.97])
     rolling([*parts, oval], ["wheel*"], notes.append)
     assert len(notes) == 1, "3 % off round still rotates"
@@ -617,7 +619,7 @@ def test_wheels_turn_by_speed_over_radius():
     with pytest.raises(
         LidarError,
         match=(
-            r"can rotate: wheel_flat is not round about y .* "
+            r"can rotate: wheel_flat is not round about its y axis .* "
             r"rotate\.$"
         ),
     ):
@@ -651,7 +653,7 @@ def test_scenarios_name_animations(tmp_path):
     )
     still = build(scenario(tmp_path, {k: v for k, v in one.items() if k != "animation"}))
     assert still.scene.actors[0].mesh.animation is None
-    assert any("actors move by animation: NAME" in line for line in advice(still))
+    assert any("set `animation: NAME` on an actor" in line for line in advice(still))
 
 
 @pytest.mark.parametrize(
@@ -705,9 +707,9 @@ def test_bad_animations_are_refused():
         LidarError, match=r"vertices of an animation must be an array of numbers, but is 'abc'"
     ):
         Animation("abc", 1)
-    with pytest.raises(LidarError, match=r"at least two poses.*but has \(1, 8, 3\), 0.1 s"):
+    with pytest.raises(LidarError, match=r"but has vertices \(1, 8, 3\), a step of 0.1 s"):
         Animation(mesh.vertices[None], 0.1)
-    with pytest.raises(LidarError, match=r"above 0, but has .* 0 s and None"):
+    with pytest.raises(LidarError, match=r"positive step and speed, .* of 0 s and"):
         Animation(np.stack([mesh.vertices] * 2), 0)
     with pytest.raises(LidarError, match="has 8 vertices, but its animation moves 7"):
         replace(mesh, animation=Animation(np.stack([mesh.vertices[1:]] * 2), 0.1))

@@ -83,7 +83,7 @@ def test_a_file_without_datagrams_is_refused_in_a_line(content, says, tmp_path):
     ("payload", "says"),
     [
         (b"\xee\xff" + b"\0" * 600, "Hesai packets, which are not supported. Convert"),
-        (b"\x55\xaa\x05\x5a" + b"\0" * 1244, "packets of a RoboSense, which are not read. Write"),
+        (b"\x55\xaa\x05\x5a" + b"\0" * 1244, "RoboSense packets, which are not supported. Convert"),
         (b"\0\x54\5" + b"\0" * 1361, "Livox packets, which are not supported. Record"),
         (b"\0" * 512, "contains no packets of a supported sensor. Sweeps can be read from"),
     ],

@@ -189,7 +189,7 @@ def test_points_are_selected_as_rows_of_an_array():
 
 @pytest.mark.parametrize("key", [2, [9], 0.5, [0.5], None, np.ones((5, 3), bool), [True], True])
 def test_what_selects_no_points(key):
-    with pytest.raises(LidarError, match=r"selected by a slice such as cloud\[:100\], a mask"):
+    with pytest.raises(LidarError, match=r"with a slice such as cloud\[:100\], a mask"):
         cloud_of()[key]
 
 

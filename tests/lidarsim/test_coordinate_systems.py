@@ -113,7 +113,7 @@ def test_scales_are_those_of_the_system_s_own_body():
     [
         (32632, 0, 0, ""),
         (25832, 5e5, 5e6, ""),
-        (25832, 5e6, 0, r"whose meter is 0\.793 m long at x 5000000, y 0: EPSG:32638 has"),
+        (25832, 5e6, 0, r"whose meter is 0\.793 m long at x 5000000, y 0.*EPSG:32638"),
         (2056, 2.6e6, 1.2e6, ""),
         (7415, 84600, 447000, ""),
         (3857, 0, 0, r"EPSG:3857 \(WGS 84 / Pseudo-Mercator\), a world map projection"),
@@ -121,7 +121,7 @@ def test_scales_are_those_of_the_system_s_own_body():
         (3994, 0, 0, r"\(WGS 84 / Mercator 41\), whose meter is"),
         (2263, 0, 0, "which is not in meters"),
         (4326, 8, 47, "which is not in meters"),
-        (1024, 0, 0, "a code that rasterio does not know"),
+        (1024, 0, 0, "which is unknown to rasterio"),
     ],
 )
 def test_chosen_systems_have_true_meters(epsg, x, y, message):
@@ -142,7 +142,7 @@ def test_without_the_registry_systems_of_the_world_are_known(monkeypatch):
 def test_meshes_in_a_stretched_system_are_told_the_factor():
     assert scale_problem("EPSG:25832", 5e5, 5e6) == scale_problem("no system", 0, 0) == ""
     problem = scale_problem("+proj=merc +datum=WGS84", 1e6, 6e6)
-    assert problem.startswith("whose meter is 0.676 m") and ": scale [0.676" in problem
+    assert problem.startswith("whose meter is 0.676 m") and "(scale [0.676" in problem
 
 
 @needs_registry

@@ -145,7 +145,7 @@ def test_a_system_in_an_extended_record(tmp_path):
 
 def test_an_unstated_unit_of_heights_is_noted(tmp_path):
     (note,) = check_conversion(tmp_path, *STATED["WKT 1, US survey foot"])
-    assert "US survey foot" in note and "no unit of heights" in note and "--unit" in note
+    assert "US survey foot" in note and "not state a unit for heights" in note and "--unit" in note
 
 
 @pytest.mark.parametrize("wkt_bit", [False, True])
@@ -163,8 +163,8 @@ def test_of_both_the_header_says_which_counts(tmp_path, wkt_bit):
         (keys((1024, 2), (2048, 4326)), r"are angles.*EPSG:4326.*reprojection"),
         (wkt(GEOGCS), r"are angles \(NAD83\)"),
         (wkt('PROJCS["no unit",PROJECTION["x"]]'), r"'no unit' has no unit"),
-        (wkt('PROJCS["cut",UNIT["foot"'), r"is cut short: its coordinate system"),
-        (wkt("+proj=utm +zone=33"), "its coordinate system begins with 'PROJ', and WKT"),
+        (wkt('PROJCS["cut",UNIT["foot"'), r"is truncated: its coordinate system"),
+        (wkt("+proj=utm +zone=33"), "its coordinate system begins with 'PROJ', but the WKT"),
     ],
 )
 def test_what_cannot_be_known_is_refused_unless_the_unit_is_given(
@@ -187,14 +187,15 @@ def test_equal_numbers_of_feet_and_meters_are_apart(tmp_path):
     meters = written(tmp_path / "meters.las", PLACE)
     found = compare(feet, meters)
     assert found.figures["distances"]["a_to_b"]["mean_m"] > 100
-    assert any("feet.las is in the unit foot" in note for note in found.figures["notes"])
+    notes = found.figures["notes"]
+    assert any("feet.las was converted from foot to meters" in note for note in notes)
     same = compare(feet, meters, unit_a="m").figures["distances"]["a_to_b"]
     assert same["mean_m"] < 1e-5
 
 
 def test_what_is_in_meters_has_no_unit_to_give(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"0")
-    with pytest.raises(LidarError, match=r"unit of .*a\.mcap is the meter\. Remove the unit 'ft'"):
+    with pytest.raises(LidarError, match=r"a\.mcap is always in meters\. Remove the unit 'ft'"):
         compare(tmp_path / "a.mcap", tmp_path / "a.mcap", unit_a="ft")
 
 

@@ -200,18 +200,18 @@ def test_copies_of_a_node(tmp_path):
     notes = []
     found = load_meshes(path, up_axis="z", tell=notes.append)
     assert [one.name for one in found] == ["Tree", "Tree", "Leaf"]
-    assert notes == [f"{path} has objects without an area, which are left out: Tree."]
+    assert notes == [f"{path} has objects without an area, which were skipped: Tree."]
     bounds = [one.flat().bounds for one in found]
     np.testing.assert_allclose(bounds[0], [[10, -4, 96], [10, 4, 104]], atol=1e-6)
     np.testing.assert_allclose(bounds[1], [[-10, 16, 96], [-10, 24, 104]], atol=1e-6)
     np.testing.assert_allclose(bounds[2], [[10, -4, 96], [10, 4, 104]], atol=1e-6)
 
     header["accessors"][3]["count"] = 2
-    with pytest.raises(LidarError, match=r"have \[2, 3, 3\] rows"):
+    with pytest.raises(LidarError, match=r"have \[2, 3, 3\]"):
         load(path, header, body)
     for accessor in header["accessors"][3:]:
         accessor["count"] = 1_000_000
-    with pytest.raises(LidarError, match="places a mesh 1,000,000 times by EXT_mesh_gpu"):
+    with pytest.raises(LidarError, match="places a mesh 1,000,000 times with EXT_mesh_gpu"):
         load(path, header, body)
 
 

@@ -132,7 +132,7 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
     assert len(load_meshes(path)[0].faces) == 12
     for number in (0, 5, 13):
         write(path, content[:80] + struct.pack("<I", number) + content[84:])
-        with pytest.raises(LidarError, match=f"announces {number} triangles and has 12"):
+        with pytest.raises(LidarError, match=f"declares {number} triangles but has 12"):
             load_meshes(path)
     write(path, bytes(84))
     with pytest.raises(LidarError, match="contains no triangles"):
@@ -142,11 +142,11 @@ def test_a_binary_stl_with_a_few_bytes_more_or_a_wrong_number(tmp_path):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (gzip.compress(b"v 0 0 0\n", mtime=0), "is packed"),
+        (gzip.compress(b"v 0 0 0\n", mtime=0), "is compressed"),
         (b"\n<!DOCTYPE html>", "is a web page"),
         (b"version https://git-lfs.github.com/spec/v1\n", "git lfs pull"),
-        (b"ply\nformat ascii 1.0\n", "begins like a .ply file: give it that ending"),
-        ("v 0 0 0\nf 1 1 1\n".encode("utf-16"), "text in UTF-16: save it as UTF-8"),
+        (b"ply\nformat ascii 1.0\n", "appears to be a .ply file. Change its extension"),
+        ("v 0 0 0\nf 1 1 1\n".encode("utf-16"), "encoded in UTF-16. Save it as UTF-8"),
     ],
 )
 def test_what_is_no_mesh_is_recognized(tmp_path, content, message):
@@ -162,7 +162,7 @@ def test_objects_farther_than_anything_on_earth(tmp_path):
     (near,) = load_meshes(path, unit="km", tell=notes.append)
     assert near.name == "Ball" and np.abs(near.bounds).max() < 1e5
     assert [note.partition(" has objects ")[2] for note in notes] == [
-        "farther than anything on Earth (2e+08 m from the origin), which are left out: Box; check "
+        "farther than anything on Earth (2e+08 m from the origin), which were skipped: Box. Check "
         "their units and placement."
     ]
     away = Transform.from_parts((2e8, 0, 0))
@@ -225,46 +225,46 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
     [
         ("m.obj", "", r"is empty \(0 bytes\)"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "line 4 is 'f 1 2 9', .*missing"),
-        ("m.obj", "o a\nv 0 0 \\\n0\nv 1 0 x\n", "line 4 is 'v 1 0 x', and three numbers"),
-        ("m.obj", "v 0 0 0\nf 1 1 1\nf -1 1 -1\nv 1 0 x\n", "line 4 is 'v 1 0 x', and three"),
+        ("m.obj", "o a\nv 0 0 \\\n0\nv 1 0 x\n", "line 4 is 'v 1 0 x', but three numbers"),
+        ("m.obj", "v 0 0 0\nf 1 1 1\nf -1 1 -1\nv 1 0 x\n", "line 4 is 'v 1 0 x', but three"),
         ("m.obj", "v 0 0 0\nf 1 1 1\nf 0 1 1\nv 1 0 0\n", "line 3 is 'f 0 1 1', .*missing"),
         ("m.obj", "v 0 0 0\nf 1 1 -2\nv 1 0 0\n", "line 2 is 'f 1 1 -2', .*missing"),
-        ("m.obj", "v 0 0 0\nf 1 1 a/1\n", "line 2 is 'f 1 1 a/1', and numbers of vertices"),
+        ("m.obj", "v 0 0 0\nf 1 1 a/1\n", "line 2 is 'f 1 1 a/1', but vertex numbers"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\nv 5 5 5\n", "f -1 -2 -4.*missing"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "only triangles without an area"),
-        ("m.obj", "v 1 2\nf 1 1 1\n", "line 1 is 'v 1 2', and three numbers"),
+        ("m.obj", "v 1 2\nf 1 1 1\n", "line 1 is 'v 1 2', but three numbers"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "line 6 is '3 0 1 7', .*0 to 2"),
         ("m.off", "OFF # a b\n\n3 1 0\n0 0 0\n1 0 z\n0 1 0\n3 0 1 2\n", "line 5 is '1 0 z', "),
         ("m.off", "# mine\n\nOFF\n3 1 0\n0 0 0\n1 0 z\n0 1 0\n3 0 1 2\n", "line 6 is '1 0 z', "),
-        ("m.off", "OFF\n3 one 0\n", "line 2 is '3 one 0', and the numbers of vertices and faces"),
-        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "cut short: .*2 faces announced"),
-        ("m.off", "OFF\n3 1 0\n0 0 0 1 0 0\n0 1 0\n3 0 1 2\n", "each in a line of its own"),
-        ("m.off", "OFF\n3 99999999999 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "faces announced"),
+        ("m.off", "OFF\n3 one 0\n", "line 2 is '3 one 0', but the numbers of vertices and faces"),
+        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "truncated: .*2 faces are"),
+        ("m.off", "OFF\n3 1 0\n0 0 0 1 0 0\n0 1 0\n3 0 1 2\n", "each in a separate line"),
+        ("m.off", "OFF\n3 99999999999 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "faces are declared"),
         ("m.off", "OFF BINARY\n3 1 0\n", "binary OFF"),
-        ("m.stl", "solid a\nfacet\n", "is cut short: .*does not end"),
-        ("m.stl", TEXT_STL.replace("vertex 1 0 0", "vertex 1 0"), "line 4 is 'vertex 1 0', and"),
+        ("m.stl", "solid a\nfacet\n", "is truncated: .*does not end"),
+        ("m.stl", TEXT_STL.replace("vertex 1 0 0", "vertex 1 0"), "line 4 is 'vertex 1 0', but"),
         ("m.stl", TEXT_STL.replace("vertex 1 0 0", "vertex 1 a 0"), "line 4 is 'vertex 1 a 0', "),
         ("m.stl", TEXT_STL.replace("vertex 1 0 0\n", ""), "ends in line 7 has 2 vertices"),
         ("m.ply", PLY.replace("element face 2", "element face 0"), "point cloud"),
-        ("m.ply", PLY + "3 0 2 3\n", "more than announced"),
+        ("m.ply", PLY + "3 0 2 3\n", "more than declared"),
         ("m.ply", PLY.replace("double x", "double u"), "have no x"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "must be integers"),
-        ("m.ply", PLY.replace("double z", "half z"), "line .* is 'property half z', and format, "),
+        ("m.ply", PLY.replace("double z", "half z"), "line .* is 'property half z', but format, "),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 b 3"), "line 15 has 'b', but a number"),
-        ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "a list of face has the length -3"),
-        ("m.ply", PLY.replace("3 0 2 3", ""), "is cut short: 2 rows of face announced"),
+        ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "a list in face has the length -3"),
+        ("m.ply", PLY.replace("3 0 2 3", ""), "is truncated: 2 rows of face are declared"),
         ("m.ply", "plain text\n", "first line is not 'ply'"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "0 to 9"),
         ("m.ply", PLY.replace("element face", "element tristrips"), "triangle strips"),
-        ("m.ply", PLY.partition("end_header")[0], "is cut short: .*no line end_header"),
-        ("m.part", "LASF", "has the ending .part"),
+        ("m.ply", PLY.partition("end_header")[0], "is truncated: .*no end_header line"),
+        ("m.part", "LASF", "has the extension .part"),
         ("m.gltf", "[" * 100_000, "not contain valid JSON"),
         *[
             (
                 f"m{suffix}",
                 content,
-                "cannot be read|cut short|truncated|no triangles|is not glTF|valid JSON|"
+                "cannot be read|truncated|no triangles|is not glTF|valid JSON|"
                 "pip install|"
                 "is not an AMAPVox",
             )
@@ -323,7 +323,7 @@ def test_formats_of_a_package_that_is_not_installed_name_it(tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, more_formats.__name__, None)
     package = more_formats.__name__.partition(".")[0]
     with pytest.raises(
-        LidarError, match=f"{package} reads more: pip install -e \\. in a checkout of lidarpool"
+        LidarError, match=f"formats of {package}, run pip install -e \\. in a checkout"
     ):
         load_meshes(write(tmp_path / "m.usd", "#usda 1.0"))
     assert len(load_meshes(write(tmp_path / "m.obj", OBJ.format(x=0, x1=1)))) == 2

@@ -197,7 +197,7 @@ def test_a_station_may_end_a_rounding_beyond_the_last_pose():
         ({"duration_s": 1 + 0.9e-6}, None),
         ({"start_s": -1.1e-6}, "start_s is -1.1e-06 s, which is 1.1e-06 s outside"),
         ({"duration_s": 1 + 1.1e-6}, r"duration_s is 1\.0000011 s, which is 1.1e-06 s outside"),
-        ({"start_s": 1.0}, "must be above 0, but it covers 1 to 1 s"),
+        ({"start_s": 1.0}, "must be greater than 0, but it covers 1 to 1 s"),
         ({"start_s": np.nan}, "start_s must be a finite number"),
     ):
         if gap is None:
@@ -252,11 +252,11 @@ def test_angles_of_a_track_are_those_of_poses(smooth):
 @pytest.mark.parametrize(
     ("angles", "message"),
     [
-        ({"roll_deg": 3}, "Give yaw_deg beside roll_deg, for example"),
-        ({"yaw_deg": [1, 2, 3]}, r"yaw_deg must be one finite angle, or one for each of the 2"),
+        ({"roll_deg": 3}, "roll_deg cannot be used without yaw_deg. Pass"),
+        ({"yaw_deg": [1, 2, 3]}, "yaw_deg must be a finite angle, or one finite angle for each"),
         ({"yaw_deg": np.nan}, "one finite angle"),
         ({"yaw_deg": "north"}, "array of numbers"),
-        ({"yaw_deg": 3, "quaternions": [[0, 0, 0, 1]] * 2}, "quaternions and yaw_deg both give"),
+        ({"yaw_deg": 3, "quaternions": [[0, 0, 0, 1]] * 2}, "quaternions and yaw_deg both define"),
     ],
 )
 def test_angles_that_make_no_track(angles, message):

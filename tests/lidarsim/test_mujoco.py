@@ -192,7 +192,7 @@ def test_many_lidars_take_one_call(world):
         ({"site": "lidar", "exclude": ["bal"]}, "no body or geom 'bal'. Did you mean 'ball'"),
         ({"site": "lidar", "groups": [5]}, r"belongs to the groups \(5,\)"),
         ({"site": "lidar", "objects": "part"}, "objects must be .* but is 'part'"),
-        ({"site": "lidar", "sag_m": 0}, "sag_m must be above 0, but is 0"),
+        ({"site": "lidar", "sag_m": 0}, "sag_m must be greater than 0, but is 0"),
     ],
 )
 def test_wrong_options(world, options, message):

@@ -81,6 +81,6 @@ def test_materials_outside_are_noted_with_what_to_name(tmp_path, name):
     notes = []
     (mesh,) = load_meshes(folder / "a.obj", colors=True, tell=notes.append)
     assert mesh.colors is None
-    assert f"{name} (outside its folder, name the folder of that file as assets)" in notes[0]
+    assert f"{name} (outside the folder of the mesh; set assets to" in notes[0]
     (mesh,) = load_meshes(folder / "a.obj", colors=True, assets=tmp_path, tell=notes.append)
     assert mesh.colors is not None and len(notes) == 1

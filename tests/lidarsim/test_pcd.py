@@ -210,19 +210,19 @@ GOOD = header([*"xyz"], ["f4"] * 3, 2, "ascii") + b"1 2 3\n4 5 6\n"
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"FIELDS x y z", b"FIELDS x y w", "its FIELDS are x, y, w: .*has no z"),
+        (b"FIELDS x y z", b"FIELDS x y w", "its FIELDS are x, y, w.*has no z"),
         (b"FIELDS x y z\n", b"", "its header has no FIELDS"),
-        (b"SIZE 4 4 4", b"SIZE 4 4", "the lines FIELDS and SIZE of its header differ in length"),
-        (b"SIZE 4 4 4", b"SIZE 4 3 4", "its field 'y' has TYPE F, SIZE 3 and COUNT 1: "),
+        (b"SIZE 4 4 4", b"SIZE 4 4", "its header has 3 entries in FIELDS, but 2 in SIZE"),
+        (b"SIZE 4 4 4", b"SIZE 4 3 4", "its field 'y' has TYPE F, SIZE 3 and COUNT 1"),
         (b"TYPE F F F", b"TYPE F F X", "its field 'z' has TYPE X"),
-        (b"COUNT 1 1 1", b"COUNT 1 -1 1", "line 6 of its header is 'COUNT 1 -1 1': whole numbers"),
-        (b"COUNT 1 1 1", b"COUNT 2 1 1", r"line 12 has 3 cells, and 4 were expected \(x_0, x_1, y"),
+        (b"COUNT 1 1 1", b"COUNT 1 -1 1", "is 'COUNT 1 -1 1'. Expected whole numbers"),
+        (b"COUNT 1 1 1", b"COUNT 2 1 1", r"line 12 has 3 cells, but 4 were expected \(x_0, x_1, y"),
         (b"WIDTH 2", b"WIDTH 3", "2 POINTS, but a WIDTH of 3 by a HEIGHT of 1"),
-        (b"WIDTH 2", b"WIDTH two", "line 7 of its header is 'WIDTH two': a whole number"),
-        (b"POINTS 2", b"POINTS 2\nPOINTS 2", "its header has POINTS in line 10 and 11"),
-        (b"HEIGHT 1", b"DEPTH 1", "line 8 of its header begins with 'DEPTH': VERSION, FIELDS"),
+        (b"WIDTH 2", b"WIDTH two", "line 7 of its header is 'WIDTH two'. Expected a whole number"),
+        (b"POINTS 2", b"POINTS 2\nPOINTS 2", "its header repeats POINTS in lines 10 and 11"),
+        (b"HEIGHT 1", b"DEPTH 1", "line 8 of its header begins with 'DEPTH', but VERSION, FIELDS"),
         (b"0 0 0 1 0 0 0", b"0 0 0 2 0 0 0", "line 9 of its header is 'VIEWPOINT .*of length 1"),
-        (b"0 0 0 1 0 0 0", b"0 0 1 0 0 0 0", "a quaternion w x y z of length 1 were expected"),
+        (b"0 0 0 1 0 0 0", b"0 0 1 0 0 0 0", "a quaternion w x y z of length 1"),
         (b"0 0 0 1 0 0 0", b"0 0 0 1 0 0", "a position x y z and a quaternion"),
         (b"0 0 0 1 0 0 0", b"nan 0 0 1 0 0 0", "a position x y z and a quaternion"),
         (
@@ -231,8 +231,8 @@ GOOD = header([*"xyz"], ["f4"] * 3, 2, "ascii") + b"1 2 3\n4 5 6\n"
             "its DATA is 'zip', but must be ascii, binary or binary_compressed",
         ),
         (b"4 5 6", b"4 5 a", "line 13 has 'a' as z, but a number was expected"),
-        (b"4 5 6", b"4 5", r"line 13 has 2 cells, and 3 were expected \(x, y, z\)"),
-        (b"4 5 6\n", b"4 5 6\n7 8 9\n", "2 points announced, and 3 lines follow"),
+        (b"4 5 6", b"4 5", r"line 13 has 2 cells, but 3 were expected \(x, y, z\)"),
+        (b"4 5 6\n", b"4 5 6\n7 8 9\n", "2 points are declared, but 3 lines follow"),
         (b"TYPE F F F", b"TYPE F F U", None),
         (b"TYPE F F F\n", b"TYPE F F U\n#", None),
     ],
@@ -251,7 +251,7 @@ def test_what_is_wrong_is_named(tmp_path, old, new, message):
 def test_whole_numbers_that_are_none_are_named(tmp_path):
     text = header([*"xyz", "label"], ["f4"] * 3 + ["u1"], 2, "ascii")
     for cell in ("2.5", "256", "-1"):
-        with pytest.raises(ValueError, match="its field 'label' has other numbers than whole ones"):
+        with pytest.raises(ValueError, match="its field 'label' must contain whole numbers"):
             read(tmp_path, text + f"1 2 3 4\n1 2 3 {cell}\n".encode())
 
 
@@ -266,7 +266,7 @@ def test_what_ends_too_early_is_cut_short(tmp_path, encoding):
 def test_bytes_after_the_points_are_refused_and_zeros_are_padding(tmp_path):
     content = encoded("binary", [*"xyz"], ["f4"] * 3, [X, Y, Z])
     assert len(read(tmp_path, content + bytes(4000)).positions) == COUNT
-    with pytest.raises(ValueError, match="50 points announced, and 12 bytes follow them"):
+    with pytest.raises(ValueError, match="50 points are declared, but 12 bytes follow them"):
         read(tmp_path, content + 12 * b"\x01")
 
 

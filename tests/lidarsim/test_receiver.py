@@ -568,13 +568,16 @@ def drive(subrays=1, backend="numpy", **noise):
 @pytest.mark.slow
 @pytest.mark.slow(keep=("7",))
 @pytest.mark.parametrize("subrays", (1, 7))
-def test_batches_do_not_matter(subrays):
+def test_batches_do_not_matter(subrays, monkeypatch):
     rig, survey = drive(subrays, crosstalk=True)
     whole = cast_between(rig, survey, [0, 24])
     assert cast_between(rig, survey, range(25)) == whole
     assert cast_between(rig, survey, [0, 5, 6, 12, 17, 24]) == whole
     causes = np.frombuffer(whole[0]["cause"], np.uint8)
     assert set(causes.tolist()) == {SURFACE, FALSE_ALARM, CROSSTALK, BLOOMING}
+    first = cast_between(rig, survey, [0, 2])
+    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 500)
+    assert cast_between(rig, survey, [0, 2]) == first
 
 
 @pytest.mark.extended

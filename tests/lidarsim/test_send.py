@@ -107,7 +107,7 @@ def test_what_cannot_be_sent_is_noted_once_and_counted(receiver):
     assert lateness.sent == 2
     assert lateness.failures == {"Message too long": 3}
     assert len(notes) == 1
-    assert "are not sent: Message too long" in notes[0]
+    assert "packets cannot be sent to" in notes[0]
     assert "3 not sent: Message too long" in str(lateness)
 
 
@@ -198,14 +198,14 @@ def test_the_process_imports_nothing_that_takes_time_to_start():
         ("::1", "Use an IPv4 address"),
         ("[::1]:2368", "an IPv6"),
         ("239.1.2.3:2368", "a multicast address"),
-        ("0.0.0.0", "no address of a receiver"),
+        ("0.0.0.0", "not the address of a receiver"),
         ("127.0.0.1:0", "Use HOST or HOST:PORT"),
         ("127.0.0.1:70000", "Use HOST or HOST:PORT"),
         ("127.0.0.1:x", "Use HOST or HOST:PORT"),
         ("127.0.0.1:" + "9" * 5000, "Use HOST or HOST:PORT"),
         ("127.0.0.1:\u0662", "Use HOST or HOST:PORT"),
-        ("255.255.255.255:2368", "no address of a receiver"),
-        ("127.255.255.255", "no address of a receiver"),
+        ("255.255.255.255:2368", "not the address of a receiver"),
+        ("127.255.255.255", "not the address of a receiver"),
         ("no-such-host.invalid", "has no IPv4 address"),
         ("", "has no IPv4 address"),
         ("a" * 70 + ".b", "has no IPv4 address"),

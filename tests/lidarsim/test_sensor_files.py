@@ -541,13 +541,13 @@ def test_a_scanner_of_many_is_named_and_has_its_highest_rates(tmp_path):
     path.write_text(SCANNERS)
     with pytest.raises(
         LidarError,
-        match=r"2 scanners. Name one, for example scanners.xml#far. Its scanners are far, ",
+        match=r"2 scanners. Select one, for example scanners.xml#far. Its scanners are far, ",
     ):
         sensor_of_scanner(path, tmp_path / "new")
     with pytest.raises(LidarError, match=r"the file has no <scanner> 'fur'\. Did you mean 'far'"):
         sensor_of_scanner(tmp_path / "scanners.xml#fur", tmp_path / "new")
     sensor, mount, [note] = sensor_of_scanner(tmp_path / "scanners.xml#far", tmp_path / "new")
-    assert note == "missing <scannerSettings> (the highest rates are used)"
+    assert note == "scanners without <scannerSettings> (the highest rates are used)"
     assert sensor.times_ns(np.arange(2))[:, 0].tolist() == [0, 500_000] and sensor.min_range_m == 2
     assert np.allclose(np.degrees(np.arcsin(sensor.directions(np.arange(9))[:, 0, 2])), 70)
     assert mount.position == (0, 0, 0.1) and mount.rotation is not None
@@ -846,7 +846,7 @@ def test_import_reads_tables_of_other_programs(tmp_path):
     assert np.allclose(np.degrees(np.arcsin(z)), [10, -10, 90])
     path.write_text("azimuth_deg,elevation_deg\n0,0\n1,0\n")
     [line] = import_whole(import_sensor, path, tmp_path / "untimed", (), Scenario.load)
-    assert line == "missing firing times (2 rays are fired in 0.1 s)"
+    assert line == "files without firing times (2 rays are fired in 0.1 s)"
     path.write_text("azimuth_deg,speed\n0,0\n")
     with pytest.raises(
         LidarError,

@@ -293,7 +293,7 @@ def test_a_step_without_a_role_cannot_be_defined():
 
 def test_a_step_where_it_would_not_act_is_refused():
     for step, before in ((Echo, CastStep), (Echo, RecordingStep), (HalfOfReturns, CastStep)):
-        with pytest.raises(ValueError, match=rf"^step {step.__name__} of Role.* must be after "):
+        with pytest.raises(ValueError, match=rf"^step {step.__name__} with Role.* must be after "):
             add_step(step, before)
     with pytest.raises(ValueError, match=r"^step Aside with Role.AIMS must be before CastStep"):
         add_step(Aside, DirtStep)

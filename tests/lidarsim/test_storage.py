@@ -139,7 +139,7 @@ def test_nothing_goes_through_a_link_below_the_named_folder(use, tmp_path):
     named.symlink_to(tmp_path / "out")
     (named / "link").symlink_to(theirs)
     for storage in (Storage.at(named), pickle.loads(pickle.dumps(Storage.at(named)))):
-        with pytest.raises(LidarError, match=f"{named}/link is a symbolic link. Nothing behind"):
+        with pytest.raises(LidarError, match=f"{named}/link is a symbolic link, but links in"):
             USES[use](storage)
     assert {path.name for path in theirs.iterdir()} == {"in", "file"}
     Storage.at(named).discard("link")
@@ -215,7 +215,7 @@ def header(shape):
     [
         (
             packed({"x": header((400_000_000,)) + bytes(9)}),
-            "x.npy does not have the length of its",
+            "the size of x.npy does not match its header",
         ),
         (packed({f"x{k}": np.zeros(2**16 - 16) for k in range(4)}), "unpack to at least 2.00 MiB"),
         (packed({"x": header((1,)) + bytes(2**24)}), "would unpack to at least 16.00 MiB"),

@@ -76,7 +76,7 @@ def test_exact_names_are_not_spelled_otherwise():
             "'range \\[ft\\]' has the unit 'ft', which is not supported. Convert it to m, cm",
         ),
         ("time_s,range,range\n0,1,1\n", "its column 'range' occurs twice"),
-        ("time_s,range,distance\n0,1,1\n", "'range' and 'distance' both mean range_m"),
+        ("time_s,range,distance\n0,1,1\n", "'range' and 'distance' both correspond to range_m"),
         ("time_s,rnage\n0,1\n", "unknown column 'rnage'"),
         ("time_s,\n0,car\n", "column 2 has no name, but contains 'car'"),
         ("time_s,range\n0,1\n1,2,3\n", "line 3 has 3 cells, but the header has 2"),

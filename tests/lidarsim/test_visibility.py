@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
-from tests.shapes import CPU, ball, level, quad, tally_of, wall
+from tests.shapes import CPU, ball, cast_between, level, quad, tally_of, wall
 
 from lidarpool import (
     Actor,
@@ -223,6 +223,21 @@ EFFECTS = {
         "returns": Returns("all", divergence_mrad=3),
     },
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_chunks_of_rays_change_no_byte(name, monkeypatch):
+    middle = (0, 0, 1) if name in ("refraction", "leaves") else (4, 5, 1)
+    scene = Scene.from_meshes(
+        [level("Ground"), wall("Wall", 12), ball("Pane", 2.0, middle, 3), PLATE]
+    )
+    columns = [*COLUMNS, "cause", "return_number"]
+    survey = Survey(GRID, poses=[(0, 0, 1)], steps=2, columns=columns, **EFFECTS[name])
+    rig = Rig(scene, survey, "numpy")
+    whole = cast_between(rig, survey, [0, 2])
+    assert len(whole[0]["x"]) > 500
+    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 200)
+    assert cast_between(rig, survey, [0, 2]) == whole
 
 
 @pytest.mark.extended

@@ -114,8 +114,8 @@ def test_variants_of_the_format(tmp_path):
     told = []
     (one,) = load_meshes(first, tell=told.append)
     assert told == [
-        f"{first} states the leaf angle distribution 'Planophile'. Set the same leaf_angle for its "
-        "object."
+        f"{first} specifies the leaf angle distribution 'Planophile'. Set the same leaf_angle for "
+        "its object."
     ]
     assert one.voxels.density.tolist() == [[[1, 2]]]
     second = written(tmp_path / "b.vox", [[[1, 2]]], size=2.0)
@@ -156,7 +156,7 @@ def test_unknown_voxels_are_empty_and_told_of(tmp_path):
         (
             "1 0 1 0.4",
             "1 0 1 -0.4",
-            "has a density of -0.4 m²/m³ in voxel 1 0 1, but densities must be from 0 to 10000",
+            "has a density of -0.4 m²/m³ in voxel 1 0 1, but densities must be between 0 and 10000",
         ),
         ("1 0 1 0.4", "1 0 1 1e9", r"has a density of 1e\+09 m²/m³ in voxel 1 0 1"),
         ("1 0 1 0.4", "1 0 1 leaf", "line 10 has 'leaf' as PadBVTotal, but a number"),

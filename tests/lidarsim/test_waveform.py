@@ -287,6 +287,15 @@ def test_samples_are_rounded_to_the_smallest_step_that_holds_them(power):
     assert digitized(np.zeros((1, 4)))[0].tolist() == [[2048] * 4]
 
 
+def test_chunks_of_rays_change_no_record(monkeypatch):
+    made = survey(steps=1, noise=Noise(range_m=0.02, detection_range_m=60), waveform_samples=64)
+    rig = Rig(fence(), made, "numpy")
+    whole, tally = cast_between(rig, made, [0, 1])
+    assert len(whole["x"]) > 4 * 50
+    monkeypatch.setattr("lidarsim.simulator.pulses.CHUNK_RAYS", 1000)
+    assert cast_between(rig, made, [0, 1]) == (whole, tally)
+
+
 @pytest.mark.extended
 def test_recording_changes_no_point_and_no_batch_changes_a_record():
     made = survey(noise=Noise(range_m=0.02, detection_range_m=60), waveform_samples=64)

@@ -211,7 +211,7 @@ def test_points_are_shown_in_their_own_colors(tmp_path):
     assert "rgb" not in [column["name"] for column in state["columns"]], "no column to filter by"
     answer, arrays = told(view, "points", color="rgb", most=ALL, filter="x,10,19")
     assert arrays["colors"].tolist() == [[k, 9, 200, 255] for k in range(10, 20)]
-    assert answer["legend"]["title"] == "colors of the surfaces"
+    assert answer["legend"]["title"] == "surface colors"
 
 
 def test_surfaces_have_the_colors_that_are_asked_for(cloud, pictured):
@@ -410,7 +410,7 @@ def test_results_of_unlike_sweeps_are_not_played_and_those_in_sensor_axes_are_re
     unlike = [result_in(tmp_path / name, of) for name, of in (("a", spun), ("b", later))]
     assert open_results(unlike).sweeps is None
     in_axes = result_in(tmp_path / "c", replace(spun, coordinates="sensor"))
-    with pytest.raises(LidarError, match=r"c has points in the axes of its sensors"):
+    with pytest.raises(LidarError, match=r"c contains points in sensor coordinates"):
         open_results([unlike[0], in_axes])
 
 
@@ -445,7 +445,7 @@ def test_what_cannot_be_written_is_told(tmp_path, spun, monkeypatch):
     with pytest.raises(KeyError):
         told(view, "export", format="exe")
     monkeypatch.setattr("lidarview.viewer.view.MAX_POINTS", 3)
-    assert "20 points are more than 3" in told(view, "export", format="ply")[0]["error"]
+    assert "20 points; the limit is 3" in told(view, "export", format="ply")[0]["error"]
     held = View(HeldPoints(Cloud(np.zeros((1, 3)), {})), downloads=formats)
     assert not told(held, "state")[0]["exports"], "of a run, some parts are read"
     monkeypatch.undo()
@@ -489,7 +489,7 @@ def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, p
     survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")
     view = View(CloudFile(cloud), pictured, Sweeps.from_survey(survey, scene))
     state, arrays = told(view, "state")
-    assert (state["scene_colors"], "axes of their sensor" in state["note"]) == (None, True)
+    assert (state["scene_colors"], "in sensor coordinates" in state["note"]) == (None, True)
     assert not arrays["sensor0_places"].any()  # each sensor is at its own origin
     assert len(pictured.sample_rays) and not len(arrays["rays"]), "which are in the scene's axes"
     assert ["Wall", 0] in told(view, "column", name="object")[0]["labels"]
@@ -574,7 +574,7 @@ def test_normals_are_colors_of_points_and_of_the_scene(tmp_path, cloud, pictured
     told, arrays = view.answer("points", {"color": "normals", "most": "9"}, bool)
     shown = arrays["colors"][:, :3].tolist()
     assert shown == [[255, 128, 128], [128, 0, 128], [128, 128, 255], [128, 128, 128]]
-    assert "x red, y green, z blue" in told["legend"]["title"]
+    assert "x is red, y is green, z is blue" in told["legend"]["title"]
     surface = View(CloudFile(cloud), pictured).answer("surface", {"color": "normals"}, bool)[1]
     assert not surface["colors"].std(axis=1).any(), "of flat faces"
     edges = np.diff(surface["corners"][:, [0, 1, 2]], axis=1)

@@ -31,15 +31,15 @@ def test_shares_of_the_field_are_those_of_the_maker():
     shares = [re.fullmatch(r"after ([\d.]+) s: (\d+) %", words).groups() for words in covered]
     assert frame == "one frame" and [time for time, _ in shares] == ["0.1", "0.5", "2"]
     assert [int(share) for _, share in shares] == pytest.approx([19.5, 68, 100], abs=5)
-    assert any("azimuth: degrees from x, forward, to y, left" in text for text in texts(page))
+    assert any("azimuth in degrees from x (forward) to y (left)" in text for text in texts(page))
 
 
 def test_a_pattern_that_repeats_is_drawn_once():
     page = pattern_page(Sensor.grid(360, 4, 20, rate_hz=10))
     assert headings(page) == [
         "one revolution",
-        "the first 8 firings, 1,944 µs, from the first color on",
-        "after 0.1, 0.5, 2 s: the same directions",
+        "first 8 firings, 1,944 µs, with the full color range",
+        "after 0.1, 0.5, 2 s: identical coverage",
     ]
 
 
@@ -50,7 +50,7 @@ def test_a_slow_head_covers_more_and_more():
 
 def test_a_sensor_that_looks_down_states_its_angle():
     page = pattern_page(load_sensor("airborne/riegl-vq780i"))
-    assert any(text.startswith("angle: 0 is down") for text in texts(page))
+    assert any(text.startswith("angle: 0 points down") for text in texts(page))
 
 
 def test_the_documentation_shows_each_model_in_a_small_picture():

@@ -272,16 +272,18 @@ def test_a_page_with_less_room_has_fewer_points_where_they_are_dense(drive, monk
     far = [np.linalg.norm(some, axis=1) > 15 for some in (places, dense)]
     assert 1000 < len(places) < 40_000 and far[0].mean() > 1.02 * far[1].mean()
     monkeypatch.setattr(lidarview.viewer.sharing, "PAGE_BYTES", 500_000)
-    with pytest.raises(LidarError, match="Even without points"):
+    with pytest.raises(LidarError, match="even without points"):
         page_of(open_result(drive))
 
 
 def test_wrong_names_and_results_without_points_are_refused(drive, tmp_path):
     film = tmp_path / "film.mp4"
     page = tmp_path / "page.htm"
-    with pytest.raises(LidarError, match=r"film.mp4 does not end with .gif or .webp"):
+    with pytest.raises(
+        LidarError, match=r"film.mp4 has an unsupported extension. Use .gif or .webp"
+    ):
         share(open_result(drive), film, None)
-    with pytest.raises(LidarError, match=r"page.htm does not end with .html"):
+    with pytest.raises(LidarError, match=r"page.htm has an unsupported extension. Use .html"):
         share(open_result(drive), None, page)
     with pytest.raises(LidarError, match="cannot be written"):
         share(open_result(drive), None, tmp_path / "none" / "page.html")

@@ -296,7 +296,7 @@ def test_only_paths_that_can_be_seen_beside_the_best_are_in_the_legend(planned, 
 
 
 def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):
-    with pytest.raises(LidarError, match=r"gone.*Choose a folder"):
+    with pytest.raises(LidarError, match=r"gone.*Choose an existing, writable folder"):
         draw_scene(shot, 9).save(tmp_path / "gone" / "scene.png")
 
     def full_disk(figure, file, **options):

@@ -345,7 +345,7 @@ WRONG = {
     "swapped": ({"adapt": [8, 1]}, "value 1 for the maximum of partition 'GPU'. .* at least 8"),
     "nothing": ({"adapt": [0, 0]}, "value 0 for the maximum of partition 'GPU'. .* at least 1"),
     "a time": ({"adapt": [0, 1], "idle_s": "1m"}, "value '1m' for `idle_s` of partition 'GPU'"),
-    "a time alone": ({"idle_s": 60}, "`idle_s` without `adapt`"),
+    "a time alone": ({"idle_s": 60}, "`idle_s`, which requires `adapt`"),
     "an option": ({"adapt": [0, 1], "mem": "1GB"}, "'GPU' cannot be started.*'mem'"),
     "another option": ({"mem": "1GB"}, "'GPU' cannot be started.*'mem'"),
     "slots": ({"slots": 0}, "value 0 for the number of slots of partition 'GPU'"),

@@ -70,7 +70,7 @@ def test_it_ends_when_it_is_idle_but_not_under_results_and_pipes(wait_until, cap
         second.put(1)
         second.delete()
         wait_until(lambda: pool.client.status == "closed")
-        assert "The local pool was closed, because it was idle for 0.2 s." in caplog.text
+        assert "The local pool was closed because it was idle for 0.2 s." in caplog.text
         with pytest.raises(PoolError, match="The client is closed"):
             io.for_each([1], abs)
 

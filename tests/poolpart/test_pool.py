@@ -106,7 +106,7 @@ def test_rules_for_a_partition_that_workers_were_started_with(start):
     client = start({"a": {"resources": {"CPU": 1}}, "b": {"resources": {"CPU": 1}}, "c": {}})
     pool = Pool.from_client(client)
     message = (
-        r"Workers were started with the resource 'CPU', and the rule does not select all of them\. "
+        r"The rule does not select all workers that were started with the resource 'CPU'\. "
         r"Workers that are not selected: [ab]\. Use the existing partition with "
         r"`Pool\.from_client\(client\)\['CPU'\]`, pass a rule"
     )

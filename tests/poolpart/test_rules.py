@@ -49,7 +49,7 @@ def test_fewer_than_the_minimum():
     with pytest.raises(PoolError, match=message):
         divide({"P": n_workers(2), "Q": per_host(1)}, pool)
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
-    with pytest.raises(PoolError, match=r"names 'c', but the pool contains 'a', 'b'\."):
+    with pytest.raises(PoolError, match=r"selects 'c', but the pool contains 'a', 'b'"):
         divide({"P": named("c")}, pool)
     with pytest.raises(PoolError, match="requires at least 3 workers, but its rule selects 2"):
         divide({"P": rest(minimum=3)}, pool)

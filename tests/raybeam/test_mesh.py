@@ -16,9 +16,9 @@ POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         (POINTS[:, :2], [[0, 1, 2]], r"vertices must be .*\(3, 2\)"),
         (POINTS.ravel(), [[0, 1, 2]], r"vertices must be .*\(9,\)"),
         (POINTS.astype(complex), [[0, 1, 2]], "complex"),
-        (POINTS, [0, 1, 2], r"faces must be .* of shape \(f, 3\)"),
-        (POINTS, [[0, 1, 2, 2]], r"int64 and the shape \(1, 4\)"),
-        (POINTS, [[0.0, 1, 2]], "faces must be integers"),
+        (POINTS, [0, 1, 2], r"faces must be .* with shape \(f, 3\)"),
+        (POINTS, [[0, 1, 2, 2]], r"int64 and shape \(1, 4\)"),
+        (POINTS, [[0.0, 1, 2]], "faces must be an integer array"),
         (
             POINTS,
             [[0, 1, 2], [0, 1, 3]],
@@ -32,7 +32,7 @@ POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
         ),
         ([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], "Vertex 2 must .*nan"),
         ([[0, 0, 0], [1, 0, 0], [0, np.inf, 0]], [[0, 1, 2]], "Vertex 2 must .*inf"),
-        (POINTS, [[0, 1, 1], [2, 2, 2]], "only triangles without an area"),
+        (POINTS, [[0, 1, 1], [2, 2, 2]], "only triangles with zero area"),
     ],
 )
 def test_refused(vertices, faces, words):

@@ -21,16 +21,24 @@ DOWN = [[0.0, 0, -1]]
         ([0, 0, 1], [[0, 0, -1], [np.inf, 0, 0]], "Direction 1 must .*inf"),
         ([0, 0, np.nan], DOWN, "Origin 0 must .*nan"),
         ([[0, 0, 1], [0, np.inf, 1]], [[0, 0, -1], [0, 0, -1]], "Origin 1 must .*inf"),
-        ([[0, 0, 1], [0, 0, 1]], DOWN * 3, "directions, which is 3, but has the length 2"),
+        ([[0, 0, 1], [0, 0, 1]], DOWN * 3, "directions, which is 3, but has length 2"),
         (
             [0, 0, 1],
             [[0, 0]],
-            r"directions must be real numbers of shape \(n, 3\), .* \(1, 2\)",
+            r"directions must be an array of real numbers with shape \(n, 3\), .* \(1, 2\)",
         ),
-        ([0, 0], DOWN, r"origins must be real numbers of shape \(n, 3\), .* int64 .* \(2,\)"),
-        (0, DOWN, r"origins must be real numbers of shape \(n, 3\), .* int64 .* \(\)"),
-        ([0, 0, 1], [["a", "b", "c"]], "directions must be real numbers"),
-        ([0, 0, 1], [[0, 0, 1j]], "directions must be real numbers"),
+        (
+            [0, 0],
+            DOWN,
+            r"origins must be an array of real numbers with shape \(n, 3\), .* int64 .* \(2,\)",
+        ),
+        (
+            0,
+            DOWN,
+            r"origins must be an array of real numbers with shape \(n, 3\), .* int64 .* \(\)",
+        ),
+        ([0, 0, 1], [["a", "b", "c"]], "directions must be an array of real numbers"),
+        ([0, 0, 1], [[0, 0, 1j]], "directions must be an array of real numbers"),
     ],
 )
 def test_refused(origins, directions, words):

@@ -318,7 +318,7 @@ def test_pattern_refused():
         Pattern([[0, 0, 1], [0, 1, 0], [0, 0, 0]])
     with pytest.raises(ValueError, match=r"Origin 1 must .*nan"):
         Pattern(np.eye(3), [[0, 0, 0], [0, np.nan, 0], [0, 0, 0]])
-    with pytest.raises(ValueError, match="directions, which is 3, but has the length 2"):
+    with pytest.raises(ValueError, match="directions, which is 3, but has length 2"):
         Pattern(np.eye(3), np.zeros((2, 3)))
     for table in ("directions", "origins"):
         with pytest.raises(ValueError, match="read-only"):

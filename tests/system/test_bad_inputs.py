@@ -94,7 +94,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     "out cannot be made": (["run", "good.yaml", "--out", "/proc/o"], "Cannot write to the folder"),
     "malformed address": (["run", "good.yaml", "--scheduler", "tcp://::1:x"], "tcp://host:8786"),
     "unknown scheme": (["run", "good.yaml", "--scheduler", "foo://127.0.0.1:1"], "scheme 'foo'"),
-    "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "must consist of a host"),
+    "no host": (["run", "good.yaml", "--scheduler", "tcp://:8786"], "Expected a host"),
     "no port": (["doctor", "--scheduler", "localhost"], "a port from 1 to 65535"),
     "no certificates": (
         ["run", "good.yaml", "--scheduler", "tls://127.0.0.1:1"],

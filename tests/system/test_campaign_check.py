@@ -93,7 +93,11 @@ def test_jobs_that_cannot_run_are_reasons(campaign, lidarpool):
     ("name", "job", "says"),
     [
         ("campaign.yaml", 9, "Job 9 does not exist. The jobs of the campaign are 0 to 8"),
-        ("base.yaml", 1, "base.yaml is not a campaign, so it has no job 1"),
+        (
+            "base.yaml",
+            1,
+            "base.yaml is not a campaign. `--job 1` can only be used with a campaign.",
+        ),
         ("campaign.yaml", -1, "-1 is not in the range"),
     ],
 )

@@ -444,7 +444,7 @@ def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool
         assert f"damaged: job 0002 ({name} is missing or damaged). " in found.err
         assert "bit for bit" not in found.out and found.err.count("\n") == 1
     again = lidarpool(*run, "--verify" if harm == "flipped" else "--resume")
-    assert again.code == 0 and "note: jobs run again: job 0002 (" in again.out
+    assert again.code == 0 and "note: these jobs are run again: job 0002 (" in again.out
     assert bytes_of(files / "ds") == whole
     assert not (files / "ds" / "run").exists()
 
@@ -466,7 +466,7 @@ def test_jobs_of_an_unfinished_campaign_are_looked_at(client, tmp_path):
 def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
     (files / "report.json").write_text("{}")
     for place, says in (
-        (files, "is not a data set of lidarpool"),
+        (files, "is not a lidarpool data set"),
         (files / "none", "does not exist"),
     ):
         refused = lidarpool("run", "--verify", place)

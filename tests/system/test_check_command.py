@@ -451,7 +451,7 @@ def test_sizes_that_speak_of_another_unit(size, unit, check, tmp_path, lidarpool
     outcome = lidarpool("check", tmp_path / "my box.stl")
     assert outcome.code == 0
     assert ("my box.stl states no unit" in outcome.out) == (unit is not None)
-    assert unit is None or f"possibly {unit}, or" in outcome.out
+    assert unit is None or f"possibly {unit}), or" in outcome.out
     assert unit is None or f"or pass `--unit {unit}` with a mesh file" in outcome.out
     given = check(text="scene: {files: [{file: my box.stl, unit: m}]}")
     assert given.code == 0 and "states no unit" not in given.out

@@ -55,11 +55,11 @@ def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["clean", "nowhere"], "nowhere does not exist. Specify the folder of a result"),
+        (["clean", "nowhere"], "nowhere does not exist"),
         (["clean", "clean.yaml"], "clean.yaml is not supported. Specify the folder of a result"),
         (
             ["clean", "clean", "--sweep", "3"],
-            "There is no pair 3 of sweeps. Pairs are numbered from 0",
+            "Sweep pair 3 does not exist. Pairs are numbered from 0",
         ),
         (
             ["clean", "clean", "--sensor-a", "roof"],

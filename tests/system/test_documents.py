@@ -246,7 +246,7 @@ OF_OTHERS = {
     "--seed": "helios",
 }
 # Single words of code before a verb that are neither commands nor names of this project.
-OTHER_WORDS = {"lint-imports", "json", "frame"}
+OTHER_WORDS = {"lint-imports", "json", "frame", "nvidia-smi", "surface"}
 
 
 def commands_of(group: click.Command, name: tuple[str, ...] = ()) -> Iterator[Any]:
@@ -658,7 +658,7 @@ def test_numbers_of_formats_and_models_are_those_of_the_code():
     assert words.index(count) + 4 == len(DATA_SETS)
     names = model_names()
     assert f"lists {len(names)} models" in (ROOT / "docs/overview.md").read_text("utf-8")
-    assert f"**{len(names)} sensors**" in (ROOT / "README.md").read_text("utf-8")
+    assert f"**{len(names)} sensor models**" in (ROOT / "README.md").read_text("utf-8")
     stated = sum(read_model(name).performance is not None for name in names)
     assert f"[{stated} models]" in (ROOT / "docs/how-to/noise.md").read_text("utf-8")
 

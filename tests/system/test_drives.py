@@ -26,7 +26,7 @@ BAD = [
     (
         "trajectory: t.txt",
         LINE + "3 5 0 0 0 0 0 1.01\n",
-        ("quaternion of pose 2 does not have the length 1"),
+        ("quaternion of pose 2 is not of unit length"),
     ),
     ("trajectory: {file: t.txt, start_s: 4.5}", LINE, "start_s is 4.5 s, which is 2.5 s outside"),
     ("trajectory: {file: t.txt, format: kitti}", LINE, "Set `times` to the file that contains"),

@@ -83,11 +83,11 @@ def test_json_has_the_warning_as_a_note(run):
     [
         (
             {"sensor": SURVEY["sensor"] | {"min_range_m": 500}, "poses": [[0, 0, 1]]},
-            "all surfaces are closer than min_range_m, which is 500 m, at ranges",
+            "all surfaces are closer than `min_range_m` (500 m), at ranges",
         ),
         (
             {"sensor": SURVEY["sensor"] | {"max_range_m": 1}, "poses": [[0, 0, 1]]},
-            "all surfaces are farther than max_range_m, which is 1 m, at ranges",
+            "all surfaces are farther than `max_range_m` (1 m), at ranges",
         ),
         (
             {"noise": {"dropout": 1.0}, "poses": [[0, 0, 1]]},

@@ -70,7 +70,7 @@ def test_the_sensor_that_is_written_has_the_noise_of_the_recording(
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["nowhere"], "nowhere does not exist. Specify the folder of a result"),
+        (["nowhere"], "nowhere does not exist"),
         ([".", "--model", "no-such"], "Unknown sensor model 'no-such'"),
         ([".", "--scene", "none.glb"], "none.glb"),
         ([".", "--out", "mine.txt"], "not a sensor file. Use a file name with"),

@@ -104,7 +104,9 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     arguments = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--out", url]
     refused = lidarpool(*arguments, "--cloud-only", "-q")
     assert (
-        refused.code == 2 and "contains path.png, which does not belong to a result" in refused.err
+        refused.code == 2
+        and "contains path.png, which would be replaced although it does not belong to a result"
+        in refused.err
     )
     done = lidarpool(*arguments, "--cloud-only", "--json", "-q", "--overwrite")
     assert (done.code, done.err) == (0, "")
@@ -128,7 +130,7 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     Storage.at(url).remove(["report.json"])
     for command in (["plot"], ["export", "--format", "pcd"], ["view"]):
         half = lidarpool(*command, url)
-        assert half.code == 2 and f"{url} has no complete result" in half.err
+        assert half.code == 2 and f"{url} does not contain a complete result" in half.err
 
 
 @pytest.mark.slow

@@ -95,14 +95,12 @@ def test_files_of_no_result_are_neither_replaced_nor_removed_unasked(result, tmp
     own.write_text("mine")
     result.report(tmp_path, only_cloud=True)
     result.report(tmp_path, only_cloud=True)
-    with pytest.raises(
-        LidarError, match=r"contains kitti, which does not belong to a result .*--over"
-    ):
+    with pytest.raises(LidarError, match=r"contains kitti, which would be replaced .*--over"):
         result.report(tmp_path, only_cloud=True, formats=["kitti"])
     assert own.read_text() == "mine"
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "cloud.ply").write_text("mine")
-    with pytest.raises(LidarError, match=r"other contains cloud\.ply, which does not"):
+    with pytest.raises(LidarError, match=r"other contains .*cloud\.ply"):
         result.report(tmp_path / "other", only_cloud=True)
     result.report(tmp_path / "other", only_cloud=True, overwrite=True)
     result.report(tmp_path / "other", only_cloud=True)

@@ -53,7 +53,7 @@ def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
     assert len(results) == 3
     assert all(same_cloud(results[0].cloud, other.cloud) for other in results)
     assert waited == {"", "LIDAR"}
-    assert any("until other runs released 4 slots" in n for r in results for n in r.notes)
+    assert any("for other runs to release 4 slots" in n for r in results for n in r.notes)
     with Client(cluster, set_as_default=False) as client:
         assert left_over(client) == ([], [], [])
 

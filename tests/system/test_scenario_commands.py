@@ -94,7 +94,7 @@ def test_init_without_a_mesh_is_short_too(tmp_path, lidarpool):
     ("options", "says"),
     [
         (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
-        (["--mesh", "notes.txt"], "notes.txt cannot be read. If it is a point cloud, make a mesh"),
+        (["--mesh", "notes.txt"], "If it is a point cloud, convert it to a mesh"),
         (["--sensor", "vlp61"], "Did you mean 'vlp16'?"),
         (["--unit", "mm"], "require `--mesh`"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),

@@ -199,7 +199,7 @@ def test_damaged_files_are_named_and_the_next_merge_takes_them(
     made = content(out)
     whole = content(campaigns("folder") / "one")
     notes = made.pop("report.json")["notes"]
-    assert notes[0].startswith("jobs run again: job 0001")
+    assert notes[0].startswith("these jobs are run again: job 0001")
     del whole["report.json"]
     assert made == whole
 
@@ -254,7 +254,7 @@ def test_a_table_of_jobs_is_only_compared(parts, campaigns, tmp_path, edit, slot
     assert table.read_text() != whole
     merge(parts, out)  # whose rows are those of manifests
     assert content(out) == content(campaigns("folder") / "one")
-    with pytest.raises(LidarError, match=r"jobs\.csv is damaged.*--resume` to write"):
+    with pytest.raises(LidarError, match=r"jobs\.csv is damaged.*--resume` to rewrite"):
         sweeps(parts[1])
     with pytest.raises(LidarError, match=r"jobs\.csv is damaged"):
         verify(Storage.at(parts[1]))
@@ -320,7 +320,7 @@ def test_a_damaged_record_of_a_campaign_is_named_and_made_again(parts, tmp_path,
         campaign = Campaign.load(parts[0].parent / "c.yaml")
         run = campaign.run(parts[1], client=client, resume=True, shard=(2, 3))
     assert (run.resumed, run.done) == (2, 2)
-    assert run.notes == ("campaign.json was damaged and has been created again",)
+    assert run.notes == ("campaign.json was damaged and has been recreated",)
     merge(parts, tmp_path / "ds")
 
 
@@ -738,7 +738,11 @@ SHARDS = [
     ("3/10", {}, Shard(3, 10)),
     ("auto/10", {"JOB_COMPLETION_INDEX": "2"}, Shard(3, 10)),
     ("auto", slurm(14, 10, 28, 2, 10), Shard(3, 10)),
-    ("auto", slurm(9, 1, 3, 1, 3), "Shard 9/3 does not exist. The shards are 1/3 to"),
+    (
+        "auto",
+        slurm(9, 1, 3, 1, 3),
+        "Shard 9/3 does not exist. The shard number must be from 1 to 3",
+    ),
     (
         "auto",
         slurm(2, 1, 9, 2, 6),

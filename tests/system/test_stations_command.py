@@ -84,7 +84,7 @@ def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lid
     arguments = ("--sensor", "velodyne/vlp16", "--count", "100", "--out", "a/b", "--spacing", "2")
     outcome = lidarpool("stations", "hall.glb", *arguments)
     assert outcome.code == 0, outcome.err
-    assert "of 100 stations already cover everything" in outcome.out
+    assert "of 100 stations already cover all surfaces" in outcome.out
     written = Scenario.load(hall / "a/b/stations.yaml")
     assert [entry.file for entry in written.scene.files] == ["../../hall.glb"]
     # The sensor of a scenario is the default.

@@ -161,7 +161,7 @@ class PictureContent:
         sensors = len(self.sensors)
         actors = len(self.scene.actors)
         if any(sensor.moves for sensor in self.sensors):
-            words = f"{plural(sensors, 'sensor')} on {'its' if sensors == 1 else 'their'} way"
+            words = plural(sensors, "moving sensor")
         else:
             positions = sum(len(sensor.positions) for sensor in self.sensors)
             words = plural(positions, "sensor position")
@@ -309,7 +309,7 @@ class PictureContent:
         Raises ValueError for another format.
         """
         if (version := int(arrays["format"])) != _FORMAT:
-            raise ValueError(f"it is of format {version}, not {_FORMAT}")
+            raise ValueError(f"its format version is {version}; expected {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
         mesh_of_actor = arrays["actor_mesh"].tolist()
         meshes = [
@@ -345,7 +345,7 @@ class PictureContent:
         ]
         counts = arrays["hit_counts"]
         if counts.shape != (scene.triangles,):
-            raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
+            raise ValueError(f"hit_counts has shape {counts.shape}; expected ({scene.triangles},)")
         return cls(
             scene=scene,
             sensors=sensors,

@@ -35,7 +35,7 @@ def in_weather(survey: Survey, **weather: Any) -> Survey:
 
 
 def points(scene: Scene, survey: Survey) -> dict[str, Real]:
-    """Positions, range, intensity and cause of its points."""
+    """Return the positions, range, intensity and cause of all points of a survey."""
     batches = list(Rig(scene, survey).cast(0, survey.scan_count))
     columns = {
         "cause": [

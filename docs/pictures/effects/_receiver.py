@@ -47,7 +47,7 @@ def spinning_beam(firings: int, rate_hz: float = 10.0, clockwise: bool = False) 
 
 
 def cloud(scene: Scene, survey: Survey) -> dict[str, NDArray[Any]]:
-    """Causes and positions of all points of a survey."""
+    """Return the causes and positions of all points of a survey."""
     batches = list(Rig(scene, survey).cast(0, survey.scan_count))
     causes = [
         np.zeros(len(b)) if b.pulse_returns.cause is None else b.pulse_returns.cause
@@ -58,7 +58,7 @@ def cloud(scene: Scene, survey: Survey) -> dict[str, NDArray[Any]]:
 
 
 def points(meshes: list[SceneMesh], survey: Survey) -> dict[str, NDArray[Any]]:
-    """Cast all scans of a survey: {column: values}."""
+    """Simulate all scans of a survey and return the values of its stored columns."""
     rig = Rig(Scene.from_meshes(meshes), survey, "numpy")
     batches = list(rig.cast(0, survey.scan_count))
     return {

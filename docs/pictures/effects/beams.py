@@ -64,7 +64,7 @@ def share(returns: Returns, edge_m: float) -> float:
 
 
 def picture(path: Path) -> None:
-    """Draw footprints, light on an edge, and width against range."""
+    """Plot beam footprints, the share of light at an edge, and the beam width against range."""
     figure = Figure((13.5, 4.5), dpi=100, layout="constrained")
     prints, edges, widths = figure.subplots(1, 3, width_ratios=[0.8, 1, 1])
     kinds = (

@@ -38,7 +38,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Draw the points from above, and their velocities over the azimuth."""
+    """Plot the points from above, and their radial velocities against azimuth."""
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 

@@ -18,7 +18,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Draw a street in dust, and the energies against range."""
+    """Plot a street in dust, and the received energies against range."""
     figure, right = _air.page("100 mg/m³ of dust", WEATHER, 25.0)
     _air.energies(right, WEATHER)
     _air.save(figure, path)

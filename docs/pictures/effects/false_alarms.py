@@ -34,7 +34,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Draw a turn of a VLP-16 in a yard, and how false alarms lie before and behind a wall."""
+    """Plot a VLP-16 revolution in a yard, and false alarms in front of and behind a wall."""
     figure = Figure((9, 3.9), layout="constrained", dpi=110)
     above, lies = figure.subplots(1, 2, width_ratios=[1, 1.15])
     sensor = load_sensor("velodyne/vlp16", max_range_m=100)

@@ -34,7 +34,7 @@ def upright(name: str, start: tuple[float, float], stop: tuple[float, float]) ->
 
 
 def picture(path: Path) -> None:
-    """Draw a shop window from above, and energies against the angle of incidence."""
+    """Plot ghosts of a shop window from above, and energies against the angle of incidence."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     above, right = figure.subplots(1, 2, width_ratios=[1.5, 1])
     car, van = (

@@ -25,7 +25,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndarray]:
-    """Return errors of ranges of a wall 10 m ahead, with channel and time, seconds."""
+    """Return range errors at a wall 10 m ahead, with the channel and the time in seconds."""
     batches_by_noise = []
     for noise_of_run in (Noise(), noise):
         survey = Survey(
@@ -44,7 +44,7 @@ def errors(sensor: Sensor, noise: Noise, **options: object) -> dict[str, np.ndar
 
 
 def picture(path: Path) -> None:
-    """Draw errors by channel, by time and by azimuth, beside the closed forms."""
+    """Plot errors by channel, time and azimuth, together with their closed forms."""
     figure = Figure((11, 3.6), layout="constrained", dpi=100)
     by_channel, by_time, by_azimuth = figure.subplots(1, 3)
     revolution = errors(

@@ -73,7 +73,7 @@ def outage(axes: Any, still: SimpleNamespace) -> None:
 
 
 def picture(path: Path) -> None:
-    """Draw Allan deviations, and the errors of positions over the hours."""
+    """Plot Allan deviations, position errors over several hours, and errors during outages."""
     from matplotlib.figure import Figure
 
     from lidarsim.motion.trajectory import CENTER, Stations

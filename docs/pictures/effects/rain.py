@@ -18,7 +18,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Draw a street in rain, and the numbers of returns against range."""
+    """Plot a street in rain, and the number of returns against range."""
     figure, right = _air.page("50 mm/h of rain", WEATHER, 12.0)
     _air.counts(right, WEATHER, 6.0)
     _air.save(figure, path)

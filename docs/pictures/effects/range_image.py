@@ -48,7 +48,7 @@ def image_of(scene: Scene, survey: Survey) -> dict[str, np.ndarray]:
 
 
 def picture(path: Path) -> None:
-    """Draw a turn of an OS1-128 without and with a threshold of detection."""
+    """Plot the range image of an OS1-128 with and without a detection threshold."""
     scene = city(200_000, trees=60, cars=60)
     sensor = load_sensor("ouster/os1-128", max_range_m=170)
     survey = with_effect(Survey(sensor, poses=[(45, 1, 2)], steps=36, materials=MATERIALS))

@@ -24,7 +24,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Draw scatter and walk of simulated walls against energy, with the model's curves."""
+    """Plot range noise and range walk at simulated walls against energy, with the model curves."""
     kinds = {
         "10 % reflectance": (Material("*", 0.1), GRAY, np.geomspace(4, 105, 9)),
         "80 %": (Material("*", 0.8), BLUE, np.geomspace(10, 250, 9)),

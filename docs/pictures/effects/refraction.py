@@ -38,7 +38,7 @@ def with_effect(survey: Survey) -> Survey:
 def box(
     name: str, lower: tuple[float, float, float], upper: tuple[float, float, float]
 ) -> SceneMesh:
-    """Make a box whose triangles face outwards."""
+    """Create a box whose triangles face outward."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     squares = ([0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3])
     faces = [[a, b, c] for a, b, c, _ in squares] + [[a, c, d] for a, _, c, d in squares]
@@ -46,7 +46,7 @@ def box(
 
 
 def pool() -> list[SceneMesh]:
-    """Make a pool with a step, in the ground."""
+    """Create a pool in the ground, with a step on one side."""
     return [
         # Into the walls, which light that goes straight on would miss otherwise.
         box("Water", (-5.3, -9, -DEPTH - 0.5), (5.3, 9, 0)),
@@ -74,7 +74,7 @@ def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Re
 
 
 def picture(path: Path) -> None:
-    """Draw a section of the pool, and energies of its floor."""
+    """Plot a cross section of the pool, and the received energies of its floor."""
     straight = Material("Water", transparent="pass")
     wet = Material("Water", transparent="pass", refractive_index=INDEX, attenuation_per_m=LOSS)
     figure = Figure((13.5, 4.7), dpi=100, layout="constrained")

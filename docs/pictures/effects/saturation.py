@@ -65,7 +65,7 @@ def _separable_distance(name: str, plate_m: float) -> tuple[float, float]:
 
 
 def picture(path: Path) -> None:
-    """Draw a clipped pulse; widths and ranges, and what is told apart, on closed forms."""
+    """Plot clipped pulses, pulse widths and range errors, and the distance of separable walls."""
     figure = Figure((11, 3.7), layout="constrained", dpi=110)
     pulse, widths, apart = figure.subplots(1, 3)
     pulse.axhline(1, color="k", lw=0.8, ls=":")

@@ -18,7 +18,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Draw a street in snow, and the numbers of returns against range."""
+    """Plot a street in snow, and the number of returns against range."""
     figure, right = _air.page("1 mm/h of snow", WEATHER, 20.0)
     _air.counts(right, WEATHER, 16.0)
     _air.save(figure, path)

@@ -53,7 +53,7 @@ def lorry(name: str, start: tuple[float, float], height: float = 0.0) -> Actor:
 
 
 def picture(path: Path) -> None:
-    """Draw a lorry from above and from the side, and how spray falls off behind it."""
+    """Plot a truck with spray from above and from the side, and the decrease of spray behind it."""
     figure = Figure((12, 4.4), layout="constrained", dpi=100)
     views = figure.subplot_mosaic([["above", "right"], ["aside", "right"]], width_ratios=[1.5, 1])
     road = SceneMesh("Road", 80.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]),

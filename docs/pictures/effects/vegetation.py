@@ -89,7 +89,7 @@ def canopy(kind: str, zenith_deg: float) -> Real:
 
 
 def picture(path: Path) -> None:
-    """Draw sections of a tree, gap fractions and depths of returns."""
+    """Plot cross sections of a tree, gap fractions, and the depths of returns."""
     figure = Figure((13.5, 5.2), dpi=100, layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=[1.05, 1, 1])
     above = figure.add_subplot(grid[0, 0])

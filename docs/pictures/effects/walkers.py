@@ -28,7 +28,7 @@ def with_effect(survey: Survey) -> Survey:
 
 
 def picture(path: Path) -> None:
-    """Draw points of sweeps from aside, and their velocities over time."""
+    """Plot a pedestrian's points from the side, and their radial velocities over time."""
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
 

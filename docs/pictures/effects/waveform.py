@@ -113,7 +113,7 @@ def _panel(
 
 
 def picture(path: Path) -> None:
-    """Draw the picture."""
+    """Plot waveforms and returns at the edge of a roof and in an oak."""
     figure, (edge_axes, tree_axes) = plt.subplots(
         1, 2, figsize=(10, 4.2), layout="constrained", width_ratios=(1, 1.5), sharey=True
     )

@@ -94,14 +94,14 @@ def start_partitions(
         describe = _process
     else:
         raise PoolError(
-            f"A {type(cluster).__name__} has only one kind of worker. Start its workers, and "
+            f"A {type(cluster).__name__} has only one kind of worker. Start its workers, then "
             "divide them with `Pool.from_client(client).divide(…)`. Only dask-jobqueue clusters "
             "and `SSHCluster` can start workers by partition."
         )
     if cluster.worker_spec or _NAME in cluster.periodic_callbacks:
         raise PoolError(
             f"The cluster already has {len(cluster.worker_spec)} workers or jobs. Create a cluster "
-            "without workers, that is, without `n_workers`, or for an `SSHCluster` with only the "
+            "that starts no workers: omit `n_workers`, or pass an `SSHCluster` only the "
             "scheduler's host."
         )
     parts = {
@@ -185,8 +185,8 @@ def take_bounds(name: str, options: dict[str, Any]) -> Bounds | None:
     if adapt is None:
         if idle_s is not None:
             raise PoolError(
-                f"Partition {name!r} has `idle_s` without `adapt`. Set `adapt`, for example to "
-                "[0, 8]."
+                f"Partition {name!r} sets `idle_s`, which requires `adapt`. Set `adapt`, for "
+                "example to [0, 8]."
             )
         return None
     require(ADAPTING)
@@ -221,7 +221,7 @@ class _JobStarter:
         self._logs_read_at = time.monotonic()
 
     async def begin(self) -> None:
-        """Submit the first jobs, and look after all jobs as long as the cluster is open."""
+        """Submit the first jobs, and manage all jobs as long as the cluster is open."""
         kinds = {name: part.kind for name, part in self._parts.items()}
         try:
             await ask_of_cluster(self._cluster, begin, kinds=kinds)
@@ -296,7 +296,7 @@ class _JobStarter:
 
 
 async def _start(cluster: SpecCluster) -> None:
-    """Start the workers of a cluster that its specification asks for and that are missing."""
+    """Start the workers that the specification of a cluster requires and that are missing."""
     try:
         await cluster
     except Exception:

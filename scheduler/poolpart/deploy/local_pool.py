@@ -62,7 +62,7 @@ class LocalPool:
                 last_transitions = transitions
                 used_at = time.monotonic()
             elif time.monotonic() - used_at >= idle_s:
-                logger.warning("The local pool was closed, because it was idle for %g s.", idle_s)
+                logger.warning("The local pool was closed because it was idle for %g s.", idle_s)
                 self.close()
 
 

@@ -56,7 +56,7 @@ class OwnNanny(Nanny):
     """
 
     async def instantiate(self) -> Status:
-        """Start a worker for the first time or again."""
+        """Start or restart a worker."""
         _spare_workers_the_script()
         _starting.add(self)
         try:

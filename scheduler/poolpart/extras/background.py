@@ -60,7 +60,7 @@ def after_all(
     futures: Iterable[Future | concurrent.futures.Future[Any]],
     function: Callable[[list[Any]], Result],
 ) -> concurrent.futures.Future[Result]:
-    """Call `function(results)` after all futures have succeeded, and return a future of its result.
+    """Call `function(results)` once all futures have succeeded, and return a future for its result.
 
     The function is called in a thread of this process. To call it on a partition, pass the futures
     to a task instead: ``partition.submit(function, futures)``.
@@ -68,8 +68,8 @@ def after_all(
     Parameters
     ----------
     futures
-        Futures of Dask, of `Partition.for_each` and `after_all`, and of Python's executors. The
-        results are in the same order.
+        Dask futures, futures returned by `Partition.for_each` or `after_all`, or futures of Python
+        executors. The results are passed to `function` in the same order.
     function
         Function that is called with the list of results. If a future fails or is canceled, the
         function is not called, and the returned future immediately fails with the same error.
@@ -77,7 +77,7 @@ def after_all(
     Returns
     -------
     concurrent.futures.Future
-        Future of the return value. Its `cancel` prevents the call of the function, but does not
+        Future for the return value. Canceling it prevents the call to `function`, but does not
         cancel `futures`.
 
     Examples

@@ -34,11 +34,11 @@ RESTART_S = 60.0  # seconds for a worker to come back
 
 
 def cancelled() -> bool:
-    """Return whether the task that calls this function was canceled.
+    """Return whether the calling task was canceled.
 
-    Dask does not stop running functions, so a canceled function keeps its slot until it returns.
-    Call `cancelled` regularly in long-running functions, in the thread of the task, and return if
-    it is True. Outside of tasks, it returns False.
+    Dask does not stop running functions, so a canceled function keeps its slot until it returns. In
+    a long-running function, call `cancelled` regularly from the task's own thread, and return early
+    when it returns True. Outside of tasks, it always returns False.
 
     Examples
     --------
@@ -111,7 +111,7 @@ async def _cancel_tasks(
 
 
 async def _end(scheduler: Any, worker: Any, keys: Iterable[Any], restarts: bool) -> str:
-    """Restart a worker, if it has nothing but cancelled tasks, and return what happened."""
+    """Restart a worker if all of its tasks are canceled, and return the outcome."""
     still_running = f"running: worker {worker.name}"
     if not restarts:
         return still_running
@@ -146,7 +146,7 @@ async def _load(scheduler: Any, worker: Any) -> _Load | None:
 
 
 async def _within(request: Coroutine[Any, Any, T], seconds: float) -> T | None:
-    """Await a request, or return None after so many seconds, whatever becomes of the request."""
+    """Await a request, or return None if it takes longer than the given number of seconds."""
     # `asyncio.wait_for` of Python 3.11 also waits until the cancelled request has ended, which may
     # involve closing a connection to a worker that reads nothing. Tried on one to four workers, of
     # which one held the interpreter's lock for 40 s, from 1 s before to 1 s after the request:

@@ -158,7 +158,7 @@ class _Handler(web.RequestHandler):
         if reason:
             self.set_status(HTTPStatus.FORBIDDEN)
             self.set_header("Content-Type", "text/plain; charset=utf-8")
-            self.finish(f"{reason} `distributed.dashboard.link` may contain another name.")
+            self.finish(f"{reason} Another name can be set in `distributed.dashboard.link`.")
 
     def get(self) -> None:
         self.set_header("Cache-Control", "no-store")

@@ -130,7 +130,7 @@ class _Inheriting(Feature):
         return frozenset() if rule is None else rule.names
 
     async def settle(self) -> None:
-        """Wait until the workers have begun or ended to lend, at most `ANSWER_S` seconds."""
+        """Wait until the workers have started or stopped lending, at most `ANSWER_S` seconds."""
         loop = asyncio.get_running_loop()
         requests = {request for request in _requests if request.get_loop() is loop}
         if requests:

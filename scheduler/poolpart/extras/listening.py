@@ -20,7 +20,7 @@ _CHECK_S = 1.0  # interval at which the thread checks whether the listener was c
 
 
 class Listener:
-    """Thread that calls a function for each item of a pipe, as started by `Pipe.listen`.
+    """Background thread, started by `Pipe.listen`, that calls a function for each item of a pipe.
 
     `join` waits until the pipe has ended, and `close` stops listening. At the end of a ``with``
     block, the listener is joined, or closed if the block raises an error.
@@ -52,18 +52,18 @@ class Listener:
         Parameters
         ----------
         timeout_s
-            Maximum wait in seconds. By default, the wait is unlimited.
+            Maximum time to wait, in seconds. By default, there is no limit.
 
         Raises
         ------
         PipeFailed
             If the pipe has failed or was deleted, or if the cluster was restarted.
         TimeoutError
-            If the pipe has not ended in time. The listener continues.
+            If the pipe has not ended within `timeout_s`. The listener keeps running.
         RuntimeError
             If the function itself calls this method.
         Exception
-            The error that the function has raised, if any.
+            The error that the function raised, if any.
         """
         if threading.current_thread() is self._thread:
             raise RuntimeError(
@@ -79,8 +79,8 @@ class Listener:
         """Stop listening without waiting for the end of the pipe.
 
         If the function is currently running, this method waits for it to return. The function is
-        not called again, and the remaining items stay in the pipe. This method does not raise
-        errors of the function or of the pipe. Use `join` to raise them.
+        not called again, and the remaining items stay in the pipe. Errors from the function or the
+        pipe are not raised here. To raise them, call `join`.
         """
         self._closed.set()
         if threading.current_thread() is self._thread:

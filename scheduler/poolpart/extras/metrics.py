@@ -36,7 +36,7 @@ class PartitionCollector:
         prefix = f"{namespace}_partition"
         gauges = {
             "workers": GaugeMetricFamily(f"{prefix}_workers", "Workers", labels=_LABELS),
-            "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots of the workers", labels=_LABELS),
+            "slots": GaugeMetricFamily(f"{prefix}_slots", "Slots on all workers", labels=_LABELS),
             "busy": GaugeMetricFamily(f"{prefix}_busy_slots", "Slots in use", labels=_LABELS),
         }
         tasks = GaugeMetricFamily(f"{prefix}_tasks", "Unfinished tasks", labels=[*_LABELS, "state"])

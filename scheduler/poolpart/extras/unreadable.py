@@ -61,7 +61,7 @@ class UnreadableInputs:
         ]
 
     async def _examine(self, task: Any, worker: str) -> None:
-        """Let the tasks that wait for a result fail if their worker cannot read the result."""
+        """Let tasks that wait for a result fail if their worker cannot unpickle the result."""
         holder = next(iter(task.who_has)).address
         request = call(self.scheduler, worker, why_unreadable, key=task.key, holder=holder)
         try:

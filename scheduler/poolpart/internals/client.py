@@ -119,7 +119,7 @@ def when_done(future: Future, function: Callable[[Future], Any]) -> None:
 
 
 async def take_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
-    """Fetch the results that a worker has, without the scheduler."""
+    """Fetch results directly from a worker, without involving the scheduler."""
     from distributed.utils_comm import gather_from_workers
 
     data, *_ = await gather_from_workers({key: [address] for key in keys}, rpc=client.rpc)
@@ -129,8 +129,8 @@ async def take_from_worker(client: Client, address: str, keys: Collection[str]) 
 async def ask(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
     """Call a handler of a worker, or of the scheduler if the address is None.
 
-    Returns None if the scheduler lacks the handler; the log of the scheduler then says so. The
-    caller limits the time of a worker; `answer_of_scheduler` limits that of the scheduler.
+    Returns None if the scheduler lacks the handler, in which case the scheduler logs an error. The
+    caller sets a time limit for a worker; `answer_of_scheduler` sets the limit for the scheduler.
     """
     if address is None:
         return await answer_of_scheduler(client, getattr(client.scheduler, question)(**arguments))

@@ -130,14 +130,14 @@ class BoundedQueue:
         return max(0, self.capacity - len(self._queue))
 
     async def put(self, record: Record) -> None:
-        """Add an item, after a wait until the queue has room."""
+        """Wait until the queue has room, then add an item."""
         await wait_until(lambda: self.room > 0 or self._why_no_put() is not None, [self.waiters])
         if (error := self._why_no_put()) is not None:
             raise error
         self.extend([record])
 
     async def get(self) -> Record:
-        """Remove the first item, after a wait until the queue has an item."""
+        """Wait until the queue has an item, then remove the first item."""
         await wait_until(
             lambda: bool(self._queue) or self._why_no_put() is not None, [self.waiters]
         )
@@ -200,7 +200,7 @@ class QueueAndVariable:
         self.queue.waiters.notify()
 
     async def wake_early_readers(self) -> None:
-        """Answer the requests that have read the variable before the variable existed."""
+        """Answer the requests that tried to read the variable before it existed."""
         async with self._variables.started:
             self._variables.started.notify_all()
 

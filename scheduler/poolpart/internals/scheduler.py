@@ -30,7 +30,7 @@ class Submitter(NamedTuple):
 
 
 def show(scheduler: Any, worker: Any, resources: Resources) -> None:
-    """Let the scheduler place tasks by the given resources of a worker only."""
+    """Make the scheduler use only the given resources when it places tasks on a worker."""
     for name in worker.resources.keys() | resources.keys():
         declaring = scheduler.resources.setdefault(name, {})
         declaring.pop(worker.address, None)
@@ -205,7 +205,7 @@ def reopen(scheduler: Any, worker: Any) -> None:
 
 
 async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
-    """Close workers, or return False if any stays because nobody can take over its results."""
+    """Close workers. Return False if one stays because no other worker can take its results."""
     addresses = [worker.address for worker in workers]
     retired = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
     return len(retired) == len(addresses)
@@ -232,7 +232,7 @@ def cancel_keys(scheduler: Any, keys: Collection[Any], client: str) -> None:
 
 
 async def restart(scheduler: Any, worker: Any, seconds: float) -> bool:
-    """Have a worker restarted by its nanny, or return False if it is not back in time."""
+    """Restart a worker through its nanny, or return False if it does not rejoin in time."""
     try:
         await scheduler.restart_workers(
             [worker.address], timeout=seconds, stimulus_id=f"poolpart-restart-{time.time()}"
@@ -287,7 +287,7 @@ async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments
 async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
     """Call a function in the event loop of a worker, passed as `dask_worker`.
 
-    OSError if nobody answers there, or the function raises something.
+    Raises OSError if the worker does not respond or the function raises an exception.
     """
     answer = await scheduler.rpc(address).run(function=dumps(function), kwargs=dumps(arguments))
     if answer["status"] != "OK":

@@ -13,15 +13,15 @@ from ..columns.parts import StoredCloud, read_part
 
 @checked
 def to_dask(points: StoredCloud) -> Any:
-    """Return a Dask DataFrame with all columns of stored points, and one partition for each part.
+    """Return a Dask DataFrame with all columns of the stored points, and one partition per part.
 
-    The workers that compute the DataFrame must be able to read the parts. Keep the result until the
-    DataFrame is computed.
+    The workers that compute the DataFrame must be able to read the parts. Keep a reference to the
+    result until the DataFrame has been computed.
 
     Parameters
     ----------
     points
-        The stored points of a result, `Result.points`.
+        Stored points of a result, `Result.points`.
 
     Returns
     -------

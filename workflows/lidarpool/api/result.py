@@ -28,7 +28,7 @@ _SHOWN = ("hits", "cloud")  # pictures of a result in a notebook
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Result(RunResult):
-    """Result of a survey, with methods that write and show it.
+    """Result of a survey, with methods to write and display it.
 
     Notebooks display the result as a table with two pictures.
     """
@@ -48,7 +48,7 @@ class Result(RunResult):
         formats: Sequence[str | Mapping[str, Any]] = (),
         overwrite: bool = False,
     ) -> None:
-        """Write the files of `lidarpool run`, which are the cloud, the pictures and the report.
+        """Write the same files as `lidarpool run`: the cloud, the pictures and the report.
 
         Either all files are written, or none.
 
@@ -60,18 +60,18 @@ class Result(RunResult):
         only_cloud
             Whether to omit `report.html` and `pictures.npz`.
         pictures
-            Whether to draw the pictures, too.
+            Whether to draw the pictures as well.
         formats
-            Additional formats of the cloud, as under `output.write` in a scenario, such as "laz" or
-            {"format": "mcap", "layout": "ouster"}.
+            Additional formats for the cloud, specified as in `output.write` of a scenario, for
+            example "laz" or {"format": "mcap", "layout": "ouster"}.
         overwrite
-            Whether to replace the result of a different survey, too.
+            Whether to replace even the result of a different survey.
 
         Raises
         ------
         LidarError
-            If a file cannot be written, the folder contains the result of a different survey, or a
-            format requires a package or column that is missing.
+            If a file cannot be written, if the folder contains the result of a different survey, or
+            if a format requires a missing package or column.
         """
         from ..clouds.folder import output_place
         from ..clouds.writing import Format
@@ -101,8 +101,8 @@ class Result(RunResult):
         folder
             Output folder, which is created if it does not exist.
         only
-            Names of the pictures to draw, from scene, hits, intensity, cloud and path. By default,
-            all pictures are drawn.
+            Names of the pictures to draw (scene, hits, intensity, cloud or path). By default, all
+            pictures are drawn.
         size
             Width and height in pixels.
         color
@@ -110,7 +110,7 @@ class Result(RunResult):
 
         Returns
         -------
-        The files of the pictures.
+        Paths of the picture files.
 
         Raises
         ------
@@ -126,8 +126,8 @@ class Result(RunResult):
     def view(self, *, port: int = 8080, browser: bool = True) -> None:
         """Show the result in the browser until Ctrl-C, as `lidarpool view` does.
 
-        In a notebook, the page is shown in the cell and is available as long as the result is in
-        use.
+        In a notebook, the page is shown in the cell and remains available as long as the result
+        exists.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class Result(RunResult):
             Port on 127.0.0.1. If the port is in use, the next free port is used. 0 selects any free
             port.
         browser
-            Whether to open a browser if there is a desktop.
+            Whether to open a browser if the machine has a desktop.
         """
         from lidarsim.columns.cloud_file import CloudFile
         from lidarview.viewer.result_views import result_page, wait_for_interrupt
@@ -203,7 +203,7 @@ class Result(RunResult):
         names = ", ".join(("x", "y", "z", *(column.name for column in self.points.table)))
         yield "cloud", f"{plural(len(self.points), 'point')}{self.thinned}: {names}"
         if self.plan is not None:
-            free = "free of collisions" if self.plan.collision_free else "not free of collisions"
+            free = "collision-free" if self.plan.collision_free else "not collision-free"
             yield (
                 "path",
                 f"{self.plan.length:.2f} m, {free} ({self.plan.trials} trials, "

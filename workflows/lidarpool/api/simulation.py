@@ -59,18 +59,19 @@ def simulate(
     on_progress: Callable[[Progress], None] | None = None,
     **options: Unpack[RunKeywords],
 ) -> Result:
-    """Simulate a survey of a scene on a cluster, and plan a path at the same time.
+    """Simulate a survey of a scene on a cluster, and optionally plan a path at the same time.
 
     Parameters
     ----------
     scene, survey
-        The scene and the survey. Poses are in the local coordinates of the scene.
+        Scene and survey to simulate. Poses are in the local coordinates of the scene.
     planning
-        The path to plan on the OTHER partition while the survey runs, or None.
+        Path planning to run on the OTHER partition during the survey, or None.
     on_frame
         Function that is called with each frame, in scan order, while the survey runs. The points of
-        the frame are already stored (`ScanFrame.points`, `ScanFrame.hit_counts`). The function is
-        called in this thread. If it is slow, the pipeline waits and no frame is lost.
+        the frame have been stored by then, so `ScanFrame.points` and `ScanFrame.hit_counts` are
+        available. The function is called in the calling thread. If it is slow, the pipeline waits,
+        so no frame is lost.
     on_progress
         Function that is called with the progress about ten times per second. By default, progress
         bars are shown in notebooks and terminals.
@@ -79,20 +80,20 @@ def simulate(
     ----------------
     client
         Client of a cluster whose workers declare the resources GPU, LIDAR and OTHER. During the
-        run, the dashboard of the cluster has a page with the partitions, whose address is logged.
-        By default, a local cluster is started on the loopback interface and stopped at the end.
+        run, the cluster's dashboard has a page that shows the partitions. Its address is logged. By
+        default, a local cluster is started on the loopback interface and stopped at the end.
     backend
-        Ray-casting backend of stage 2: auto, cuda, tiles or numpy.
+        Ray-casting backend for stage 2: auto, cuda, tiles or numpy.
     live
-        Whether to show the run in the browser, as `lidarpool run --live` does, or in the cell of a
-        notebook. "foxglove" and "rerun" show the sweeps in Foxglove and Rerun. To show the result
-        afterwards, call `Result.view`.
+        Whether to show the run in the browser, as `lidarpool run --live` does, or in a notebook
+        cell. With "foxglove" or "rerun", the sweeps are shown in Foxglove or Rerun. To show the
+        result afterwards, call `Result.view`.
     pace
-        Speed at which `on_frame` and the live page receive the frames, in scan order. 1 is the rate
-        of the scanner, and 0.1 is a tenth of it. By default, they receive each frame as soon as its
-        points are stored.
+        Speed at which `on_frame` and the live page receive the frames in scan order, relative to
+        the rate of the scanner. For example, 0.1 is a tenth of that rate. By default, they receive
+        each frame as soon as its points are stored.
     queue_capacity
-        Maximum number of items that stage 1 is ahead of stage 2.
+        Maximum number of items by which stage 1 can be ahead of stage 2.
     collectors
         Number of tasks in stage 4.
     batch_mb
@@ -103,34 +104,37 @@ def simulate(
     tls
         Whether to encrypt the traffic of a local cluster with a new certificate.
     startup_timeout_s, worker_timeout_s
-        Time in seconds to wait for partitions that have no workers at the start, and for partitions
-        that lose all their workers later. To wait for a scheduler, use ``Client(address,
-        timeout=600)``.
+        Maximum time in seconds to wait for workers: the former applies to partitions that have no
+        workers at startup, the latter to partitions that lose all their workers later. To wait for
+        a scheduler, use ``Client(address, timeout=600)``.
     folder
         Folder of the run, from which the run can be resumed if this process or its machine dies.
-        Its parent must exist. The run stays in the folder; remove it with `remove_run` once the
-        result is saved. By default, the points are stored in a temporary folder as long as the
-        result is in use. The folder may be a URL that fsspec can open, such as ``s3://bucket/run``.
+        Its parent must exist. The run stays in the folder. Remove it with `remove_run` once the
+        result has been saved. By default, the points are stored in a temporary folder that exists
+        as long as the result. The folder can also be a URL that fsspec can open, such as
+        ``s3://bucket/run``.
     parts
-        Location of the parts, which is a folder that the workers can access, or a URL that fsspec
-        can open, such as ``s3://bucket/survey``. It requires `folder`, whose database lists the
-        parts. `remove_run` removes both. By default, the parts are in `folder`.
+        Location of the parts: a folder that the workers can access, or a URL that fsspec can open,
+        such as ``s3://bucket/survey``. This option requires `folder`, which contains the database
+        that lists the parts. `remove_run` removes both. By default, the parts are stored in
+        `folder`.
     resume
         Whether to continue an unfinished run in `folder`. If there is none, a new run is started.
-        `on_frame` is called with the frames that it has not received yet, and again with the frames
-        of the last second before the earlier run died, or of the last seconds if `folder` is a URL.
+        `on_frame` is called with the frames that it has not received yet. It receives the frames
+        from the last second before the earlier run died again, or from the last few seconds if
+        `folder` is a URL.
 
     Returns
     -------
     Result
-        The result. The same survey results in the same cloud on any cluster.
+        Result of the survey. The same survey produces the same cloud on any cluster.
 
     Raises
     ------
     LidarError
-        If the cluster lacks a resource, a task fails, `folder` contains an unfinished run and
-        `resume` is not set, or that run is damaged or has a different scene, survey, planning or
-        version. The message names the cause and the remedy.
+        If the cluster lacks a resource or a task fails, if `folder` contains an unfinished run and
+        `resume` is not set, or if that run is damaged or has a different scene, survey, planning or
+        version. The message states the cause and the remedy.
     KeyboardInterrupt
         If the run is interrupted. The run is stopped before the error is raised.
 
@@ -175,22 +179,22 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             Function that is called with the progress about ten times per second. By default,
             progress bars are shown in notebooks and terminals.
         shard
-            Share of the jobs to run. For example, (3, 10) is the third of ten equal shares, which
-            `lidarpool.merge` combines.
+            Shard of the campaign to run. For example, (3, 10) runs the third of ten equal shards of
+            the jobs. Use `lidarpool.merge` to combine the shards.
 
         Other Parameters
         ----------------
         client
             Client of a cluster whose workers declare the resources GPU and LIDAR. The LIDAR
-            partition needs one more slot than for a survey, to write jobs. By default, a local
-            cluster is started.
+            partition requires one more slot than for a survey, which is used to write the jobs. By
+            default, a local cluster is started.
         backend, collectors, queue_capacity, batch_mb
             As for `simulate`. By default, the values are taken from the scenario.
         gpu_workers
             Number of casting workers in a local cluster. By default, the number is taken from the
             scenario.
         scratch_dir
-            Location of the points during the run, as for `simulate`.
+            Location of the points during the run, like `parts` of `simulate`.
         resume
             Whether to continue an unfinished run in `out`. If there is none, a new run is started.
         restart
@@ -198,27 +202,29 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         retry_failed
             Whether to resume the run and repeat the jobs that have failed.
         verify
-            Whether to resume the run and compare every byte of the finished jobs. Jobs with
-            different bytes are damaged and are repeated.
+            Whether to resume the run and verify every byte of the finished jobs. Damaged jobs are
+            repeated.
         overwrite
             Whether to replace a finished data set. Together with `restart`, a data set with failed
-            jobs is replaced, too.
+            jobs is also replaced.
         live
-            Whether to show the jobs in the browser, as `lidarpool run --live` does, or in the cell
-            of a notebook. "foxglove" and "rerun" show sweeps of the jobs in Foxglove and Rerun.
+            Whether to show the jobs in the browser, as `lidarpool run --live` does, or in a
+            notebook cell. With "foxglove" or "rerun", sweeps of the jobs are shown in Foxglove or
+            Rerun.
         tls, startup_timeout_s, worker_timeout_s
             As for `simulate`.
 
         Returns
         -------
         CampaignRun
-            Counts of the jobs, and the jobs that have failed. A failed job does not stop the run.
+            Summary of the run, including the jobs that have failed. A failed job does not stop the
+            run.
 
         Raises
         ------
         LidarError
-            If the cluster lacks a resource, or `out` contains other files or the unfinished run of
-            a different campaign or version. The message names the cause and the remedy.
+            If the cluster lacks a resource, or if `out` contains other files or the unfinished run
+            of a different campaign or version. The message states the cause and the remedy.
         """
         target = output_place(out)
         chosen = options_of_call("run", options, without=_NOT_OF_CAMPAIGNS)
@@ -237,18 +243,18 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         split: str | None = None,
         **options: Unpack[RunKeywords],
     ) -> SweepStream:
-        """Stream the sweeps of the jobs while they are cast, without writing a data set.
+        """Stream the sweeps of the jobs as they are simulated, without writing a data set.
 
         The sweeps are the same as in a data set of the campaign, with all columns, and are ordered
-        by job, sensor and time. Points are sent from the workers directly to this process, and not
-        through the scheduler. If a worker dies, its sweeps are cast again. A job that fails is
+        by job, sensor and time. The workers send points directly to this process, and not through
+        the scheduler. If a worker dies, its sweeps are simulated again. A job that fails is
         skipped, and the reason is logged.
 
         Parameters
         ----------
         ahead
-            Maximum number of sweeps that are being cast or wait to be read, which limits the
-            memory. Use at least twice the number of casting workers.
+            Maximum number of sweeps that are being simulated or waiting to be read, which limits
+            memory use. Use at least twice the number of casting workers.
         split
             Name of a split. By default, the jobs of all splits are streamed.
 
@@ -268,8 +274,8 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         Raises
         ------
         LidarError
-            If the split is unknown. The loop raises the error if the cluster lacks a resource or is
-            lost.
+            If the split is unknown. Iteration raises this error if the cluster lacks a resource or
+            is lost.
         """
         chosen = options_of_call("stream", options, without=_NOT_OF_STREAMS)
         if split is not None and split not in self.splits:

@@ -245,7 +245,7 @@ def _is_cached(kind: type, name: str) -> bool:
 
 def _refusal(value: Any) -> LidarError:
     return LidarError(
-        f"{reprlib.repr(value)} of type {type(value).__name__} cannot be hashed, so runs that use "
-        "it cannot be distinguished. Use only numbers, text, arrays and dataclasses in the fields "
-        "of sensors and columns."
+        f"{reprlib.repr(value)} of type {type(value).__name__} cannot be hashed, so runs that "
+        "use it cannot be distinguished. Use only numbers, strings, arrays and dataclasses in "
+        "sensor and column fields."
     )

@@ -97,8 +97,8 @@ def check_address(address: str) -> None:
         if parts.hostname and parts.port:
             return
     raise LidarError(
-        f"The address {address!r} must consist of a host and a port from 1 to 65535. Use the "
-        "address of the scheduler, such as tcp://host:8786, or its scheduler file."
+        f"Invalid scheduler address {address!r}. Expected a host and a port from 1 to 65535, "
+        "such as tcp://host:8786, or a scheduler file."
     )
 
 
@@ -125,7 +125,7 @@ def check_certificates(address: str, files: TlsFiles) -> None:
     if missing:
         raise LidarError(
             f"The cluster at {address!r} uses TLS, but {' and '.join(missing)} "
-            f"{'is' if len(missing) == 1 else 'are'} missing. Pass the certificates that the "
-            "scheduler was started with as `--tls-ca`, `--tls-cert` and `--tls-key`, or set "
-            "`distributed.comm.tls` in Dask's configuration."
+            f"{'is' if len(missing) == 1 else 'are'} missing. Pass the cluster's certificates "
+            "with `--tls-ca`, `--tls-cert` and `--tls-key`, or set `distributed.comm.tls` in "
+            "Dask's configuration."
         )

@@ -31,8 +31,7 @@ class Shard:
     def __post_init__(self) -> None:
         if not 1 <= self.number <= self.total:
             raise LidarError(
-                f"Shard {self} does not exist. The shards are 1/{self.total} to "
-                f"{self.total}/{self.total}."
+                f"Shard {self} does not exist. The shard number must be from 1 to {self.total}."
             )
 
     def __str__(self) -> str:
@@ -46,7 +45,7 @@ class Shard:
         """
         if not (match := re.fullmatch(r"(?:(\d+)|auto)/(\d+)|auto", text, re.ASCII)):
             raise LidarError(
-                f"Invalid shard {text!r}. Expected N/M, such as 3/10, or auto/M, or auto."
+                f"Invalid shard {text!r}. Expected N/M (such as 3/10), auto/M or auto."
             )
         if match[1]:
             return cls(int(match[1]), int(match[2]))
@@ -55,7 +54,7 @@ class Shard:
             index, *array = (int(environment[name]) for name in names)
             first, last, step, count = array or (0, int(match[2]) - 1, 1, int(match[2]))
             if last != first + step * (count - 1):
-                raise ValueError("the tasks of the array are not evenly spaced")
+                raise ValueError("the array task IDs are not evenly spaced")
             return cls((index - first) // step + 1, count)
         except (LookupError, ValueError, ZeroDivisionError) as error:
             variables = ", ".join(f"{name}={environment.get(name, '')}" for name in names)

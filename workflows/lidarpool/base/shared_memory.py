@@ -63,7 +63,7 @@ class SharedHandle(NamedTuple):
         """
         target = str(Path(self.path).readlink())
         if target.partition(" ")[0] != f"/memfd:{self.name}":
-            raise FileNotFoundError(f"{self.path} is a different file")
+            raise FileNotFoundError(f"{self.path} refers to a different file")
         with Path(self.path).open("rb") as file:
             memory = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY))
         head, *buffers = [memory[start:stop] for start, stop in self.spans]

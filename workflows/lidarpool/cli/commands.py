@@ -58,8 +58,8 @@ _common_options = shared.combine(
         "--live",
         type=click.Choice([PAGE, *VIEWERS]),
         shell_complete=completion.live,
-        help="Show the progress and the point cloud during the run, in the browser (default), in "
-        "Foxglove or in Rerun, until Ctrl-C.",
+        help="Show the progress and the point cloud in the browser (default), in Foxglove or in "
+        "Rerun, until Ctrl-C is pressed.",
     ),
     click.option(
         "--exit",
@@ -72,17 +72,17 @@ _common_options = shared.combine(
         "--pace",
         type=click.FloatRange(0, min_open=True),
         metavar="SPEED",
-        help="With --live, show frames in order at this multiple of the scanner's rate (default: "
-        "as soon as they are cast). Not for campaigns.",
+        help="With --live, show frames in order at this multiple of the scan rate (default: show "
+        "each frame as soon as it is simulated). Not for campaigns.",
     ),
     shared.flag(
         "--cloud-only", help="Write only the point cloud and report.json, without report.html."
     ),
-    shared.flag("--overwrite", help="Overwrite the result of a different survey, or a data set."),
+    shared.flag("--overwrite", help="Overwrite a data set or the result of a different survey."),
     shared.path(
         "--timeline",
-        help="Record the duration of each startup and shutdown step, print them, and write them "
-        "to FILE as an HTML page.",
+        help="Print the duration of each startup and shutdown step, and write the durations to "
+        "FILE as an HTML page.",
     ),
     shared.flag("--quiet", "-q", help="Do not show progress."),
     shared.flag("--verbose", "-v", help="Show log messages of Dask and other libraries."),
@@ -268,21 +268,23 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
 @shared.flag("--retry-failed", help="Run the failed jobs of a campaign again.")
 @shared.flag(
     "--verify",
-    help="Verify the checksums of a data set, or of the finished jobs of a run that is resumed.",
+    help="Verify the checksums of a data set, or those of the finished jobs before a campaign is "
+    "resumed.",
 )
 @shared.job
 @shared.shard
 @click.option(
     "--scratch-dir",
     metavar="PLACE",
-    help="Folder or URL (s3://…) where LIDAR workers store points during the run.",
+    help="Folder or URL (s3://…) where LIDAR workers store points during the run (default: in the "
+    "output folder).",
 )
 @click.option(
     "--startup-timeout",
     "startup_timeout_s",
     type=_seconds,
     metavar="TIME",
-    help="How long to wait for the scheduler and for workers at startup, such as 90s or 10m "
+    help="Maximum time to wait for the scheduler and the workers at startup, such as 90s or 10m "
     f"(default: {WAIT_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
 )
 @click.option(
@@ -290,7 +292,7 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     "worker_timeout_s",
     type=_seconds,
     metavar="TIME",
-    help="How long to wait for new workers if a partition loses all of its workers during the run "
+    help="Maximum time to wait for new workers if a partition loses all its workers during the run "
     f"(default: {PATIENCE_S:g}s; with --cluster {QUEUE_S / 3600:g}h).",
 )
 @_common_options
@@ -307,12 +309,12 @@ def run(
 ) -> None:
     """Simulate a survey, or a campaign of surveys.
 
-    SCENARIO is a scenario file, a mesh file or a campaign file. A campaign file, or several
-    scenarios, produce one data set.
+    SCENARIO is a scenario file, a mesh file or a campaign file. A campaign file or several
+    scenarios produce a single data set.
 
     For a mesh file, poses are chosen automatically unless --pose is given: rooms and landscapes are
-    scanned from the center of the floor, objects from all sides. To create a scenario file from the
-    same options, use lidarpool init DIR --mesh FILE.
+    scanned from the center of the floor, and objects from all sides. To create a scenario file with
+    the same options, use lidarpool init DIR --mesh FILE.
 
     \b
     Examples:
@@ -372,7 +374,7 @@ def run(
 @cli.command()
 @click.argument("shards", metavar="SHARD...", nargs=-1, required=True, type=shared.StoragePath())
 @click.option(
-    "--partial", is_flag=True, help="Merge the shards that exist, and report what is missing."
+    "--partial", is_flag=True, help="Merge the available shards, and report the missing ones."
 )
 @shared.path("--scenario", help="Scenario or mesh file of the survey, if it has been moved.")
 @shared.out
@@ -382,7 +384,7 @@ def run(
 def merge(
     shards: tuple[Any, ...], out: Any, quiet: bool, strict: bool, as_json: bool, **settings: Any
 ) -> None:
-    """Merge shards into a data set or result.
+    """Merge shards into a data set or a result.
 
     If a merge was interrupted, run the same command again to continue.
 
@@ -406,7 +408,7 @@ def merge(
 @shared.scheduler
 @shared.as_json
 def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
-    """Show what is here, workers of a cluster, and what to fix first.
+    """Check the installation and cluster workers, and suggest fixes.
 
     \b
     Examples:
@@ -471,7 +473,7 @@ def _explanation(error: Exception) -> str | None:
             return error.format_message()
         case OSError(filename=str() | Path() as name):
             # No file can have this name, or its folder may not be read.
-            return f"{name}: {error.strerror}. Use another file or folder."
+            return f"{name} cannot be accessed: {error.strerror}. Use another file or folder."
         case MemoryError():
             return "Not enough memory. Use a smaller scene, fewer scans or a larger keep_every."
         case LidarError():

@@ -29,7 +29,7 @@ def starting_with(incomplete: str, names: Iterable[str]) -> Items:
 
 
 def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete a sensor model, with or without its manufacturer, or a file name."""
+    """Complete the name of a sensor model, with or without its manufacturer, or a file name."""
     del ctx, param
     from lidarsim.base.model_names import model_names, plugin_model_names
 
@@ -46,7 +46,7 @@ def sensors(ctx: click.Context, param: click.Parameter, incomplete: str) -> Item
 
 
 def columns(ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
-    """Complete the last name in a comma-separated list of columns."""
+    """Complete the last column name in a comma-separated list."""
     del ctx, param
     return _in_list(incomplete, OPTIONAL_COLUMNS)
 

@@ -31,7 +31,7 @@ READY = "ready"
 FREE = "free"
 # {port of this machine: what listens there}
 PORTS = {
-    80: "interface of a played sensor",
+    80: "HTTP interface of `lidarpool play`",
     8765: "Foxglove",
     8786: "Dask scheduler",
     8787: "Dask dashboard",
@@ -128,12 +128,12 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
         yield figures["open3d"]
     if machine["available_memory_gib"] < _MIN_MEMORY_GIB:
         yield (
-            f"Only {machine['available_memory_gib']:.1f} GiB of memory are available, but a "
+            f"Only {machine['available_memory_gib']:.1f} GiB of memory is available, but a "
             f"small run needs about {_MIN_MEMORY_GIB:g} GiB. Close other programs"
         )
     for folder, free_gib in machine["disk_gib"].items():
         if free_gib < _MIN_DISK_GIB:
-            yield f"Only {free_gib:.1f} GiB are free on the disk of {folder}. Free some space"
+            yield f"The disk of {folder} has only {free_gib:.1f} GiB of free space. Free some space"
     if figures["gpus"] and backends["cuda"] != READY:
         yield f"The GPU of this machine is not used: {backends['cuda']}"
     if backends["tiles"] != READY:
@@ -151,9 +151,7 @@ def in_words(figures: dict[str, Any]) -> list[str]:
     """Return the lines of a report for a terminal."""
     machine = figures["machine"]
     disks = ", ".join(f"{free:.1f} GiB in {name}" for name, free in machine["disk_gib"].items())
-    memory = (
-        f"{machine['memory_gib']:.1f} GiB, of which {machine['available_memory_gib']:.1f} are free"
-    )
+    memory = f"{machine['memory_gib']:.1f} GiB, {machine['available_memory_gib']:.1f} GiB available"
     rows: dict[str, str] = {
         **figures["versions"],
         "cores": str(machine["cores"]),
@@ -169,7 +167,7 @@ def in_words(figures: dict[str, Any]) -> list[str]:
         lines += [f"  {name:<12} {state}" for name, state in states.items()]
     lines.append("ports of 127.0.0.1")
     lines += [
-        f"  {port:<12} {state}, for {PORTS[int(port)]}" for port, state in figures["ports"].items()
+        f"  {port:<12} {state} ({PORTS[int(port)]})" for port, state in figures["ports"].items()
     ]
     return lines
 

@@ -57,7 +57,9 @@ def forecast_scenario(
     """
     campaign = CampaignSpec.load(path) if not of_mesh and is_campaign(path) else None
     if campaign is None and number is not None:
-        raise LidarError(f"{path} is not a campaign, so it has no job {number}.")
+        raise LidarError(
+            f"{path} is not a campaign. `--job {number}` can only be used with a campaign."
+        )
 
     terminal = Terminal(quiet)
 
@@ -185,7 +187,7 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
         )
         points = sum((job["estimate"] or {"points": 0})["points"] for job in figures["jobs"])
         yield (
-            f"in all      about {scans_in_words(scans, sweeps)}, {rays:,} rays and "
+            f"total       about {scans_in_words(scans, sweeps)}, {rays:,} rays and "
             f"{round(share * points):,} points, estimated from "
             f"{plural(len(figures['jobs']), 'job')}"
         )

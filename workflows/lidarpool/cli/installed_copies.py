@@ -35,8 +35,8 @@ def second_copy() -> str:
     for checkout in (_editable_checkout(), _checkout_of(Path.cwd())):
         if checkout not in (None, root):
             return (
-                f"There are two copies of lidarpool: it is imported from {root}, so that changes "
-                f"in {checkout} have no effect. {_REMEDY}"
+                f"There are two copies of lidarpool: it is imported from {root}, so changes in "
+                f"{checkout} have no effect. {_REMEDY}"
             )
     return ""
 

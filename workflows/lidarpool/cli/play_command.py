@@ -30,18 +30,19 @@ _NOW_NS = 2_000_000_000  # time between reading the source and the first sweep o
     metavar="BRIDGE",
     shell_complete=completion.bridges,
     required=True,
-    help="Output: packets (the network protocol of the sensor), ros2 (ROS 2 topics), foxglove or "
-    "rerun.",
+    help="Output protocol: packets (network packets of the sensor), ros2 (ROS 2 topics), foxglove "
+    "or rerun.",
 )
 @click.option(
     "--to",
     metavar="[NAME=]ADDRESS",
     multiple=True,
     help="For packets, the destination HOST or HOST:PORT; with several sensors, NAME=HOST:PORT. "
-    "For "
-    "viewers, the address to listen on (default: 127.0.0.1).",
+    "For viewers, the address to listen on (default: 127.0.0.1).",
 )
-@options.flag("--loop", help="Repeat until Ctrl-C with increasing timestamps.")
+@options.flag(
+    "--loop", help="Repeat the playback, with increasing timestamps, until Ctrl-C is pressed."
+)
 @click.option(
     "--rate",
     type=click.FloatRange(0.001, 1000),
@@ -56,9 +57,8 @@ _NOW_NS = 2_000_000_000  # time between reading the source and the first sweep o
     "--api",
     metavar="[NAME=]ADDRESS",
     multiple=True,
-    help="For packets, the address on which the HTTP or command interface of the sensor listens, "
-    "HOST "
-    "or HOST:PORT (default: 127.0.0.1, port 80 or a free one).",
+    help="For packets, the address of the sensor's HTTP or command interface, HOST or HOST:PORT "
+    "(default: 127.0.0.1, with port 80 or a free port).",
 )
 @click.option(
     "--layout",
@@ -75,7 +75,7 @@ _NOW_NS = 2_000_000_000  # time between reading the source and the first sweep o
     "--organized",
     is_flag=True,
     default=None,
-    help="For ros2, publish one point per ray, NaN for rays without a return.",
+    help="For ros2, publish one point per ray, with NaN for rays without a return.",
 )
 @options.mesh_reading
 @options.new_file(

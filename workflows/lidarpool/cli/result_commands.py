@@ -72,7 +72,7 @@ class _FormatName(click.Choice[str]):
     shell_complete=completion.colors,
     default="z",
     show_default=True,
-    help="Column that determines the point colors, or rgb.",
+    help="Column by which points are colored, or rgb.",
 )
 def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) -> None:
     """Draw the pictures of a result and add them to report.html.
@@ -94,8 +94,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
         if not (folder_of_result / PICTURE_FILE).exists():
             raise LidarError(
                 f"{result} does not contain {PICTURE_FILE}, from which the pictures are drawn. "
-                "Pass the "
-                "output folder of a finished run."
+                "Pass the output folder of a finished run."
             )
         keep_freed_memory()
         content = PictureContent.load(folder_of_result / PICTURE_FILE)
@@ -135,8 +134,8 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
     "--compensated-actors",
     is_flag=True,
     help=(
-        "Store points of actors where the actor was at the start of the sweep, in formats with "
-        "sweeps."
+        "Move the points of each actor to its pose at the start of the sweep (formats with sweeps "
+        "only)."
     ),
 )
 @click.option(
@@ -148,13 +147,14 @@ def plot(result: Path | Storage, out: Path | Storage | None, **settings: Any) ->
 @click.option(
     "--organized",
     is_flag=True,
-    help="Write one point per ray to mcap and rosbag2, NaN for rays without a return.",
+    help="Write one point per ray to mcap and rosbag2, with NaN for rays without a return.",
 )
 @click.option(
     "--intensity-full-scale",
     type=click.FloatRange(0, min_open=True),
     metavar="INTENSITY",
-    help="Intensity that las and laz store as 65,535 (default: reached by at most 1 % of points).",
+    help="Intensity that is stored as 65,535 in las and laz (default: a value that at most 1 % of "
+    "the points reach).",
 )
 @options.copies
 @options.overwrite
@@ -282,7 +282,7 @@ def _tell(note: str) -> None:
 @options.flag("--no-browser", help="Print the address without opening a browser.")
 @options.new_file(
     "--film",
-    help="Render an animation to a .gif or .webp file: along a drive, or around the scene.",
+    help="Render an animation, along the trajectory or around the scene, to a .gif or .webp file.",
 )
 @options.new_file("--export", help="Export the view as a single .html file of at most 25 MB.")
 @options.flag("--keep-noise", help="Include withheld points and noise of .las and .laz files.")
@@ -367,7 +367,7 @@ def view(
     "sweeps",
     type=int,
     multiple=True,
-    help="Compare only the pair of sweeps with this index, starting at 0; can be repeated.",
+    help="Index of a pair of sweeps to compare, starting at 0; can be repeated (default: all).",
 )
 @click.option(
     "--match",
@@ -377,7 +377,7 @@ def view(
     help="How to pair the sweeps of A and B.",
 )
 @click.option("--sensor-a", metavar="NAME", help="Sensor or topic of A, if A contains several.")
-@click.option("--sensor-b", metavar="NAME", help="Sensor or topic of B.")
+@click.option("--sensor-b", metavar="NAME", help="Sensor or topic of B, if B contains several.")
 @click.option("--intensity-a", metavar="COLUMN", help="Column of A to compare as intensity.")
 @click.option("--intensity-b", metavar="COLUMN", help="Column of B to compare as intensity.")
 @click.option(
@@ -385,7 +385,11 @@ def view(
     type=click.Choice([*UNITS_M]),
     help="Length unit of A (default: from a .las or .laz file, otherwise m).",
 )
-@click.option("--unit-b", type=click.Choice([*UNITS_M]), help="Length unit of B.")
+@click.option(
+    "--unit-b",
+    type=click.Choice([*UNITS_M]),
+    help="Length unit of B (default: from a .las or .laz file, otherwise m).",
+)
 @options.flag("--keep-noise", help="Include withheld points and noise of .las and .laz files.")
 @click.option(
     "--azimuth-deg",
@@ -413,9 +417,10 @@ def view(
 def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None:
     """Compare two point clouds or recordings of the same scene.
 
-    B is the reference. A and B can be results, data sets, .ply, .pcd or folders of these, .las,
-    .laz, .e57, text such as .csv, .pts, .ptx, .npy, .bin, ROS 2 bags, .pcap and .osf. Sweeps of the
-    same sensor are compared as range images, clouds without rings by point distances.
+    B is the reference. A and B can be results, data sets, .ply or .pcd files or folders of these,
+    .las, .laz, .e57, .pts, .ptx, .npy, .bin, .pcap, .osf or text files such as .csv, or ROS 2 bags.
+    Sweeps of the same sensor are compared as range images, and clouds without rings by point
+    distances.
 
     \b
     Examples:
@@ -445,9 +450,9 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
     "--model",
     metavar="MODEL|FILE",
     shell_complete=completion.sensors,
-    help="Sensor model that provides the properties the recording does not reveal.",
+    help="Sensor model for the properties that cannot be estimated from the recording.",
 )
-@options.path("--scene", help="Mesh of the scene.")
+@options.path("--scene", help="Mesh file of the scene.")
 @options.poses
 @click.option(
     "--sensor", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
@@ -457,16 +462,16 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
     "--white-intensity",
     "white",
     type=float,
-    help="Intensity of a white surface, if it does not depend on the range.",
+    help="Intensity of a white surface, if intensities do not depend on the range.",
 )
 @options.as_json
 def fit(
     recording: Path, out: Path, pose: Sequence[Sequence[float]], as_json: bool, **settings: Any
 ) -> None:
-    """Estimate noise, dropout and false alarms of a sensor from a recording.
+    """Estimate noise, dropout and false alarms from a recording.
 
     RECORDING can have any format that `lidarpool compare` reads, and must contain sweeps and rings.
-    The sensor must be stationary, unless --scene and its poses are given.
+    The sensor must be stationary unless the scene is given with --scene and its poses are known.
 
     \b
     Examples:

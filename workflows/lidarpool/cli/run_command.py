@@ -206,8 +206,8 @@ def run_job(
             return ""
         if Tally.from_cloud(result.points).sha256 not in hashes:
             raise LidarError(
-                f"The points of job {name} differ from those in {target}. Files that the job "
-                "uses have changed, such as images of a mesh."
+                f"The points of job {name} differ from those in {target}, because a file that the "
+                "job uses, such as an image of a mesh, has changed."
             )
         return f"the points of job {name} are bit-identical to those in {target}"
 

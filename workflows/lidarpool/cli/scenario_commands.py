@@ -40,7 +40,7 @@ _SENSOR_FORMATS = "File format: " + ", ".join(row.name for row in FORMATS) + "."
 )
 @options.path("--mesh", "meshes", multiple=True, help="Mesh file to survey; can be repeated.")
 @options.mesh_options
-@options.flag("--all", "every", help="Write every field with its default and a description.")
+@options.flag("--all", "every", help="Write all fields with their defaults and descriptions.")
 def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every: bool) -> None:
     """Create a scenario file.
 
@@ -93,8 +93,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     except FileExistsError as error:
         raise LidarError(
             f"{error.filename} already exists and is not overwritten. Remove it, or pass another "
-            "folder: "
-            "lidarpool init DIR."
+            "folder: lidarpool init DIR."
         ) from error
     name = click.format_filename(target)
     if meshes:
@@ -115,9 +114,8 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     metavar="DIR",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
     multiple=True,
-    help="Folder for resolving references in the survey; can be repeated (default: the folder of "
-    "the "
-    "survey and its parents).",
+    help="Folder in which references in the survey are resolved; can be repeated (default: the "
+    "folder of the survey and its parents).",
 )
 @options.path("--out", "-o", metavar="DIR", help="Output folder (default: the name of the survey).")
 def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
@@ -125,8 +123,8 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 
     Supported inputs are HELIOS++ surveys and scanners, Gazebo worlds (.sdf, .world) with their
     lidars, MuJoCo models (.xml) with their rangefinders, ray tables of a sensor (.csv, .npz,
-    .parquet), OmniLidar prims (.usd, .usda), and formats of installed plug-ins. Unsupported
-    features are listed. Mesh files are referenced, not copied.
+    .parquet), OmniLidar prims (.usd, .usda), and formats of installed plug-ins. Features that are
+    not supported are printed. Mesh files are referenced, not copied.
 
     \b
     Examples:
@@ -199,13 +197,13 @@ def check(
     strict: bool,
     as_json: bool,
 ) -> None:
-    """Validate a scenario and estimate its run time and memory.
+    """Validate a scenario and estimate points, memory and disk space.
 
     No workers are started. For a campaign, the varying values and five of the jobs are checked.
 
-    A sample of the rays is cast in this process to estimate the number of points. Warnings point
-    out implausible poses, trajectories and noise. The exit code is 0 if the scenario can run, and 2
-    if it cannot.
+    The number of points is estimated by casting a sample of the rays in this process. A warning is
+    printed for implausible poses, trajectories and noise. The exit code is 0 if the scenario can be
+    run, and 2 if it cannot.
 
     \b
     Examples:
@@ -270,10 +268,12 @@ def _free_target(target: Path | Storage) -> str:
 def schema(campaign: bool) -> None:
     """Print the JSON Schema of scenario files.
 
-    Editors can use the schema to complete and check scenarios: Visual Studio Code with the
-    extension redhat.vscode-yaml, and Vim, Emacs and others with yaml-language-server. The first
-    line of the scenario must refer to the schema:
-    # yaml-language-server: $schema=scenario.schema.json
+    Editors can use the schema to complete and check scenarios. Visual Studio Code requires the
+    extension redhat.vscode-yaml; Vim, Emacs and other editors require yaml-language-server. The
+    first line of the scenario must refer to the schema:
+
+    \b
+      # yaml-language-server: $schema=scenario.schema.json
 
     \b
     Examples:
@@ -327,7 +327,7 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
 @_generated_scene_options(triangles=2_000_000)
 @click.option("--side", default=1000.0, help="Side length in meters.")
 @click.option(
-    "--trees", default=0, help="Number of trees; they grow in woods where the ground is not steep."
+    "--trees", default=0, help="Number of trees, which form woods where the ground is not steep."
 )
 def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, trees: int) -> None:
     """Generate a square terrain with hills and mountains.
@@ -366,8 +366,8 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     "--epsg",
     type=click.IntRange(1024, 32767),
     metavar="CODE",
-    help="EPSG code of a coordinate system in meters to which the cloud is converted, for example "
-    "from degrees or Web Mercator.",
+    help="Convert the cloud, for example from degrees or Web Mercator, to the coordinate system "
+    "with this EPSG code, whose unit must be meters.",
 )
 @options.flag("--keep-noise", help="Include withheld points and noise.")
 @click.option(
@@ -381,8 +381,8 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
 def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
     """Convert a point cloud to a scene that can be scanned again.
 
-    CLOUD must be z-up. Supported formats are .ply, .pcd, .las, .laz, .e57, text (.xyz, .txt, .asc,
-    .csv), Leica .pts and .ptx, .npy, and .bin from KITTI or nuScenes.
+    The z axis of CLOUD must point up. Supported formats are .ply, .pcd, .las, .laz, .e57, text
+    (.xyz, .txt, .asc, .csv), Leica .pts and .ptx, .npy, and .bin from KITTI or nuScenes.
 
     \b
     Examples:
@@ -403,7 +403,7 @@ def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
         if made.gap_note:
             tell(f"{cloud}: {made.gap_note}")
         if place.epsg is not None:
-            tell(f"{out} keeps the coordinate system of {cloud}, EPSG:{place.epsg}")
+            tell(f"{out} uses the coordinate system of {cloud}, EPSG:{place.epsg}")
         if out.suffix.lower() != ".glb" and (place.has_colors.any() or place.material_names):
             tell(
                 f"{out} cannot store the colors and classes of {cloud}. Write a .glb file to "
@@ -431,8 +431,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     elif scene.instances and scene.triangles > MAX_COPIED_TRIANGLES:
         raise LidarError(
             f"{file} would contain {scene.triangles:,} triangles, because only .glb files can "
-            "store "
-            "instances. Write a .glb file."
+            "store instances. Write a .glb file."
         )
     write_scene(file, scene)
     lower, upper = scene.bounds
@@ -450,9 +449,8 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
 @options.path(
     "--out",
     metavar="FILE",
-    help="Write the sensor to FILE for other programs. The format follows from the file "
-    "extension or "
-    "from --as; .png draws the scan pattern.",
+    help="Export the sensor to FILE. The format is determined by --as or by the file extension; "
+    ".png draws the scan pattern.",
     shell_complete=completion.sensor_file,
 )
 @click.option(
@@ -472,7 +470,7 @@ def _write(file: Path, make: Callable[[], Scene], overwrite: bool, paint: bool =
     "--revolutions",
     type=click.IntRange(1, 10_000_000),
     metavar="N",
-    help="Number of revolutions or frames, as an alternative to --seconds.",
+    help="Number of revolutions or frames, instead of --seconds.",
 )
 @options.path("--calibration", help="Calibration file of the unit, as in a scenario.")
 @click.option(
@@ -504,10 +502,10 @@ def sensors(
     overwrite: bool,
     **settings: Any,
 ) -> None:
-    """List sensor models, describe one, or export it to a file.
+    """List the sensor models, or describe or export one of them.
 
-    Exported files contain rays in firing order; docs/how-to/other-simulators.md describes the
-    conventions. Properties that the format cannot store are printed.
+    Exported files contain the rays in firing order; docs/how-to/other-simulators.md describes the
+    conventions. Properties that the format cannot store are listed on the screen.
 
     \b
     Examples:
@@ -522,10 +520,12 @@ def sensors(
     settings = {name: value for name, value in settings.items() if value is not None}
     writing = [file_format, seconds, revolutions, *settings]
     if out is None and any(value is not None for value in writing):
-        raise click.UsageError("These options require `--out FILE`.")
+        raise click.UsageError(
+            "The options of `lidarpool sensors` only apply to an exported file. Pass `--out FILE`."
+        )
     if model is None and "calibration" not in settings:
         if out is not None:
-            raise click.UsageError("Specify the model to write, or pass `--calibration FILE`.")
+            raise click.UsageError("Specify the model to export, or pass `--calibration FILE`.")
         _list_models()
         return
     if model is not None:

@@ -62,8 +62,7 @@ shard = click.option(
     metavar="N/OF",
     type=Shard.parse,
     help="Run only shard N of OF, for example 3/10; combine the shards with lidarpool merge. Use "
-    "auto "
-    "for the task ID of a Slurm array, or auto/10 for the index of a Kubernetes job.",
+    "auto in a Slurm job array, or auto/10 in an indexed Kubernetes Job with 10 pods.",
 )
 cluster = path(
     "--cluster",
@@ -72,7 +71,7 @@ cluster = path(
 overwrite = flag("--overwrite", help="Overwrite existing files.")
 as_json = flag("--json", "as_json", help="Print the results as JSON.")
 WARNED = 1  # exit code of --strict
-strict = flag("--strict", help="Exit with code 1 if there was a warning.")
+strict = flag("--strict", help="Exit with code 1 if there are warnings.")
 result = click.argument("result", metavar="FOLDER", type=StoragePath())
 copies = click.option(
     "--out", type=StoragePath(file_okay=False), help="Output folder (default: FOLDER)."
@@ -96,8 +95,7 @@ def _position(text: str) -> list[float]:
     except ValueError as error:
         message = (
             f"{text!r} is not a position. Expected X,Y,Z, for example 0,0,1.9. To set angles, "
-            "use a "
-            "scenario file."
+            "use a scenario file."
         )
         raise click.BadParameter(message) from error
     return [int(number) if number.is_integer() else number for number in (x, y, z)]
@@ -115,9 +113,9 @@ def _mesh_option(name: str, description: str, **settings: Any) -> Callable[[Comm
 
 _mesh_list_option = partial(_mesh_option, metavar="NAME,…", type=_names, multiple=True)
 poses = click.option("--pose", metavar="X,Y,Z", type=_position, multiple=True,
-                     help="Position of the sensor in the scene, in meters; repeat it to give one "
-                     "position for each "
-                     "sweep (default: from the recording, otherwise 0,0,0).")  # fmt: skip
+                     help="Position of the sensor in the scene, in meters; can be repeated, with "
+                     "one position per sweep (default: from the recording, otherwise "
+                     "0,0,0).")  # fmt: skip
 _MESH_READING = ("unit", "up_axis")  # how a mesh is read, wherever a command takes a mesh
 _mesh_reading_options = combine(
     _mesh_option(
@@ -135,8 +133,7 @@ _mesh_options = combine(
     click.option(
         "--sensor",
         help="Sensor model, as listed by lidarpool sensors, or a sensor file. Mesh input, or "
-        "scenarios "
-        "with one sensor.",
+        "scenarios with one sensor.",
         metavar="MODEL|FILE.yaml",
         shell_complete=completion.sensors,
     ),
@@ -222,13 +219,13 @@ def scheduler(command: Command) -> Command:
     for name, description in (
         ("key", "Private key of the client certificate, if it is in a separate file (PEM)."),
         ("cert", "Client certificate for a TLS cluster (PEM)."),
-        ("ca", "Certificate authority of a TLS cluster (PEM)."),
+        ("ca", "CA certificate of a TLS cluster (PEM)."),
     ):
         click.option(f"--tls-{name}", type=pem, help=description)(with_files)
     click.option(
         "--scheduler-file",
         type=click.Path(dir_okay=False, path_type=Path),
-        help="File with the address of the scheduler, as written by dask scheduler "
+        help="File that contains the address of the scheduler, as written by dask scheduler "
         "--scheduler-file.",
     )(with_files)
     return click.option(
@@ -256,9 +253,9 @@ def _check_combination(settings: Mapping[str, Any], file: Path | None, files: Tl
         )
     if settings.get("tls") and (starts_cluster or has_scheduler):
         raise click.UsageError(
-            "`--tls` can only be used with the local cluster. Clusters of `--cluster` are "
-            "encrypted if their file specifies it, and clusters of `--scheduler` if the "
-            "address begins with tls://."
+            "`--tls` can only be used with the local cluster. A cluster that `--cluster` starts "
+            "is encrypted if its file enables TLS, and a cluster that `--scheduler` connects to "
+            "is encrypted if its address begins with tls://."
         )
     if any(files) and not has_scheduler:
         raise click.UsageError(

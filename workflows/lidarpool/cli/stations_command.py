@@ -72,14 +72,15 @@ def _share(text: str) -> float:
 @options.path(
     "--cloud",
     "cloud",
-    help="Compare the stations in SCENARIO with this result or cloud; no stations are chosen.",
+    help="Measure the coverage of this result or cloud from the stations in SCENARIO, instead of "
+    "choosing stations.",
 )
 @click.option(
     "--within",
     "within_m",
     default=0.1,
     metavar="M",
-    help="With --cloud, the distance from a point within which a surface is covered, in meters.",
+    help="With --cloud, maximum distance in meters between a covered surface and a point.",
 )
 @click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
 @click.option(
@@ -88,7 +89,7 @@ def _share(text: str) -> float:
     metavar="SHARE",
     help=(
         "Add stations until this share of the visible surface is covered, such as 95% (default: "
-        "without --count, as long as each station adds 1%)."
+        "add stations as long as each adds at least 1%, unless --count is passed)."
     ),
 )
 @click.option(
@@ -130,14 +131,16 @@ def stations(
     of_mesh: dict[str, Any],
     **settings: Any,
 ) -> None:
-    """Choose stations for a terrestrial scan, or say what a scan has covered.
+    """Choose or evaluate the stations of a terrestrial scan.
 
-    Places on the floor are tried, and whichever adds most to what is covered comes next. Coverage
-    is by area, of what any of these places sees of the objects to cover. A scenario with the
-    stations is written, and a picture of what they cover.
+    Stations are chosen one by one from candidate positions on the floor. The next station is always
+    the candidate that adds the most coverage, which is the covered share of the surface area that
+    is visible from at least one candidate. The output is a scenario with the stations, and a
+    picture of the surfaces that they cover.
 
-    With --cloud, the stations of the scenario are taken, and of the area that they see, the share
-    near points of a result, or of any cloud that `lidarpool compare` reads.
+    With --cloud, no stations are chosen. Instead, the command computes which share of the surface
+    area visible from the stations in SCENARIO is close to a point of a result, or of any cloud that
+    `lidarpool compare` reads.
 
     \b
     Examples:
@@ -156,7 +159,7 @@ def stations(
     if cloud is not None:
         _refuse_beside_cloud(scene, settings | {"model": model})
         if not within_m > 0:
-            raise LidarError(f"`--within` is {within_m:g}; it must be greater than 0.")
+            raise LidarError(f"`--within` must be greater than 0, but is {within_m:g}.")
         scenario = Scenario.load(scene, of_mesh)
         sight = {key: settings[key] for key in ("slant_deg", "targets")}
         _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
@@ -193,7 +196,7 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     sensor_elevations(sensor)  # an unsuitable sensor is reported before the scene is read
     terminal = Terminal(quiet=as_json)
     built, notes = _built_with_notes(scenario, terminal)
-    with terminal.status("computing the visibility from all candidates"):
+    with terminal.status("computing the visibility from all candidate positions"):
         plan = plan_stations(built.scene, sensor, **settings)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
@@ -226,8 +229,8 @@ def _refuse_beside_cloud(scene: Path, settings: dict[str, Any]) -> None:
     }
     if unused := [f"`{name}`" for name, value in chosen.items() if value is not None]:
         raise click.UsageError(
-            f"{joined(unused)} cannot be used with `--cloud`, which takes the stations and the "
-            f"sensor from {scene}."
+            f"{joined(unused)} cannot be used with `--cloud`, because the stations and the sensor "
+            f"are those in {scene}."
         )
 
 
@@ -256,7 +259,7 @@ def _show_coverage(
     built, notes = _built_with_notes(scenario, terminal)
     if len(built.survey.carried) > 1:
         raise LidarError(
-            "`--cloud` compares the scan of a single sensor, but the scenario has several sensors."
+            "`--cloud` requires a scenario with a single sensor, but the scenario has several."
         )
     positions = _station_positions(built)
     clouds = (
@@ -349,8 +352,8 @@ def _target_notes(plan: StationPlan, built: Built) -> Iterator[str]:
     share = float(visible_m2[largest] / visible_m2.sum())
     if share > _MOST_OF_THE_AREA and (visible_m2 > 0).sum() > 1:
         yield (
-            f"{printable(built.scene.names[largest])} has {share:.0%} of the visible area, so "
-            "it determines where the stations are. If other objects matter, select them with "
+            f"{printable(built.scene.names[largest])} accounts for {share:.0%} of the visible "
+            "area, so it largely determines the stations. To cover other objects, select them with "
             "`--target`"
         )
 
@@ -362,14 +365,13 @@ def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) ->
     reached = float(plan.coverage[-1])
     if coverage is not None and reached < coverage:
         yield (
-            f"The coverage of {coverage:.0%} is not reached: {MAX_STATIONS} stations, which "
-            f"is the maximum, cover {reached:.1%}. Increase `--height`, `--slant` or "
-            "`--spacing`"
+            f"The coverage of {coverage:.0%} was not reached. The maximum of {MAX_STATIONS} "
+            f"stations covers {reached:.1%}. Increase `--height`, `--slant` or `--spacing`"
         )
     if count is not None and len(plan.stations) < count:
         yield (
-            f"{len(plan.stations)} of {count} stations already cover everything that is visible "
-            "from the candidates"
+            f"{len(plan.stations)} of {count} stations already cover all surfaces that are visible "
+            "from the candidate positions"
         )
 
 
@@ -405,7 +407,7 @@ def _stations_scenario(
     head = (
         f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. "
         f"They cover {plan.coverage[-1]:.1%} of the\n# visible surface{_of_targets(targets)}. "
-        "The steps are 10 degrees wide, with one revolution from each station.\n"
+        "Each station scans one revolution in steps of 10 degrees.\n"
     )
     for warning in warnings:
         lines = textwrap.wrap(f"Warning: {warning}", 96, break_on_hyphens=False)

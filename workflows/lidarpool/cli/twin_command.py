@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     "--model",
     metavar="MODEL|FILE",
     shell_complete=completion.sensors,
-    help="Sensor model; required for sensors without rings.",
+    help="Sensor model of the recording; required for sensors without rings.",
 )
 @options.path(
     "--trajectory",
-    help="File with the poses of the sensor, with timestamps or as KITTI rows, one per sweep "
-    "(default: from the recording, otherwise by registration).",
+    help="File with the poses of the sensor, either with timestamps or as one KITTI row per sweep "
+    "(default: from the recording, otherwise estimated by registration).",
 )
 @click.option(
     "--voxel-m",
@@ -59,11 +59,12 @@ def twin(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Reconstruct the scene of a recorded drive, without moving objects.
+    """Reconstruct the static scene of a recorded drive.
 
-    Writes the scene (place.glb), the trajectory (trajectory.csv), the sensor (sensor.yaml), a
-    scenario that combines them, and report.html, which compares held-out sweeps with simulated
-    ones. RECORDING can have any format that `lidarpool compare` reads, and must contain sweeps.
+    Moving objects are removed. The output folder contains the scene (place.glb), the trajectory
+    (trajectory.csv), the sensor (sensor.yaml), a scenario that combines them, and report.html,
+    which compares held-out sweeps with simulated sweeps. RECORDING can have any format that
+    `lidarpool compare` reads, and must contain sweeps.
 
     \b
     Examples:

@@ -413,14 +413,11 @@ def _scale(headers: Sequence[Any]) -> _Scale:
         return _Scale([None] * len(headers))
     pairs = zip(headers, limits, strict=True)
     if any("intensity" in header.point_fields and limit is None for header, limit in pairs):
-        note = "has scans with and without intensityLimits. Their intensities are used as stored"
+        note = "has scans with and without intensityLimits, so their intensities are used as stored"
         return _Scale([None] * len(headers), (note,))
     following = iter(scales)
     applied = [None if limit is None else next(following) for limit in limits]
-    note = (
-        "states the scale of its intensities in intensityLimits. The intensities were scaled to "
-        "the range 0 to 1"
-    )
+    note = "specifies intensityLimits, so its intensities were scaled to the range 0 to 1"
     return _Scale(applied, (note,))
 
 
@@ -478,7 +475,7 @@ def _pose(header: Any, name: str) -> tuple[Floats | None, tuple[str, ...]]:
         )
     length = np.sqrt((quaternion**2).sum())
     if length < _MIN_QUATERNION:
-        note = f"has a zero quaternion in the pose of {name}. The scan is not rotated"
+        note = f"has a zero quaternion in the pose of {name}, so the scan is not rotated"
         return affine(np.eye(3), position), (note,)
     (rotation,) = matrices(quaternion[None] / length)
     return affine(rotation, position), ()

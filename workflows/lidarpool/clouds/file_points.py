@@ -49,9 +49,7 @@ def from_columns(columns: Columns) -> FilePoints:
     Raises ValueError if an axis is missing.
     """
     if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise ValueError(
-            f"the coordinates of its vertices are incomplete ({', '.join(missing)} missing)"
-        )
+        raise ValueError(f"its vertex coordinates are incomplete ({', '.join(missing)} missing)")
     positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return FilePoints(positions, columns)
 

@@ -80,7 +80,7 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
 
     LidarError if the folder does not exist, the storage cannot be read, or has no complete result.
     """
-    refuse_missing(output, "specify the folder of a finished run, as passed to `--out`")
+    refuse_missing(output, "specify the output folder of a finished run")
     with local_folder(output) as folder:
         if not isinstance(output, Storage):
             yield folder
@@ -89,9 +89,9 @@ def local_result(output: Path | Storage, names: Sequence[str]) -> Iterator[Path]
             sizes = output.sizes()
             if LAST_FILE not in sizes:
                 raise LidarError(
-                    f"{output.url} contains no complete result, because it has no "
-                    f"{LAST_FILE}. Specify the URL of a finished run. To complete an "
-                    "unfinished run, use `lidarpool run --resume`."
+                    f"{output.url} does not contain a complete result, because {LAST_FILE} is "
+                    "missing. Specify the URL of a finished run. To complete an unfinished run, "
+                    "use `lidarpool run --resume`."
                 )
             for name in (*names, LAST_FILE):
                 if name in sizes:

@@ -174,7 +174,7 @@ class FormatRow:
         `name` is the name of the file or folder in the message.
         """
         for package in self.packages:
-            need(package, self.extra, f"{name} is read")
+            need(package, self.extra, f"Reading {name}")
         return self.provides(function)
 
 
@@ -449,8 +449,8 @@ def _row_of_plugin(plugin: Plugin) -> FormatRow:
         )
     if "/" in row.file or (row.write and row.file in _FILES):
         raise LidarError(
-            f"{plugin} writes {row.file!r}. Choose the name of a file or folder that no other "
-            "format writes, without parent folders."
+            f"{plugin} writes {row.file!r}, which contains a parent folder or is used by another "
+            "format. Set `file` to a unique file or folder name."
         )
     return replace(row, plugin=plugin)
 

@@ -270,7 +270,7 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
         """Return the rows that belong to the files, and note those that belong to none."""
         indices = rows_of_frames(files, len(rows), table, "point files")
         if surplus := frames_without_file(files, len(rows)):
-            notes.append(f"has no point file for {frames_in_words(surplus)} of {table}")
+            notes.append(f"has no point file for {frames_in_words(surplus)} in {table}")
         return rows[indices]
 
     poses: Floats | None = None
@@ -278,13 +278,13 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
         rows = of_frames(_matrices(folder / "poses.txt"), "poses.txt")
         poses = lidar_poses(rows, calibration)
         if not calibration.exists():
-            notes.append(
-                f"has no {CALIBRATION_FILE}, so its poses are assumed to be poses of the lidar"
-            )
+            notes.append(f"has no {CALIBRATION_FILE}, so its poses are assumed to be lidar poses")
     times_ns: Floats | None = None
     if (folder / "times.txt").exists():
         seconds = np.loadtxt(folder / "times.txt", ndmin=1)
-        times_ns = 1e9 * seconds_of(seconds, None, advice="write seconds to times.txt")
+        times_ns = 1e9 * seconds_of(
+            seconds, None, advice=("specify the times in times.txt in seconds")
+        )
         times_ns = of_frames(times_ns, "times.txt")
 
     def read(number: int) -> Read:
@@ -330,8 +330,8 @@ def _calibration(path: Path) -> Floats:
             except ValueError as error:
                 raise ValueError(f"{path.name}: {error}") from error
     raise ValueError(
-        f"{path.name} has no line `Tr:`, the transform from the lidar to the camera of the poses. "
-        f"Add it, or remove {path.name} if the poses are those of the lidar."
+        f"{path.name} has no `Tr:` line, which transforms lidar coordinates to the camera frame "
+        f"of the poses. Add this line, or remove {path.name} if the poses are lidar poses."
     )
 
 

@@ -30,7 +30,7 @@ _MAX_RECORD = 1 << 20  # bytes of a record with a coordinate system
 _WKT_BIT = 16  # bit of the global encoding: the coordinate system is WKT
 _SIGNATURE = b"LASF"  # first bytes
 _EARLY_END = "failed to fill whole buffer"  # part of the error of lazrs at the end of a file
-_SMALLER = "write a .las file, or downsample it first"
+_SMALLER = "convert it to .las, or downsample it first"
 
 
 @contextmanager
@@ -63,7 +63,7 @@ def open_las(path: Path) -> Iterator[Any]:
             except Exception as error:  # the text of the error of lazrs tells its kind
                 if _EARLY_END not in str(error):
                     raise
-                raise CutShortError("its compressed points end too early") from error
+                raise CutShortError("its compressed points are truncated") from error
 
 
 def noise_classes(header: Any) -> tuple[int, ...]:
@@ -104,7 +104,7 @@ def _records(
         file.seek(start)
         data = file.read(head.size)
         if len(data) < head.size:
-            raise CutShortError("its variable-length records end too early")
+            raise CutShortError("its variable-length records are truncated")
         user, number, size = head.unpack(data)
         if user.rstrip(b"\0") == _PROJECTION and size <= _MAX_RECORD:
             yield number, file.read(size)
@@ -142,5 +142,5 @@ def _unpacked(file: BinaryIO, layout: struct.Struct, offset: int) -> tuple[int, 
     file.seek(offset)
     data = file.read(layout.size)
     if len(data) < layout.size:
-        raise CutShortError("its header ends too early")
+        raise CutShortError("its header is truncated")
     return layout.unpack(data)

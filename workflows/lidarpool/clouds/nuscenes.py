@@ -240,8 +240,8 @@ def merge(storage: Storage, jobs: Iterable[Mapping[str, Any]]) -> dict[str, list
 
     Returns
     -------
-    The classes that labels number, for each job whose labels number others: jobs have different
-    classes.
+    Class list to which the labels must be renumbered, by the name of each job whose labels refer to
+    a different class list. Jobs can have different classes.
     """
     shared: set[str] = set()  # tokens of rows that several jobs have
     with ExitStack() as stack:

@@ -19,7 +19,7 @@ def to_open3d(cloud: Cloud) -> Any:
     Raises
     ------
     LidarError
-        If Open3D is not installed, or a system library that it requires is missing.
+        If Open3D is not installed, or if a system library that it requires is missing.
     """
     o3d = load_open3d()
     positions = np.ascontiguousarray(cloud.positions)

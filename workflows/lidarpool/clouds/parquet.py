@@ -167,7 +167,7 @@ def _points(path: Path) -> SweepFiles:
         groups += of_file
         files += len(of_file) * [(columns, size)]
     if axes := sorted(unread.intersection("xyz")):
-        raise ValueError(f"it has coordinates that are not numbers: {', '.join(axes)}")
+        raise ValueError(f"its coordinate columns are not numeric: {', '.join(axes)}")
     names = {column.in_files: column.name for column in TABLE.values()}
 
     def read(number: int) -> Read:
@@ -180,7 +180,5 @@ def _points(path: Path) -> SweepFiles:
 
     notes = []
     if unread:
-        notes.append(
-            f"has columns that are not numeric and were skipped: {', '.join(sorted(unread))}"
-        )
+        notes.append(f"has non-numeric columns, which were skipped: {', '.join(sorted(unread))}")
     return SweepFiles(len(groups), read, point_count=dataset.count_rows(), notes=tuple(notes))

@@ -259,9 +259,9 @@ def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
 
 @checked
 def read_cloud(path: str | Path) -> Cloud:
-    """Read a .ply point cloud that a run or `save_cloud` has written, with all its columns.
+    """Read a .ply point cloud written by a run or by `save_cloud`, with all its columns.
 
-    A cloud from the folder of a result has sweeps, and can be saved in all formats.
+    A cloud that is read from a result folder includes its sweeps, and can be saved in all formats.
 
     Returns
     -------
@@ -344,7 +344,8 @@ def write_with_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> 
         raise LidarError(f"Open3D cannot write to {path.parent}: {error}.") from error
     if not written:
         raise LidarError(
-            f"Open3D cannot write to {path.parent}. Check the folder and the free disk space."
+            f"Open3D cannot write to {path.parent}. Check the folder's permissions and the free "
+            "disk space."
         )
 
 
@@ -422,8 +423,8 @@ def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
     except (OSError, ValueError, TypeError, LookupError, LidarError):
         keep_every = 1
     note = (
-        f"{source.name} keeps one of {keep_every} hits, so its gaps do not represent lost "
-        "returns. To compare lost returns, run the survey with `keep_every: 1`"
+        f"{source.name} contains only one in every {keep_every} hits, so its gaps do not "
+        "represent lost returns. To compare lost returns, run the survey with `keep_every: 1`"
     )
     fields = {"notes": (note,), "thinned": True} if keep_every > 1 else {}
     load = partial(Sweeps.load, sweeps_path)

@@ -423,9 +423,7 @@ def positions_of(columns: Columns) -> Floats:
     Raises ValueError without these.
     """
     if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise ValueError(
-            f"the coordinates of its points are incomplete ({', '.join(missing)} missing)"
-        )
+        raise ValueError(f"its point coordinates are incomplete ({', '.join(missing)} missing)")
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
 
 
@@ -442,7 +440,7 @@ def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> st
         return chosen
     contents = f"It contains the {kind} {joined(available)}." if available else ""
     if available == [""]:
-        contents = f"Its {kind} have no names, so do not choose one."
+        contents = f"Its {kind} have no names and cannot be selected."
     if not available:
         raise LidarError(f"{name} contains no {kind}. Record at least one.")
     if chosen is None:

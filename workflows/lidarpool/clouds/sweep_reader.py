@@ -98,7 +98,8 @@ class Reader:
             data = np.frombuffer(bytearray(self.storage.read(name)), np.uint8)
         if len(data) % row.itemsize:
             raise ValueError(
-                f"{len(data)} bytes are not a multiple of the row size ({row.itemsize} bytes)"
+                f"its size of {len(data)} bytes is not a multiple of the row size "
+                f"({row.itemsize} bytes)"
             )
         rows = data.view(row)
         if count not in (None, len(rows)):

@@ -50,7 +50,9 @@ class Pieces(pieces.Pieces):
         self.names = plain_names(name or "lidar" for name in sweeps.sensors)
         self.offsets = np.zeros((len(sweeps), 3), np.int64)
         if clash := [column.name for column in cloud.table if column.name in _RESERVED]:
-            raise LidarError(f"WebDataset reserves the name {clash[0]!r}. Rename the column.")
+            raise LidarError(
+                f"The column name {clash[0]!r} is reserved in WebDataset. Rename the column."
+            )
 
     def spans(self, min_spans: int = 1) -> list[PieceRange]:
         """Divide all sweeps into ranges with separate tar files, wherever they are written."""
@@ -212,8 +214,8 @@ def _sensors(files: list[Path]) -> dict[str, SweepFiles]:
             samples_of_sensor.setdefault(description.get("sensor", ""), []).append(sample)
     if not samples_of_sensor:
         raise LidarError(
-            f"{files[0].name} contains no point samples. A WebDataset of sweeps has files "
-            "named KEY.points.npy."
+            f"{files[0].name} contains no point samples. A WebDataset with sweeps must contain "
+            "files named KEY.points.npy."
         )
 
     def sweeps_of(

@@ -31,19 +31,26 @@ from .laser_scan import has_laser_scans
 from .pieces import RangeWorkers, RangeWriter
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
-_FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)
+_FILES = ", ".join(f"{name} ({FORMATS[name].file})" for name in EXPORTS)
 _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # schema for editors
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Format:
-    """A format that a cloud is exported to.
+    """A format to which a cloud is exported.
 
-    In YAML, the format alone will do.
+    In YAML, the format alone is sufficient.
     """
 
-    format: Annotated[str, about(f"{_FILES}; or a format of a plug-in", json_schema_extra=_NAMES)]
+    format: Annotated[
+        str,
+        about(
+            f"format, with the name of its file or folder in parentheses: {_FILES}, or a format "
+            "of a plug-in",
+            json_schema_extra=_NAMES,
+        ),
+    ]
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
         about("point layout in mcap and rosbag2"),
@@ -51,17 +58,17 @@ class Format:
     compensated: Annotated[
         bool,
         about(
-            "whether points in mcap, rosbag2 and pcd are in the sensor frame at the start of "
-            "the sweep, without point times; by default, each point is in the sensor frame "
-            "at its firing, as drivers publish it"
+            "whether points in mcap, rosbag2 and pcd are motion-compensated to the start of the "
+            "sweep and have no times; otherwise, each point is in the sensor frame at the time of "
+            "its firing, as published by drivers"
         ),
     ] = False
     compensated_actors: Annotated[
         bool,
         about(
-            "whether points of actors are stored where the actor was at the start of the "
-            "sweep, so that they lie in its box (formats of single sweeps); by default, they "
-            "are stored where the actor was at their firing"
+            "whether points of actors are moved to the pose of the actor at the start of the "
+            "sweep, so that they are inside its box; otherwise, they are at the pose at the time "
+            "of their firing (formats of single sweeps only)"
         ),
     ] = False
     pose_rate_hz: Annotated[
@@ -76,9 +83,9 @@ class Format:
     organized: Annotated[
         bool,
         about(
-            "whether clouds in mcap and rosbag2 contain a point for each ray, NaN without a "
-            "return, in rows as the driver of the layout publishes them (velodyne, ouster, "
-            "images, robosense)"
+            "whether clouds in mcap and rosbag2 contain one point per ray, with NaN for rays "
+            "without a return, in the row order of the driver (layouts velodyne, ouster, images "
+            "and robosense only)"
         ),
     ] = False
     intensity_full_scale: Annotated[
@@ -96,26 +103,25 @@ class Format:
         if self.compensated and not row.raw_or_compensated:
             choices = [name for name, row in FORMATS.items() if row.raw_or_compensated]
             raise LidarError(
-                f"{self.format} does not have the option `compensated`. It can be set for "
-                f"{joined(choices)} only."
+                f"The format {self.format} does not support `compensated`. It can only be set "
+                f"for {joined(choices)}."
             )
         if self.compensated_actors and not row.positions_of_sweeps:
             choices = [name for name, row in FORMATS.items() if row.positions_of_sweeps]
             raise LidarError(
-                f"{self.format} does not have the option `compensated_actors`. It can only be "
-                "set for formats that store the points of single sweeps, which are "
-                f"{joined(choices)}."
+                f"The format {self.format} does not support `compensated_actors`. It can only be "
+                f"set for formats that store single sweeps: {joined(choices)}."
             )
         if self.pose_rate_hz is not None and not row.layouts:
             choices = [name for name, row in FORMATS.items() if row.layouts]
             raise LidarError(
-                f"{self.format} does not have the option `pose_rate_hz`. It can only be set "
+                f"The format {self.format} does not support `pose_rate_hz`. It can only be set "
                 f"for {joined(choices)}."
             )
         if self.intensity_full_scale is not None and not row.integer_intensities:
             choices = [name for name, row in FORMATS.items() if row.integer_intensities]
             raise LidarError(
-                f"{self.format} does not have the option `intensity_full_scale`. It can only "
+                f"The format {self.format} does not support `intensity_full_scale`. It can only "
                 f"be set for {joined(choices)}."
             )
         if self.organized and self.layout not in row.organized_layouts:
@@ -127,13 +133,13 @@ class Format:
         if not layouts:
             choices = [name for name, row in FORMATS.items() if row.organized_layouts]
             raise LidarError(
-                f"{self.format} does not have the option `organized`. It can only be set for "
+                f"The format {self.format} does not support `organized`. It can only be set for "
                 f"{joined(choices)}."
             )
         raise LidarError(
-            f"The layout {self.layout} does not have the option `organized`, because its "
-            "driver does not publish organized clouds. Remove `organized`, or use one of the "
-            f"layouts {joined(layouts)}."
+            f"The layout {self.layout} does not support `organized`, because its driver does not "
+            "publish organized clouds. Remove `organized`, or use one of the layouts "
+            f"{joined(layouts)}."
         )
 
     @classmethod
@@ -143,7 +149,7 @@ class Format:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
         except TypeError as error:
             raise LidarError(
-                f"{entry!r} does not specify a format. Use the name of a format, or "
+                f"{entry!r} does not specify a format. Use a format name or a mapping such as "
                 "{'format': name, 'layout': name}."
             ) from error
 
@@ -220,7 +226,7 @@ class Format:
         if not expected or not sensors or sensors[0] in ("", expected):
             return []
         note = (
-            f"{self.title} expects the name {expected!r} for the first sensor, so {sensors[0]!r} "
+            f"{self.title} expects the first sensor to be named {expected!r}, so {sensors[0]!r} "
             f"is renamed to {expected!r}"
         )
         if expected in sensors[1:]:
@@ -234,16 +240,17 @@ class Format:
         if self.row.one_system:
             return [
                 (
-                    f"readers of {self.format} expect points in one coordinate system, but with "
-                    "`coordinates: sensor` each point is in the sensor frame at its firing. Set "
-                    "`cloud.coordinates: world`"
+                    f"readers of {self.format} expect all points in a single coordinate system, "
+                    "but with `coordinates: sensor`, each point is in the sensor frame at its "
+                    "firing. Set `cloud.coordinates: world`"
                 )
             ]
         if self.compensated or self.row.compensates:
             return [
                 (
-                    f"{self.title} stores points compensated for motion, so they are transformed "
-                    "to the start of the sweep although `cloud.coordinates` is sensor"
+                    f"{self.title} stores motion-compensated points, so all points are "
+                    "transformed to the sensor frame at the start of the sweep, although "
+                    "`cloud.coordinates` is `sensor`"
                 )
             ]
         return []
@@ -281,9 +288,9 @@ class Format:
             lacks = joined(missing)
             columns = "column" if len(missing) == 1 else "columns"
             raise LidarError(
-                f"The format {self.format}{laid_out} requires {lacks}, but the cloud has no "
-                f"such {columns}. Run the survey again with {self.format} in `output.write`, "
-                f"or add {lacks} to `cloud.columns`."
+                f"The format {self.format}{laid_out} requires the {columns} {lacks}, which the "
+                f"cloud does not contain. Run the survey again with {self.format} in "
+                f"`output.write`, or add {lacks} to `cloud.columns`."
             )
 
     def write(
@@ -371,8 +378,9 @@ def refuse_strangers(storage: Storage, rows: Iterable[FormatRow]) -> None:
         for name in storage.tree(row.file):
             if not own_names.fullmatch(name):
                 raise LidarError(
-                    f"{storage.path(name)} was not written by lidarpool, but {row.file} would "
-                    "be replaced. Move it elsewhere, or specify another folder with `--out`."
+                    f"{storage.path(name)} was not written by lidarpool and would be lost, "
+                    f"because {row.file} is replaced. Move it elsewhere, or specify another "
+                    "folder with `--out`."
                 )
 
 
@@ -390,11 +398,11 @@ def save_cloud(
     intensity_full_scale: float | None = None,
     precision_m: float | None = None,
 ) -> list[str]:
-    """Write points in the format given by the extension of the path.
+    """Save a point cloud in the format of the file extension, or in a specified format.
 
-    The file is written completely or not at all. The same points result in the same bytes, except
-    in .rrd files. About one million points are in memory at a time, or all points of the largest
-    sweep.
+    The file is written completely or not at all. The same points produce the same bytes, except in
+    .rrd files. At most about one million points are held in memory at a time, or all points of the
+    largest sweep if it has more.
 
     Parameters
     ----------
@@ -405,33 +413,34 @@ def save_cloud(
         .osi, .mcap, .rrd or .parquet. Its parent folder must exist. An existing file is replaced,
         but an existing folder is not.
     format
-        Name of the format, such as "laz", or of a format with many files in a folder: "parquet",
-        "pcd", "images", "kitti", "nuscenes", "webdataset" or "rosbag2". It may be the format of a
-        plug-in.
+        Name of the format, such as "laz". The formats "parquet", "pcd", "images", "kitti",
+        "nuscenes", "webdataset" and "rosbag2" create a folder of files. Formats of plug-ins are
+        also supported.
     layout
-        Layout of the points in mcap and rosbag2, which is that of a manufacturer's driver
-        (velodyne, ouster, hesai, robosense or livox), autoware, or images, which is velodyne with
-        range images.
+        Layout of the points in mcap and rosbag2: that of a manufacturer's driver (velodyne, ouster,
+        hesai, robosense or livox), autoware, or images, which is velodyne with additional range
+        images.
     compensated
-        Whether points in mcap, rosbag2 and pcd are in the sensor frame at the start of the sweep
-        and have no times. By default, each point is in the sensor frame at the time of its firing,
-        as drivers provide it.
+        Whether points in mcap, rosbag2 and pcd are compensated for motion, which means that they
+        are in the sensor frame at the start of the sweep and have no times. By default, each point
+        is in the sensor frame at the time of its firing, as in the output of drivers.
     compensated_actors
         Whether the points of each actor are moved to the pose of the actor at the start of the
         sweep, so that they are inside its box, in formats with one file or message per sweep. The
         cloud must have the column `time`.
     pose_rate_hz
-        Poses per second on `/tf` in mcap and rosbag2. By default, there is one at the start of each
-        sweep and one at the end of the last.
+        Number of poses per second on `/tf` in mcap and rosbag2. By default, there is one pose at
+        the start of each sweep, and one at the end of the last sweep.
     organized
-        Whether mcap and rosbag2 contain a point for each ray, NaN without a return, in the rows
-        that the driver of the layout uses (velodyne, ouster, images and robosense only).
+        Whether mcap and rosbag2 contain a point for each ray, arranged in the same rows as by the
+        driver of the layout. Rays without a return are NaN. This option is available for the
+        layouts velodyne, ouster, images and robosense.
     intensity_full_scale
         Intensity that .las and .laz files store as 65,535. By default, it is the smallest power of
         two for which at most 1 % of the points are stored as 65,535.
     precision_m
-        Step of the stored positions in meters. By default, it is the precision of the survey, or
-        0.001.
+        Resolution of the stored positions in meters. By default, it is the precision of the survey,
+        or 0.001.
 
     Returns
     -------
@@ -440,15 +449,15 @@ def save_cloud(
     Raises
     ------
     LidarError
-        If the format is unknown, requires a missing column or package, or stores single sweeps and
-        the cloud does not come from a result; or if the file cannot be written.
+        If the format is unknown or requires a missing column or package, if it stores individual
+        sweeps but the cloud does not come from a result, or if the file cannot be written.
     """
     path = Path(path)
     name = format or _ENDINGS.get(path.suffix)
     if name is None:
         raise LidarError(
-            f"{path} has the extension {path.suffix!r}, which does not belong to a format. "
-            f"Use {alternatives([*_ENDINGS])}, or specify a format."
+            f"{path} has the extension {path.suffix!r}, which does not belong to any supported "
+            f"format. Use {alternatives([*_ENDINGS])}, or set `format`."
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarError(f"`precision_m` is {precision_m}; it must be a positive length in meters.")
@@ -469,7 +478,7 @@ def save_cloud(
     if cloud.sweeps is None and "scan" in file_format.needs:
         raise LidarError(
             f"{name} stores single sweeps, but the cloud has no sweeps. Save the cloud of a "
-            "`Result`, or a cloud that was read from the folder of a result."
+            "`Result`, or a cloud that was read from a result folder."
         )
     file_format.write(path, cloud, sweeps, overwrite=True)
     return file_format.left_out(cloud, sweeps)

@@ -172,7 +172,7 @@ class _OpenPart:
         """Compare the checksums of all columns after the last block."""
         for name, array in self._arrays.items():
             if self._crcs[name] != array.crc:
-                raise LidarError(f"it is damaged ({name}.npy is damaged)")
+                raise LidarError(f"it is damaged (the checksum of {name}.npy is wrong)")
 
     def _fill(self, data: memoryview, offset: int) -> None:
         """Read the bytes from an offset on."""
@@ -181,4 +181,4 @@ class _OpenPart:
         while data and (count := self._file.readinto(data)):
             data = data[count:]
         if data:
-            raise LidarError("it is damaged (it is truncated)")
+            raise LidarError("it is damaged (truncated)")

@@ -205,14 +205,14 @@ class StoredCloud(CloudDisplay):
 
     @property
     def bounds(self) -> Floats:
-        """Minimum and maximum coordinates in meters, or zeros without points. Shape (2, 3)."""
+        """Minimum and maximum coordinates in meters, or zeros if empty. Shape (2, 3)."""
         if self.cells is None:
             return np.zeros((2, 3))
         return positions_of(self.cells, self.precision_m, self.origin)
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """Columns apart from the positions, in the order in which files store them."""
+        """All columns except the positions, in the order in which files store them."""
         columns = [c for c in self.columns if c not in AXES and c.name != WAVEFORM]
         return (SCAN, *columns)
 
@@ -222,18 +222,18 @@ class StoredCloud(CloudDisplay):
         return any(column.name == WAVEFORM for column in self.columns)
 
     def cloud_of(self, part: PartColumns, row_selection: Integers | slice = slice(None)) -> Cloud:
-        """Return all points of a part, or the selected rows."""
+        """Return all points of a part, or only the selected rows."""
         return part.cloud(self.table, self.precision_m, self.origin, row_selection, self.sweeps)
 
     def positions_of(self, columns: Mapping[str, AnyArray]) -> Iterator[tuple[str, Floats]]:
-        """Yield the name and the coordinates in meters for each axis of a part."""
+        """Yield the name of each axis and the coordinates of a part along it, in meters."""
         for i, axis in enumerate(AXES):
             yield axis.name, positions_of(columns[axis.name], self.precision_m, self.origin[i])
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the points in order from row `first`, in chunks of `points` points.
 
-        LidarError if a part cannot be read.
+        Raises LidarError if a part cannot be read.
         """
         held: list[Cloud] = []
         count = 0

@@ -225,7 +225,7 @@ def draw_rings(comparison: Comparison) -> Page:
         _draw_ring_gaps(page, axes, rings)
     frame = frames[2] if has_gaps else frames[1]
     axes = page.chart(
-        frame, xlabel="A − B, mm; larger values are in the outer bins", ylabel="cells", yscale="log"
+        frame, xlabel="A − B, mm (outer bins include larger values)", ylabel="cells", yscale="log"
     )
     _draw_residual_histogram(axes, comparison.residuals, limit)
     return page

@@ -86,7 +86,7 @@ class _PolarSweep:
         around zero, or the points are too far away.
         """
         if sweep.rings is None:
-            raise LidarError(f"{name} has no column with rings, such as ring or channel")
+            raise LidarError(f"{name} has no ring column, such as `ring` or `channel`")
         ranges = np.linalg.norm(sweep.points, axis=1)
         if np.median(ranges) > _MAX_RANGE_M:
             raise LidarError(
@@ -105,9 +105,9 @@ class _PolarSweep:
         )
         if np.median(upper - lower) > max(_TILT_DEG, _spacing(middle) / 2):
             raise LidarError(
-                f"the elevation angles within the rings of {name} vary: either the sensor does not "
-                "scan in rings, like airborne and Livox sensors, or the points are not in the "
-                "sensor frame"
+                f"the elevation angles within the rings of {name} vary, so either the sensor "
+                "does not scan in rings, as is the case for airborne and Livox sensors, or the "
+                "points are not in the sensor frame"
             )
         azimuth = np.degrees(np.arctan2(y, x)) % 360
         return cls(
@@ -332,7 +332,9 @@ def _common_rings(a: _PolarSweep, b: _PolarSweep, names: tuple[str, str]) -> _Co
     """
     numbers, notes = _ring_numbers(a, b)
     if (unmatched := len(np.setxor1d(numbers, b.rings))) > 0:
-        notes.append(f"only one of the clouds has returns of {plural(unmatched, 'ring')}")
+        notes.append(
+            f"{plural(unmatched, 'ring has', 'rings have')} returns in only one of the clouds"
+        )
     rings, first = np.unique(np.append(b.rings, numbers), return_index=True)
     elevation = np.append(b.ring_elevation, a.ring_elevation)[first]
     _check_elevations(a, b, numbers, names)
@@ -370,7 +372,7 @@ def _ring_numbers(a: _PolarSweep, b: _PolarSweep) -> tuple[Ints, list[str]]:
             if sign > 0 and not shift:
                 return numbers, []
             rule = f"n {'+-'[shift < 0]} {abs(shift)}" if sign > 0 else f"{shift} - n"
-            return numbers, [f"ring n of A is ring {rule} of B"]
+            return numbers, [f"ring n of A corresponds to ring {rule} of B"]
     is_match = difference[index_a, index_b] <= _ring_tolerance(b)
     numbers = -1 - np.arange(len(a.rings))
     numbers[index_a[is_match]] = b.rings[index_b[is_match]]
@@ -393,8 +395,8 @@ def _check_elevations(
         range_a = f"{a.ring_elevation.min():.1f}° to {a.ring_elevation.max():.1f}°"
         range_b = f"{b.ring_elevation.min():.1f}° to {b.ring_elevation.max():.1f}°"
         raise LidarError(
-            f"the rings of {names[0]} have elevation angles of {range_a} and the rings of "
-            f"{names[1]} of {range_b}, so they come from different sensors"
+            f"the ring elevation angles are {range_a} in {names[0]} and {range_b} in {names[1]}, "
+            "so the sweeps come from different sensors"
         )
 
 

@@ -54,38 +54,39 @@ def compare(
     """Compare two clouds or recordings of the same scene.
 
     B is the reference. Recordings of one sensor are compared sweep by sweep in the sensor frame.
-    The comparison includes range images, returns that only A or B has, intensities, and distances
-    to nearest neighbors. Recordings without rings have no range images. Clouds without sweeps, such
-    as .las files, are compared in world coordinates, by distances and intensities only. The clouds
-    are not aligned.
+    The comparison includes range images, returns that are present only in A or only in B,
+    intensities, and distances to nearest neighbors. Recordings without rings have no range images.
+    Clouds without sweeps, such as .las files, are compared in world coordinates, by distances and
+    intensities only. The clouds are not aligned with each other beforehand.
 
     Parameters
     ----------
     a, b
-        The clouds, as the folder of a result or its .ply file, a data set, .pcd or a folder with
-        .pcd files, .las, .laz, .e57, text (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin, a ROS 2
-        bag (.mcap or a folder), or a cloud in memory.
+        Clouds to compare. Each can be a result folder or its .ply file, a data set, a .pcd file or
+        a folder of .pcd files, a .las, .laz, .e57, .pts, .ptx, .npy, .bin or text file (.xyz, .txt,
+        .asc, .csv), a ROS 2 bag (.mcap or a folder), or a cloud in memory.
     sweeps
         Indices of the pairs of sweeps to compare, counted from 0. By default, all pairs are
         compared.
     match
-        Whether sweeps are paired by number or by time.
+        Whether to pair sweeps by their order or by time.
     sensor_a, sensor_b
-        Name of the sensor, or topic of a bag, in recordings with several.
+        Name of the sensor (or topic of a bag) in recordings that contain several sensors.
     intensity_a, intensity_b
-        Columns that are compared as the intensity. The default is ``intensity``.
+        Names of the columns that contain the intensities. The default is ``intensity``.
     unit_a, unit_b
         Length unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text file (um, mm, cm, dm, m,
-        km, in, ft, yd or mi). By default, the unit is the one that a .las or .laz file or a header
-        states, and meters otherwise.
+        km, in, ft, yd or mi). By default, the unit is the one stated in the file or its header, or
+        meters if no unit is stated.
     keep_noise
-        Whether to include points that a .las or .laz file withholds or classifies as noise (classes
-        7 and 18), or that other clouds mark in such columns.
+        Whether to include points that are marked as withheld or classified as noise (classes 7 and
+        18) in a .las or .laz file, or in the corresponding columns of other clouds.
     azimuth_deg
-        Width of a cell in degrees. By default, it is the larger of the two steps between pulses.
+        Width of a cell of the range images in degrees. By default, it is the larger of the two
+        recordings' azimuth steps between pulses.
     distances_m
-        Distances in meters within which a point counts as present in the other cloud, for precision
-        and recall.
+        Distance thresholds in meters for precision and recall. A point counts as present in the
+        other cloud if that cloud has a point within this distance.
     max_points
         Maximum number of points of each cloud in memory. Larger clouds are subsampled evenly.
 
@@ -97,8 +98,8 @@ def compare(
     Raises
     ------
     LidarError
-        If A or B cannot be read, is empty or has distorted lengths, as in Web Mercator, or if A and
-        B have no quantity in common.
+        If A or B cannot be read, is empty, or has a coordinate system that distorts lengths, such
+        as Web Mercator, or if A and B have no quantity in common that can be compared.
     """
     if not distances_m or any(not 0 < distance < np.inf for distance in distances_m):
         raise LidarError(
@@ -130,8 +131,8 @@ def compare(
     if sweeps or match == "time":
         raise LidarError(f"{cloud.name} has no sweeps. Omit `--sweep` and `--match`.")
     comparing.notes.append(
-        f"{cloud.name} has no sweeps. All points are compared at once in world coordinates, "
-        "by distances and intensities only"
+        f"{cloud.name} has no sweeps, so all points are compared at once in world coordinates, "
+        "and only by distance and intensity"
     )
     points_a = comparing.read_cloud(first, max_points)
     points_b = comparing.read_cloud(second, max_points)
@@ -149,8 +150,8 @@ def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[t
     for number in sweeps:
         if not 0 <= number < len(pairs):
             raise LidarError(
-                f"There is no pair {number} of sweeps. Pairs are numbered from 0, and there are "
-                f"{len(pairs):,}."
+                f"Sweep pair {number} does not exist. Pairs are numbered from 0 to "
+                f"{len(pairs) - 1:,}."
             )
     return [pairs[number] for number in sorted({*sweeps})]
 
@@ -174,8 +175,8 @@ def _pair_sweeps(a: Recording, b: Recording, match: str) -> list[tuple[int, int]
             pairs = [(int(nearest_a[number]), int(number)) for number in close]
     if not pairs:
         raise LidarError(
-            f"{a.name} has {plural(a.count, 'sweep')} and {b.name} has {b.count:,}, but no "
-            f"two of them have the same {match}."
+            f"{a.name} has {plural(a.count, 'sweep')} and {b.name} has {b.count:,}, but none of "
+            f"them match by {match}."
         )
     return pairs
 
@@ -248,9 +249,8 @@ class _Comparing:
         if share == 1 or not parts:
             return RecordedPoints.joined(parts)
         self.note(
-            f"{recording.name} has {count:,} points, of which {100 * share:.3g} % are "
-            "compared, evenly chosen. Distances to this cloud are "
-            "overestimated"
+            f"{100 * share:.3g} % of the {count:,} points in {recording.name} are compared, "
+            "sampled evenly. Distances to this cloud are therefore overestimated"
         )
         return RecordedPoints.joined(parts)
 
@@ -260,7 +260,7 @@ class _Comparing:
         """Compare two sweeps in the sensor frame, at most `budget` cells and points of each."""
         if max(len(a), len(b)) > budget:
             self.note(
-                f"in each sweep, {budget:,} points and cells are compared, which are evenly chosen"
+                f"at most {budget:,} points and cells of each sweep are compared, sampled evenly"
             )
         if len(a) and len(b):
             self.pictured = self.pictured or numbers

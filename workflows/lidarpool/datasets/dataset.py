@@ -278,8 +278,8 @@ class DataSet:
         named = dict[int, dict[str, None]]()  # {class: its names in the jobs, in order}
         for job, (manifest, damage) in self.look(jobs):
             if damage:
-                message = f"Job {job.name} of {self.storage} is incomplete: its {damage}."
-                raise LidarError(f"{message} Run it again with `--resume`.")
+                message = f"Job {job.name} of {self.storage} is incomplete, because {damage}."
+                raise LidarError(f"{message} Run the campaign again with `--resume`.")
             row = {"number": job.number, "name": job.name, "sensors": manifest["sensors"]}
             index.write(f"{comma}\n{json.dumps(row)}")
             comma = ","

@@ -42,7 +42,7 @@ def read_seconds(storage: Storage) -> Mapping[int, float]:
     try:
         header, *rows = csv.reader(io.StringIO(storage.read(SECONDS_FILE).decode()), strict=True)
         if header != _HEADER:
-            raise ValueError("its header is not the expected one")
+            raise ValueError("its header is invalid")
         return {int(number): float(seconds) for number, seconds in rows}
     except (OSError, ValueError, csv.Error) as error:
         raise LidarError(

@@ -38,7 +38,7 @@ Value = bool | int | float | str
 
 TABLE_FILE = "jobs.csv"
 PARQUET_FILE = "jobs.parquet"
-WRITE_AGAIN = "run the campaign again with `--resume` to write the table again"
+WRITE_AGAIN = "run the campaign again with `--resume` to rewrite the table"
 ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
 MAX_JOBS = 100_000_000  # limit for a campaign: a larger number is not a job's
 MAX_ERROR_LETTERS = 4_000  # limit for an error in the table: csv.reader refuses cells of 131,072
@@ -118,11 +118,13 @@ class JobRow:
         not a plain file name.
         """
         if differing := data.keys() ^ {entry.name for entry in fields(cls)}:
-            raise ValueError(f"the entries of a job row are wrong, for example {min(differing)!r}")
+            raise ValueError(
+                f"a job row has a missing or unknown entry, such as {min(differing)!r}"
+            )
         kinds = {**_HEAD, **_TAIL, "seconds": int | float, "values": dict, "classes": dict}
         for name, kind in kinds.items():
             if not isinstance(data[name], kind):
-                raise ValueError(f"the {name} of a job is {data[name]!r}")
+                raise ValueError(f"the {name} of a job has the invalid value {data[name]!r}")
         classes = {int(number): int(count) for number, count in data["classes"].items()}
         return _with_plain_names(cls(**{**data, "classes": classes}))
 
@@ -173,8 +175,8 @@ class Tally:
             self._columns = {name: hashlib.sha256() for name in arrays}
         if self._columns.keys() != arrays.keys():
             raise LidarError(
-                "The points of one job must have the same columns, but they have "
-                f"{', '.join(self._columns)} first and {', '.join(arrays)} later."
+                "All points of a job must have the same columns, but the columns change from "
+                f"{', '.join(self._columns)} to {', '.join(arrays)}."
             )
         for name, array in arrays.items():
             self._columns[name].update(np.ascontiguousarray(array))
@@ -261,7 +263,8 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
             if checksum is not None and Storage(str(path.parent)).checksum(path.name) != checksum:
                 raise LidarError(
                     f"{storage.path(TABLE_FILE)} is damaged or has been edited, because its "
-                    f"checksum differs from that in the data set. {as_sentence(WRITE_AGAIN)}"
+                    "checksum does not match the checksum in the data set. "
+                    f"{as_sentence(WRITE_AGAIN)}"
                 )
             file = TextIOWrapper(open_input(path), encoding="utf-8", newline="")
             stack.enter_context(file)
@@ -283,7 +286,7 @@ def read_table(storage: Storage, checksum: Sequence[int] | None = None) -> Itera
             for cells in reader:
                 row = _row(header, names, cells)
                 if not last_number < row.number < MAX_JOBS:
-                    raise ValueError(f"job {row.number} follows job {last_number}")
+                    raise ValueError(f"job {row.number} must not follow job {last_number}")
                 last_number = row.number
                 yield row
         except (ValueError, csv.Error) as error:
@@ -339,7 +342,7 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
     Raises ValueError for an invalid row.
     """
     if len(cells) != len(header):
-        raise ValueError(f"it has {len(cells)} cells in {len(header)} columns")
+        raise ValueError(f"the row has {len(cells)} cells, but the header has {len(header)}")
     first = len(_HEAD)
     stop = len(_HEAD) + len(names)
     fixed = dict(zip(header[:first], cells, strict=False))
@@ -384,8 +387,8 @@ def _kind(value: Any) -> type:
         return str
     if kind not in (bool, int, float, str):
         raise LidarError(
-            f"A varied value is {value!r} ({kind.__name__}); it must be a number, a string, "
-            "true or false."
+            f"The varied value {value!r} ({kind.__name__}) is not supported. Use a number, a "
+            "string, true or false."
         )
     return kind
 

@@ -241,14 +241,14 @@ def sweeps(
     sensors: Sequence[str] | None = None,
     shuffle: Annotated[int, Field(ge=0)] | None = None,
 ) -> SavedSweeps:
-    """Open the sweeps of a data set that a campaign has written.
+    """Open the sweeps of a data set written by a campaign.
 
     Parameters
     ----------
     location
         Folder or URL of the data set.
     split
-        Names of one or several splits. By default, the jobs of all splits are used.
+        Name of a split, or several names. By default, the jobs of all splits are used.
     jobs
         Numbers or names of jobs. By default, all jobs are used.
     sensors
@@ -259,15 +259,16 @@ def sweeps(
 
     Returns
     -------
-    A sequence of `Sweep` objects, which are read on access. A loop reads a few of them ahead in
-    threads. All loops have the same order. The sequence requires memory for one row per job, for 8
-    bytes per sweep if shuffled, and for the poses and boxes of 16 jobs in each thread.
+    A sequence of `Sweep` objects, which are read on access. Iteration prefetches a few sweeps in
+    background threads. The order is the same in each iteration. The sequence requires memory for
+    one row per job, for the poses and boxes of 16 jobs in each thread and, if shuffled, for 8 bytes
+    per sweep.
 
     Raises
     ------
     LidarError
-        If the data set is missing, unfinished or damaged, a package that its format requires is not
-        installed, or the split, job or sensor is unknown.
+        If the data set is missing, unfinished or damaged, if a package that its format requires is
+        not installed, or if the split, job or sensor is unknown.
     """
     storage = replace(Storage.at(location), named="")  # the user's own links may be followed
     head = read_index(storage)
@@ -278,7 +279,7 @@ def sweeps(
     rows = [job for job in table if job.number in sweep_counts]
     if len(rows) < len(sweep_counts):
         raise LidarError(
-            f"{storage.path(TABLE_FILE)} does not contain all jobs that are done. "
+            f"{storage.path(TABLE_FILE)} does not contain all completed jobs. "
             f"{as_sentence(WRITE_AGAIN)}"
         )
     rows = _chosen(rows, split, jobs, storage)
@@ -302,7 +303,7 @@ def read_index(storage: Storage) -> dict[str, Any]:
 
     Raises LidarError if the set is unfinished.
     """
-    refuse_missing(storage, "specify the folder of a data set, as passed to `--out` of a campaign")
+    refuse_missing(storage, "specify the output folder of a campaign")
     try:
         head = unsealed(storage.read(INDEX_FILE))
         if head["version"] != VERSION:
@@ -319,8 +320,8 @@ def read_index(storage: Storage) -> dict[str, Any]:
                 f"CAMPAIGN --out {storage} --resume`."
             ) from error
         raise LidarError(
-            f"{storage} is not a data set of lidarpool, because it contains no {INDEX_FILE}. "
-            "Specify the folder that was passed to `--out` of a campaign."
+            f"{storage} is not a lidarpool data set, because {INDEX_FILE} is missing. Specify "
+            "the output folder of a campaign."
         ) from error
     except OSError as error:
         raise _unreadable(storage.path(INDEX_FILE), error) from error

@@ -23,7 +23,7 @@ from .job_table import JobRow, Value
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sweep:
-    """A sweep of a sensor, with its points, the pose of the sensor and the boxes of actors.
+    """Single sweep of a sensor, with its points, the sensor pose and the boxes of actors.
 
     Coordinates are in the sensor frame at the start of the sweep. x is forward, y is left and z is
     up, unless the mount is rotated. The points are compensated for the motion during the sweep.
@@ -56,7 +56,7 @@ class Sweep:
         boxes: Boxes | None,
         index: int | EllipsisType = ...,
     ) -> Sweep:
-        """Create the sweep with a given number from the points of a job."""
+        """Create the sweep with the given number from its points."""
         positions, columns = points
         return cls(
             job=job.name,
@@ -86,7 +86,7 @@ class Sweep:
 
     @cached_property
     def boxes(self) -> SweepBoxes:
-        """Boxes of the actors that are in the scene, in the sensor frame."""
+        """Bounding boxes of the actors that are in the scene, in the sensor frame."""
         return SweepBoxes.select(*self._boxes) if isinstance(self._boxes, tuple) else self._boxes
 
     @property

@@ -255,7 +255,7 @@ def twin(
         and `model` is not set; if an extra is missing; or if the folder contains the steps of a
         different twin.
     """
-    need("scipy", "twin", "Recordings are reconstructed")
+    need("scipy", "twin", "Reconstructing a recording")
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
         recorded = RecordedSweeps.of_choice(RecordingChoice(Path(recording), sensor, intensity))

@@ -109,8 +109,9 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         if len(steps_m) and steps_m.max() > _MAX_STEP_M:
             number = int(steps_m.argmax()) + 1
             raise LidarError(
-                f"Registration failed: it moves sweep {number} of {sweeps.recording.name} by "
-                f"{steps_m.max():.1f} m from sweep {number - 1}. Pass `--trajectory`."
+                f"Registration failed, because it places sweep {number} of "
+                f"{sweeps.recording.name} {steps_m.max():.1f} m away from sweep {number - 1}. "
+                "Pass the poses with `--trajectory`."
             )
     located = RecordedPoses.in_world(poses, times_s, source)
     return located._replace(share=share, first_s=first_s)
@@ -189,7 +190,7 @@ def _registered(sweeps: RecordedSweeps) -> Floats:
     sweeps are the same circles. Points are not compensated for the motion within sweeps: all sweeps
     are distorted alike, and to compensate by a motion that is estimated so makes estimates swing.
     """
-    need("small_gicp", "twin", "Sweeps without poses are registered")
+    need("small_gicp", "twin", "Registering sweeps without poses")
     import small_gicp
 
     # The first sweeps may be empty, or parts of one.

@@ -155,7 +155,7 @@ class Place:
         supported = votes >= self.surfels.dark  # a dark surfel needs a pulse that is lost
         if not supported.any():
             raise LidarError(
-                f"The sweeps of {sweeps.name} contradict each other. Check their poses."
+                f"The sweeps of {sweeps.name} are inconsistent with each other. Check their poses."
             )
         return self.surfels.moved(shifts_m).part(supported)
 

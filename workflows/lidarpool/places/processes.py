@@ -31,19 +31,20 @@ _UNLIMITED = dict.fromkeys(
 
 @contextmanager
 def mapping(client: Client | None, count: int) -> Iterator[Map]:
-    """Yield a function that maps a function over items in worker processes, in order.
+    """Yield a `map` function that runs in worker processes and keeps the order of the items.
 
     Parameters
     ----------
     client
-        Of a cluster whose OTHER workers do it; None for processes of this machine.
+        Client of a cluster whose OTHER workers run the function. None to start processes on this
+        machine.
     count
-        Largest number of items: one item is done in this process.
+        Maximum number of items. A single item is processed in this process.
 
     Raises
     ------
     LidarError
-        If this process may not start others.
+        If this process cannot start worker processes.
     """
     workers = min(count, CPU_COUNT, max(1, memory() // _STRETCH_BYTES))
     if client is not None:

@@ -291,8 +291,8 @@ class RecordedSweeps:
                 return cls(recording, np.empty(0), None, ())
             if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
                 note = (
-                    f"The rings of {recording.name} do not form cones, so its rays are not "
-                    "calibrated."
+                    f"The rings of {recording.name} do not form cones, so its ray directions are "
+                    "not calibrated."
                 )
                 return cls(recording, np.empty(0), None, (note,))
             return cls(recording, medians, numbers, ())
@@ -307,9 +307,9 @@ class RecordedSweeps:
                 )
                 return cls(recording, clusters, None, (note,), are_cones=True)
             note = (
-                f"{recording.name} has no ring column, and its rings cannot be determined "
-                "from the order or the elevation angles of its points. Either its points are "
-                "compensated for motion, or its rays are not calibrated."
+                f"{recording.name} has no ring column, and its rings cannot be determined from "
+                "the order or the elevation angles of its points. Either its points are "
+                "motion-compensated, or its ray directions are not calibrated."
             )
             return cls(recording, np.empty(0), None, (note,))
         medians = max(runs, key=len)
@@ -444,8 +444,8 @@ def _clock_notes(name: str, times: PointTimes | None) -> tuple[str, ...]:
     if times is None or times.clock is not Clock.OTHER:
         return ()
     return (
-        f"The point times in {name} are from a different clock than the timestamps of its "
-        "sweeps. The first point of each sweep is assumed to be fired at the timestamp.",
+        f"The point times in {name} use a different clock than the sweep timestamps. The first "
+        "point of each sweep is assumed to be fired at the timestamp of the sweep.",
     )
 
 

@@ -113,14 +113,15 @@ class Surfels:
         count = len(voxels.counts)
         if count * POINT_BYTES > memory() // 2:
             raise LidarError(
-                f"{name} results in {count:,} surfels, which require "
+                f"The reconstruction of {name} would have {count:,} surfels, which require "
                 f"{bytes_of(count * POINT_BYTES)} of memory, but the limit is "
                 f"{bytes_of(memory() // 2)}. Set `voxel_m` to more than {voxel_m:.3g}."
             )
         if count < _NEIGHBORS[-1]:
             raise LidarError(
                 f"{name} has stationary points in {count} voxels of {voxel_m:.3g} m, but at "
-                f"least {_NEIGHBORS[-1]} are required."
+                f"least {_NEIGHBORS[-1]} are required. Use a smaller `voxel_m`, or a longer "
+                "recording."
             )
         means = voxels.means(points.positions)
         outward = voxels.means(points.outward)

@@ -53,13 +53,13 @@ class Planning(Search):
     radii
         Radii of the discs in meters, greater than 0. Shape (m,), or one number for all discs.
     **search
-        The fields of `Search`. The same seed results in the same plan, bit for bit, on all workers.
+        The fields of `Search`. The same seed produces the same plan, bit for bit, on all workers.
 
     Raises
     ------
     LidarError
-        If the start or the target is within a disc, both are the same point, or a value is out of
-        range.
+        If the start or the target is within a disc, if they are the same point, or if a value is
+        out of range.
 
     Examples
     --------

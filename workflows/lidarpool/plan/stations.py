@@ -387,7 +387,9 @@ def candidates(scene: Scene, caster: RayCaster, height_m: float, spacing_m: floa
     positions[:, 2] = floor[rows] + height_m
     positions = positions[_free_positions(scene, caster, positions)]
     if not len(positions):
-        fault = "The scene has no floor" if not walkable.any() else "The floor has no space"
+        fault = (
+            "No floor was found" if not walkable.any() else ("No free space was found on the floor")
+        )
         raise LidarError(
             f"{fault} for an instrument at a height of {height_m:g} m on a grid of "
             f"{spacing_m:g} m. Check the unit and the up axis of the scene, use another "

@@ -90,12 +90,12 @@ class Plan:
         Length of the path in meters.
     shortest_possible
         Length of the shortest path in meters, computed from the tangents of the discs. It is inf if
-        discs block the way to the target.
+        the discs completely block the way to the target.
     clearance
         Minimum distance from the path to a disc in meters. It is negative if the path enters a
         disc, and inf without discs.
     trial
-        Number of the trial that found the path.
+        Index of the trial that found the path.
     trials
         Number of trials.
     """

@@ -25,7 +25,7 @@ KINDS = (
 _CONVERSIONS = {  # {suffix of recordings that are not read: advice}
     ".bag": "It is a ROS 1 bag. Convert it with rosbags-convert --src IN.bag --dst OUT.",
     ".db3": "It is part of a ROS 2 bag. Specify the folder that contains it.",
-    ".rrd": "It is a Rerun recording. Open it with the command rerun.",
+    ".rrd": "It is a Rerun recording. Open it with the `rerun` command.",
     ".osi": "It is an OSI trace. Use it as the traffic of a scenario.",
     **dict.fromkeys((".glb", ".gltf", ".obj", ".stl"), "It is a mesh. Run a survey of it first."),
 }
@@ -58,7 +58,7 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
     sequences = list(dict.fromkeys(recording.sequence for recording in recordings.values()))
     if len(sequences) == 1:
         return recordings
-    note = f"Only the first of {len(sequences):,} sequences is shown, {sequences[0]}."
+    note = f"Only {sequences[0]}, the first of {len(sequences):,} sequences, is shown."
     return {
         name: replace(recording, notes=(note,))
         for name, recording in recordings.items()
@@ -86,14 +86,14 @@ def open_recording(
     """
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:
-            raise LidarError(f"The unit of {name} is the meter. Remove the unit {unit!r}.")
+            raise LidarError(f"{name} is always in meters. Remove the unit {unit!r}.")
         return open_cloud(name, source, source.sweeps, sensor, intensity)
     path = Path(source)
     name = str(source)
     if unit is not None and path.suffix.lower() not in _UNIT_SUFFIXES:
         raise LidarError(
-            f"The unit of {name} is the meter. Remove the unit {unit!r}, which can only be "
-            f"set for {joined(_UNIT_SUFFIXES)} files."
+            f"{name} is always in meters. Remove the unit {unit!r}, which can only be set for "
+            f"{joined(_UNIT_SUFFIXES)} files."
         )
     recording = _open_path(RecordingSource(path, name, sensor, intensity, unit))
     noise_filter = recording.noise_filter

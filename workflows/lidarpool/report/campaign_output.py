@@ -108,7 +108,7 @@ class DataSetOutput(Output[CampaignRun]):
         try:
             self._record = check_same(storage, self.campaign)
         except DamagedRecordError:  # the manifests name the campaign of the jobs
-            self._lost_record = f"{CAMPAIGN_FILE} was damaged and has been created again"
+            self._lost_record = f"{CAMPAIGN_FILE} was damaged and has been recreated"
             return None
         self._check_shards(self._record["shards"])
         if not self._is_complete(self._record, verify=options.verify):
@@ -182,7 +182,7 @@ class DataSetOutput(Output[CampaignRun]):
         retried = store.db.failed() if options.retry_failed else ()
         store.forget([*self._wrong, *retried])
         if self._wrong:
-            store.notes.append(f"jobs run again: {listed([*self._wrong.values()])}")
+            store.notes.append(f"these jobs are run again: {listed([*self._wrong.values()])}")
         for row in store.rows():
             run.page.ended(row)
 
@@ -249,23 +249,23 @@ def read_record(storage: Storage) -> dict[str, Any]:
 
     DamagedRecordError if the file is damaged or edited; LidarError if there is none.
     """
-    refuse_missing(storage, "specify the folder of a data set, as passed to `--out` of a campaign")
+    refuse_missing(storage, "specify the output folder of a campaign")
     try:
         record = unsealed(storage.read(CAMPAIGN_FILE))
         for name, kind in _RECORDED.items():
             if not isinstance(record.get(name), kind):
-                raise ValueError(f"its entry {name} is missing or has the wrong type")
+                raise ValueError(f"its entry `{name}` is missing or has the wrong type")
         for shard in record["shards"]:
             Shard.parse(str(shard))
     except OSError as error:
         raise LidarError(
-            f"{storage} contains no finished data set, which would have a valid "
-            f"{CAMPAIGN_FILE}: {error}."
+            f"{storage} does not contain a finished data set, because {CAMPAIGN_FILE} cannot be "
+            f"read: {error}."
         ) from error
     except (ValueError, LidarError) as error:
         raise DamagedRecordError(
             f"{storage.path(CAMPAIGN_FILE)} is damaged or has been edited: {error}. Run the "
-            "campaign again with `--resume` to write the file again."
+            "campaign again with `--resume` to rewrite the file."
         ) from error
     return record
 
@@ -287,7 +287,7 @@ def read_notes(storage: Storage) -> list[str]:
         notes = json.loads(storage.read(LAST_FILE))["notes"]
         if isinstance(notes, list):
             return [*map(str, notes)]
-        reason = "its entry notes is not a list"
+        reason = "its entry `notes` is not a list"
     except (OSError, ValueError, LookupError, TypeError) as error:
         reason = message_of(error).rstrip(".")
     return [f"{storage.path(LAST_FILE)} is damaged: {reason}. Its notes are lost"]
@@ -356,7 +356,7 @@ def _check_jobs(
                 share = (
                     ""
                     if campaign.shard == ALL
-                    else f" in total, of which this run is shard {campaign.shard}"
+                    else f" in total and this run is shard {campaign.shard}"
                 )
                 raise LidarError(
                     f"{dataset.storage} contains job {row.name}, which is not part of this "

@@ -33,12 +33,12 @@ _CAPTIONS = {
         "Varied quantities: the number of jobs by value, and the number of points per job as a "
         "function of the value."
     ),
-    "results": "Results: the number of jobs by number of points, and by share of rays that hit.",
+    "results": "Results: histograms of jobs by number of points and by share of rays that hit.",
 }
 # Of the page alone: the card and the files of pictures are the same in every run.
 _PAGE_CAPTIONS = {
     **_CAPTIONS,
-    "times": "The number of jobs by casting time, which is the sum over all tasks of a job.",
+    "times": "Histogram of jobs by casting time, summed over all tasks of a job.",
 }
 
 
@@ -124,8 +124,8 @@ def _with_splits(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
                 if row.split not in files:
                     if not re.fullmatch(r"\w[\w.-]*", row.split):
                         raise LidarError(
-                            f"{row.split!r} is not a valid name for a split. Use only letters "
-                            "and digits."
+                            f"{row.split!r} is not a valid split name. Use only letters, digits, "
+                            "underscores, hyphens and periods."
                         )
                     name = f"{SPLITS}/{row.split}.txt"
                     files[row.split] = stack.enter_context(storage.writing(name))

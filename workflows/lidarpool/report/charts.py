@@ -80,8 +80,8 @@ def draw_varied(figures: Figures) -> Page | None:
         layout.label_charts(page, number, scale, upper, lower)
     page.title(
         "Varied quantities and resulting points",
-        "Top: the number of jobs by value. Bottom: a dot for each job, with the median of "
-        "jobs with similar values and the range of their central 80 %.",
+        "Top: number of jobs by value. Bottom: one dot per job, with the median and the central "
+        "80 % of jobs with similar values.",
         _remarks(figures, informative, len(drawable) - len(scales)),
     )
     return page
@@ -195,7 +195,7 @@ def draw_results(figures: Figures) -> Page | None:
 def draw_times(figures: Figures) -> Page | None:
     """Draw how casting times are distributed over jobs, or None if no job is done."""
     seconds = figures.per_job("seconds")[~figures.failures]
-    quantity = Varied("casting time per job, all tasks, s", seconds)
+    quantity = Varied("casting time per job (all tasks), s", seconds)
     return _draw_distributions((quantity,), "Casting time", "Number of jobs by casting time")
 
 

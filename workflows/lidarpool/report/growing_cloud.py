@@ -250,9 +250,8 @@ class CloudWriter:
             first.counts.merge(part_writer.counts)
         if first.counts.point_count != self.file.count:
             raise LidarError(
-                f"only {first.counts.point_count:,} of {self.file.count:,} points lie on "
-                "objects of the scene or on no object, so the parts belong to a different "
-                "scene."
+                f"only {first.counts.point_count:,} of {self.file.count:,} points belong to an "
+                "object of the scene or to no object, so the parts belong to a different scene."
             )
         return first.counts
 

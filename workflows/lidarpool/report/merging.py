@@ -112,32 +112,33 @@ def merge(
 ) -> dict[str, Any]:
     """Merge shards into the data set or result that a single run would have written.
 
-    Every byte is compared with the checksums of its shard. The rows of the jobs are read from their
-    manifests, which have checksums. If the merge is interrupted, the same call continues it.
+    Every byte is verified with the checksums of its shard. The rows of the jobs are read from the
+    manifests of the jobs, which also have checksums. If the merge is interrupted, the same call
+    resumes it.
 
     Parameters
     ----------
     shards, out
         Folders or URLs of the shards of one campaign or survey, and of the merged data set or
         result. Shards can be added to a data set later. `out` must not be inside a shard or contain
-        one.
+        a shard.
     partial
         Whether to merge the available shards if others are missing. A note lists the missing
         shards.
     scenario
-        Scenario or mesh file of a survey, if it was moved after the shards ran.
+        Scenario or mesh file of a survey, if it has been moved since the shards were run.
     screen
         Object that shows the progress. By default, the progress is logged.
 
     Returns
     -------
-    The content of report.json.
+    The contents of report.json.
 
     Raises
     ------
     LidarError
-        If shards are missing, damaged, passed twice or unfinished, or come from a different run or
-        different software. The message names the shards.
+        If shards are missing, damaged, passed twice or unfinished, or come from different runs or
+        software versions. The message names the shards.
     """
     target = output_place(str(out))
     screen = screen or Screen()
@@ -197,9 +198,7 @@ def _read_folder(storage: Storage) -> _ShardFolder:
 
     Raises LidarError if damaged or unfinished.
     """
-    refuse_missing(
-        storage, "specify the folder of a shard, as passed to `--out` of `lidarpool run --shard`"
-    )
+    refuse_missing(storage, "specify the output folder of `lidarpool run --shard`")
     with explained(f"{storage} cannot be read"):
         files = storage.sizes()
         run = storage.below(RUN_FOLDER)
@@ -303,7 +302,7 @@ def _check(
             message = f"{shard_folder.storage} and {first} differ in {differs[0]}"
             message += f" ({changed})" * bool(changed)
             mistakes.lines.append(
-                f"{message}. Merge shards of a single run with the same software."
+                f"{message}. Merge only shards of a single run that used the same software."
             )
         elif len(common) > len(expected):
             expected = common

@@ -133,7 +133,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         foreign = [name for name in (*FILES, *further) if name in entries and name not in listed]
         if foreign and not overwrite:
             lists = (
-                f"{target} contains {foreign[0]}, which does not belong to a result in this folder."
+                f"{target} contains {foreign[0]}, which would be replaced although it does not "
+                "belong to a result."
             )
             raise LidarError(f"{lists} {advice}")
         refuse_strangers(storage, _rows({*further, *listed}))

@@ -324,11 +324,11 @@ def draw_stations(plan: StationPlan) -> Page:
     page.numbers(axes, shot)
     names = ["covered", "not covered", "not visible"] + ["not a target"] * (not plan.targets.all())
     page.legend([*zip(names, COLORS, strict=False)], "station")
-    candidates = plural(len(plan.candidates), "place")
+    candidates = plural(len(plan.candidates), "candidate position")
     targets = "" if plan.targets.all() else f" of {plural(int(plan.targets.sum()), 'object')}"
     page.title(
         plural(len(plan.stations), "station").capitalize(),
-        f"{plan.coverage[-1]:.1%} of the visible surface{targets} covered from {candidates}",
+        f"{plan.coverage[-1]:.1%} of the visible surface{targets} covered; {candidates}",
         plan.sight.sensor.model,
     )
     return page

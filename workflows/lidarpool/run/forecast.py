@@ -200,7 +200,7 @@ def _cluster_of(
             backend = usable[0] if options.backend == "auto" else options.backend
             # Dask gives each worker of a local cluster its share of the memory.
             worker_memory = MEMORY_LIMIT / CPU_COUNT
-            check_memory(job, options, backend, worker_memory, "a casting worker of this machine")
+            check_memory(job, options, backend, worker_memory, "a casting worker on this machine")
     slots = {
         name: {"needed": required_slots, "there": present.get(name, 0)}
         for name, required_slots in required.items()
@@ -267,9 +267,9 @@ def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
         return []
     return [
         f"{format_bytes(available_bytes)} of memory are available, but the run needs about "
-        f"{format_bytes(required_bytes)}. Reduce the scene, the number of casting workers "
-        "(`pool.gpu`), `batch_mb`, `rays_per_revolution` or `planning.particles`, or use a machine "
-        "with more memory."
+        f"{format_bytes(required_bytes)}. Use a smaller scene, reduce the number of casting "
+        "workers (`pool.gpu`), `batch_mb`, `rays_per_revolution` or `planning.particles`, or use "
+        "a machine with more memory."
     ]
 
 

@@ -147,7 +147,7 @@ class CampaignRun:
     def from_rows(
         cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **details: Any
     ) -> CampaignRun:
-        """Summarize the rows of a campaign. By default, all jobs belong to an earlier run."""
+        """Summarize the job rows of a campaign, which by default all belong to an earlier run."""
         failed = []
         job_count = 0
         points = 0

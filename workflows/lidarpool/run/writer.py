@@ -309,6 +309,6 @@ def _fetch_writer(key: str) -> RangeWriter:
 def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
     """Write a range on a worker, and return its result and the record of the task."""
     recorder = Recorder(EXPORT, LIDAR)
-    with explained(f"The worker {recorder.finish().worker} cannot write there"):
+    with explained(f"The worker {recorder.finish().worker} cannot write the output"):
         written_range = _fetch_writer(key)(span)
     return written_range, recorder.finish(span[1] - span[0])

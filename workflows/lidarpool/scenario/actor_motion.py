@@ -64,8 +64,8 @@ class MountSection(Section, InstrumentPose):
     link: Annotated[
         Text | None,
         about(
-            "link of a robot on the platform, to whose axes the mount is relative; the visible "
-            "shape of the link is omitted from the scene",
+            "robot link in whose axes the mount is defined, for a robot on the platform; the "
+            "visible shape of the link is omitted from the scene",
             "top_lidar_link",
         ),
     ] = None
@@ -121,7 +121,7 @@ CarriedEntry = Annotated[CarriedSection, by_text("model", CarriedSection)]
 
 
 class TimedPose(Section, Pose):
-    """A pose at a time.
+    """A pose at a given time.
 
     If no pose has an angle, the platform is level and faces its direction of travel.
     """
@@ -148,7 +148,7 @@ class TrajectorySection(Section):
     file: Annotated[
         Text | None,
         about(
-            "trajectory file in the TUM or KITTI format, .csv table, «oxts» folder or ROS 2 bag, "
+            "trajectory file in the TUM or KITTI format, .csv table, oxts folder or ROS 2 bag, "
             "relative to the folder of the scenario",
             "drive.tum",
         ),
@@ -197,29 +197,29 @@ class TrajectorySection(Section):
     vehicle: Annotated[
         Identity | None,
         about(
-            "identity of the vehicle in the traffic that carries the sensors of the survey; host "
-            "is the host vehicle of an OSI trace; replaces file",
+            "ID of the vehicle in the traffic that carries the sensors of the survey, or host for "
+            "the host vehicle of an OSI trace; replaces file",
             "host",
         ),
     ] = None
     interpolation: Annotated[
         Literal["linear", "smooth"],
-        about("interpolation of positions and rotations; IMUs require smooth"),
+        about("interpolation of positions and rotations; an IMU requires smooth"),
     ] = "linear"
     offset_s: Annotated[Seconds, about("offset in seconds that is added to all times")] = 0.0
     start_s: Annotated[
         Seconds | None,
-        about("time at which the survey starts (default: the first time)"),
+        about("time at which the survey starts (default: the start of the trajectory)"),
     ] = None
     duration_s: Annotated[
         Duration | None,
-        about("duration of the survey (default: to the end of the trajectory)"),
+        about("duration of the survey (default: until the end of the trajectory)"),
     ] = None
     surfaces: Annotated[
         TextOrTexts | None,
         about(
-            "names of objects that the trajectory follows, so that its heights are above them; may "
-            "contain * and ?",
+            "names of objects that the trajectory follows, so that its heights are relative to "
+            "them; may contain * and ?",
             "Terrain",
             min_length=1,
         ),
@@ -279,8 +279,8 @@ class TrajectorySection(Section):
             if piece.times_s[0] <= start + CLOCK_S and stop - CLOCK_S <= piece.times_s[-1]:
                 return replace(piece, beyond=track.beyond)
         raise LidarError(
-            f"The trajectory leaves its surfaces ({', '.join(self.surfaces)}). Shorten it so that "
-            "it ends on them."
+            f"The trajectory leaves the surfaces that it follows ({', '.join(self.surfaces)}). "
+            "Shorten it so that it ends on these surfaces."
         )
 
     def footprint(self, path: PathOf) -> Floats:
@@ -345,7 +345,7 @@ class JointTable(Section):
 
 
 class ActorSection(DeformingSection):
-    """An object or robot that moves or is stationary.
+    """A moving or stationary object or robot.
 
     In its own axes, x is forward and z is up.
     """
@@ -361,8 +361,9 @@ class ActorSection(DeformingSection):
     trajectory: Annotated[
         TrajectoryEntry | None,
         about(
-            "trajectory with the same clock as the trajectory of the survey; an actor without "
-            "trajectory and at is the platform and follows the trajectory of the survey",
+            "trajectory, with times of the same clock as the trajectory of the survey; an actor "
+            "with neither trajectory nor at is the platform and follows the trajectory of the "
+            "survey",
             "van.csv",
         ),
     ] = None
@@ -375,7 +376,7 @@ class ActorSection(DeformingSection):
     ] = None
     spray: Annotated[
         bool,
-        about("whether the wheels raise spray if weather.spray_g_m3 is set; robots raise none"),
+        about("whether the actor raises spray if weather.spray_g_m3 is set; robots never do"),
     ] = True
     joints: Annotated[
         Annotated[JointTable, by_text("file", JointTable)] | None,

@@ -113,11 +113,11 @@ def _size_note(built: Built, side: float) -> str:
     assumed = (
         f"{name} states no unit. If it is in meters,"
         if unitless
-        else f"the format of {name} prescribes meters, by which"
+        else f"the format of {name} prescribes meters, so"
     )
     return (
         f"{assumed} the scene is {rounded(side, 5)} m long. If this is wrong, set the `unit` of "
-        f"the file in `scene.files`, possibly {unit}, or pass `--unit {unit}` with a mesh file"
+        f"the file in `scene.files` (possibly {unit}), or pass `--unit {unit}` with a mesh file"
     )
 
 
@@ -161,7 +161,7 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
     if scenario.cloud.waveform_samples and not {"las", "laz"} & written:
         yield (
             "`cloud.waveform_samples` has no effect, because only LAS and LAZ files store "
-            "waveforms and none is written. Set `output: {write: [las]}`"
+            "waveforms, and no such file is written. Set `output: {write: [las]}`"
         )
     is_default = scenario.weather.fog_lidar_ratio_sr in (None, FOG_LIDAR_RATIO_SR)
     if not is_default and scenario.weather.visibility_km is None:
@@ -218,7 +218,8 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
         return
     if survey.fog_lidar_ratio_sr is None:
         yield (
-            "fog attenuates light but returns none, because `weather.fog_lidar_ratio_sr` is null"
+            "fog attenuates light but causes no returns, because `weather.fog_lidar_ratio_sr` is "
+            "null"
         )
         return
     without = [
@@ -230,9 +231,9 @@ def _dark_fog(survey: Survey) -> Iterator[str]:
         names = [carried.name for carried in without]
         of_sensors = f" of {listed(names)}" if all(names) else ""
         yield (
-            "fog attenuates light but returns none, because `noise.detection_range_m`"
-            f"{of_sensors} is not set. Set it to the range at 10 % reflectance, for example "
-            "`noise: {detection_range_m: 90}`"
+            "fog attenuates light but causes no returns, because "
+            f"`noise.detection_range_m`{of_sensors} is not set. Set it to the range at 10 % "
+            "reflectance, for example `noise: {detection_range_m: 90}`"
         )
 
 
@@ -252,7 +253,7 @@ def _heading_notes(without_angles: Mapping[str, bool]) -> Iterator[str]:
         )
     if any(without_angles.values()):
         note += (
-            f". At a corner between straight lines, they turn from {CORNER_M:g} m before to "
+            f". At a corner between straight lines, the poses turn from {CORNER_M:g} m before to "
             f"{CORNER_M:g} m after the corner. For a path without corners, set `interpolation: "
             "smooth`"
         )
@@ -271,8 +272,8 @@ def _timing_notes(built: Built) -> Iterator[str]:
         if START_FROM.timestamp() <= start_s < _LAST_DATE.timestamp():
             moment = datetime.fromtimestamp(start_s, UTC).isoformat()
             yield (
-                f"the times of the trajectory start at {start_s:.0f} s, but the times of points "
-                "count from the start of the survey. If the trajectory has seconds since 1970, set "
+                f"the trajectory starts at {start_s:.0f} s, but point times are relative to the "
+                "start of the survey. If the trajectory times are seconds since 1970, set "
                 f"`cloud: {{start: {moment}}}` to keep the date"
             )
     end = np.array([built.survey.duration_ns])

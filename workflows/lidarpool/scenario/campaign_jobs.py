@@ -371,7 +371,7 @@ class _Base:
                     if max_rows > len(tables[key]):
                         rows = plural(len(tables[key]), "row")
                         raise LidarError(
-                            f"count is up to {max_rows:,}, but {table} has only {rows}."
+                            f"count allows up to {max_rows:,} rows, but {table} has only {rows}."
                         )
         with mistakes.noted(), prefixed(label):
             self._check_disjoint()

@@ -258,7 +258,10 @@ _KINDS = ("uniform", "log_uniform", "normal", "integer", "choice", "each", "samp
 
 
 class Choice(Section):
-    """Choice of a value for each job, by exactly one field."""
+    """Rule that chooses a value for each job.
+
+    Exactly one field must be set, apart from `weights`.
+    """
 
     uniform: Annotated[
         MinMax[float] | None,
@@ -272,7 +275,7 @@ class Choice(Section):
         Normal | None, about("normally distributed number", {"mean": 0, "std": 1})
     ] = None
     integer: Annotated[
-        MinMax[int] | None, about("integer from a minimum to a maximum, inclusive", [1, 6])
+        MinMax[int] | None, about("random integer from a minimum to a maximum, inclusive", [1, 6])
     ] = None
     choice: Annotated[
         Options,
@@ -287,7 +290,7 @@ class Choice(Section):
     each: Annotated[
         Options,
         about(
-            "all values of a list in turn; several fields with each form a grid, in which the "
+            "all values of a list in turn; several fields with each form a grid in which the "
             "first field changes fastest"
         ),
     ] = None
@@ -401,18 +404,19 @@ class Keep:
     format: Annotated[
         Literal[tuple(DATA_SETS)],  # type: ignore[valid-type]
         about(
-            "kitti, nuscenes, webdataset, mcap, parquet, images, or folder for one cloud per job"
+            "format of the files: kitti, nuscenes, webdataset, mcap, parquet, images, or folder "
+            "for one cloud per job"
         ),
     ] = "kitti"
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        about("layout of the points (mcap only)"),
+        about("point layout (mcap only)"),
     ] = "velodyne"
     compensated: Annotated[
         bool,
         about(
             "whether points are motion-compensated to the start of the sweep and have no times; "
-            "otherwise, they are at the time of their firing (mcap only)"
+            "otherwise, each point is in the sensor frame at the time of its firing (mcap only)"
         ),
     ] = False
 
@@ -459,7 +463,7 @@ KeepEntry = Annotated[
 
 
 class CampaignSection(Section):
-    """Many jobs that are defined by base scenarios and by fields that differ between jobs.
+    """A campaign of jobs, which are base scenarios with fields that vary between jobs.
 
     File names are relative to the folder of the base. The name of the base is relative to the
     folder of the campaign.
@@ -472,20 +476,20 @@ class CampaignSection(Section):
     count: Annotated[
         int | None,
         about(
-            "number of jobs (default if no value is drawn at random: one for each combination of "
-            "bases and values of each)",
+            "number of jobs; if no value is random, the default is one job for each combination of "
+            "bases and values of each",
             1000,
             ge=1,
             le=MAX_JOBS,
         ),
     ] = None
-    seed: Annotated[Seed, about("seed of the random values")] = 0
+    seed: Annotated[Seed, about("random seed; the same seed results in the same values")] = 0
     vary: Annotated[
         dict[Text, ChoiceEntry],
         may_be_empty(dict[Text, Choice]),
         about(
-            "mapping from the path of a field to the choice of its value; a path consists of keys, "
-            "and of the numbers or names of list entries",
+            "mapping from the path of a field to the rule that chooses its value; a path consists "
+            "of keys, and of the indices or names of list entries",
             {"weather.visibility_km": {"log_uniform": [0.2, 20]}},
             {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}},
         ),
@@ -499,7 +503,7 @@ class CampaignSection(Section):
             {"train": 0.8, "val": 0.1, "test": 0.1},
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
-    license: Annotated[str, about("license of the data set, stated on its card", "CC-BY-4.0")] = ""
+    license: Annotated[str, about("license of the data set, for its card", "CC-BY-4.0")] = ""
     title: Annotated[str, about("title of the data set (default: the file name)")] = ""
 
     @model_validator(mode="after")

@@ -75,13 +75,13 @@ def _limits(survey: Survey, ranges: Floats) -> Iterator[str]:
         return
     if too_near.any():
         yield (
-            f"{'all' if too_near.all() else 'some'} surfaces are closer than min_range_m, which is "
-            f"{min(lower):g} m, at ranges from {_span(ranges[too_near])}"
+            f"{'all' if too_near.all() else 'some'} surfaces are closer than `min_range_m` "
+            f"({min(lower):g} m), at ranges from {_span(ranges[too_near])}"
         )
     if too_far.any():
         yield (
-            f"{'all' if too_far.all() else 'some'} surfaces are farther than max_range_m, which is "
-            f"{max(upper):g} m, at ranges from {_span(ranges[too_far])}"
+            f"{'all' if too_far.all() else 'some'} surfaces are farther than `max_range_m` "
+            f"({max(upper):g} m), at ranges from {_span(ranges[too_far])}"
         )
 
 

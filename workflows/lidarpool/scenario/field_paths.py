@@ -130,7 +130,7 @@ def _match_entry(entries: Sequence[Any], path_parts: Sequence[str], path: str) -
             return index, 1
         raise LidarError(
             f"{path} of the base has {plural(len(entries), 'entry', 'entries')}, so entry "
-            f"{shortened(path_parts[0])} does not exist. Entries are counted from 0."
+            f"{shortened(path_parts[0])} does not exist. Entries are numbered from 0."
         )
     names = [getattr(entry, "name", None) for entry in entries]
     name, part_count = _match_name(

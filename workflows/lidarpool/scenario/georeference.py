@@ -56,9 +56,9 @@ def place_problem(scene: Scene, epsg: int | None) -> str:
         origin = _in_words(scene.world_origin)
         in_files = _in_words(_middle(scene) - scene.world_origin[:2])
         return (
-            f"`world.origin` ({origin}) is added to the coordinates of the scene's files, although "
-            f"these are already close to it ({in_files}). If they are world coordinates, remove "
-            "`world.origin`."
+            f"`world.origin` ({origin}) is added to the coordinates of the scene's files, "
+            f"although these coordinates are already close to it ({in_files}). If they are world "
+            "coordinates, remove `world.origin`."
         )
     return ""
 

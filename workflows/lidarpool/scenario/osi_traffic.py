@@ -164,7 +164,7 @@ def read_osi(
     LidarError
         If betterosi is missing, or the file cannot be read or has no ground truth.
     """
-    need("betterosi", "osi", f"{path} is read")
+    need("betterosi", "osi", f"Reading {path}")
     collector = _PassageCollector(section, first_s, choice)
     stationary = 0
     for truth in _ground_truths(path):
@@ -222,8 +222,8 @@ def _ground_truths(path: Path) -> Iterator[Any]:
             if is_mcap or kind is not None:
                 raise
             raise LidarError(
-                "its first message is not clearly a GroundTruth or SensorView message. State the "
-                "type in the file name, as in town_gt.osi or town_sv.osi."
+                "the type of its first message (GroundTruth or SensorView) cannot be determined. "
+                "Specify the type in the file name, as in town_gt.osi or town_sv.osi."
             ) from error
     while truth is not None:
         yield truth
@@ -240,7 +240,7 @@ def _message_type(osi: Any, path: Path) -> str | None:
     if kind in (None, "GroundTruth", "SensorView"):
         return kind
     raise LidarError(
-        f"its name states messages of type {kind}, but only GroundTruth and SensorView are "
+        f"its name indicates messages of type {kind}, but only GroundTruth and SensorView are "
         "supported."
     )
 

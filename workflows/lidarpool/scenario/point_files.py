@@ -152,7 +152,7 @@ def read_points(
             f"{'was' if content.no_returns == 1 else 'were'} skipped as pulses without a return"
         )
     if names := _left_out(content):
-        tell(f"{path} has data that surfels cannot store and that were skipped: {', '.join(names)}")
+        tell(f"{path} has data that surfels cannot store, which were skipped: {', '.join(names)}")
     return points
 
 

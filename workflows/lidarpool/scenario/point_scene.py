@@ -45,7 +45,7 @@ CLASS_MATERIAL = "class "  # and the number: name of the material of surfels wit
 _GRAY = "have the mean color of their neighbors, or are gray"  # in notes
 _LEAST_LOSS = 0.02  # share of returns lost in gaps that a note tells
 # docs/how-to/point-clouds.md has the scans
-_MEASURED_LOSS = "4 to 40 % in scenes of one to three scans of a city"
+_MEASURED_LOSS = "4 to 40 % in scenes from one to three scans of a city"
 _WHITE_QUANTILE = 0.99  # share of intensities up to white: mirrors return more
 
 
@@ -146,8 +146,9 @@ class PointScene(NamedTuple):
         advice = f"To close gaps, increase `--voxel-m` (`voxel_m` in Python), such as to {larger_m}"
         if self.loss is None:
             return (
-                "returns are lost in gaps between points. Their share cannot be estimated, because "
-                f"the scanner positions are unknown. It was {_MEASURED_LOSS}. {advice}"
+                "returns are lost in gaps between points. Their share cannot be estimated, "
+                "because the scanner positions are unknown. In measurements, it was "
+                f"{_MEASURED_LOSS}. {advice}"
             )
         if self.loss < _LEAST_LOSS:
             return ""
@@ -256,8 +257,8 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
         )
     if count < _NEIGHBORS:
         raise LidarError(
-            f"The points of {path} are in {plural(count, 'voxel')} of {voxel_m:.3g} m, but at "
-            f"least {_NEIGHBORS} are required. Reduce `voxel_m`, or use a different cloud."
+            f"The points of {path} occupy only {plural(count, 'voxel')} of {voxel_m:.3g} m, but "
+            f"at least {_NEIGHBORS} are required. Reduce `voxel_m`, or use a different cloud."
         )
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(voxels.means(positions)))
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBORS))

@@ -170,8 +170,8 @@ class Scenario(Section):
     actors: Annotated[
         Several[ActorSection],
         about(
-            "meshes, boxes or robots that move or are stationary; an actor without trajectory and "
-            "at is the platform",
+            "moving or stationary meshes, boxes or robots; an actor with neither trajectory nor at "
+            "is the platform",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
             [{"name": "Crane", "file": "crane.urdf", "at": [4, 5, 0]}],
             max_length=10_000,
@@ -180,14 +180,14 @@ class Scenario(Section):
     traffic: Annotated[
         TrafficSection | None,
         about(
-            "vehicles and persons of a SUMO simulation or of an OSI trace, as actors",
+            "vehicles and persons from a SUMO simulation or an OSI trace, as actors",
             {"file": "fcd.xml", "vehicles": [{"box": [4.5, 1.8, 1.5], "class": 10}]},
         ),
     ] = None
     mount: Annotated[
         MountEntry | None,
         about(
-            "pose of the sensor on its platform, in the axes of the platform",
+            "pose of the sensor in the platform frame",
             [1, 0, 2],
             {"position": [1, 0, 2], "pitch_deg": 10},
         ),
@@ -203,8 +203,8 @@ class Scenario(Section):
     materials: Annotated[
         Several[Material],
         about(
-            "materials, by names of objects and of materials in their files; the first matching "
-            "entry applies",
+            "materials, assigned by the names of objects and of the materials in scene files; the "
+            "first matching entry applies",
             [{"objects": "Window*", "transparent": "pass"}, {"objects": "*", "reflectance": 0.3}],
             max_length=100_000,
         ),
@@ -212,7 +212,8 @@ class Scenario(Section):
     classes: Annotated[
         ClassNames,
         about(
-            "names of semantic classes for reports and files; they add the column class",
+            "names of semantic classes for reports and files; if set, the cloud contains the "
+            "column class",
             {40: "road"},
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
@@ -365,8 +366,8 @@ class Scenario(Section):
             others = self.trajectory.model_fields_set - {"vehicle", "start_s", "duration_s"}
             if others:
                 yield (
-                    f"`trajectory.vehicle` cannot be combined with `trajectory.{min(others)}`, but "
-                    "only with `start_s` and `duration_s`. Set other options in `traffic`."
+                    "`trajectory.vehicle` can only be combined with `start_s` and `duration_s`, "
+                    f"not with `trajectory.{min(others)}`. Set other options in `traffic`."
                 )
         carriers = [entry for entry in self.actors if entry.is_carrier]
         if carriers and self.trajectory is None:

@@ -91,18 +91,18 @@ _HEAD = f"# yaml-language-server: $schema={SCHEMA_FILE}"
 _FULL_HEAD = f"""\
 {_HEAD}
 # A lidar survey for lidarpool, with path planning. All fields have their default values and may be
-# omitted. A field after "# " is an example, because lidarpool determines its default. Lengths are
-# in meters and angles in degrees, and z is up.
+# omitted. Fields that are commented out are examples, because lidarpool determines their default
+# values. Lengths are in meters and angles in degrees, and z is up.
 #
 #     lidarpool check {SCENARIO_FILE}
 #     lidarpool run {SCENARIO_FILE}"""
 _SHORT_HEAD = f"""\
 {_HEAD}
-# A lidar survey for lidarpool. Lengths are in meters, and z is up. Omitted fields have default
-# values. To write all fields with their default values, run `lidarpool init DIR --all`."""
+# A lidar survey for lidarpool. Lengths are in meters, and z is up. Omitted fields have their
+# default values. To write all fields with their default values, run `lidarpool init DIR --all`."""
 # {section of a short scenario: (an example, its meaning)}
 _SECTIONS = {
-    "scene": ("seed", "mesh files relative to this folder, or seed for six objects"),
+    "scene": ("seed", "mesh files relative to this folder, or seed for the demo"),
     "sensor": ("ouster/os1-64", "model from `lidarpool sensors`, or a .yaml file"),
     "poses": ("[[0, 0, 1], {position: [0, 0, 2], yaw_deg: 90}]", "poses of the sensor"),
     "cloud": ("{columns: [range, intensity]}", "precision and additional columns of the points"),

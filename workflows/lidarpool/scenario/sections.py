@@ -107,7 +107,8 @@ class MeshFile(Section):
     up_axis: UpAxis = None
     translation: Annotated[Triple, about("translation in meters, applied last")] = (0, 0, 0)
     rotation_deg: Annotated[
-        Three[AngleDeg], about("rotations about the x, y and z axes of the world, in degrees")
+        Three[AngleDeg],
+        about("angles of the rotations about the x, y and z axes of the world, in degrees"),
     ] = (0, 0, 0)
     scale: Annotated[Scale, about("scale factor, or one factor for each axis; applied first")] = (
         1,
@@ -334,7 +335,8 @@ class AnimationSection(Section):
         bool, about("whether the animation repeats; otherwise, its last pose is kept")
     ] = True
     offset_s: Annotated[
-        float, about("time in the animation at the start of the survey, in s", ge=-1e9, le=1e9)
+        float,
+        about("time in the animation at the start of the survey, in seconds", ge=-1e9, le=1e9),
     ] = 0.0
 
 
@@ -367,7 +369,7 @@ class DeformingSection(ShapeSection):
 
 
 class CopiesSection(ShapeSection):
-    """An object at many positions, whose mesh is stored once.
+    """Copies of an object at many positions, whose mesh is stored only once.
 
     Each copy is a separate object.
     """
@@ -401,8 +403,8 @@ class Ground(Section):
     margin_m: Annotated[
         float,
         about(
-            "distance in meters that the ground extends beyond the objects, poses, trajectories "
-            "and actors on each side",
+            "distance in meters by which the ground extends beyond the objects, poses, "
+            "trajectories and actors on each side",
             ge=0,
             le=1e6,
         ),
@@ -410,7 +412,7 @@ class Ground(Section):
 
 
 class SceneSection(Section):
-    """The scene, which consists of mesh files, copies of meshes, a ground and a preset.
+    """The scene, which consists of mesh files, copies of objects, a ground and a preset.
 
     In YAML, a file name, a list of files or the name of a preset alone is sufficient.
     """
@@ -432,7 +434,7 @@ class SceneSection(Section):
     copies: Annotated[
         Several[CopiesSection],
         about(
-            "objects at many positions, from lists or tables, or at random",
+            "copies of objects at many positions, from a list or table, or at random",
             [{"name": "Crate", "box": [1, 1, 1], "at": [[4, 5, 0], [6, 5, 0]], "class": 4}],
             [{"name": "Tree", "file": "tree.glb", "scatter": {"count": 100, "surfaces": "Ground"}}],
             max_length=10_000,
@@ -441,8 +443,8 @@ class SceneSection(Section):
     same_names: Annotated[
         Literal["number", "join"],
         about(
-            "treatment of objects with the same name in files: number renames them, as in Wall, "
-            "Wall.2, and join combines them into one object"
+            "treatment of objects with the same name in files: number renames them, as in Wall "
+            "and Wall.2, and join combines them into one object"
         ),
     ] = "number"
     ground: Annotated[
@@ -469,8 +471,8 @@ class WorldSection(Section):
     epsg: Annotated[
         EpsgCode | None,
         about(
-            "EPSG code of the coordinate system that point cloud files state and to which rasters "
-            "are converted (default: from the files of the scene)",
+            "EPSG code of the coordinate system, which is stored in point cloud files and to which "
+            "rasters are converted (default: from the files of the scene)",
             25832,
         ),
     ] = None
@@ -527,7 +529,7 @@ class SensorSection(Section):
     columns: Annotated[
         int | None,
         about(
-            "azimuth steps per revolution (Ouster sensors and beam tables only)",
+            "number of azimuth steps per revolution (Ouster sensors and beam tables only)",
             512,
             ge=1,
             le=100_000,
@@ -556,9 +558,9 @@ class SensorSection(Section):
     performance: Annotated[
         Sheet | None,
         about(
-            "datasheet uses the noise, the detection range and the beam of the model's data sheet, "
-            "which fields of noise and returns override; ideal uses none of them (default: "
-            "datasheet if the model file states these values)",
+            "noise, detection range and beam of the model: with datasheet, they are those of the "
+            "data sheet unless noise and returns override them; with ideal, data sheet values are "
+            "ignored (default: datasheet for a .yaml file with these values, otherwise ideal)",
             "ideal",
         ),
     ] = None
@@ -676,7 +678,7 @@ def _with_packets(sensor: Sensor, section: str) -> Sensor:
 class OutputSection(Section):
     """Additional files of the result.
 
-    The columns that they require are written.
+    Columns that the formats require are added to the cloud.
     """
 
     write: Annotated[
@@ -690,8 +692,8 @@ class OutputSection(Section):
         names = [entry.format for entry in self.write]
         if twice := next((name for name in names if names.count(name) > 1), None):
             raise ValueError(
-                f"`write` contains {twice} twice, but both would be the same file. To write a "
-                "second file of this format, use `lidarpool export --out`."
+                f"`write` contains {twice} twice, but both entries would write the same file. To "
+                "write a second file of this format, use `lidarpool export --out`."
             )
         return self
 
@@ -702,20 +704,20 @@ class OutputSection(Section):
 
 
 class ReturnsSection(Section, Returns):
-    """Sub-rays of a beam, and the selection of reported returns."""
+    """Sub-rays of the beams, and the returns that are reported."""
 
 
 class NoiseSection(Section, Noise):
-    """Noise of ranges and angles, and lost and false returns."""
+    """Noise of ranges and angles, lost returns, and false returns."""
 
 
 class Obstacle(Section):
-    """An obstacle, which is a disc or the bounding circle of named objects.
+    """An obstacle, which is a disc or the bounding circle of an object.
 
     `object` may contain * and ?. In YAML, this name alone is sufficient, as in `- Shelf*`.
     """
 
-    object: Annotated[Text | None, about("name of objects in the scene; may contain * and ?")] = (
+    object: Annotated[Text | None, about("name of an object in the scene; may contain * and ?")] = (
         None
     )
     center: Annotated[Pair | None, about("x and y of the center of a disc, in meters")] = None
@@ -774,12 +776,12 @@ class TaskOptions:
     collectors: Annotated[int, about("number of tasks that write the parts", ge=1, le=64)] = 2
     queue_capacity: Annotated[
         int,
-        about("maximum number of items that stage 1 is ahead of stage 2", ge=1, le=100_000),
+        about("maximum number of items by which stage 1 is ahead of stage 2", ge=1, le=100_000),
     ] = 10
     batch_mb: Annotated[
         int,
         about(
-            "maximum memory, in megabytes, of the batch of scans that a GPU worker casts at once",
+            "maximum memory in megabytes of a batch of scans, which a GPU worker casts at once",
             ge=1,
             le=1_000_000,
         ),
@@ -788,7 +790,7 @@ class TaskOptions:
         Literal[BACKENDS],  # type: ignore[valid-type]
         about(
             "ray-casting backend: cuda, tiles (compiled code for CPUs) or numpy; auto selects the "
-            "fastest one that is available"
+            "fastest available backend"
         ),
     ] = "auto"
 
@@ -812,12 +814,11 @@ class _Workers:
 
 
 class PoolSection(Section, TaskOptions, _Workers):
-    """The partitions and their tasks.
+    """The worker partitions and their tasks.
 
-    Default sizes depend on the machine.
-
-    `gpu` and `other` set the number of workers in a local cluster. They have no effect on a cluster
-    that is already running. The fields of `TaskOptions` apply to both.
+    `gpu` and `other` set the number of workers in a local cluster, which depends on the machine by
+    default. They have no effect on a cluster that is already running. The other fields apply to
+    every cluster.
     """
 
 

@@ -562,7 +562,8 @@ def _read_copies(path: Path, table: CopyTable) -> _CopyPoses:
         )
         if "scale" in columns and any(name in columns for name in _SCALE_NAMES):
             raise ValueError(
-                "it has both a scale and scales of axes. Ignore one of them with `ignore`"
+                "it has both a uniform scale and scales of single axes. Exclude one of them with "
+                "`ignore`"
             )
     except (OSError, ValueError, LidarError) as error:
         raise LidarError(

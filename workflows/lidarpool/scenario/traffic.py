@@ -84,7 +84,7 @@ class VehicleSection(DeformingSection):
     ] = ("*",)
     name: Annotated[
         Text | None,
-        about("name of the objects, followed by the identity in parentheses (default: the type)"),
+        about("name of the objects, followed by the ID in parentheses (default: the type)"),
     ] = None
 
 
@@ -123,8 +123,8 @@ class TrafficSection(Section):
     surfaces: Annotated[
         TextOrTexts | None,
         about(
-            "names of objects that the vehicles and persons are on; may contain * and ? (default: "
-            "heights from the file)",
+            "names of objects on which the vehicles and persons are placed; may contain * and ? "
+            "(default: heights from the file)",
             min_length=1,
         ),
     ] = None
@@ -489,7 +489,10 @@ def carrier_of(
         known = sorted(content.left_out)
         hint = name_hint(entry.vehicle or "", known) if known else ""
         if entry.vehicle == HOST:
-            hint = f" If the trace does not state its host vehicle, set an identity.{hint}"
+            hint = (
+                " If the trace does not state its host vehicle, set `trajectory.vehicle` to an "
+                f"identity.{hint}"
+            )
         raise LidarError(
             f"`trajectory.vehicle` is {entry.vehicle!r}, but {section.file} does not contain this "
             f"vehicle in at least two time steps.{hint}"

@@ -349,7 +349,7 @@ class _CityFile:
             )
         if self._unread:
             listed = ", ".join(f"{n} {kind}" for kind, n in self._unread.items())
-            content.notes.append(f"contains content that was skipped: {listed}")
+            content.notes.append(f"contains unsupported content, which was skipped: {listed}")
         return content
 
 
@@ -434,7 +434,7 @@ def _points(coordinates: Any) -> Floats:
     except (TypeError, ValueError) as error:
         raise ValueError("the vertices are not rows of three numbers") from error
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"the vertices have the shape {points.shape}; expected (v, 3)")
+        raise ValueError(f"the vertices have shape {points.shape}; expected (v, 3)")
     return points
 
 
@@ -443,7 +443,7 @@ def _integers(numbers: Sequence[int]) -> Ints:
     array = np.array(numbers or np.zeros(0, np.int64))
     if array.ndim != 1 or array.dtype != np.int64:
         raise ValueError(
-            "the boundaries do not have the nesting of the geometry type, or contain values "
+            "the boundaries are not nested as the geometry type requires, or contain values "
             "that are not integers"
         )
     return array

@@ -60,7 +60,7 @@ def read_dae(data: bytes, path: Path, options: ReadOptions) -> Content:
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
         raise MeshFileError(
-            f"is an XML file, but not COLLADA. Its root element is <{root.tag[:40]}>"
+            f"is an XML file, but not a COLLADA file. Its root element is <{root.tag[:40]}>"
         )
     allowance = Allowance(len(data), SMALLER)
     paint = _Effects(path, options, allowance) if options.colors else None

@@ -51,6 +51,6 @@ MESH_FORMATS = (
     ),
     MeshFormat((".ifczip",), _IFC, from_path=True, options=_IFC_OPTIONS, signatures=(_ZIP,)),
     MeshFormat(
-        ROBOTS, advice="it describes a robot. Read it with load_robot, or name it in a scenario"
+        ROBOTS, advice="it describes a robot. Read it with load_robot, or add it to a scenario"
     ),
 )

@@ -83,7 +83,7 @@ _MAP_NUMBERS = (
     "FactorZ",
 )
 _ADVICE = "export it in parts"
-_EMPTY = "contains no elements with a shape, such as walls and slabs, in the selected storeys"
+_EMPTY = "contains no elements with geometry, such as walls or slabs, in the selected storeys"
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class IfcOptions:
 
     storeys: Annotated[
         Annotated[Several[Text], Field(min_length=1)] | None,
-        about("names of the storeys whose elements are read, by default all (.ifc only)"),
+        about("names of the storeys whose elements are read (default: all; .ifc only)"),
     ] = None
 
 
@@ -244,7 +244,7 @@ def _content(
             f"first error is: {building['first_error']}"
         )
     if not building["unit_stated"]:
-        content.unit_note = "states no length unit. Meters are assumed, as in ifcopenshell"
+        content.unit_note = "does not specify a length unit. Meters are assumed, as in ifcopenshell"
     return content
 
 

@@ -95,10 +95,7 @@ class RasterOptions:
     ] = None
     window: Annotated[
         Rectangle | None,
-        about(
-            "part of a raster to read, [x0, y0, x1, y1]: its lowest x and y, and its highest x "
-            "and y"
-        ),
+        about("part of a raster to read, as [x0, y0, x1, y1] with the minimum and maximum x and y"),
     ] = None
     # Code of the mesh's coordinate system, `world.epsg` of scenarios; None chooses by the file.
     epsg: EpsgCode | None = None
@@ -263,8 +260,8 @@ def _source(file: Any, path: Path) -> _Source:
     unit = linear_unit(crs) if is_local(crs) else None
     if unit is None:
         raise MeshFileError(
-            f"uses {crs_name(crs)}, which has no horizontal axes. Project it to meters first, "
-            "for example with `gdalwarp -t_srs SYSTEM IN OUT`"
+            f"uses {crs_name(crs)}, which has no horizontal axes. Reproject it to meters "
+            "first, for example with `gdalwarp -t_srs SYSTEM IN OUT`"
         )
     name, unit_m = unit
     local = _LocalSystem(str(projjson(crs)["name"])[:80], name, unit_m)
@@ -389,13 +386,13 @@ def _target_crs(source: _Source, epsg: int | None, notes: list[str]) -> Any:
         if scale is not None and not scale.is_true:
             if (area := missed_area(crs, *middle.tolist())) is not None:
                 raise MeshFileError(
-                    f"states {crs_name(crs)}, whose area of use ({area}) is not at its x "
-                    f"{middle[0]:,.9g}, y {middle[1]:,.9g}. State the system of its coordinates "
-                    "(gdal_edit.py -a_srs EPSG:CODE FILE)"
+                    f"specifies {crs_name(crs)}, whose area of use ({area}) does not include its "
+                    f"center, x {middle[0]:,.9g}, y {middle[1]:,.9g}. Assign the correct "
+                    "coordinate system with `gdal_edit.py -a_srs EPSG:CODE FILE`"
                 )
             target = _zone_crs(source, middle)
             notes.append(
-                f"uses {crs_name(crs)}, whose meter is {scale} long on the ground here. It was "
+                f"uses {crs_name(crs)}, in which one meter is {scale} on the ground here. It was "
                 f"reprojected to {crs_name(target)}"
             )
     else:
@@ -432,8 +429,8 @@ def _zone_crs(source: _Source, middle: Floats) -> Any:
     if place is None:
         raise MeshFileError(
             f"uses {crs_name(source.crs)}, but its coordinates cannot be converted to longitude "
-            "and latitude. Project it to meters first, for example with `gdalwarp -t_srs SYSTEM "
-            "IN OUT`"
+            "and latitude. Reproject it to meters first, for example with `gdalwarp -t_srs "
+            "SYSTEM IN OUT`"
         )
     code = zone_in_meters(*place)
     width_deg = _width_deg(source)
@@ -483,7 +480,7 @@ def _affine(file: Any, path: Path) -> Any:
             a, d, b, e, c, f = map(float, numbers)
             affine = Affine(a, b, c - (a + b) / 2, d, e, f - (d + e) / 2)
     if not np.isfinite(affine).all() or affine.determinant == 0:
-        raise MeshFileError(f"has the geotransform {[*affine][:6]}, which gives its pixels no area")
+        raise MeshFileError(f"has the geotransform {[*affine][:6]}, whose pixels have no area")
     return affine
 
 
@@ -584,7 +581,7 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
 
     if step_m < grid.pixel_m * (1 - 1e-6):
         raise MeshFileError(
-            f"has a pixel size of {grid.pixel_m:.6g} m. The value of step_m must not be smaller"
+            f"has a pixel size of {grid.pixel_m:.6g} m. Set step_m to at least this value"
         )
     lower, upper = grid.extent
     if window is not None:
@@ -598,7 +595,7 @@ def _coarser_grid(grid: _RasterGrid, step_m: float, window: Window | None) -> It
         )
     columns, rows = np.ceil((upper - lower) / step_m - 1e-6).astype(int).tolist()
     if min(columns, rows) < 2:
-        raise MeshFileError("covers fewer than 2 x 2 steps of step_m. Choose a smaller value")
+        raise MeshFileError("covers fewer than 2 x 2 grid cells. Choose a smaller value for step_m")
     # Whole cells have their middle at their mean.
     width_m, height_m = (upper - lower) / (columns, rows)
     affine = Affine(width_m, 0, lower[0], 0, -height_m, upper[1])
@@ -650,13 +647,13 @@ def _check_size(
     if count <= max_read:
         extent = [*np.floor(lower).tolist(), *np.ceil(upper).tolist()]
         raise MeshFileError(
-            f"has {sides[0]:,} x {sides[1]:,} pixels, which would make {2 * count / 1e6:.0f} "
+            f"has {sides[0]:,} x {sides[1]:,} pixels, which would produce {2 * count / 1e6:.0f} "
             f"million triangles. To average them, write\nscene: [{{file: {name}, step_m: "
             f"{step:g}}}] in a scenario. Instead of step_m, window: {window} selects the center, "
             f"and window: {extent} selects all pixels"
         )
     raise MeshFileError(
-        f"has {sides[0]:,} x {sides[1]:,} pixels, which would make a mesh of "
+        f"has {sides[0]:,} x {sides[1]:,} pixels, which would produce a mesh of "
         f"{bytes_of(count * _PIXEL_BYTES)}. The limit is {bytes_of(memory_share())}, a quarter "
         f"of the memory. Set window: {window}{f' or step_m: {step:g}' * (count <= _MAX_READ)} in "
         "scene.files"
@@ -719,7 +716,7 @@ def _height_unit_m(source: _Source, notes: list[str]) -> float:
         name, factor = source.crs.linear_units_factor
     if factor != 1:
         notes.append(
-            f"states no height unit. The unit of its coordinates, {name}, is assumed. "
+            f"does not specify a height unit. The unit of its coordinates, {name}, is assumed. "
             'To read heights in meters, use <file.unit="m">'
         )
     return float(factor)
@@ -732,14 +729,14 @@ def _notes(source: _Source, path: Path) -> list[str]:
     unit_m = 1.0 if source.local is None else source.local.unit_m
     if file.transform.is_identity and source.affine.f == file.height * unit_m:
         notes.append(
-            f"is not georeferenced. Pixels of {unit_m:.6g} m that start at x = 0 and y = 0 are "
-            "assumed"
+            f"is not georeferenced. A pixel size of {unit_m:.6g} m and an origin at x = 0, y = 0 "
+            "are assumed"
         )
     if source.local is not None:
         notes += [source.local.note] if source.local.note else []
     elif source.crs is None:
         notes.append(
-            "states no coordinate system. Coordinates in meters are assumed. To add a "
+            "does not specify a coordinate system. Coordinates in meters are assumed. To add a "
             "coordinate system, use `gdal_translate -a_srs EPSG:CODE`"
         )
     if file.count > 1:

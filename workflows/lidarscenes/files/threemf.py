@@ -125,7 +125,7 @@ def read_3mf(data: bytes, path: Path, options: ReadOptions) -> Content:
         words = plural(gray_count, "triangle")
         content.notes.append(
             f"contains textures, which are not supported, or lacks colors. As a result, {words} "
-            "became gray"
+            f"{'is' if gray_count == 1 else 'are'} gray"
         )
     return content
 

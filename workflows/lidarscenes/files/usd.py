@@ -309,9 +309,11 @@ def _with_notes(content: Content, stage: dict[str, Any], counts: dict[str, int])
         raise ValueError(f"the unit is {stage['unit_m']} meters, but it must be a positive number")
     if stage["up_axis"] not in UP_AXES:
         raise ValueError(f"the value of upAxis is {stage['up_axis'][:20]!r}, which is not an axis")
-    content.turned = "as the file states" if stage["up_stated"] else "the default of OpenUSD"
+    content.turned = "as the file states" if stage["up_stated"] else "the OpenUSD default"
     if not stage["unit_stated"]:
-        content.unit_note = "states no unit. Centimeters, the default of OpenUSD, are assumed"
+        content.unit_note = (
+            "does not specify a length unit. Centimeters, the OpenUSD default, are assumed"
+        )
     notes = content.notes
     notes += _notes(stage, counts)
     if notes and not (content.meshes or content.moving):
@@ -329,18 +331,18 @@ def _notes(stage: dict[str, Any], counts: dict[str, int]) -> Iterator[str]:
         )
     if names := [name[-80:] for name in stage["missing"]]:
         listed = ", ".join(map(repr, names[:3])) + ", …" * (len(names) > 3)
-        yield f"refers to content that does not exist or cannot be read and was skipped: {listed}"
+        yield f"refers to content that is missing or cannot be read, which was skipped: {listed}"
     if counts:
         listed = ", ".join(f"{n} {kind}" for kind, n in counts.items())
         yield f"contains prims that were skipped: {listed}"
     if moving:
         yield (
-            f"contains {plural(moving, 'object')} whose motion is not supported because it is a "
-            "deformation or a motion of instances. The first frame is used"
+            f"contains {plural(moving, 'object')} with unsupported motion, such as deformation or "
+            "moving instances. The first frame is used"
         )
     if stage["animations"] and len(stage["times_s"]) == 1:
         yield (
-            "contains animated skeletons, which are static here. To animate an actor, set "
+            "contains animated skeletons, which are treated as static. To animate an actor, set "
             "animation: NAME"
         )
     if skinned:
@@ -352,5 +354,5 @@ def _notes(stage: dict[str, Any], counts: dict[str, int]) -> Iterator[str]:
     if smooth:
         yield (
             f"contains {plural(smooth, 'subdivision mesh', 'subdivision meshes')}. Subdivision "
-            "is not supported, and the coarse mesh is used"
+            "is not supported, so the coarse mesh is used"
         )

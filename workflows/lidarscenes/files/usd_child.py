@@ -544,7 +544,7 @@ class Looks:
             frame["unread"] = "does not exist"
         elif not outer.startswith(self._folders):
             frame["unread"] = (
-                "is outside the scene's folder; name the folder that contains it as assets"
+                "is outside the scene's folder; set assets to a folder that contains it"
             )
         elif asset := Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path)):
             data = asset.GetBuffer()
@@ -696,7 +696,7 @@ def _checked_layers(path: str) -> list[Any]:
             outer = Ar.SplitPackageRelativePathOuter(full_name)[0]
             is_usual = os.path.isfile(outer) or os.path.isdir(outer)  # noqa: PTH112, PTH113
             if os.path.exists(outer) and not is_usual:  # noqa: PTH110
-                raise ValueError(f"it names {name[-80:]!r}, which is not a regular file")
+                raise ValueError(f"it refers to {name[-80:]!r}, which is not a regular file")
             if name in layer.subLayerPaths and full_name not in names:
                 names.add(full_name)
                 layers.append(Sdf.Layer.FindOrOpen(full_name))

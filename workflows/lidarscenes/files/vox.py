@@ -59,7 +59,8 @@ def read_vox(data: bytes, path: Path, options: ReadOptions) -> Content:
     angles = table.header.get("lad_type", "").strip()
     if angles and angles.lower() != "spherical":
         notes.append(
-            f"states the leaf angle distribution {angles!r}. Set the same leaf_angle for its object"
+            f"specifies the leaf angle distribution {angles!r}. Set the same leaf_angle for its "
+            "object"
         )
     return Content([mesh], unit_m=1.0, up_axis="z", notes=notes)
 
@@ -191,7 +192,8 @@ def _check_rows(indices: Floats, density: Floats, shape: Floats) -> None:
     if is_bad.any():
         raise MeshFileError(
             f"has a density of {density[is_bad][0]:g} m²/m³ in voxel "
-            f"{_spaced(indices[is_bad][0])}, but densities must be from 0 to {MAX_LEAF_DENSITY:g}"
+            f"{_spaced(indices[is_bad][0])}, but densities must be between 0 and "
+            f"{MAX_LEAF_DENSITY:g}"
         )
 
 

@@ -48,7 +48,7 @@ class Link(NamedTuple):
 
 
 class Instance(NamedTuple):
-    """Model that is placed in a world or in another model."""
+    """Placement of a model in a world or in another model."""
 
     name: str
     body: Body
@@ -199,7 +199,9 @@ class BodyReader:
         """
         key = id(element)
         if key in self._open_elements:
-            raise LidarError("it includes itself through its own files. Remove an <include>.")
+            raise LidarError(
+                "it includes itself, directly or through other files. Remove an <include>."
+            )
         if len(self._open_elements) > _MAX_NESTED:
             raise LidarError(f"models are nested more than {_MAX_NESTED} levels deep.")
         if key not in self._bodies:

@@ -33,9 +33,9 @@ _OTHER_SENSORS = (
 _SCANS = ("horizontal", "vertical")
 _NOISE_LEFT_OUT = {
     "mean": "the mean of the noise",
-    "bias_mean": "the bias of the noise",
-    "bias_stddev": "the random bias of the noise",
-    "dynamic_bias_stddev": "the drifting bias of the noise",
+    "bias_mean": "the mean of the noise bias",
+    "bias_stddev": "the standard deviation of the noise bias",
+    "dynamic_bias_stddev": "the dynamic bias of the noise",
     "precision": "the precision of the noise",
 }
 _MAX_NAMES = 12  # limit for the names that a line lists
@@ -100,7 +100,7 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
     rate_hz = numbers_of(element, "update_rate", 1, "0").item()
     if rate_hz <= 0:
         rate_hz = _RATE_HZ
-        left_out.append(f"a missing update_rate ({_RATE_HZ:g} Hz is used)")
+        left_out.append(f"sensors without an update_rate ({_RATE_HZ:g} Hz is used)")
     data: dict[str, Any] = {
         "name": f"{full_name} of Gazebo",
         "sources": {"all": "the world's <sensor>"},
@@ -114,7 +114,8 @@ def _lidar(element: Element, link: PlacedLink, name: str, full_name: str) -> Lid
     data |= _noise(element, figures, left_out)
     if element.get("type") in _COLLISION_LIDARS:
         left_out.append(
-            "rays that hit collision shapes (to get them, set geometry: collision in scene.files)"
+            "rays that hit collision shapes (to include them, set geometry: collision in "
+            "scene.files)"
         )
     return Lidar(
         name=full_name,

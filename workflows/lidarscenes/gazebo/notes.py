@@ -129,7 +129,7 @@ def _line(noun: str, names: Counter[str]) -> Iterator[str]:
 def _first_lines(lines: Iterable[str], max_lines: int = 3) -> Iterator[str]:
     """Yield the first lines on meshes, and the number of further lines."""
     all_lines = [*lines]
-    yield from (f"uses a mesh with a note: {line.rstrip('.')}" for line in all_lines[:max_lines])
+    yield from (f"has a note on a mesh: {line.rstrip('.')}" for line in all_lines[:max_lines])
     further = len(all_lines) - max_lines
     if further > 0:
-        yield f"uses meshes with {plural(further, 'further note')}"
+        yield f"has {plural(further, 'further note')} on meshes"

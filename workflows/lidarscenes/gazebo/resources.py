@@ -158,13 +158,13 @@ class Resources:
             if not is_inside(resolved, roots):
                 raise LidarError(
                     f"{printable(uri)!r} refers to a file outside {root}. Move the file there, "
-                    "or name its folder as assets."
+                    "or set `assets` to its folder."
                 )
             yield Source(path, next(f for f in roots if resolved.is_relative_to(f)))
         if refused is not None:
             raise LidarError(
-                f"{printable(uri)!r} is in {refused}, which has no {_CONFIGS[0]}. Name the "
-                "folder that contains it as assets."
+                f"{printable(uri)!r} is in {refused}, which has no {_CONFIGS[0]}. Set "
+                "`assets` to the folder that contains it."
             )
 
     def _candidates(self, uri: str, source: Source) -> Iterator[Candidate]:

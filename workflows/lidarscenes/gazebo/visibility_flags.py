@@ -64,7 +64,5 @@ def _bits(element: Element, name: str) -> int:
     except ValueError:
         bits = -1
     if not 0 <= bits <= ALL_BITS:
-        raise LidarError(
-            f"<{name}> is {shown(text)}; it must be a whole number from 0 to {ALL_BITS}."
-        )
+        raise LidarError(f"<{name}> is {shown(text)}; it must be an integer from 0 to {ALL_BITS}.")
     return bits

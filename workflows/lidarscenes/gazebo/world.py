@@ -60,7 +60,7 @@ class GazeboOptions:
 
     geometry: Annotated[
         Literal["visual", "collision"],
-        about("shapes that are read from a Gazebo world: visual or collision shapes", "collision"),
+        about("shapes that are read from a Gazebo world: visual or collision", "collision"),
     ] = "visual"
 
 
@@ -210,12 +210,12 @@ def load_world(data: bytes, path: Path, folders: tuple[Path, ...]) -> World:
     root = lenient_root(data)
     if root.tag == _OLD_ROOT:
         raise MeshFileError(
-            "has the format of Gazebo before version 1.9. Convert it with `gz sdf -k` of an old "
-            "Gazebo release"
+            "uses the file format of Gazebo before version 1.9. Convert it with `gz sdf -k` from "
+            "an old Gazebo release"
         )
     if root.tag not in ("sdf", "model", "world"):
         raise MeshFileError(
-            f"is an XML file, but not SDFormat. Its root element is <{root.tag[:40]}>"
+            f"is an XML file, but not an SDFormat file. Its root element is <{root.tag[:40]}>"
         )
     notes = Notes()
     allowance = Allowance(len(data), _ADVICE)

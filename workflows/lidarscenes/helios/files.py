@@ -59,8 +59,9 @@ class Assets:
             if is_inside(file, self._allowed):
                 return
             raise LidarError(
-                f"the survey names the file {printable(name)!r}, which is not in its folder or one "
-                "above it. Name a folder that contains the file with --assets DIR."
+                f"the survey refers to the file {printable(name)!r}, which is neither in its "
+                "folder nor in a parent folder. Pass a folder that contains the file with "
+                "--assets DIR."
             )
 
     def file(self, name: str) -> Path:
@@ -73,8 +74,8 @@ class Assets:
                 self.check(folder / name, name)
                 return folder / name
         raise LidarError(
-            f"the file {name!r} is neither in the folder of the survey nor in a folder above it. "
-            "Name the folder that its path starts from with --assets DIR."
+            f"the file {name!r} is neither in the folder of the survey nor in a parent folder. "
+            "Pass the folder to which its path is relative with --assets DIR."
         )
 
     def asset(self, reference: str, kind: str, home: Path) -> Asset:
@@ -120,9 +121,9 @@ def _root(path: Path) -> Element:
 
 
 def read(path: Path) -> bytes:
-    """Return the content of a plain file.
+    """Read a regular file completely.
 
-    Raises LidarError for a larger file than the memory holds.
+    Raises LidarError if the file does not fit into memory.
     """
     with explained(f"{path} cannot be read"), prefixed(path):
         return read_input(path)

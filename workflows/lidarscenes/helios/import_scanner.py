@@ -84,7 +84,7 @@ def import_scanner(survey: Path, folder: Path, assets: Sequence[Path]) -> list[s
     lines = [line for scanner in scanners.values() for line in unsupported_features(scanner)]
     settings = _settings(files, reference.file, element)
     if settings is None:
-        lines.append("missing <scannerSettings> (the highest rates are used)")
+        lines.append("scanners without <scannerSettings> (the highest rates are used)")
         settings = _highest_rates(first)
     devices = {name: device(scanner, settings) for name, scanner in scanners.items()}
     sensors = _merged(devices)
@@ -114,7 +114,7 @@ def _element(files: Assets, reference: _Reference) -> Element:
     if len(elements) > 1:
         names = [*by_id]
         raise LidarError(
-            f"it has {len(elements)} scanners. Name one, for example "
+            f"it has {len(elements)} scanners. Select one, for example "
             f"{reference.file.name}#{names[0]}. Its scanners are {listed(names, _MAX_NAMES)}."
         )
     return elements[0]

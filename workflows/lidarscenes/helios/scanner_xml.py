@@ -126,7 +126,7 @@ def device(scanner: HeliosScanner, settings: dict[str, str]) -> Device:
     supported = scanner.values.get("pulseFreqs_Hz", "").split(",")[0] or "0"
     pulse_hz = number({"pulseFreq_hz": supported} | settings, "pulseFreq_hz", 0)
     if pulse_hz <= 0:
-        raise LidarError(f"{scanner.name} has no pulseFreq_hz above 0.")
+        raise LidarError(f"{scanner.name} must have a pulseFreq_hz above 0.")
     optics = scanner.values.get("optics", "")
     if optics not in ("rotating", *_OPTICS):
         raise LidarError(
@@ -391,7 +391,7 @@ def _cone(scanner: HeliosScanner, settings: dict[str, str], pulse_hz: float) -> 
     """Return a sensor with a rotating wedge (Palmer), at its greatest rate, as in HELIOS++."""
     rate_hz = scanner.number("scanFreqMax_Hz")
     if rate_hz <= 0:
-        raise LidarError(f"{scanner.name} has no scanFreqMax_Hz above 0.")
+        raise LidarError(f"{scanner.name} must have a scanFreqMax_Hz above 0.")
     beams = {"elevation_deg": [clean(90 - _half_angle_deg(scanner, settings))]}
     return {"firing_us": _exact_us(1, pulse_hz), "rate_hz": rate_hz, "beams": beams}, _CONE
 
@@ -440,7 +440,7 @@ def _half_angle_deg(scanner: HeliosScanner, settings: dict[str, str]) -> float:
     max_deg = scanner.number("scanAngleMax_deg")
     half_deg = min(max(number(settings, "scanAngle_deg", 0), 0), max_deg) or max_deg
     if half_deg <= 0:
-        raise LidarError(f"{scanner.name} has no scanAngleMax_deg above 0.")
+        raise LidarError(f"{scanner.name} must have a scanAngleMax_deg above 0.")
     return half_deg
 
 

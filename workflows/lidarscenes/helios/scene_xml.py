@@ -248,7 +248,9 @@ class HeliosScene:
                 if rows:  # micrometers and per cent
                     lengths, shares = np.array(sorted((float(x), float(y)) for x, y in rows)).T
                     return float(np.interp(wavelength_nm / 1000, lengths, shares) / 100)
-        self.unread.append(f"the missing spectrum {name!r} (a reflectance of 0.5 is used)")
+        self.unread.append(
+            f"the spectrum {name!r}, which is missing (a reflectance of 0.5 is used)"
+        )
         return None
 
     def left_out(self) -> list[str]:
@@ -263,7 +265,7 @@ class HeliosScene:
         lines += self.unread
         if self._missing:
             positions = "; ".join(sorted(self._missing))
-            lines.append(f"onGround where there is no ground, at {positions} (z is 0)")
+            lines.append(f"onGround at positions without ground, {positions} (z is 0)")
         return lines
 
 

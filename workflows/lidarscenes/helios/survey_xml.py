@@ -141,12 +141,12 @@ class _Import:
             raise LidarError("no leg has an active scanner.")
         if len(self._sensors) > MAX_SENSORS:
             raise LidarError(
-                f"its active legs and channels make {len(self._sensors)} sensors, but a scenario "
-                f"can have at most {MAX_SENSORS}."
+                f"its active legs and channels require {len(self._sensors)} sensors, but a "
+                f"scenario can have at most {MAX_SENSORS}."
             )
         self._materials = self.scene.materials(self._first.number("wavelength_nm", 1064))
         if element.get("legRandomOffset", "false") in ("true", "1"):
-            self._notes.append("legRandomOffset (legs have their stated positions)")
+            self._notes.append("legRandomOffset (legs are at their specified positions)")
         if number(element, "numRuns", 1) > 1:
             self._notes.append("numRuns (a single run is simulated)")
         if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:

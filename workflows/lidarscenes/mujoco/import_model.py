@@ -258,6 +258,6 @@ def _differences(model: Any, groups: dict[_Group, list[int]]) -> list[str]:
         numbers = ", ".join(map(str, further))
         lines.append(
             f"rangefinder hits on geoms of {'groups' if len(further) > 1 else 'group'} {numbers} "
-            "(to get them, set groups in scene.files)"
+            "(to include them, set groups in scene.files)"
         )
     return lines

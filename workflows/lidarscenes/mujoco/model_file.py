@@ -70,7 +70,7 @@ class MujocoOptions:
     ] = None
     groups: Annotated[
         Several[Annotated[int, Field(ge=0, le=5)]],
-        about("groups of the geoms that are read (MuJoCo models only)"),
+        about("geom groups that are read (MuJoCo models only)"),
     ] = (0, 1, 2)
     exclude: Annotated[
         Several[Text], about("bodies and geoms that are not read (MuJoCo models only)")
@@ -90,7 +90,8 @@ def read_mjcf(data: bytes, path: Path, options: ReadOptions) -> Content:
     if not content.meshes and not content.skipped:
         groups = tuple(options.own.groups)
         raise MeshFileError(
-            f"contains nothing that a lidar can detect in the groups {groups}. Set groups"
+            f"contains nothing that a lidar can detect in the groups {groups}. Select other "
+            "groups with `groups`"
         )
     return content
 

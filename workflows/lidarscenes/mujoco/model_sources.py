@@ -27,7 +27,7 @@ _OTHER_ROOTS = {  # {root element of other XML files: advice}
     "sdf": "is a Gazebo world. Change its extension to .sdf",
     "document": "is not a MuJoCo model but may be a HELIOS++ survey. Convert it with "
     "`lidarpool import`",
-    "fcd-export": "is not a MuJoCo model but SUMO floating car data. Name it in traffic.file of a "
+    "fcd-export": "is not a MuJoCo model but SUMO floating car data. Set it as traffic.file in a "
     "scenario",
 }
 

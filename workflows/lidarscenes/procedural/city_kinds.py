@@ -245,7 +245,7 @@ def regular(sides: int, radius: float) -> Floats:
 
 
 def box(width: float, depth: float, height: float) -> Solid:
-    """Return a box that stands on the plane z = 0."""
+    """Return a box whose bottom face lies in the plane z = 0."""
     return loft(rectangle(width, depth), [(0, 0), (height, 0)])
 
 

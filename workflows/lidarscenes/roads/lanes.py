@@ -128,7 +128,7 @@ class LaneSection:
         numbers = [lane.number for lane in lanes]
         if len(set(numbers)) < len(numbers):
             raise MeshFileError(
-                "contains <laneSection> with two lanes of the same id. Correct the ids"
+                "contains a <laneSection> in which two lanes have the same id. Correct the ids"
             )
         lanes.sort(key=lambda lane: abs(lane.number))
         self.lanes = {side: [lane for lane in lanes if lane.side == side] for side in (1, -1)}

@@ -74,7 +74,7 @@ def read_xodr(data: bytes, path: Path, options: ReadOptions) -> Content:
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "OpenDRIVE":
         raise MeshFileError(
-            f"is an XML file, but not OpenDRIVE. Its root element is <{root.tag[:40]}>"
+            f"is an XML file, but not an OpenDRIVE file. Its root element is <{root.tag[:40]}>"
         )
     header = root.find("header")
     if header is not None and number(header, "revMajor", 1.0) > 1:

@@ -205,8 +205,8 @@ class PlanTable:
         distances = np.append(0, np.add.accumulate(lengths))
         if not (0 < distances[-1] < np.inf and speeds.min() > _MIN_SPEED * speeds.max()):
             raise MeshFileError(
-                f"contains <{shape.tag}> with zero length or with a point where its speed is "
-                "zero. Correct its parameters"
+                f"contains a <{shape.tag}> that has zero length or a point where its derivative "
+                "is zero. Correct its parameters"
             )
         if is_normalized:  # the end of the parameters is the end of the length
             distances = distances * (length / distances[-1])

@@ -42,7 +42,7 @@ def placed(points: Floats, origin: Floats, turn: Floats) -> Floats:
 
 
 def box(size: ArrayLike, origin: Floats, turn: Floats, material: str) -> Piece:
-    """Return a box with the given size that stands at the origin."""
+    """Return a rotated box of the given size whose bottom face is centered at `origin`."""
     size = np.maximum(size, MIN_SIZE_M)
     return Piece(placed(_CORNERS * size, origin, turn), _BOX, material=material)
 

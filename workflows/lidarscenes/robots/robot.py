@@ -85,21 +85,23 @@ class Joint:
 class Robot:
     """Robot with links and joints, as read by `load_robot`.
 
-    Values of joints are radians or meters. `joints` of the methods are a table (a file with a
-    header), or a mapping: of a joint's name to its value, or, with time_s, to its values at these
-    seconds by the trajectory's clock. Values in between are linear in time. A joint without values
-    follows the joint that it mimics, else it is at zero, or at its limit nearest to zero.
+    Joint values are angles in radians or displacements in meters. The methods accept `joints` as a
+    table file with a header, or as a mapping of joint names to values. To describe a motion, add
+    the key `time_s` with times in seconds, according to the clock of the trajectory, and pass one
+    value per time for each joint. Values are interpolated linearly in time. A joint without values
+    follows the joint that it mimics. Otherwise, it is at zero, or at the limit that is closest to
+    zero.
 
     Attributes
     ----------
     name
         Name of the robot.
     links
-        Names of the links: the root first, each after its parent.
+        Names of the links. The root comes first, and each link comes after its parent.
     joints
-        {link: joint that holds the link}, of all links but the root.
+        {link: joint that connects the link to its parent}, for all links except the root.
     meshes
-        {link: mesh in the link's frame}, of the links with a visual mesh.
+        {link: mesh in the frame of the link}, for all links with a visual mesh.
     """
 
     __signature__ = ReadableSignature()
@@ -114,7 +116,7 @@ class Robot:
 
     @property
     def summary(self) -> str:
-        """Description of the numbers of links, movable joints and triangles."""
+        """Text with the numbers of links and triangles, and the movable joints."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
         return f"{plural(len(self.links), 'link')}, {plural(triangles, 'triangle')}; " + (
@@ -145,13 +147,12 @@ class Robot:
     ) -> Trajectory:
         """Return the trajectory of a link, given the trajectory of the root link.
 
-        `joints` are values of joints (`Robot`); `ignore` are names of columns of a table of
-        joints to leave out, with * and ?; `time_unit` is as for `actors`.
+        `joints`, `ignore` and `time_unit` are as for `actors`.
 
         Raises
         ------
         LidarError
-            If the robot has no such link, or the joints cannot be used.
+            If the robot has no such link, or if the joint values cannot be used.
         """
         if link not in self.joints and link != self.links[0]:
             raise LidarError(f"{self.name} has no link {link!r}.{name_hint(link, self.links)}")
@@ -170,31 +171,32 @@ class Robot:
         time_unit: TimeUnit | None = None,
         tell: Callable[[str], None] = _log.warning,
     ) -> tuple[Actor, ...]:
-        """Return an actor for each link that is moved by a joint, including links fixed to it.
+        """Return an actor for each rigid body, which is a group of links fixed to each other.
 
         Parameters
         ----------
         trajectory
             Trajectory of the root link.
         joints
-            Values of joints (`Robot`).
+            Joint values, as a table file or a mapping. See `Robot`.
         name
-            Name of the robot. Actors are called NAME/LINK, by the first link with triangles.
+            Name of the robot. By default, it is the name in the robot's file. Each actor is named
+            NAME/LINK, where LINK is the first link of the body with triangles.
         without
-            Links to leave out.
+            Names of links to omit.
         ignore
-            Names of columns of a table of joints to leave out, with * and ?.
+            Names of columns to ignore in a table file, with the wildcards * and ?.
         time_unit
-            Unit of the times of a file, "s", "ms", "us" or "ns", if it is not the unit that its
-            header states. Without `time_unit`, times of 1e11 s and more, and times that span more
-            than a year, are refused.
+            Unit of the times in a table file ("s", "ms", "us" or "ns"), if it differs from the unit
+            that the header states. Without `time_unit`, times of 1e11 s or more, and times that
+            span more than a year, are rejected.
         tell
-            Called with a line on values beyond limits.
+            Function that is called with a warning for each joint whose values exceed its limits.
 
         Raises
         ------
         LidarError
-            If the joints cannot be used.
+            If the joint values cannot be used.
         """
         times_s, values = self._values(joints, ignore, time_unit, tell)
         robot_name = self.name if name is None else name
@@ -280,7 +282,7 @@ class Robot:
         if isinstance(joints, (str, Path)):
             table = self._read_values(Path(joints), ignore, time_unit)
         elif time_unit is not None:
-            raise LidarError("time_unit applies only to a joint file. Give time_s in seconds.")
+            raise LidarError("time_unit applies only to a joint file. Specify time_s in seconds.")
         elif joints is not None:
             table = {name: as_array(name, value).reshape(-1) for name, value in joints.items()}
         times = table.pop("time_s", np.zeros(1))
@@ -302,7 +304,7 @@ class Robot:
             if value.shape != times.shape or not np.isfinite(value).all():
                 raise LidarError(
                     f"The values of joint {name!r} must be finite, with one value for each time_s "
-                    f"({len(times)}), or a single value without time_s. It has {value.size}."
+                    f"({len(times)}), or a single value without time_s, but it has {value.size}."
                 )
         if not (len(times) and np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise LidarError("The values of time_s must be finite and strictly increasing.")
@@ -372,7 +374,7 @@ class Robot:
             ) from error
         if len(table) < 2:
             raise LidarError(
-                f"{path} has no column for a movable joint. Name its columns like the joints of "
+                f"{path} has no column for a movable joint. Name its columns after the joints of "
                 f"{self.name}, for example {', '.join(self.moving[:3])}."
             )
         return table

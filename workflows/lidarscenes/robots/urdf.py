@@ -58,32 +58,34 @@ def load_robot(
 ) -> Robot:
     """Read a robot from a URDF file, with the visual meshes of its links.
 
-    Mesh files are read from the robot's package only: the folder with a package.xml, at most five
-    above the file, or, without a package.xml, the file's own folder; and from `assets`. A name that
-    begins with package://NAME is looked for in `assets`, and in folders with a package.xml that are
-    called NAME, or whose package.xml has that name, beside the file and at most five folders above.
-    As in RViz, a mesh keeps the axes of its file, even if the file states an up-axis, and a .dae
-    its unit.
+    Mesh files are read only from the robot's package, from other packages that the file names, and
+    from `assets`. The robot's package is the closest folder with a package.xml, which is the folder
+    of the file or at most five levels above it. Without a package.xml, it is the folder of the
+    file. For a mesh name that begins with package://NAME, the package is searched for in `assets`,
+    in the folder of the file, and in up to five folders above it. Its folder must be called NAME,
+    or its package.xml must state this name. Packages outside `assets` and the robot's package must
+    have a package.xml. As in RViz, a mesh keeps the axes of its file, even if the file states an up
+    axis, and a .dae file keeps its unit.
 
     Parameters
     ----------
     path
-        A .urdf file; a .xacro has to be expanded before.
+        A .urdf file. A .xacro file must be expanded first.
     opacity
-        Use of transparent textures (`load_meshes`).
+        How to use transparent textures, as for `load_meshes`.
     colors, materials
-        Whether colors and names of materials are read. A material of the URDF applies to shapes,
-        and to meshes without colors, or without materials.
+        Whether to read colors and names of materials. A material of the URDF file applies to
+        shapes, and to meshes that have no colors or materials of their own.
     assets
-        A further folder whose mesh files, and the files that these name, may be read: a
-        package, or a folder of packages.
+        Additional folder from which mesh files, and the files that they refer to, may be read. It
+        can be a package or a folder of packages.
     tell
-        Called with a line on content that is left out.
+        Function that is called with a line of text for content that is omitted.
 
     Raises
     ------
     LidarError
-        If the file or a mesh cannot be read, or the joints do not make a tree.
+        If the file or a mesh cannot be read, or if the joints do not form a tree.
     """
     path = Path(path)
     root, size = _read_root(path)
@@ -399,8 +401,8 @@ class _LinkMeshes:
         if not is_inside(path, (package, *self.assets)):
             kind = "package" if _is_package(package) else "folder of the .urdf file"
             raise LidarError(
-                f"its mesh {name[:200]!r} is outside the {kind}, {package}. Name a folder that "
-                "contains the mesh as assets."
+                f"its mesh {name[:200]!r} is outside the {kind}, {package}. Set `assets` "
+                "to a folder that contains the mesh."
             )
         if path not in self._files:
             # Like RViz, which lets assimp ignore Collada's up_axis
@@ -443,15 +445,15 @@ class _LinkMeshes:
             if inner.is_dir() and (folder in self.assets or _is_package(inner)):
                 return inner / file, inner.resolve()
         raise LidarError(
-            f"its mesh {name[:200]!r} is in a package that was not found. Name the folder "
-            f"{package[:80]!r}, or a folder that contains it, as assets. Packages beside or "
-            "above the .urdf file are found if they contain a package.xml."
+            f"its mesh {name[:200]!r} is in a package that was not found. Set `assets` to "
+            f"the folder {package[:80]!r} or a folder that contains it. Packages beside or above "
+            "the .urdf file are found if they contain a package.xml."
         )
 
     def _without_package(self, name: str, scheme: str, location: str) -> str:
         """Return the error of a URI without the name of a package: package:///my_robot/leg.dae."""
         parts = [part for part in location.split("/") if part not in _NO_FOLDERS]
-        start = f"its mesh {name[:200]!r} names no package. Write"
+        start = f"its mesh {name[:200]!r} does not specify a package. Write"
         if len(parts) < 2:
             folder = self.path.resolve().parent.name
             return (
@@ -459,9 +461,9 @@ class _LinkMeshes:
                 "of the .urdf file."
             )
         return (
-            f"{start} {scheme}://{'/'.join(parts)[:200]}, and name the folder {parts[0][:80]!r}, "
-            "or a folder that contains it, as assets. This is not necessary for packages beside "
-            "or above the .urdf file."
+            f"{start} {scheme}://{'/'.join(parts)[:200]}, and set `assets` to the folder "
+            f"{parts[0][:80]!r} or a folder that contains it. Packages beside or above the .urdf "
+            "file do not need `assets`."
         )
 
 

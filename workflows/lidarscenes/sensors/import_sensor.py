@@ -52,7 +52,7 @@ def import_sensor(path: Path, folder: Path, assets: Sequence[Path]) -> list[str]
     rays = sensor.rays
     if rays.times_ns is None:
         lines.append(
-            f"missing firing times ({len(rays):,} rays are fired in {1 / rays.rate_hz:g} s)"
+            f"files without firing times ({len(rays):,} rays are fired in {1 / rays.rate_hz:g} s)"
         )
     ray_npz.write(folder / _RAYS_FILE, rays.timed(), lines)
     head = [

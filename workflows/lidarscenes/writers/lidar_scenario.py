@@ -24,26 +24,26 @@ _ZERO = 1e-9  # numbers below are roundings
 
 
 class Lidar(NamedTuple):
-    """A lidar of a world.
+    """A lidar in a world of another program.
 
     Attributes
     ----------
     name
-        Its name, which no other lidar of the world has.
+        Name of the lidar, which is unique in the world.
     sensor
-        Its short name.
+        Short name of the lidar, which several lidars can share.
     model
         Name of the model that carries the lidar.
     data
-        Content of a data file of the sensor.
+        Content of the data file for the sensor.
     range_m
-        Shortest and longest range, meters; the longest may be infinite.
+        Minimum and maximum range in meters. The maximum may be infinite.
     matrix, model_matrix
-        From the frames of the lidar and of the model to the world, (4, 4).
+        Transforms from the frames of the lidar and of the model to the world. Shape (4, 4).
     left_out
-        What is not as in the other program, a clause each.
+        Differences from the other program, as one clause each.
     unseen
-        Patterns of the names of the objects that the lidar does not see.
+        Name patterns of the objects that the lidar does not see.
     """
 
     name: str

@@ -81,8 +81,8 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
             step = np.spacing(np.float32(np.abs(scene.origin).max()))
             x, y, _ = scene.origin
             raise LidarError(
-                "A .ply file stores coordinates in single precision, which gives steps of "
-                f"{step:.2g} m at x {x:.0f}, y {y:.0f}. Write a .glb or .obj file instead."
+                "A .ply file stores coordinates in single precision, which limits their resolution "
+                f"to {step:.2g} m at x {x:.0f}, y {y:.0f}. Write a .glb or .obj file instead."
             )
         drawn = SimplifiedScene.from_scene(scene, scene.triangles).scene
         joined = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)

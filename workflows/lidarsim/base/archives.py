@@ -258,7 +258,7 @@ def read_npy(content: bytes | memoryview, name: str) -> AnyArray:
     kind, shape, is_fortran, start = _array_type(content, name)
     data = bytearray(memoryview(content)[start:])
     if len(data) != math.prod(shape) * kind.itemsize:
-        raise ValueError(f"{name} does not have the length of its array")
+        raise ValueError(f"the size of {name} does not match its header")
     array = np.frombuffer(data, kind)
     return array.reshape(shape[::-1]).T if is_fortran else array.reshape(shape)
 

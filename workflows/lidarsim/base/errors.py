@@ -30,7 +30,7 @@ class LidarError(Exception):
     shortened in the middle, and long lists of names are wrapped.
 
     If a file does not exist, the error is also a FileNotFoundError. If an argument does not match
-    the annotation of its parameter, it is also a ValueError.
+    the annotation of its parameter, the error is also a ValueError.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -125,9 +125,9 @@ def unreadable(subject: object, error: Exception, advice: str = "") -> str:
     >>> unreadable("vlp16.yaml", KeyError("lasers"))
     "vlp16.yaml cannot be read: 'lasers' is missing."
     >>> unreadable("a.stl", CutShortError("line 7 is the last"), "export it again")
-    'a.stl is cut short: line 7 is the last. Export it again.'
+    'a.stl is truncated: line 7 is the last. Export it again.'
     """
-    failure = "is cut short" if isinstance(error, CutShortError) else "cannot be read"
+    failure = "is truncated" if isinstance(error, CutShortError) else "cannot be read"
     message = f"{subject} {failure}: {reason_of(error)}."
     return f"{message} {as_sentence(advice)}" if advice else message
 

@@ -34,11 +34,11 @@ def need(package: str, extra: str, purpose: str) -> None:
 
     Raises LidarError if not.
 
-    `purpose` starts the error: «clouds are read».
+    `purpose` is the subject of the error message, such as "Reading clouds".
     """
     if find_spec(package) is None:
         raise LidarError(
-            f"{purpose} by {package}, which is not installed. Run "
+            f"{purpose} requires {package}, which is not installed. Run "
             f"{install_command(f'lidarpool[{extra}]')}."
         )
 

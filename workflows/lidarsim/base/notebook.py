@@ -23,10 +23,11 @@ def cell_display() -> Any:
 
 
 def draw_with(drawers: Mapping[str, str]) -> None:
-    """Draw instances of classes by functions from now on, {class: "module:function"}.
+    """Register functions that draw objects in notebooks.
 
-    A function gets an instance and returns a PNG, or None if there is nothing to draw. Its module
-    is imported when a notebook first shows an instance.
+    `drawers` maps class names to functions, which are specified as "module:function". A function
+    receives an instance of the class and returns a PNG, or None if there is nothing to draw. Its
+    module is imported when a notebook displays such an instance for the first time.
     """
     _drawers.update(drawers)
 

@@ -126,8 +126,8 @@ class Storage:
                 break
             if ancestor.is_symlink():
                 raise LidarError(
-                    f"{ancestor} is a symbolic link. Nothing behind a link in {self.named} is "
-                    "opened, written or deleted. Replace the link with its target."
+                    f"{ancestor} is a symbolic link, but links in {self.named} are not followed. "
+                    "Replace the link with its target."
                 ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # for every caller
         return path
 

@@ -232,7 +232,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
         reason = str(error)
         if len(line) > csv.field_size_limit():
             reason = f"a cell has more than {csv.field_size_limit():,} characters"
-        raise ValueError(f"one of its lines is not part of a table: {reason}") from error
+        raise ValueError(f"one of its lines cannot be parsed as a table row: {reason}") from error
     return [cell.strip().strip('"') for cell in cells]
 
 
@@ -504,8 +504,8 @@ class _ColumnReader:
             if earlier_cell == cell:
                 raise ValueError(f"its column {printable(cell)!r} occurs twice")
             raise ValueError(
-                f"its columns {printable(earlier_cell)!r} and {printable(cell)!r} both mean "
-                f"{quantity.name}. Ignore one of them, for example with `{_ignoring([cell])}`"
+                f"its columns {printable(earlier_cell)!r} and {printable(cell)!r} both correspond "
+                f"to {quantity.name}. Ignore one of them, for example with `{_ignoring([cell])}`"
             )
         self.assigned[quantity.name] = index, unit
 
@@ -593,7 +593,11 @@ def _numbers(
         for number, cells in _rows_of(lines, header):
             for name, index in names.items():
                 if not _is_finite(cells[index]):
-                    alternative = "" if name in required_names else ". Otherwise, ignore the column"
+                    alternative = (
+                        ""
+                        if name in required_names
+                        else (". Correct the value, or ignore the column")
+                    )
                     raise ValueError(
                         f"its column {printable(header.cells[index])!r} contains "
                         f"{printable(cells[index])!r} in line {number}. Each row must have a "

@@ -38,7 +38,10 @@ def into_axes(vectors: Floats, rotations: Floats | None) -> Floats:
 
 
 def products(first: Floats, second: Floats) -> Floats:
-    """Return the scalar products (...) of vectors (3, ...)."""
+    """Return the dot products of two arrays of vectors.
+
+    Both arrays have shape (3, ...), and the result has shape (...).
+    """
     x, y, z = first
     a, b, c = second
     product = x * a

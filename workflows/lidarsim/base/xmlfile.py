@@ -81,7 +81,7 @@ def parse_pieces(parser: expat.XMLParserType, pieces: Iterable[bytes]) -> Iterat
         parser.Parse(piece)
         count += len(piece)
         if count - parser.CurrentByteIndex > MAX_TAG_BYTES:
-            raise ValueError(f"it has a tag or comment of more than {bytes_of(MAX_TAG_BYTES)}")
+            raise ValueError(f"it contains a tag or comment longer than {bytes_of(MAX_TAG_BYTES)}")
         yield
     parser.Parse(b"", True)
     yield

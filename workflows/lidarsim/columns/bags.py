@@ -61,7 +61,7 @@ def open_bag(path: Path, name: str) -> Reader:
 
     Raises LidarError, which begins with `name`, if that is impossible.
     """
-    need("rosbags", "ros", f"{name} is read")
+    need("rosbags", "ros", f"Reading {name}")
     from rosbags.rosbag2 import ReaderError
 
     from .closing_bag import ClosingBag
@@ -131,8 +131,8 @@ def point_columns(data: bytes) -> dict[str, AnyArray]:
             )
         if field.offset + field.count > message.point_step:  # each number has a byte or more
             raise ValueError(
-                f"its field {printable(field.name)!r} has {field.count:,} numbers from byte "
-                f"{field.offset:,} on, but a point has {message.point_step:,} bytes"
+                f"its field {printable(field.name)!r} has {field.count:,} numbers starting at "
+                f"byte {field.offset:,}, but a point has only {message.point_step:,} bytes"
             )
     numbers = [
         (field.name if field.count == 1 else f"{field.name}_{index}", field, index)

@@ -73,27 +73,28 @@ class CloudDisplay:
 class Cloud(CloudDisplay):
     """Point cloud of a survey, ordered by scan and ray.
 
-    Read a column with ``cloud["channel"]``, or with ``cloud.scan`` if there is no attribute of that
-    name. Select points with ``cloud[:100]``, ``cloud[mask]`` or ``cloud[indices]``.
-    ``np.asarray(cloud)`` returns the positions as float64 (n, 3).
+    Read a column with ``cloud["channel"]``, or as an attribute such as ``cloud.scan`` if the class
+    has no attribute with that name. Select points with ``cloud[:100]``, ``cloud[mask]`` or
+    ``cloud[indices]``. ``np.asarray(cloud)`` returns the positions as a float64 array.
 
     Parameters
     ----------
     positions
-        float32 or float64 (n, 3): world coordinates in meters.
+        World coordinates in meters. Shape (n, 3), float32 or float64.
     columns
-        {name: (n,)}: the other columns, from `lidarsim.columns.table` or custom.
+        Mapping from column names to values of shape (n,). The names are those in
+        `lidarsim.columns.table`, or names of custom columns.
     custom_columns
         Descriptions of the columns that are not in `lidarsim.columns.table`.
     sweeps
-        Function that returns the sweeps of the survey, which `save_cloud` requires for some
-        formats. The clouds of a `Result` have such a function.
+        Function that returns the sweeps of the survey. `save_cloud` requires it for some formats.
+        Clouds of a `Result` provide this function.
 
     Raises
     ------
     LidarError
-        If the lengths differ, a position is not finite, or a value does not fit the type of its
-        column.
+        If a column and the positions differ in length, a position is not finite, or a value does
+        not fit the type of its column.
     """
 
     positions: AnyFloats
@@ -148,9 +149,9 @@ class Cloud(CloudDisplay):
             positions = np.empty(0)
         if positions.ndim != 2:
             raise LidarError(
-                "The points of a cloud are selected by a slice such as cloud[:100], a mask or a "
-                "list of row numbers, and a column by its name such as cloud['range'], not by "
-                f"{shown(key)}."
+                f"A cloud cannot be indexed with {shown(key)}. Select points with a slice such as "
+                "cloud[:100], a mask or a list of row numbers, and a column with its name, such "
+                "as cloud['range']."
             )
         columns = {name: array[rows] for name, array in self.columns.items()}
         return Cloud(positions, columns, self.custom_columns, self.sweeps)
@@ -166,7 +167,7 @@ class Cloud(CloudDisplay):
 
     @property
     def table(self) -> tuple[Column, ...]:
-        """The columns apart from the positions, in the order in which files store them."""
+        """Descriptions of all columns except positions and waveforms, in file order."""
         known_columns = TABLE | {column.name: column for column in self.custom_columns}
         return tuple(
             known_columns.get(name) or Column(name, array.dtype.str, "", "")
@@ -176,7 +177,7 @@ class Cloud(CloudDisplay):
 
     @property
     def by_name(self) -> dict[str, AnyArray]:
-        """Coordinates and columns by name, without waveforms."""
+        """Mapping from names to coordinates and columns, without waveforms."""
         axes = dict(zip("xyz", self.positions.T, strict=True))
         return axes | {column.name: self[column.name] for column in self.table}
 
@@ -189,7 +190,10 @@ class Cloud(CloudDisplay):
     def waveforms(self) -> Waveforms:
         """Recorded waveforms of the points.
 
-        Raises LidarError if the survey recorded no waveforms (see `waveform_samples`).
+        Raises
+        ------
+        LidarError
+            If the survey recorded no waveforms (see `waveform_samples`).
         """
         if not self.has_waveforms:
             raise LidarError(
@@ -200,14 +204,24 @@ class Cloud(CloudDisplay):
 
     @property
     def bounds(self) -> AnyFloats:
-        """Minimum and maximum coordinates in meters, or zeros for an empty cloud. Shape (2, 3)."""
+        """Minimum and maximum coordinates in meters.
+
+        The shape is (2, 3). All values are zero if the cloud is empty.
+        """
         if not len(self):
             return np.zeros((2, 3), self.positions.dtype)
         return np.stack([self.positions.min(axis=0), self.positions.max(axis=0)])
 
     @checked
     def to_dataframe(self, library: Literal["pandas", "polars"] = "pandas") -> Any:
-        """Return a pandas or polars DataFrame with all columns.
+        """Convert the cloud to a pandas or polars DataFrame.
+
+        The DataFrame contains the coordinates and all columns except waveforms.
+
+        Parameters
+        ----------
+        library
+            Library of the DataFrame.
 
         Raises
         ------
@@ -218,16 +232,22 @@ class Cloud(CloudDisplay):
         return import_module(library).DataFrame(self.by_name)
 
     def head(self, points: int = SHOWN_POINTS) -> Cloud:
-        """Return the first points, or the entire cloud if it is smaller."""
+        """Return the first points, or the entire cloud if it has fewer points."""
         return self[:points]
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
-        """Yield the points in order, from row `first` on, as views of at most `points` points."""
+        """Yield consecutive slices of the cloud, starting at row `first`.
+
+        Each slice has at most `points` points and is a view of the cloud.
+        """
         for start in range(first, len(self), points):
             yield self[start : start + points]
 
     def row_of(self, scan: int) -> int:
-        """Return the row of the first point of a scan, for points in the order of scans."""
+        """Return the row of the first point in a scan.
+
+        The points must be ordered by scan.
+        """
         return int(np.searchsorted(self["scan"], scan))
 
     @classmethod

@@ -121,7 +121,7 @@ def mapped_rows(path: Path) -> Records:
             # An empty file cannot be mapped.
             return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
     except ValueError as error:
-        raise LidarError(f"{path} is not a point cloud of lidarpool: {error}.") from error
+        raise LidarError(f"{path} is not a point cloud written by lidarpool: {error}.") from error
 
 
 def _parse_header(text: str) -> tuple[int, np.dtype[np.void]]:

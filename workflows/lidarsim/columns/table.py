@@ -35,29 +35,32 @@ _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 @dataclass(frozen=True)
 @checked_fields
 class Column:
-    """A column of a point cloud, with one value per point.
+    """Description of a point cloud column, which has one value per point.
 
     Parameters
     ----------
     name
-        A Python identifier. Files use it as well, unless `file_name` is set.
+        Name of the column, which must be a Python identifier. Files use this name as well, unless
+        `file_name` is set.
     dtype
         NumPy dtype of the values, for example "float32".
     unit
-        Unit of the values; "" if they have no unit.
+        Unit of the values, or "" if they have no unit.
     meaning
         Description in a few words, without a period.
     source
-        Name of an attribute of `lidarsim.simulator.points.batch_points.BatchPoints`, the returns in
-        a batch, or a function that computes the column from this object as an array of shape
-        (n,). The function runs on the worker that casts the rays. By default, the attribute with
-        the name of the column is used.
+        Source of the values. Either the name of an attribute of
+        `lidarsim.simulator.points.batch_points.BatchPoints`, which contains the returns in a batch,
+        or a function that receives this object and returns an array of shape (n,). The function
+        runs on the worker that casts the rays. By default, the attribute with the same name as the
+        column is used.
     coordinates
         Coordinate system of the values: "world", "sensor", or "" if the values are not coordinates.
     kind
-        How the values are displayed: "number" uses a color scale, and "label" one color per value.
+        How the values are displayed: "number" uses a color scale, and "label" uses one color per
+        value.
     file_name
-        Usual name of the column in files.
+        Name of the column in files, if it differs from `name`.
     scale
         Color scale for numbers: "linear" for positions, angles, times and counts, or "logarithmic"
         for quantities that vary by large factors, such as energies.
@@ -65,7 +68,8 @@ class Column:
     Raises
     ------
     LidarError
-        If the name is not an identifier, or if NumPy does not support the dtype.
+        If the name is not an identifier, or if the dtype is neither an integer nor a floating-point
+        type.
     """
 
     name: str
@@ -98,9 +102,15 @@ class Column:
         return self.file_name or self.name
 
     def make(self, returns: Any) -> AnyArray:
-        """Return the values of this column for the returns of a batch. Shape (n,).
+        """Compute the values of this column for the returns in a batch.
 
-        LidarError if the source has a wrong number of values, or values that do not fit the type.
+        The result has shape (n,) and the dtype of the column.
+
+        Raises
+        ------
+        LidarError
+            If the source does not provide one value per return, or if a value does not fit the
+            dtype.
         """
         source = self.source or self.name
         values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
@@ -125,71 +135,88 @@ class Column:
         return values.astype(dtype, copy=False)
 
 
-SCAN = Column("scan", "int32", "", "scan of the point: a time step at a pose", kind="label")
-X = Column("x", "int32", "m", "position along x, to the east on maps", "cell_x", "world")
-Y = Column("y", "int32", "m", "position along y, to the north on maps", "cell_y", "world")
-Z = Column("z", "int32", "m", "position along z, up", "cell_z", "world")
-CHANNEL = Column(
-    "channel", "uint16", "", "beam of the sensor, the lowest is 0", kind="label", file_name="ring"
+SCAN = Column(
+    "scan", "int32", "", "scan that the point belongs to: one time step at one pose", kind="label"
 )
-OBJECT = Column("object", "int32", "", "object that was hit; -1 for no surface", kind="label")
+X = Column("x", "int32", "m", "x coordinate, east in map coordinates", "cell_x", "world")
+Y = Column("y", "int32", "m", "y coordinate, north in map coordinates", "cell_y", "world")
+Z = Column("z", "int32", "m", "z coordinate, up", "cell_z", "world")
+CHANNEL = Column(
+    "channel", "uint16", "", "beam of the sensor; 0 is the lowest", kind="label", file_name="ring"
+)
+OBJECT = Column(
+    "object",
+    "int32",
+    "",
+    "object that was hit; -1 if the return is not from a surface",
+    kind="label",
+)
 
 AXES = (X, Y, Z)  # in a part: whole multiples of the precision from the scene's local origin
 ALWAYS = (*AXES, CHANNEL, OBJECT)  # columns of every part; `scan` follows from the row
 OPTIONAL = (
-    Column("ray", "uint32", "", "number of the ray within its scan"),
-    Column("time", "int64", "ns", "time of the ray since the survey's start"),
-    Column("azimuth", "float32", "deg", "angle about the sensor's z axis", coordinates="sensor"),
+    Column("ray", "uint32", "", "index of the ray in its scan"),
+    Column("time", "int64", "ns", "time of the ray since the start of the survey"),
     Column(
-        "elevation", "float32", "deg", "angle above the sensor's xy plane", coordinates="sensor"
+        "azimuth", "float32", "deg", "azimuth about the z axis of the sensor", coordinates="sensor"
     ),
-    Column("range", "float32", "m", "distance from the beam's origin", coordinates="sensor"),
+    Column(
+        "elevation",
+        "float32",
+        "deg",
+        "elevation above the xy plane of the sensor",
+        coordinates="sensor",
+    ),
+    Column("range", "float32", "m", "distance from the beam origin", coordinates="sensor"),
     Column(
         "intensity",
         "float32",
         "",
-        "energy received; 1 is a white surface 10 m away at right angles in clear air",
+        "received energy; 1 for a white surface at normal incidence, 10 m away in clear air",
         scale="logarithmic",
     ),
     Column(
         "reflectance",
         "float32",
         "",
-        "intensity without the loss by distance and air: the surface's times cosine of incidence",
+        "intensity corrected for range and attenuation: surface reflectance times the cosine of "
+        "the angle of incidence",
     ),
-    Column("reflectivity", "uint8", "", "reflectance on the scale of the sensor's maker"),
+    Column("reflectivity", "uint8", "", "reflectance on the scale of the sensor manufacturer"),
     Column(
         "signal",
         "uint16",
         "",
-        "counts: 10,000 for an intensity of 1, 65,535 at most",
+        "intensity in counts: 10,000 for an intensity of 1, at most 65,535",
         scale="logarithmic",
     ),
     Column(
         VELOCITY,
         "float32",
         "m/s",
-        "how fast the range grows: negative while it shrinks; NaN of false alarms",
+        "radial velocity: positive if the range increases, negative if it decreases; NaN for "
+        "false alarms",
     ),
     Column(
         "amplitude",
         "float32",
         "",
-        "height of the echo in the waveform, clipped at the saturation of the receiver; of one as "
-        "narrow as the pulse its intensity",
+        "peak of the echo in the waveform, clipped at the receiver saturation; equal to the "
+        "intensity if the echo is as narrow as the pulse",
         scale="logarithmic",
     ),
     Column(
         "pulse_width",
         "float32",
         "ns",
-        "full width at half maximum of the echo; without waveforms the pulse's, 0 for no echo",
+        "full width at half maximum of the echo, or of the pulse if no waveform is simulated; 0 "
+        "if there is no echo",
     ),
     Column(
         "return_number",
         "uint8",
         "",
-        "number among the reported returns of its pulse, from 1",
+        "number of the return among the reported returns of its pulse, starting at 1",
         kind="label",
     ),
     Column("returns", "uint8", "", "number of reported returns of its pulse", kind="label"),
@@ -197,7 +224,7 @@ OPTIONAL = (
         "class",
         "uint16",
         "",
-        "semantic class of the material; 0 for none",
+        "semantic class of the material; 0 if none",
         "semantic_class",
         kind="label",
     ),
@@ -205,7 +232,7 @@ OPTIONAL = (
         "material",
         "int32",
         "",
-        "material of the face in the scene's file; -1 for none",
+        "material of the face in the scene file; -1 if none",
         "material_number",
         kind="label",
     ),
@@ -213,17 +240,25 @@ OPTIONAL = (
         "cause",
         "uint8",
         "",
-        "why the return is there: " + "; ".join(f"{n} {cause}" for n, cause in enumerate(CAUSES)),
+        "cause of the return: " + "; ".join(f"{n} {cause}" for n, cause in enumerate(CAUSES)),
         kind="label",
     ),
-    Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),
+    Column(
+        "sensor",
+        "uint8",
+        "",
+        "index of the sensor on the platform, starting at 0",
+        "sensor_number",
+        kind="label",
+    ),
     Column("triangle", "int32", "", "triangle of the scene that was hit"),
     *(
         Column(
             f"normal_{axis}",
             "float32",
             "",
-            f"{axis} of the surface's unit normal, on the side that was hit; NaN without a surface",
+            f"{axis} component of the unit surface normal on the side that was hit; NaN if there "
+            "is no surface",
             coordinates="world",
             file_name=f"n{axis}",
         )
@@ -233,15 +268,26 @@ OPTIONAL = (
         "incidence_deg",
         "float32",
         "deg",
-        "angle between the ray and the surface's normal, 0 to 90; NaN without a surface",
+        "angle between the ray and the surface normal, 0 to 90; NaN if there is no surface",
     ),
     *(
-        Column(f"origin_{axis}", "float64", "m", f"{axis} of the ray's origin", coordinates="world")
+        Column(
+            f"origin_{axis}",
+            "float64",
+            "m",
+            f"{axis} coordinate of the ray origin",
+            coordinates="world",
+        )
         for axis in "xyz"
     ),
-    Column("red", "uint8", "", "red of the surface, sRGB; what has no color is gray, 188"),
-    Column("green", "uint8", "", "green of the surface, sRGB"),
-    Column("blue", "uint8", "", "blue of the surface, sRGB"),
+    Column(
+        "red",
+        "uint8",
+        "",
+        "red component of the surface color, sRGB; surfaces without a color are gray (188)",
+    ),
+    Column("green", "uint8", "", "green component of the surface color, sRGB"),
+    Column("blue", "uint8", "", "blue component of the surface color, sRGB"),
 )
 COLORS = ("red", "green", "blue")
 

@@ -26,7 +26,7 @@ _ANGLES = 500  # number of angles of leaves in the integrals
 
 LeafAngle = Annotated[
     LeafAngles | Annotated[float, Field(ge=0.05, le=20)],
-    allowed(f"one of {', '.join(NAMES)}, or the ratio of an ellipsoid's axes from 0.05 to 20"),
+    allowed(f"one of {', '.join(NAMES)}, or the axis ratio of an ellipsoid from 0.05 to 20"),
 ]
 
 

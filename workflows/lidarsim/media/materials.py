@@ -92,10 +92,8 @@ def reflectances() -> dict[str, Measured]:
 class Material:
     """Optical properties and semantic class of surfaces.
 
-    If several entries apply to a face, the first one is used.
-
-    An entry selects objects by name, faces by the name of their material in the scene file, or
-    faces by both.
+    A material selects objects by name, faces by the name of their material in the scene file, or
+    faces by both. If several materials apply to a face, the first one is used.
 
     The reflectance is the diffuse reflectance at the wavelength of the sensor. A share of the light
     that is not scattered is reflected specularly. The rest is transmitted, or absorbed if
@@ -111,63 +109,82 @@ class Material:
     objects: Annotated[
         str | Sequence[str] | None,
         written_as(TextOrTexts | None),
-        about("names of objects, with * and ?; by default all", min_length=1),
+        about("names of objects, which may contain * and ? (default: all)", min_length=1),
     ] = None
     reflectance: Annotated[
         UnitShare | Literal["texture"] | None,
         allowed("from 0 to 1, or texture"),
         about(
-            "share of light that is scattered; by default 0.5, for glass and whole mirrors "
-            "0; texture: the luminance of the color that was hit"
+            "fraction of the light that is scattered (default: 0.5, or 0 for glass and perfect "
+            "mirrors); texture uses the luminance of the surface color"
         ),
     ] = None
-    semantic_class: Annotated[SemanticClass, about("value of the column class", alias="class")] = 0
-    retro: Annotated[
-        bool, about("whether light returns in its own direction, as from traffic signs")
-    ] = False
-    transparent: Annotated[Transparent, about("pass: the rest of the light passes through")] = (
-        "none"
+    semantic_class: Annotated[
+        SemanticClass, about("semantic class, which is stored in the column `class`", alias="class")
+    ] = 0
+    retro: Annotated[bool, about("whether the surface is retroreflective, like a traffic sign")] = (
+        False
     )
+    transparent: Annotated[
+        Transparent,
+        about("whether light that is not scattered passes through (pass) or not (none)"),
+    ] = "none"
     specular_reflectance: Annotated[
         UnitShare | Literal["fresnel"] | None,
         allowed("from 0 to 1, or fresnel"),
         about(
-            "share of the rest that is mirrored at right angles, and shows ghosts; grows towards "
-            "grazing angles. 1 for a mirror, 0.04 for paint; fresnel for what light passes",
+            "fraction of the light not scattered that is reflected specularly at normal incidence, "
+            "which causes ghosts; increases toward grazing angles; 1 for a mirror, 0.04 for paint, "
+            "fresnel for materials that transmit light",
             0.04,
         ),
     ] = None
     scale: Annotated[
-        float, about("with reflectance: texture, a factor of the luminance", gt=0, le=100)
+        float, about("factor for the luminance, with `reflectance: texture`", gt=0, le=100)
     ] = 1.0
     spectrum: Annotated[
         str | None,
-        about("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
+        about(
+            "name of a material in the table of measured reflectances; replaces reflectance",
+            "asphalt, dry",
+        ),
     ] = None
     roughness: Annotated[
-        float | None, about("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1)
+        float | None,
+        about(
+            "roughness of a glossy surface, such as paint or metal (default: no gloss)",
+            ge=0.1,
+            le=1,
+        ),
     ] = None
     metalness: Annotated[
-        UnitShare, about("with roughness: 1 for metals, which scatter by their gloss alone")
+        UnitShare,
+        about(
+            "metalness of a glossy surface, with `roughness`; 1 for metals, which have no "
+            "diffuse reflection"
+        ),
     ] = 0.0
     refractive_index: Annotated[
         float | None,
         about(
-            "with transparent: pass, light is refracted and slower within the closed "
-            "surface, as 1.33 for water; by default it goes straight on",
+            "refractive index inside the closed surface, such as 1.33 for water, with "
+            "`transparent: pass` (default: light is not refracted)",
             1.33,
             ge=1,
             le=4,
         ),
     ] = None
     attenuation_per_m: Annotated[
-        float, about("with refractive_index, extinction within the surface", ge=0, le=1e6)
+        float,
+        about(
+            "attenuation in 1/m inside the closed surface, with `refractive_index`", ge=0, le=1e6
+        ),
     ] = 0.0
     leaf_area_density: Annotated[
         float | None,
         about(
-            "the closed surface is full of leaves: their one-sided area, m²/m³; "
-            "reflectance is theirs",
+            "one-sided area, in m²/m³, of the leaves that fill the closed surface; reflectance "
+            "then applies to the leaves",
             0.8,
             gt=0,
             le=1e4,
@@ -176,16 +193,16 @@ class Material:
     leaf_angle: Annotated[
         LeafAngle,
         about(
-            "with leaf_area_density, or of voxels, how leaves are inclined: spherical, "
-            "planophile, erectophile, plagiophile, extremophile, uniform, or Campbell's ratio "
-            "of axes"
+            "leaf angle distribution, with `leaf_area_density` or voxels: spherical, planophile, "
+            "erectophile, plagiophile, extremophile, uniform, or the axis ratio of Campbell's "
+            "ellipsoid"
         ),
     ] = "spherical"
     material: Annotated[
         str | Sequence[str] | None,
         written_as(TextOrTexts | None),
         about(
-            "names that materials have in the scene's files, with * and ?; by default all",
+            "names of materials in the scene files, which may contain * and ? (default: all)",
             "Glass",
             min_length=1,
         ),
@@ -275,12 +292,21 @@ class Material:
         )
 
     def check_leaves(self, name: str, voxels: bool) -> None:
-        """Check that the material can be used for an object.
+        """Check that the leaf properties of this material suit an object.
+
+        Parameters
+        ----------
+        name
+            Name of the object, for the error message.
+        voxels
+            Whether the object contains leaf voxels.
 
         Raises
         ------
         LidarError
-            If the material has leaves and the object has voxels, or the like.
+            If the object contains voxels and the material sets a leaf area density or properties
+            that leaves cannot have, or if the object contains no voxels and the material sets
+            `leaf_angle` without a leaf area density.
         """
         if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
             raise LidarError(
@@ -294,7 +320,10 @@ class Material:
             )
 
     def share(self, wavelength_nm: float) -> float:
-        """Return the share of light that is scattered, for a texture where it lacks a color."""
+        """Return the share of the light that is scattered at a wavelength.
+
+        If `reflectance` is "texture", the result applies to faces without a color.
+        """
         if self.spectrum is not None:
             at_905_nm, at_1550_nm = reflectances()[self.spectrum].shares
             # The nearer measurement: between both wavelengths, leaves absorb more than at either.
@@ -309,11 +338,18 @@ class Material:
 
     @property
     def specular(self) -> float:
-        """Share of the light not scattered that is mirrored at right angles, 1 for "fresnel"."""
+        """Specular reflectance at normal incidence, as a share of the light that is not scattered.
+
+        The value is 1 if `specular_reflectance` is "fresnel".
+        """
         return float(self.specular_reflectance == "fresnel" or self.specular_reflectance or 0)
 
     def named(self, name: str, materials: Collection[str] = ("",)) -> bool:
-        """Return whether this entry applies to an object `name` with faces of `materials`."""
+        """Return whether this material applies to an object.
+
+        `name` is the name of the object, and `materials` are the names that the materials of its
+        faces have in the scene file.
+        """
         return _fits(name, self.objects) and any(_fits(face, self.material) for face in materials)
 
     @property

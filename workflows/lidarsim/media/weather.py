@@ -60,8 +60,8 @@ class Weather:
     visibility_km: Annotated[
         float | None,
         about(
-            "meteorological optical range of fog and haze, over which 5 % of the light is left; "
-            "by default no fog",
+            "meteorological optical range in kilometers, the distance over which fog or haze "
+            "attenuates light to 5 % (default: no fog)",
             10.0,
             ge=0.001,
             le=1e6,
@@ -70,31 +70,45 @@ class Weather:
     fog_lidar_ratio_sr: Annotated[
         float | None,
         about(
-            "extinction over backscatter of fog and haze, for returns from it; "
-            "18.8 of clean droplets, null for none",
+            "lidar ratio of fog and haze in sr, which is extinction divided by backscatter; 18.8 "
+            "for clean droplets, null for no returns from fog",
             18.8,
             ge=1,
             le=1000,
         ),
     ] = FOG_LIDAR_RATIO_SR
-    rain_mm_h: Annotated[float, about("rain; drops attenuate and return light", ge=0, le=300)] = 0.0
+    rain_mm_h: Annotated[
+        float, about("rain rate in mm/h; drops attenuate and return light", ge=0, le=300)
+    ] = 0.0
     snow_mm_h: Annotated[
-        float, about("dry snow, melted; flakes attenuate and return light", ge=0, le=50)
+        float,
+        about(
+            "snowfall rate in mm/h of melted water; dry flakes attenuate and return light",
+            ge=0,
+            le=50,
+        ),
     ] = 0.0
     dust_mg_m3: Annotated[
-        float, about("mineral dust; it attenuates and returns light", ge=0, le=1e5)
+        float,
+        about(
+            "concentration of mineral dust in mg/m³; dust attenuates and returns light",
+            ge=0,
+            le=1e5,
+        ),
     ] = 0.0
 
     wet: Annotated[
         UnitShare,
-        about("share of surfaces that face up, such as roads, that is below a film of water"),
+        about(
+            "fraction of upward-facing surfaces, such as roads, that is covered by a film of water"
+        ),
     ] = 0.0
 
     spray_g_m3: Annotated[
         float,
         about(
-            "water in the air behind vehicles at 90 km/h on ground that is all wet: 1 behind a "
-            "car, 20 behind a lorry; vehicles have to move, and the ground to be wet",
+            "mass of water in the spray behind a vehicle at 90 km/h on completely wet ground, in "
+            "g/m³, such as 1 for a car and 20 for a truck; requires moving vehicles and wet ground",
             5.0,
             ge=0,
             le=1000,

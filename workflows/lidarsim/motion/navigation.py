@@ -36,10 +36,10 @@ from .rotations import rotation_sines
 from .trajectory import AT_CENTER, CENTER, Pose, Trajectory, full_poses, velocities
 
 WHITE = Purpose(41, "white noise of an instrument")
-DRIVEN = Purpose(42, "steps of an instrument's bias")
-WALK = Purpose(43, "steps of an instrument's random walk")
-SKEW = Purpose(44, "scale factors of an instrument's axes, and angles between axes")
-OUTAGE = Purpose(45, "drift in outages of GNSS")
+DRIVEN = Purpose(42, "bias steps of an instrument")
+WALK = Purpose(43, "random walk steps of an instrument")
+SKEW = Purpose(44, "scale factors and misalignments of the axes of an instrument")
+OUTAGE = Purpose(45, "drift during GNSS outages")
 BLOCK = 1 << 14  # samples in a block
 RETURNS_IN_S = 1.0  # after an outage, its error falls to 37 % in this time
 
@@ -59,12 +59,12 @@ Span = Annotated[float, Field(ge=0, le=1e9)]  # seconds
 @dataclass(frozen=True)
 @checked_fields
 class Imu:
-    """An inertial measurement unit on the platform.
+    """An inertial measurement unit (IMU) on the platform.
 
-    Without arguments, the unit has no errors.
+    By default, the measurements have no errors.
 
-    `mount` is its pose in the platform frame. The noise parameters have the names and units of
-    `imu.yaml` in kalibr.
+    `mount` is the pose of the IMU in the platform frame. The noise parameters have the names and
+    units of Kalibr's `imu.yaml`.
 
     Raises
     ------
@@ -73,33 +73,41 @@ class Imu:
     """
 
     rate_hz: Annotated[
-        float, about("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
+        float, about("number of samples per second; update_rate in Kalibr", ge=0.001, le=100_000)
     ] = 200.0
-    mount: Annotated[Pose, AT_CENTER, about("pose in the carrier frame")] = CENTER
-    gyroscope_noise_density: Annotated[TurnNoise, about("angle random walk, rad/s/sqrt(Hz)")] = 0.0
+    mount: Annotated[Pose, AT_CENTER, about("pose of the IMU in the platform frame")] = CENTER
+    gyroscope_noise_density: Annotated[TurnNoise, about("angle random walk in rad/s/sqrt(Hz)")] = (
+        0.0
+    )
     gyroscope_bias: Annotated[
         TurnNoise,
         about(
-            "standard deviation of a bias that wanders about zero (Gauss-Markov of "
-            "first order), rad/s"
+            "standard deviation of a bias in rad/s that fluctuates about zero (first-order "
+            "Gauss-Markov process)"
         ),
     ] = 0.0
-    gyroscope_bias_time_s: Annotated[Correlation, about("correlation time of the bias")] = 300.0
+    gyroscope_bias_time_s: Annotated[
+        Correlation, about("correlation time of the bias in seconds")
+    ] = 300.0
     gyroscope_random_walk: Annotated[
-        TurnNoise, about("random walk of the bias, rad/s^2/sqrt(Hz)")
+        TurnNoise, about("random walk of the bias in rad/s^2/sqrt(Hz)")
     ] = 0.0
     accelerometer_noise_density: Annotated[
-        SpeedNoise, about("velocity random walk, m/s^2/sqrt(Hz)")
+        SpeedNoise, about("velocity random walk in m/s^2/sqrt(Hz)")
     ] = 0.0
     accelerometer_bias: Annotated[
-        SpeedNoise, about("standard deviation of a bias that wanders about zero, m/s^2")
+        SpeedNoise, about("standard deviation of a bias in m/s^2 that fluctuates about zero")
     ] = 0.0
-    accelerometer_bias_time_s: Annotated[Correlation, about("correlation time of the bias")] = 300.0
+    accelerometer_bias_time_s: Annotated[
+        Correlation, about("correlation time of the bias in seconds")
+    ] = 300.0
     accelerometer_random_walk: Annotated[
-        SpeedNoise, about("random walk of the bias, m/s^3/sqrt(Hz)")
+        SpeedNoise, about("random walk of the bias in m/s^3/sqrt(Hz)")
     ] = 0.0
-    scale: Annotated[UnitShare, about("standard deviation of each axis's scale factor")] = 0.0
-    misalignment_deg: Annotated[Skew, about("standard deviation of angles between axes")] = 0.0
+    scale: Annotated[UnitShare, about("standard deviation of the scale factor of each axis")] = 0.0
+    misalignment_deg: Annotated[
+        Skew, about("standard deviation in degrees of the misalignment between axes")
+    ] = 0.0
 
 
 @dataclass(frozen=True)
@@ -107,9 +115,9 @@ class Imu:
 class Gnss:
     """A GNSS receiver on the platform.
 
-    Without arguments, the receiver has no errors.
+    By default, the measurements have no errors.
 
-    `mount` is the pose of its antenna in the platform frame.
+    `mount` is the pose of the antenna in the platform frame.
 
     Raises
     ------
@@ -117,34 +125,37 @@ class Gnss:
         If a number is out of range.
     """
 
-    rate_hz: Annotated[float, about("positions a second", ge=0.0001, le=1000)] = 10.0
-    mount: Annotated[Pose, AT_CENTER, about("pose of the antenna in the carrier frame")] = CENTER
+    rate_hz: Annotated[float, about("number of positions per second", ge=0.0001, le=1000)] = 10.0
+    mount: Annotated[Pose, AT_CENTER, about("pose of the antenna in the platform frame")] = CENTER
     horizontal_m: Annotated[
-        Deviation, about("standard deviation of white noise to the east and north")
+        Deviation, about("standard deviation of the white noise to the east and north, in meters")
     ] = 0.0
-    vertical_m: Annotated[Deviation, about("standard deviation of white noise, up")] = 0.0
+    vertical_m: Annotated[
+        Deviation, about("standard deviation of the vertical white noise, in meters")
+    ] = 0.0
     drift_horizontal_m: Annotated[
         Deviation,
         about(
-            "standard deviation of an error that drifts (Gauss-Markov of first order), "
-            "to the east and north"
+            "standard deviation of the drift to the east and north, in meters (first-order "
+            "Gauss-Markov process)"
         ),
     ] = 0.0
     drift_vertical_m: Annotated[
-        Deviation, about("standard deviation of an error that drifts, up")
+        Deviation, about("standard deviation of the vertical drift, in meters")
     ] = 0.0
-    drift_time_s: Annotated[Correlation, about("correlation time of the drift")] = 600.0
+    drift_time_s: Annotated[Correlation, about("correlation time of the drift in seconds")] = 600.0
     outages: Annotated[
         Several[MinMax[Span]],
         about(
-            "starts and ends, seconds; the IMU bridges outages, without it positions are missing"
+            "start and end times of outages, in seconds after the start of the survey; an IMU "
+            "bridges outages, and without an IMU, positions are missing"
         ),
     ] = ()
     origin: Annotated[
         GeodeticPosition | None,
         about(
-            "latitude and longitude, degrees, and ellipsoidal height, meters, of the "
-            "world's zero, x to the east and y to the north; by default by world.epsg",
+            "latitude and longitude in degrees and ellipsoidal height in meters of the world "
+            "origin, with x to the east and y to the north (default: from `world.epsg`)",
             [48.7758, 9.1829, 290.0],
         ),
     ] = None
@@ -155,12 +166,16 @@ class Gnss:
 class Navigation:
     """Instruments that measure the motion of the platform.
 
-    Their samples are written next to the cloud.
+    Their samples are written to files next to the point cloud.
 
     Parameters
     ----------
     imu, gnss
-        An IMU and a GNSS receiver, or None.
+        The IMU and the GNSS receiver, or None if the platform does not have them.
+    gravity_m_s2
+        Gravitational acceleration in m/s^2, which points down along the z axis of the world.
+    seed
+        Seed for the measurement errors.
 
     Raises
     ------
@@ -171,22 +186,27 @@ class Navigation:
     imu: Annotated[
         Imu | None,
         about(
-            "inertial measurement unit: angular velocities and specific forces in imu.csv, "
-            "/imu/data_raw",
+            "inertial measurement unit; angular velocities and specific forces are written to "
+            "imu.csv and /imu/data_raw",
             {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
         ),
     ] = None
     gnss: Annotated[
         Gnss | None,
         about(
-            "GNSS receiver: positions in gnss.csv, /gnss/fix",
+            "GNSS receiver; positions are written to gnss.csv and /gnss/fix",
             {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
         ),
     ] = None
     gravity_m_s2: Annotated[
-        float, about("gravity, downwards along the world's z axis", ge=-100, le=100)
+        float,
+        about(
+            "gravitational acceleration in m/s^2 along the negative z axis of the world",
+            ge=-100,
+            le=100,
+        ),
     ] = 9.80665
-    seed: Annotated[Seed, about("the same seed gives the same errors")] = 0
+    seed: Annotated[Seed, about("seed of the errors; the same seed produces the same errors")] = 0
 
 
 class ImuSamples(NamedTuple):

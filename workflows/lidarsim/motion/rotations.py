@@ -97,7 +97,10 @@ def rotations_between(first: Floats, last: Floats, durations_s: Floats) -> tuple
 
 
 def matrices(quaternions: Floats) -> Floats:
-    """Return the rotation matrices (k, 3, 3) of unit quaternions x, y, z, w (k, 4)."""
+    """Convert unit quaternions to rotation matrices.
+
+    The quaternions (x, y, z, w) have shape (k, 4), and the matrices have shape (k, 3, 3).
+    """
     return matrices_by_component(quaternions.T).transpose(2, 0, 1)
 
 

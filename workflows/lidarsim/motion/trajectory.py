@@ -53,34 +53,46 @@ Beyond = Literal["refuse", "hold", "absent"]
 @dataclass(frozen=True)
 @checked_fields
 class Pose:
-    """Position and rotation of a sensor in scene coordinates.
+    """Position and orientation of a sensor or platform.
 
     The position is in meters. The angles are yaw, pitch and roll in degrees, applied in the
-    aerospace order.
+    aerospace order: yaw about z, then pitch about the new y, then roll about the new x.
     """
 
-    position: Annotated[tuple[float, float, float], written_as(Triple), about("x, y and z, meters")]
-    yaw_deg: Annotated[AngleDeg, about("rotation about z, first")] = 0.0
-    pitch_deg: Annotated[AngleDeg, about("rotation about the new y, second")] = 0.0
-    roll_deg: Annotated[AngleDeg, about("rotation about the new x, last")] = 0.0
+    position: Annotated[
+        tuple[float, float, float], written_as(Triple), about("x, y and z in meters")
+    ]
+    yaw_deg: Annotated[AngleDeg, about("rotation about z in degrees, applied first")] = 0.0
+    pitch_deg: Annotated[
+        AngleDeg, about("rotation about the new y axis in degrees, applied second")
+    ] = 0.0
+    roll_deg: Annotated[
+        AngleDeg, about("rotation about the new x axis in degrees, applied last")
+    ] = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", tuple(map(float, self.position)))
 
     @property
     def rotation(self) -> Floats | None:
-        """Rotation (3, 3) from the sensor frame to the scene frame, or None without rotation."""
+        """Rotation matrix from the sensor frame to the scene frame, or None without rotation.
+
+        The shape is (3, 3).
+        """
         if not (self.yaw_deg or self.pitch_deg or self.roll_deg):
             return None
         return rotations_of(np.array([self.yaw_deg, self.pitch_deg, self.roll_deg]))
 
     @property
     def rotation_matrix(self) -> Floats:
-        """Rotation from the sensor frame to the scene frame, (3, 3), identity without rotation."""
+        """Rotation matrix from the sensor frame to the scene frame.
+
+        The shape is (3, 3). Without rotation, this is the identity matrix.
+        """
         return np.eye(3) if self.rotation is None else self.rotation
 
     def compose(self, mount: Pose) -> Pose:
-        """Return the scene pose of an instrument that is mounted at `mount` in this pose."""
+        """Return the pose of an instrument mounted at `mount` on a platform with this pose."""
         if mount == CENTER:
             return self
         rotation = self.rotation_matrix
@@ -89,12 +101,19 @@ class Pose:
 
     @classmethod
     def from_rotation(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
-        """Return the pose with a position and a rotation matrix (3, 3), or None for no rotation.
+        """Create a pose from a position and a rotation matrix.
+
+        Parameters
+        ----------
+        position
+            Coordinates in meters. Shape (3,).
+        rotation
+            Rotation matrix of shape (3, 3), or None for no rotation.
 
         Raises
         ------
         LidarError
-            If the matrix mirrors or deforms.
+            If the matrix is not a rotation matrix.
         """
         coordinates = tuple(np.asarray(position, np.float64).tolist())
         if rotation is None:
@@ -138,7 +157,7 @@ CENTER = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
 class InstrumentPose(Pose):
     """Position and angles of an instrument in the carrier frame, as written in a file."""
 
-    position: Annotated[Triple, about("x, y and z, meters")] = (0, 0, 0)
+    position: Annotated[Triple, about("x, y and z in meters")] = (0, 0, 0)
 
 
 # A pose in a file, which may leave out the position, or be the position alone.
@@ -292,38 +311,39 @@ class StaticPose:
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Track:
-    """Timed poses with a linear or smooth path between them.
+    """A trajectory that interpolates timed poses along straight lines or smooth curves.
 
-    A track is a trajectory with a single station.
+    A track has a single station.
 
     Parameters
     ----------
     times_s
-        float64 (k,): times of the poses in seconds, ascending, with an arbitrary zero.
+        Times of the poses in seconds, in ascending order, with an arbitrary zero. Shape (k,),
+        float64.
     positions
-        float64 (k, 3): positions in scene coordinates, in meters.
+        Positions in scene coordinates, in meters. Shape (k, 3), float64.
     quaternions
-        float64 (k, 4): rotations from the platform frame to the scene frame, as x, y, z, w of
-        quaternions whose length is 1 within 1e-3. If None, the platform is level and faces its
-        direction of travel, which is the tangent of its path. On a linear path, it turns within
-        1 m before and after each corner, or from the center of one segment to the center of the
-        next if they are shorter than 2 m. A platform that is stationary or moves vertically keeps
-        its heading and turns to the next heading in the last second.
+        Rotations from the platform frame to the scene frame, as quaternions (x, y, z, w) with a
+        norm of 1 within 1e-3. Shape (k, 4), float64. If None, the platform is level and faces its
+        direction of travel, which is the tangent of its path. On a linear path, it turns within 1 m
+        before and after each corner. If the adjacent segments are shorter than 2 m, it turns from
+        the center of one segment to the center of the next. A platform that is stationary or moves
+        vertically keeps its heading and turns to the next heading in the last second.
     smooth
         If True, positions and quaternions follow cubic splines with continuous accelerations, and
         they are constant between equal poses. Otherwise, positions follow straight lines, and the
         platform rotates at a constant rate about one axis between two poses (Shoemake, 1985).
     start_s
-        Start of the station on the time scale of `times_s`; by default the first time.
+        Start of the station on the time scale of `times_s`. The default is the first time.
     duration_s
-        Duration of the station in seconds; by default until the last time.
+        Duration of the station in seconds. By default, the station ends at the last time.
     beyond
         Behavior before the first and after the last time: "refuse" raises an error, "hold" keeps an
         actor at its first or last pose, and "absent" removes an actor from the scene.
     yaw_deg, pitch_deg, roll_deg
-        Angles of the poses in degrees, as in `Pose` and as an alternative to `quaternions`: (k,),
-        or one angle for all poses. Pitch and roll are zero by default and require yaw. The track
-        stores the angles as `quaternions`.
+        Angles of the poses in degrees, as in `Pose`, as an alternative to `quaternions`. Each is
+        either one angle for all poses or an array of shape (k,). Pitch and roll are zero by default
+        and require yaw. The track converts the angles to `quaternions`.
 
     Raises
     ------
@@ -371,18 +391,19 @@ class Track:
     def from_matrices(
         cls, times_s: Floats, matrices: Floats, beyond: Literal["refuse", "hold"] = "refuse"
     ) -> Sequence[Track]:
-        """Return linear tracks of k bodies from matrices.
+        """Create a linear track for each of k bodies from transformation matrices.
 
-        The poses of all tracks are computed together.
+        The tracks share their data, so that the poses of all tracks can be computed together.
 
-        Time 0 of the tracks is 0 on the time scale of `times_s`, even if this is outside the times.
+        Each track starts at time 0 of `times_s`, even if the first pose is earlier or later.
 
         Parameters
         ----------
         times_s
-            (s,): times of the poses of all tracks in seconds, ascending; at least two.
+            Times of the poses of all tracks in seconds, in ascending order. Shape (s,), at least
+            two.
         matrices
-            (k, s, 4, 4): rigid transforms, which are not validated.
+            Rigid transforms, which are not validated. Shape (k, s, 4, 4).
         beyond
             As in `Track`.
 
@@ -402,18 +423,22 @@ class Track:
         """Set the quaternions of poses by their angles, {name: (k,) or one for all, degrees}."""
         if self.quaternions is not None:
             raise LidarError(
-                f"quaternions and {joined([*angles])} both give the rotations. Give one of them."
+                f"quaternions and {joined([*angles])} both define the rotations. Pass only one of "
+                "them."
             )
         if "yaw_deg" not in angles:
-            raise LidarError(f"Give yaw_deg beside {joined([*angles])}, for example yaw_deg=0.")
+            raise LidarError(
+                f"{joined([*angles])} cannot be used without yaw_deg. Pass yaw_deg as well, for "
+                "example yaw_deg=0."
+            )
         poses = np.size(self.times_s)
         table = np.zeros((poses, 3))
         for axis, name in enumerate(("yaw_deg", "pitch_deg", "roll_deg")):
             values = as_array(name, angles.get(name, 0.0))
             if values.shape not in ((), (poses,)) or not np.isfinite(values).all():
                 raise LidarError(
-                    f"{name} must be one finite angle, or one for each of the {poses} poses, not "
-                    f"{shown(angles[name])}."
+                    f"{name} must be a finite angle, or one finite angle for each of the {poses} "
+                    f"poses, but is {shown(angles[name])}."
                 )
             table[:, axis] = values
         object.__setattr__(self, "quaternions", quaternions_of(rotations_of(table)))
@@ -424,8 +449,8 @@ class Track:
         positions = as_array("positions", self.positions).copy()
         if times.ndim != 1 or len(times) < 2 or positions.shape != (len(times), 3):
             raise LidarError(
-                "A trajectory requires at least two poses with x, y and z each, but has "
-                f"{times.size} times and positions of the shape {positions.shape}."
+                "A trajectory requires at least two poses, with x, y and z for each time, but "
+                f"has {times.size} times and positions of the shape {positions.shape}."
             )
         finite = np.isfinite(positions[:, 0] + positions[:, 1] + positions[:, 2])
         _check_poses(~finite, "The position of pose {} is not finite")
@@ -435,13 +460,13 @@ class Track:
             quaternions = as_array("quaternions", self.quaternions).copy()
             if quaternions.shape != (len(times), 4):
                 raise LidarError(
-                    f"quaternions must be x, y, z and w for each of the {len(times)} poses, but "
-                    f"has the shape {quaternions.shape}."
+                    f"quaternions must contain x, y, z and w for each of the {len(times)} poses, "
+                    f"but has the shape {quaternions.shape}."
                 )
             lengths = length(quaternions)
             # Written so that NaN is an error.
             bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
-            _check_poses(bad, "The quaternion of pose {} does not have the length 1")
+            _check_poses(bad, "The quaternion of pose {} is not of unit length")
             quaternions /= lengths[:, None]
             arrays["quaternions"] = quaternions
         for name, array in arrays.items():
@@ -454,7 +479,7 @@ class Track:
         start = times[0] if self.start_s is None else self.start_s
         last = times[-1] if self.duration_s is None else start + self.duration_s
         max_gap_s = CLOCK_S if self.beyond == "refuse" else np.inf
-        for label, time in (("start_s", start), ("The end by duration_s", last)):
+        for label, time in (("start_s", start), ("start_s + duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
             if not gap <= max_gap_s:  # or NaN
                 raise LidarError(
@@ -463,8 +488,8 @@ class Track:
                 )
         if self.beyond == "refuse" and last <= start:
             raise LidarError(
-                f"The duration of a trajectory must be above 0, but it covers {start:.9g} to "
-                f"{last:.9g} s."
+                f"The duration of a trajectory must be greater than 0, but it covers {start:.9g} "
+                f"to {last:.9g} s."
             )
         object.__setattr__(self, "start_s", float(start))
         object.__setattr__(self, "duration_s", float(max(last - start, 0.0)))
@@ -477,7 +502,11 @@ class Track:
 
     @property
     def presence_ns(self) -> tuple[float, float]:
-        """First and last nanosecond at which an actor is in the scene, by `beyond`."""
+        """Times at which an actor enters and leaves the scene.
+
+        The times are in nanoseconds since the start of the station. They are infinite unless
+        `beyond` is "absent".
+        """
         if self.beyond != "absent":
             return ALWAYS
         assert self.start_s is not None  # set above
@@ -486,7 +515,7 @@ class Track:
 
     @property
     def slack_s(self) -> float:
-        """Time outside the trajectory that poses may have, seconds."""
+        """Maximum time in seconds by which a requested pose may lie outside the trajectory."""
         return _FIRING_S if self.beyond == "refuse" else np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
@@ -495,7 +524,19 @@ class Track:
         return Pose.from_rotation(positions[0], rotations[0])
 
     def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return positions (k, 3) and rotations (k, 3, 3) at times (k,) since the start, ns.
+        """Return the positions and rotations at several times.
+
+        Parameters
+        ----------
+        station
+            Index of the station, which is ignored because a track has a single station.
+        times_ns
+            Times in nanoseconds since the start of the station. Shape (k,).
+
+        Returns
+        -------
+        tuple
+            Positions (k, 3) in meters and rotation matrices (k, 3, 3).
 
         Raises
         ------
@@ -523,10 +564,20 @@ class Track:
         return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
 
     def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return velocities (k, 3), m/s, and angular velocities (k, 3), rad/s, at times (k,), ns.
+        """Return the linear and angular velocities at several times.
 
-        Both are in the scene frame, and exact derivatives of the curves; at a pose of the track,
-        derivatives of the segment that follows.
+        Both velocities are in the scene frame and are exact derivatives of the path. At a pose of
+        the track, they are the derivatives of the next segment.
+
+        Parameters
+        ----------
+        station, times_ns
+            As in `poses`.
+
+        Returns
+        -------
+        tuple
+            Linear velocities (k, 3) in m/s and angular velocities (k, 3) in rad/s.
 
         Raises
         ------
@@ -566,16 +617,17 @@ class Track:
         elif gap > self.slack_s:
             raise LidarError(
                 f"The trajectory covers {times[0]:.9g} to {times[-1]:.9g} s, but poses from "
-                f"{first_s:.9g} to {last_s:.9g} s are required, {gap:.6g} s outside it."
+                f"{first_s:.9g} to {last_s:.9g} s are required, which is up to {gap:.6g} s "
+                "outside the trajectory."
             )
         segment = np.clip(np.searchsorted(times, moments_s, "right") - 1, 0, len(times) - 2)
         return _SegmentTimes(segment, moments_s - times.take(segment), within)
 
     @cached_property
     def with_turns(self) -> Track:
-        """The same motion with quaternions, and with poses where turns begin and end.
+        """Equivalent track with quaternions, and with additional poses where turns begin and end.
 
-        The track itself if it has quaternions, or is smooth.
+        A track that is smooth or already has quaternions is returned unchanged.
         """
         if self.smooth or self.quaternions is not None:
             return self
@@ -605,7 +657,7 @@ class Track:
 
     @cached_property
     def segments(self) -> Segments:
-        """Coefficients of the poses of `with_turns` on straight lines."""
+        """Coefficients of the straight segments between the poses of `with_turns`."""
         track = self.with_turns
         quaternions = track.quaternions
         assert quaternions is not None  # of a track on straight lines

@@ -84,42 +84,46 @@ def load_trajectory(
     Parameters
     ----------
     path
-        A TUM file (rows of time, x, y, z, qx, qy, qz, qw); a KITTI file (rows of a 3 x 4 matrix); a
-        table with a header, separated by commas, semicolons, tabs or spaces, such as data.csv of
-        EuRoC; an oxts folder of KITTI; or a ROS 2 bag (.mcap, .db3 or its folder), which requires
-        the extra ``ros``. A table contains time_s (or time_ns), x, y, z, and optionally qx, qy,
-        qz, qw, or yaw_deg (or heading_deg, clockwise from y) with pitch_deg and roll_deg. Without
-        rotations, the platform faces its direction of travel.
+        Path of the file or folder. The supported formats are TUM (rows of time, x, y, z, qx, qy,
+        qz, qw), KITTI poses (rows of a 3 x 4 matrix), tables with a header (separated by commas,
+        semicolons, tabs or spaces, such as EuRoC's data.csv), KITTI oxts folders, and ROS 2 bags
+        (.mcap, .db3 or the bag folder), which require the extra ``ros``. A table must contain
+        time_s (or time_ns), x, y and z. Rotations are optional: either qx, qy, qz and qw, or
+        yaw_deg (or heading_deg, clockwise from y) with pitch_deg and roll_deg. Without rotations,
+        the platform faces its direction of travel.
     format
-        "tum", "kitti", "csv", "oxts" or "bag"; by default determined from the content.
+        "tum", "kitti", "csv", "oxts" or "bag". By default, the format is determined from the
+        content.
     times
-        For a KITTI file or a file with oxts rows, the file with the times of its rows, in seconds
-        or as dates, such as timestamps.txt of KITTI.
+        For KITTI poses or a file with oxts rows, the file that contains the times of the rows, in
+        seconds or as dates, such as KITTI's timestamps.txt.
     time_unit
-        Unit of the times in the file, "s", "ms", "us" or "ns", if it differs from the unit in the
-        header or of the format. Without `time_unit`, times of 1e11 s or more, and times that span
-        more than a year, raise an error.
+        Unit of the times in the file ("s", "ms", "us" or "ns"), if it differs from the unit in the
+        header or the default unit of the format. Without `time_unit`, times of 1e11 s or more, and
+        times that span more than a year, raise an error.
     columns
-        For a table with other column names, a mapping {name as above: name in the file}.
+        For a table with other column names, a mapping from the names listed above to the names in
+        the file.
     ignore
         For a table, names of columns to skip; * and ? are wildcards. Any other unused column raises
         an error.
     topic
-        For a bag with several topics, a topic with Odometry, PoseStamped,
-        PoseWithCovarianceStamped, TransformStamped or NavSatFix messages; "/tf:FRAME" for a frame;
-        or a NavSatFix topic and an Imu topic with orientations, separated by a space.
+        For a bag with several topics, the topic to read. It can be a topic with Odometry,
+        PoseStamped, PoseWithCovarianceStamped, TransformStamped or NavSatFix messages, or
+        "/tf:FRAME" for a frame. To combine positions with orientations, pass a NavSatFix topic and
+        an Imu topic, separated by a space.
     origin
-        For geographic coordinates, latitude and longitude of the world origin in degrees, and its
-        height in meters. By default, the first position.
+        For geographic coordinates, the world origin as latitude and longitude in degrees, and
+        height in meters. The default is the first position.
     camera_axes
         Whether to convert poses from a camera frame (z forward, y down) to a platform frame (x
-        forward, z up). By default, KITTI poses are converted.
+        forward, z up). By default, only KITTI poses are converted.
     offset_s
         Offset in seconds that is added to all times.
     smooth
         Whether the platform follows smooth curves, as in `Track`.
     start_s, duration_s
-        Start and duration of the survey in seconds, within the times of the file; by default, the
+        Start and duration of the survey in seconds, within the times in the file. By default, the
         entire trajectory is used.
     beyond
         Behavior before the first and after the last time, as in `Track`.

@@ -76,8 +76,8 @@ class PacketSource:
         """
         if sweeps.fired is None:
             raise LidarError(
-                "Packets contain all rays and returns of a survey. Run it with keep_every 1 and "
-                "the column ray."
+                "Packets require all rays and returns of a survey. Run the survey with "
+                "keep_every 1 and the column ray."
             )
         sensor = sweeps.fired.sensors[number]
         settings_of(sensor)

@@ -143,7 +143,7 @@ class PtcService(TcpService):
         return f"{self.name} at {self.host}:{self.port}"
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer the commands of a connection until it ends, or sends bytes that are none."""
+        """Answer the commands on a connection until it closes or sends invalid bytes."""
         try:
             with suppress(*_ENDS), self.counted() as renew:
                 while True:
@@ -158,9 +158,9 @@ class PtcService(TcpService):
     async def _answered(
         self, start: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> bytes:
-        """Read the rest of a request, and return the answer.
+        """Read the rest of a request and return the answer.
 
-        Raises ValueError for other bytes.
+        Raises ValueError if the bytes are not a valid request.
         """
         header = start + await reader.readexactly(_HEADER.size - 1)
         mark, command, _, size = _HEADER.unpack(header)

@@ -108,7 +108,7 @@ class HttpService(TcpService):
         return words
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer the request of a connection, and close it."""
+        """Answer the request on a connection and close the connection."""
         try:
             with suppress(OSError, TimeoutError, asyncio.IncompleteReadError), self.counted():
                 async with asyncio.timeout(_WITHIN_S):
@@ -123,7 +123,7 @@ class HttpService(TcpService):
             writer.close()
 
     async def _answered(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Answer:
-        """Read a request, and return its answer."""
+        """Read a request and return the answer."""
         try:
             try:
                 head = await reader.readuntil(b"\r\n\r\n")

@@ -326,8 +326,8 @@ class RobosenseDecoder(PacketDecoder):
     """Refuses packets of RoboSense, which no package of the index reads as sweeps."""
 
     refusal = (
-        "packets of a RoboSense, which are not read. Write their points as .pcd with rs_driver, "
-        "or record a bag with rslidar_sdk"
+        "RoboSense packets, which are not supported. Convert them to .pcd with rs_driver, or "
+        "record a bag with rslidar_sdk"
     )
 
     @staticmethod

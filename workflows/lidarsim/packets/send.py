@@ -68,12 +68,12 @@ class Lateness:
 
     def __str__(self) -> str:
         if not self.limits_ms:
-            return "the process that sends was ended before it said what it had sent"
+            return "the sender process ended before it reported statistics"
         words = f"{self.sent:,} packets sent"
         if self.sent:
             words += (
-                f", {100 * self.share_within(5):.2f} % of them within 5 ms of their time, the "
-                f"latest after {self.latest_ms:.1f} ms"
+                f", {100 * self.share_within(5):.2f} % of them within 5 ms of their scheduled "
+                f"time, with a maximum delay of {self.latest_ms:.1f} ms"
             )
         for reason, count in self.failures.items():
             words += f"; {count:,} not sent: {reason}"
@@ -187,7 +187,7 @@ class Sender:
         for line in lines:
             values = json.loads(line)
             if "failure" in values:
-                self._note(f"packets to {values['to']} are not sent: {values['failure']}.")
+                self._note(f"packets cannot be sent to {values['to']}: {values['failure']}.")
                 continue
             self._lateness = Lateness(
                 values["sent"],
@@ -285,7 +285,9 @@ class Address:
             address = _resolved(host, text)
             name = host.lower()
         if not is_single_receiver(address):
-            kind = "a multicast address" if address.is_multicast else "no address of a receiver"
+            kind = (
+                "a multicast address" if address.is_multicast else ("not the address of a receiver")
+            )
             raise LidarError(f"{text} is {kind}. Use the address of a single receiver.")
         return cls(str(address), port, name)
 
@@ -314,8 +316,8 @@ def _resolved(host: str, text: str) -> IPv4Address:
     try:
         entries = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is no name"
-        raise LidarError(f"{text}: {host!r} has no IPv4 address ({reason}).") from error
+        reason = error.strerror if isinstance(error, OSError) else "it is not a valid host name"
+        raise LidarError(f"{text}: the host {host!r} has no IPv4 address ({reason}).") from error
     return IPv4Address(entries[0][4][0])
 
 

@@ -168,7 +168,10 @@ class Outbox:
 
 
 def report(values: dict[str, Any]) -> None:
-    """Write a line for the process that casts, which may be gone."""
+    """Write values as a line of JSON to standard output, which the ray-casting process reads.
+
+    Write errors are ignored, because that process may have exited.
+    """
     with suppress(OSError):
         os.write(1, json.dumps(values).encode() + b"\n")
 

@@ -20,7 +20,7 @@ from .shots import Shots, check_columns
 
 
 class Packets:
-    """Encoder of clouds from `Scanner.sweep` as the datagrams that a sensor sends.
+    """Encoder that converts clouds from `Scanner.sweep` to the datagrams of a sensor.
 
     Poses do not have to be continuous, because packets contain ranges and angles but no poses.
     Shots that do not fill a packet are sent with the next sweep. Sweeps must be encoded in the
@@ -34,10 +34,10 @@ class Packets:
         Name of the sensor, from which its serial number is derived. A `Mounted` sensor already has
         a name.
     returns
-        Sub-rays and reported returns, as for the scanner.
+        Sub-rays and reported returns, which must be the same as for the scanner.
     start
-        Date and time at time 0 of the scanner, as in `Survey`. If it is set, the timestamps are
-        those of a clock that is synchronized by a GNSS receiver or PTP.
+        Date and time that correspond to time 0 of the scanner, as in `Survey`. If `start` is set,
+        the timestamps are those of a clock that is synchronized by a GNSS receiver or PTP.
 
     Raises
     ------
@@ -68,7 +68,7 @@ class Packets:
     ) -> None:
         if name and isinstance(sensor, Mounted):
             raise LidarError(
-                f"name is {name!r}, and a Mounted sensor has a name of its own: give it there, "
+                f"The name of a Mounted sensor is set in Mounted, but name is {name!r}. Use "
                 f"Mounted(sensor, name={name!r})."
             )
         mounted = sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)
@@ -83,7 +83,10 @@ class Packets:
 
     @classmethod
     def of_scanner(cls, scanner: Scanner, start: Any = None) -> Packets:
-        """Return an encoder for the sensor of a scanner, with `start` as above."""
+        """Create an encoder for the sensor of a scanner.
+
+        `start` has the same meaning as in `Packets`.
+        """
         carried = scanner.survey.carried[0]
         return cls(carried, returns=scanner.survey.returns_each[0], start=start)
 
@@ -109,14 +112,14 @@ class Packets:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns that the clouds of the scanner must contain."""
+        """Names of the columns that a cloud must contain to be encoded."""
         return ("ray", "range", *self.encoder.columns)
 
     @checked
     def encode(
         self, sweep: Cloud, *, number: SweepNumber | None = None, start_s: StartSeconds = None
     ) -> list[Datagrams]:
-        """Return the datagrams of a sweep, with one group per port.
+        """Encode a sweep as datagrams, in one group per port.
 
         Parameters
         ----------
@@ -124,7 +127,7 @@ class Packets:
             Cloud that `Scanner.sweep` returned for this number and start.
         number
             Number of the revolution or frame, which must be the same as in `Scanner.sweep`. By
-            default, it is the number after that of the last sweep, starting at 0.
+            default, the first sweep has number 0, and each further sweep has the next number.
         start_s
             Start of the revolution in seconds, as in `Scanner.sweep`.
 
@@ -151,9 +154,12 @@ class Packets:
         return datagrams
 
     def finish(self) -> list[Datagrams]:
-        """Return the datagrams of the remaining shots after the last sweep."""
+        """Return the datagrams with the shots that remain after the last sweep."""
         return self.encoder.finish()
 
     def files(self) -> Mapping[str, bytes]:
-        """Return the files that readers require in addition to the packets, {suffix: content}."""
+        """Return additional files that readers of the packets require.
+
+        The keys are file name suffixes, and the values are file contents.
+        """
         return self.encoder.files()

@@ -52,7 +52,7 @@ class TcpService(Service):
 
     @abstractmethod
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Answer the requests of a connection, and close the connection."""
+        """Answer the requests on a connection and close the connection."""
 
     @contextmanager
     def counted(self) -> Iterator[Callable[[], None]]:
@@ -121,7 +121,7 @@ class TcpService(Service):
         raise AssertionError("the last port returns or raises")
 
     async def _close(self) -> None:
-        """Close the address and all connections."""
+        """Stop listening and close all connections."""
         self._server.close()
         tasks = asyncio.all_tasks() - {asyncio.current_task()}
         for task in tasks:

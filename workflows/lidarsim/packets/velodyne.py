@@ -163,7 +163,7 @@ class VelodyneDecoder(PacketDecoder):
 
     def __init__(self, path: Path, name: str) -> None:
         super().__init__(path, name)
-        need("velodyne_decoder", "fit", f"{name} is read")
+        need("velodyne_decoder", "fit", f"Reading {name}")
         self._capture = Capture(path, name)
         units = dict.fromkeys(map(_unit_of, self._packets()))
         self._units = [*units]

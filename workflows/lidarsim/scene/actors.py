@@ -48,7 +48,7 @@ class ActorSamples(NamedTuple):
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Actor:
-    """A moving object.
+    """An object that moves during a survey.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ class Actor:
         starts with the survey. By default, the actor stays at the origin until it is moved by
         `Scanner.move`.
     offset_s
-        Time in the animation of the mesh at the start of the survey, in seconds. If the speed of
-        the actor controls the animation, it is the time at the start of the trajectory.
+        Animation time of the mesh at the start of the survey, in seconds. If the speed of the actor
+        controls the animation, it is the animation time at the start of the trajectory.
     spray
         Whether the actor raises spray while it moves. It has an effect only if the weather includes
         spray.
@@ -68,7 +68,8 @@ class Actor:
     Raises
     ------
     LidarError
-        If the mesh contains voxels, or if the first rotation of the trajectory mirrors or deforms.
+        If the mesh contains voxels, or if the first rotation of the trajectory is not a valid
+        rotation matrix.
     """
 
     mesh: SceneMesh
@@ -101,7 +102,7 @@ class Actor:
         Raises
         ------
         LidarError
-            If the first rotation of the trajectory mirrors or deforms.
+            If the first rotation of the trajectory is not a valid rotation matrix.
         """
         actor = object.__new__(type(self))  # `copy` takes ten times as long
         vars(actor).update(vars(self), trajectory=trajectory)
@@ -117,11 +118,17 @@ class Actor:
 
     @property
     def bounds(self) -> Floats:
-        """Corners of the bounding box of all poses in the frame of the actor, in meters, (2, 3)."""
+        """Bounding box of the mesh in all animation frames, in the frame of the actor, in meters.
+
+        The shape is (2, 3).
+        """
         return (self.mesh.animation or self.mesh).bounds
 
     def placed(self, time_ns: float) -> SceneMesh:
-        """Return the mesh at a time, in the scene's local coordinates, or a point while absent."""
+        """Return the mesh at a given time in local scene coordinates.
+
+        At times when the actor is absent, the mesh is collapsed to a point.
+        """
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices
         if (animation := self.mesh.animation) is not None:
@@ -135,7 +142,11 @@ class Actor:
         )
 
     def played(self, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the animation frames at times (k,) in nanoseconds, and the frame rates."""
+        """Return the animation frames and frame rates at several times.
+
+        Times have shape (k,) and are in nanoseconds since the start of the survey. Frame
+        numbers can be fractional, and rates are in frames per second.
+        """
         seconds, rates = self.seconds(times_ns)
         animation = self.mesh.animation
         assert animation is not None
@@ -144,9 +155,10 @@ class Actor:
         return animation.frames(seconds), rates / animation.step_s
 
     def seconds(self, times_ns: Floats) -> tuple[Floats, Floats]:
-        """Return the animation times in seconds at times (k,) in nanoseconds, and their rates.
+        """Return the animation times and playback rates at several times.
 
-        A rate is the seconds of animation that pass in a second of the survey.
+        Times have shape (k,) and are in nanoseconds since the start of the survey. Animation times
+        are in seconds. A playback rate is the animation time that passes per second of the survey.
         """
         animation = self.mesh.animation
         assert animation is not None
@@ -184,9 +196,9 @@ class Actor:
         return times_ns, np.append(0.0, np.cumsum(steps_m))
 
     def samples(self, duration_ns: float, count: int) -> ActorSamples:
-        """Return `count` evenly spaced poses, for drawing the trajectory.
+        """Return `count` poses that are evenly spaced in time, for drawing the trajectory.
 
-        Times are even over the part of a survey of `duration_ns` while the actor is present.
+        They cover the part of a survey of `duration_ns` nanoseconds in which the actor is present.
         """
         appears, leaves = presence_ns(self.trajectory)
         first = max(appears, 0.0)
@@ -195,9 +207,12 @@ class Actor:
         return ActorSamples(times_ns, positions, quaternions_of(rotations))
 
     def check(self, start_ns: float, stop_ns: float) -> None:
-        """Check that the trajectory covers an interval in nanoseconds.
+        """Check that the trajectory covers a time interval in nanoseconds.
 
-        Raises LidarError if not.
+        Raises
+        ------
+        LidarError
+            If the trajectory does not cover the interval.
         """
         try:
             self.trajectory.poses(0, np.array([start_ns, stop_ns], np.float64))
@@ -294,7 +309,7 @@ def _join_animated(name: str, meshes: Sequence[SceneMesh]) -> SceneMesh:
 
 @checked
 def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
-    """Return the mesh of a box whose origin is the center of its bottom face.
+    """Create a box mesh whose origin is the center of its bottom face.
 
     Parameters
     ----------

@@ -58,8 +58,9 @@ class Animation:
         valid = valid and self.step_s > 0 and (speed is None or speed > 0)
         if not valid or not np.isfinite(self.vertices).all():
             raise LidarError(
-                "An animation requires finite vertices (f, v, 3) with at least two poses, and a "
-                f"step and a speed above 0, but has {shape}, {self.step_s} s and {speed} m/s."
+                "An animation requires finite vertices (f, v, 3) with at least two poses and a "
+                f"positive step and speed, but has vertices {shape}, a step of {self.step_s} s "
+                f"and a speed of {speed} m/s."
             )
 
     @property

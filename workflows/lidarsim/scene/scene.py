@@ -44,43 +44,43 @@ _log = logging.getLogger(__name__)
 @dataclass(frozen=True, eq=False)
 @checked_fields
 class Scene:
-    """A scene of triangles that belong to named objects.
+    """A scene, which consists of triangles that belong to named objects.
 
     Coordinates are local, so world coordinates are `vertices` + `origin`. The origin is zero unless
     the scene is more than 10 km away from zero, as in georeferenced data. In that case, the origin
-    is near the center of the scene, in integer meters, so that single precision is sufficient for
+    is near the center of the scene, in whole meters, so that single precision is sufficient for
     local coordinates.
 
     Parameters
     ----------
     vertices
-        float64 (v, 3): local coordinates in meters, with z pointing up.
+        Local coordinates in meters, with z pointing up. Shape (v, 3), float64.
     faces
-        int32 (f, 3): indices into `vertices`. At least one face is required, unless there are
-        instances.
+        Indices into `vertices`. At least one face is required, unless there are instances. Shape
+        (f, 3), int32.
     face_object
-        int32 (f,): index of the object of each triangle in `names`.
+        Index into `names` of the object to which each triangle belongs. Shape (f,), int32.
     names
-        Names of the static objects, without duplicates. The number of an object is its index.
+        Unique names of the static objects. The number of an object is its index in `names`.
         `object_names` also contains the actors.
     origin
-        float64 (3,): origin in integer meters, plus `world_origin`.
+        World coordinates of the local origin, which are whole meters plus `world_origin`. Shape
+        (3,), float64.
     world_origin
-        float64 (3,): offset in meters that `georeferenced` added to `origin`. Without it, world
-        coordinates are the coordinates in the scene files.
+        Offset in meters that `georeferenced` added to `origin`. Without it, world coordinates are
+        the coordinates in the scene files. Shape (3,), float64.
     actors
         Moving objects, numbered after the static objects. `faces` does not contain their meshes.
     instances
-        Static triangles that are not in `faces`: parts of meshes that are stored once and placed
-        any number of times, or parts with a mask (transparent pixels) or voxels (leaves). The
-        triangles are numbered after `faces`, instance by instance, followed by the triangles of
-        actors.
+        Static triangles that are not in `faces`. They belong to mesh parts that are stored once and
+        placed any number of times, or that have a mask (transparent pixels) or voxels (leaves).
+        Triangles are numbered in the following order: `faces`, then all instances, then the actors.
     colors
         Colors of `faces`, or None. Instances and actors have their own colors.
     materials
-        Names of the materials of static faces in the scene files, or None.
+        Material names of the static faces in the scene files, or None.
     epsg
-        EPSG code of the world coordinates, if the scene file states it. Pass it to `Survey` to
+        EPSG code of the world coordinates, if the scene file specifies it. Pass it to `Survey` to
         write it to the results.
 
     Raises
@@ -154,7 +154,7 @@ class Scene:
 
     @classmethod
     def seed(cls) -> Scene:
-        """Return the demo scene: six surfaces of revolution with 76,800 triangles.
+        """Return the demo scene of six surfaces of revolution, which have 76,800 triangles.
 
         Examples
         --------
@@ -182,40 +182,40 @@ class Scene:
             How to treat objects with the same name: "number" appends numbers (Wall, Wall.2), and
             "join" merges them into one object.
         **options
-            Options for all formats, which are listed below, and options for specific formats, with
-            the names of `scene.files` in scenarios, such as `storeys` for buildings (.ifc) and
-            `step_m` for rasters. The option `epsg`, the coordinate system to which a raster is
-            transformed, is called `world.epsg` in scenarios.
+            Options for all formats are listed below. Options for specific formats, such as
+            `storeys` for buildings (.ifc) and `step_m` for rasters, have the same names as in
+            `scene.files` in scenarios. The only exception is `epsg`, the coordinate system to which
+            a raster is transformed. Scenarios use `world.epsg` instead.
 
         Other Parameters
         ----------------
         unit
             Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. The default is the
-            unit that the file states (.dae, .3mf, .usd, .glb and .gltf), otherwise meters.
+            unit that the file specifies (.dae, .3mf, .usd, .glb and .gltf), otherwise meters.
         up_axis
             Axis that points up in the file: x, y or z. The default is the axis that the file (.dae,
             .usd) or its format (y for .glb and .gltf) specifies, otherwise z.
         transform
-            Placement of the mesh in the world in meters, as a `lidarsim.scene.transform.Transform`
-            that is applied after `unit` and `up_axis`.
+            A `lidarsim.scene.transform.Transform` that places the mesh in the world, in meters. It
+            is applied after `unit` and `up_axis`.
         opacity
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
             .obj, .usd). With "ignore", all triangles are opaque, and no images are read.
         colors
             Whether to read base colors and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON,
-            .xodr and .ifc without images), and vertex colors (.glb, .gltf, .obj, .ply, .off,
-            .usd).
+            .xodr, and .ifc without images) and vertex colors (.glb, .gltf, .obj, .ply, .off, .usd).
         materials
             Whether to store the material names of faces (.glb, .gltf, .obj, .dae, .3mf, .usd,
-            CityJSON, .xodr, .ifc), so that `Material` can select them.
+            CityJSON, .xodr, .ifc), so that a `Material` can select faces by these names.
         assets
-            Folder with further files to which the scene file refers. Files are read from this
-            folder, from the folder of the scene file, and from their subfolders. The models of a
-            Gazebo world are searched in this folder first.
+            Folder with additional files to which the scene file refers. Files are read from this
+            folder, from the folder of the scene file, and from their subfolders. Models of a Gazebo
+            world are searched for in this folder first.
 
         Returns
         -------
-        The scene. Moving objects in a .usd file become actors if the scene has static objects.
+        Scene
+            The scene. Moving objects in a .usd file become actors if the scene has static objects.
 
         Raises
         ------
@@ -239,11 +239,11 @@ class Scene:
     def from_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
         """Create a scene from the objects of mesh files.
 
-        If no object is static, the actors become static objects at their first pose, and `tell` is
-        called with a line on the loss.
+        If there are no static objects, the actors become static objects at their first pose. In
+        this case, `tell` is called with a message about the lost motion.
         """
         if not objects.static:
-            note_start = "nothing stands in the scene, and without that nothing moves: "
+            note_start = "a scene requires at least one static object. This scene moves "
             return cls.from_meshes(objects.at_start(lambda line: tell(note_start + line)))
         scene = cls.from_meshes(objects.static)
         object.__setattr__(scene, "epsg", objects.epsg)
@@ -263,13 +263,14 @@ class Scene:
         Parameters
         ----------
         meshes
-            Meshes in world coordinates, or instances of meshes, which store their triangles only
-            once. Duplicate names are numbered (Shelf, Shelf.2).
+            Meshes in world coordinates, or instances. Instances of the same mesh share its
+            triangles. Duplicate names are numbered (Shelf, Shelf.2).
 
         Raises
         ------
         LidarError
-            If there are no meshes, or if the number of vertices or triangles exceeds 32 bits.
+            If there are no meshes, or if the number of vertices or triangles exceeds the range of
+            32-bit integers.
         """
         objects = list(meshes)
         _check_objects(objects)
@@ -306,9 +307,9 @@ class Scene:
         )
 
     def with_actors(self, actors: Iterable[Actor]) -> Scene:
-        """Return a scene with the same triangles and new actors.
+        """Return a copy of the scene in which other actors replace the existing actors.
 
-        The triangles are not copied.
+        Both scenes share the static triangles.
 
         Raises
         ------
@@ -328,9 +329,13 @@ class Scene:
     def georeferenced(self, world_origin: ArrayLike) -> Scene:
         """Return the same scene at another location in the world.
 
-        Local coordinates and the poses of surveys do not change. The offset `world_origin` (3,), in
-        meters, is added to the coordinates in the scene files when points are written. An offset
-        of zero restores the original location.
+        Local coordinates and the poses of surveys do not change.
+
+        Parameters
+        ----------
+        world_origin
+            Offset in meters that is added to the coordinates in the scene files when points are
+            written. Shape (3,). An offset of zero restores the original location.
 
         Examples
         --------
@@ -344,10 +349,18 @@ class Scene:
         return scene
 
     def moved(self, instance_indices: Indices, positions: Floats, rotations: Floats) -> Scene:
-        """Return the scene with some of its instances at other poses.
+        """Return a copy of the scene in which some instances have other poses.
 
-        A pose is the pose of the mesh's frame in local coordinates: positions (m, 3), meters, and
-        rotations (m, 3, 3). The instances keep their scales.
+        Instances keep their scales.
+
+        Parameters
+        ----------
+        instance_indices
+            Indices of the instances to move. Shape (m,).
+        positions
+            New positions of the mesh frames in local coordinates, in meters. Shape (m, 3).
+        rotations
+            Rotation matrices from the mesh frames to local coordinates. Shape (m, 3, 3).
         """
         assert self.instances is not None
         scene = copy(self)
@@ -359,7 +372,7 @@ class Scene:
 
     @property
     def object_names(self) -> tuple[str, ...]:
-        """Names of all objects, static objects first, followed by actors.
+        """Names of all objects, with static objects first and actors last.
 
         The column `object` contains indices into these names.
         """
@@ -369,7 +382,10 @@ class Scene:
 
     @property
     def surface_kinds(self) -> SurfaceKinds:
-        """Surface kinds, one for each material of each object. Actors come last."""
+        """Surface kinds of all objects, one for each material of each object.
+
+        The surface kinds of actors come last.
+        """
         names = self.object_names
         static = [()] * len(self.names) if self.materials is None else self.materials.names
         moving = [
@@ -402,7 +418,10 @@ class Scene:
 
     @property
     def face_materials(self) -> Ints32 | None:
-        """Index into `material_names` for each face, or -1. None if no material has a name."""
+        """Index into `material_names` for each static face, or None if no material has a name.
+
+        The index is -1 for faces whose material has no name.
+        """
         if self.materials is None or not self.material_names:
             return None
         kinds = self.surface_kinds
@@ -416,7 +435,7 @@ class Scene:
 
     @property
     def masked(self) -> tuple[str, ...]:
-        """Names of the objects with opacity masks, in order."""
+        """Names of the objects with opacity masks, in the order of `object_names`."""
         owners = set()
         if (instances := self.instances) is not None:
             owners = set(instances.owners(lambda part: part.mask is not None).tolist())
@@ -426,9 +445,10 @@ class Scene:
 
     @property
     def colored(self) -> list[Colors]:
-        """Colors of all faces, including instances and actors. Empty if all are gray.
+        """Colors of all parts of the scene that have colors.
 
-        Only colors that exist are listed, in this order.
+        The list contains the colors of `faces`, of instances and of actors, in this order. It is
+        empty if the entire scene is gray.
         """
         parts = self.instances.mesh_parts if self.instances else ()
         colors = [self.colors, *(part.colors for part in parts)]
@@ -437,7 +457,10 @@ class Scene:
 
     @property
     def has_colors(self) -> Bools:
-        """Mask of the objects with a color, where actors come last. Shape (objects,)."""
+        """Boolean mask of the objects that have a color.
+
+        The shape is (objects,). Actors come last.
+        """
         has_color = np.zeros(len(self.object_names), np.bool_)
         if (colors := self.colors) is not None:
             gray = np.array([image is GRAY for image in colors.images])
@@ -450,7 +473,10 @@ class Scene:
 
     @property
     def has_voxels(self) -> Bools:
-        """Mask of the objects filled with leaf voxels, where actors come last. Shape (objects,)."""
+        """Boolean mask of the objects that are filled with leaf voxels.
+
+        The shape is (objects,). Actors come last.
+        """
         has_voxels = np.zeros(len(self.names) + len(self.actors), np.bool_)
         if (instances := self.instances) is not None:
             has_voxels[instances.owners(lambda part: part.voxels is not None)] = True
@@ -458,7 +484,7 @@ class Scene:
 
     @property
     def triangles(self) -> int:
-        """Number of triangles, including triangles of all instances and actors."""
+        """Number of triangles, including those of all instances and actors."""
         instance_triangles = self.instances.triangles if self.instances else 0
         return (
             len(self.faces)
@@ -468,16 +494,19 @@ class Scene:
 
     @property
     def kept_triangles(self) -> int:
-        """Number of static triangles in memory. Instances of the same mesh share its triangles."""
+        """Number of static triangles in memory.
+
+        Triangles that several instances share are counted once.
+        """
         parts = self.instances.mesh_parts if self.instances else ()
         return len(self.faces) + sum(len(part.faces) for part in parts)
 
     @property
     def counters(self) -> int:
-        """Number of hit counters, one for each triangle of each instance.
+        """Number of hit counters.
 
-        The counters of instances follow the counters of `faces`; the counters of the actors'
-        triangles come last.
+        Each triangle in `faces`, each instance, and each triangle of an actor has a counter, in
+        this order.
         """
         instance_count = len(self.instances) if self.instances else 0
         return (
@@ -485,14 +514,15 @@ class Scene:
         )
 
     def solid(self, time_ns: float) -> Scene:
-        """Return a scene with the actors at a time as static objects, without instances.
+        """Return a scene in which the actors are static objects with their poses at a given time.
 
-        A scene without actors is returned unchanged, with its instances.
+        The returned scene has no instances. However, a scene without actors is returned unchanged,
+        including its instances.
 
         Parameters
         ----------
         time_ns
-            Nanoseconds since the survey's start.
+            Time in nanoseconds since the start of the survey.
         """
         if not self.actors:
             return self
@@ -513,9 +543,9 @@ class Scene:
         )
 
     def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
-        """Return the static objects that have triangles, in world coordinates and in order.
+        """Return the static objects that have triangles, in order and in world coordinates.
 
-        An object with masks is returned as a mesh or instance for each part.
+        An object with masks is split into one mesh or instance per part.
         """
         by_object: list[list[SceneMesh | SceneInstance]] = [[] for _ in self.names]
         order = np.argsort(self.face_object, kind="stable")
@@ -568,7 +598,10 @@ class Scene:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Bounding box of the static triangles in local coordinates, in meters. Shape (2, 3)."""
+        """Bounding box of the static triangles in local coordinates, in meters.
+
+        The shape is (2, 3).
+        """
         corners = self._face_bounds
         if self.instances:
             corners = np.concatenate([corners, self.instances.bounds.reshape(-1, 3)])
@@ -584,9 +617,9 @@ class Scene:
 
     @cached_property
     def object_bounds(self) -> Floats:
-        """Bounding boxes of the static objects in local coordinates, in meters. (objects, 2, 3).
+        """Bounding boxes of the static objects in local coordinates, in meters.
 
-        An object without triangles has (+inf, -inf).
+        The shape is (objects, 2, 3). The box of an object without triangles is (+inf, -inf).
         """
         corners = self.vertices[self.faces]
         lower = np.full((len(self.names), 3), np.inf)
@@ -600,12 +633,14 @@ class Scene:
 
     @cached_property
     def footprints(self) -> Floats:
-        """Bounding circles of the static objects in the xy plane: x, y, radius. Shape (objects, 3).
+        """Bounding circles of the static objects in the xy plane.
 
-        Local coordinates, meters.
+        The shape is (objects, 3). Each row contains x, y and the radius in meters, in local
+        coordinates.
 
-        The circle is centered on the object's bounding rectangle and reaches its farthest
-        vertex: exact for discs and rectangles, at most 1.42 times too wide for other outlines.
+        The circle is centered on the bounding rectangle of the object and passes through its
+        farthest vertex. It is exact for discs and rectangles. For other outlines, the radius is at
+        most 1.42 times too large.
         """
         centers = self.object_bounds[..., :2].mean(axis=1)
         reach = np.zeros(len(self.names))

@@ -40,11 +40,12 @@ class SceneInstance:
     mesh
         The mesh in its own frame.
     transform
-        Pose of the mesh frame in world coordinates; or a matrix (4, 4) from mesh to world
-        coordinates in meters, which may rotate, translate, mirror and scale, also non-uniformly;
-        or a `lidarsim.scene.transform.Transform`.
+        Pose of the mesh frame in world coordinates, a matrix of shape (4, 4), or a
+        `lidarsim.scene.transform.Transform`. A matrix transforms mesh coordinates to world
+        coordinates in meters. It can rotate, translate, mirror and scale the mesh, also
+        non-uniformly.
     name
-        Name of the object; by default the name of the mesh.
+        Name of the object. The default is the name of the mesh.
 
     Raises
     ------
@@ -68,9 +69,18 @@ class SceneInstance:
 
     @classmethod
     def from_matrices(cls, mesh: SceneMesh, transforms: Floats, name: str) -> list[SceneInstance]:
-        """Create instances of a mesh with transforms of shape (n, 4, 4).
+        """Create an instance of a mesh for each of several transformation matrices.
 
-        The matrices are validated together.
+        Validating the matrices together is faster than creating the instances one by one.
+
+        Parameters
+        ----------
+        mesh
+            The mesh in its own frame.
+        transforms
+            Matrices as in `SceneInstance`. Shape (n, 4, 4).
+        name
+            Name of the instances.
 
         Raises
         ------
@@ -90,16 +100,16 @@ class SceneInstance:
 
     @property
     def matrix(self) -> Floats:
-        """Transform as a matrix of shape (4, 4)."""
+        """The transform as a matrix of shape (4, 4)."""
         return np.asarray(self.transform)
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneInstance:
-        """Return a renamed instance that is transformed by p -> linear @ p + offset."""
+        """Return an instance with another name, transformed by p -> linear @ p + offset."""
         position = applied(linear, self.matrix[:3, 3]) + offset
         return SceneInstance(self.mesh, affine(matmul(linear, self.matrix[:3, :3]), position), name)
 
     def flat(self) -> SceneMesh:
-        """Return the mesh in world coordinates."""
+        """Return a copy of the mesh in world coordinates."""
         return self.mesh.moved(self.name, self.matrix[:3, :3], self.matrix[:3, 3])
 
 

@@ -72,9 +72,9 @@ class SceneMesh:
     name
         Name of the object.
     vertices
-        float64 (v, 3): finite coordinates in meters, with z pointing up.
+        Finite coordinates in meters, with z pointing up. Shape (v, 3), float64.
     faces
-        int64 (f, 3): indices into `vertices`; at least one face.
+        Indices into `vertices`. At least one face is required. Shape (f, 3), int64.
     cutouts
         Cutouts of the last faces, in the order of these faces.
     colors
@@ -83,10 +83,9 @@ class SceneMesh:
         Leaf densities within the surface of the mesh, which must be closed and have no cutouts.
     animation
         Motion of the vertices, which applies if the mesh belongs to an actor. Otherwise, the mesh
-        is static and has the shape given by `vertices`.
+        is static and has the shape defined by `vertices`.
     materials
-        Names of the materials of the faces (`lidarsim.scene.face_materials.FaceMaterials`), or
-        None.
+        Material names of the faces (`lidarsim.scene.face_materials.FaceMaterials`), or None.
 
     Raises
     ------
@@ -141,12 +140,15 @@ class SceneMesh:
 
     @cached_property
     def bounds(self) -> Floats:
-        """Lower and upper corner of the bounding box in meters. Shape (2, 3)."""
+        """Minimum and maximum coordinates in meters.
+
+        The shape is (2, 3).
+        """
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     @cached_property
     def has_area(self) -> bool:
-        """Whether a triangle of the mesh has an area, or the mesh is animated."""
+        """Whether any triangle has a nonzero area, or the mesh is animated."""
         blocks = (
             self.vertices[self.faces[i : i + 65536]] for i in range(0, len(self.faces), 65536)
         )
@@ -154,7 +156,7 @@ class SceneMesh:
         return self.animation is not None or any(np.cross(*e.swapaxes(0, 1)).any() for e in edges)
 
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
-        """Return a renamed copy that is transformed by p -> linear @ p + offset."""
+        """Return a copy of the mesh with another name, transformed by p -> linear @ p + offset."""
         faces = self.faces
         cutouts = self.cutouts
         colors = self.colors

@@ -92,8 +92,8 @@ def _radii(
             length, _, height = np.ptp(mesh.bounds, axis=0).tolist()
             if abs(length - height) > _ROUNDNESS * height or not height:
                 notes.append(
-                    f"{mesh.name} is not round about y ({length:.3g} m long, {height:.3g} m high) "
-                    "and does not rotate"
+                    f"{mesh.name} is not round about its y axis ({length:.3g} m long, "
+                    f"{height:.3g} m high) and does not rotate"
                 )
             else:
                 radii[index] = height / 2

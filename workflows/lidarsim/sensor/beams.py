@@ -23,21 +23,23 @@ MAX_CHANNELS = 65_535  # limit of the type of the column
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Beams of a sensor, each of which is fired once per firing.
+    """The beams of a sensor, all of which are fired once per firing.
 
     Channel 0 is the first beam, which is usually the lowest.
 
     Parameters
     ----------
     elevation
-        float64 (c,): angle above the xy plane of the sensor, in radians.
+        Angle of each beam above the xy plane of the sensor, in radians. Shape (c,), float64.
     azimuth
-        float64 (c,): offset from the azimuth of the head, in radians; 0 by default.
+        Offset of each beam from the azimuth of the head, in radians; 0 by default. Shape (c,),
+        float64.
     time_ns
-        float64 (c,): time of a beam within a firing, in nanoseconds; 0 by default.
+        Time of each beam since the start of its firing, in nanoseconds; 0 by default. Shape (c,),
+        float64.
     origin
-        float64 (c, 3): start of a beam in the sensor frame with the head at azimuth 0, in meters;
-        the sensor origin by default.
+        Start of each beam in the sensor frame with the head at azimuth 0, in meters. By default,
+        all beams start at the sensor origin. Shape (c, 3), float64.
 
     Raises
     ------
@@ -74,18 +76,18 @@ class Beams:
     @classmethod
     @checked
     def even(cls, layers: int, vertical_fov_deg: float) -> Beams:
-        """Return beams evenly spaced over a vertical field of view, both ends included.
+        """Create beams that are evenly spaced over a vertical field of view, including both ends.
 
-        Half of the field of view is below the horizon. A single beam points straight forward.
+        The field of view is centered on the horizon. A single beam points straight forward.
         """
         half = np.radians(vertical_fov_deg) / 2
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
     def turning(self, radians_per_ns: float) -> Beams:
-        """Return the beams for a head that keeps rotating counterclockwise within a firing.
+        """Return the beams for a head that rotates counterclockwise during a firing.
 
-        Each beam is rotated by the head's angle at its time within the firing, so that casting need
-        not rotate it.
+        Each beam is rotated by the angle that the head covers until the beam is fired. The ray
+        caster therefore only needs the angle of the head at the start of each firing.
         """
         angle = radians_per_ns * self.time_ns
         x, y, z = self.origin.T
@@ -94,7 +96,7 @@ class Beams:
         return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
 
     def lowest_first(self) -> Beams:
-        """Return the same beams in the order of channels."""
+        """Return the same beams sorted by elevation, with the lowest beam as channel 0."""
         order = np.argsort(self.elevation, kind="stable")
         return Beams(*(a[order] for a in (self.elevation, self.azimuth, self.time_ns, self.origin)))
 
@@ -116,7 +118,9 @@ class Head(Protocol):
         """Return the azimuths of the head at firings (k,), in radians."""
 
 
-Step = Annotated[float, about("degrees that the head turns in one time step", gt=0, le=360)]
+Step = Annotated[
+    float, about("angle in degrees by which the head turns in one time step", gt=0, le=360)
+]
 Rate = Annotated[float, Field(gt=0, le=1e6)]
 MirrorMotion = Literal["sine", "triangle", "sawtooth"]
 Width = Annotated[float, Field(gt=0, le=360)]
@@ -126,7 +130,7 @@ Duty = Annotated[float, Field(gt=0, le=1)]
 @dataclass(frozen=True)
 @checked_fields
 class Spin:
-    """A rotating head.
+    """A head that rotates at a constant rate.
 
     Parameters
     ----------
@@ -187,32 +191,38 @@ class Spin:
         return count if count == self.firings_per_turn else None
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firings in a time step."""
+        """Return the half-open range of the firing indices in a time step."""
         # Rounded up, in whole numbers: fractions would take as long as a small scan.
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
 
     def times_ns(self, firings: Ints) -> Floats:
-        """Return the starts of firings (k,), nanoseconds since the head started: (k,)."""
+        """Return the start times of several firings in nanoseconds since the head started.
+
+        `firings` and the result have shape (k,).
+        """
         return np.asarray(firings, np.float64) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
     def azimuths(self, firings: Ints) -> Floats:
-        """Return the azimuths of the head at firings (k,), radians: (k,)."""
+        """Return the azimuths of the head at several firings, in radians.
+
+        `firings` and the result have shape (k,).
+        """
         turned = 2 * np.pi * self._within(firings) / self.firings_per_turn
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
     def within(self, start: float, share: float) -> Mirror:
-        """Return a head that fires only in a part of each revolution.
+        """Return a head that fires only during a part of each revolution.
 
-        Time 0 and firing 0 are at the start of this part. A time step is the same share of the
-        firings, and at least one.
+        Time 0 and firing 0 are at the start of this part. A time step contains the same share of
+        the firings as before, but at least one firing.
 
         Parameters
         ----------
         start
-            Start of the part, as a share of a revolution from firing 0 on.
+            Start of the part as a fraction of a revolution, measured from firing 0.
         share
-            Length of the part, as a share of a revolution.
+            Length of the part as a fraction of a revolution.
         """
         firings = max(round(self.firings_per_turn * share), 1)
         width_deg = 360 * firings / self.firings_per_turn
@@ -237,7 +247,10 @@ class Spin:
 
     @property
     def radians_per_ns(self) -> float:
-        """Angular velocity of the head in radians per nanosecond, counterclockwise."""
+        """Angular velocity of the head in radians per nanosecond.
+
+        The value is positive for a counterclockwise rotation.
+        """
         return 2 * np.pi * self.rate_hz / 1e9 * (-1 if self.clockwise else 1)
 
 

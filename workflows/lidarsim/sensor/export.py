@@ -62,19 +62,21 @@ def export_sensor(
     sensor
         A `Sensor`, for example from `load_sensor` or `Sensor.grid`.
     path
-        Path of the file. The format follows from its extension, unless `format` is set. An existing
-        file is replaced.
+        Path of the file. The file extension determines the format unless `format` is set. An
+        existing file is replaced.
     format
-        Name of the format, such as "livox"; see docs/how-to/other-simulators.md.
+        Name of the format, such as "livox". The formats are described in
+        docs/how-to/other-simulators.md.
     seconds
         Duration of the pattern in seconds.
     revolutions
-        Number of revolutions or frames, as an alternative to `seconds`; by default one.
+        Number of revolutions or frames, as an alternative to `seconds`. The default is one.
 
     Returns
     -------
     SensorFile
-        The format, the rays, and the properties of the sensor that the format cannot store.
+        The path and format of the file, the rays, and the properties of the sensor that the format
+        cannot store.
 
     Raises
     ------

@@ -423,31 +423,31 @@ def load_sensor(
     max_range_m: MaxRange | None = None,
     performance: Sheet | None = None,
 ) -> Sensor:
-    """Load a sensor from a sensor model or from the calibration of a unit.
+    """Load a sensor from a sensor model, from the calibration of a unit, or from both.
 
     Parameters
     ----------
     model
-        Name of the model, such as "velodyne/vlp16", or path of a sensor file (.yaml). By default,
-        the model whose beams are closest to the calibration.
+        Name of the model, such as "velodyne/vlp16", or path of a sensor file (.yaml). The default
+        is the model whose beams are closest to the calibration.
     calibration
         Calibration file of a unit: Velodyne YAML, Ouster metadata, Hesai angle corrections,
-        RoboSense angle.csv, Livox ray list, a beam table, or rays that were written by
+        RoboSense angle.csv, a Livox ray list, a beam table, or rays that were written by
         `export_sensor`.
     columns
         Number of firings per revolution, if the model or the beam table offers a choice.
     rate_hz
         Revolutions, lines or frames per second.
     step_deg
-        Rotation per scan in degrees. Ten degrees correspond to 800 rays of a VLP-16 and 3,600 rays
-        of an OS1-128. The overhead per scan is then low, because batches combine consecutive
-        scans, and several workers can share a revolution.
+        Rotation per scan in degrees. With the default of 10 degrees, a scan contains 800 rays of a
+        VLP-16 or 3,600 rays of an OS1-128. The overhead per scan is then low, because consecutive
+        scans are combined into batches, and several workers can share a revolution.
     min_range_m, max_range_m
-        Minimum and maximum range in meters; by default those of the model.
+        Minimum and maximum range in meters. The defaults are those of the model.
     performance
-        With "datasheet", the sensor has the noise and returns of its data sheet, unless a survey
-        sets others. The default is "ideal" for a named model, and for a file that does not
-        specify the performance.
+        With "datasheet", the sensor has the noise and returns of its data sheet, unless they are
+        overridden by a survey. The default is "datasheet" for a sensor file that specifies the
+        performance, and "ideal" otherwise.
 
     Raises
     ------

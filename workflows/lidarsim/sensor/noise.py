@@ -29,9 +29,9 @@ AngleSigma = Annotated[float, Field(ge=0, le=10)]  # degrees
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise of ranges and angles, lost returns, and false alarms.
+    """Noise model of a sensor: range and angle errors, lost returns, and false alarms.
 
-    Without arguments, the sensor is ideal.
+    By default, the sensor is ideal.
 
     The standard deviation of a range of r meters is ``range_m + range_per_m * r``. The term
     `range_at_threshold_m`, multiplied by the ratio of the detection threshold to the energy of the
@@ -41,50 +41,50 @@ class Noise:
     Raises
     ------
     LidarError
-        If a number is out of range, or requires a detection range that is not set.
+        If a number is out of range, or if `detection_range_m` is required but not set.
     """
 
-    range_m: Annotated[Meters, about("standard deviation of ranges, meters", 0.02)] = 0.0
+    range_m: Annotated[Meters, about("standard deviation of the range in meters", 0.02)] = 0.0
     range_per_m: Annotated[
-        float, about("standard deviation added for each meter of range", 0.0002, ge=0, le=1)
+        float, about("increase of the standard deviation per meter of range", 0.0002, ge=0, le=1)
     ] = 0.0
     angle_deg: Annotated[
-        AngleSigma, about("standard deviation of beam directions, in both axes", 0.05)
+        AngleSigma, about("standard deviation of the beam direction in degrees, in both axes", 0.05)
     ] = 0.0
     dropout: Annotated[
-        UnitShare, about("share of returns that are lost, whatever their energy")
+        UnitShare, about("fraction of returns that are lost, regardless of their energy")
     ] = 0.0
     detection_range_m: Annotated[
         float | None,
         about(
-            "range at which a surface of 10 % reflectance returns half the pulses; "
-            "weaker returns are lost",
+            "range in meters at which half of the pulses are detected on a surface with 10 % "
+            "reflectance; defines the detection threshold, below which returns are lost",
             100.0,
             ge=0.001,
             le=1e8,
         ),
     ] = None
-    seed: Annotated[Seed, about("the same seed gives the same noise")] = 0
+    seed: Annotated[Seed, about("seed of the noise; the same seed produces the same noise")] = 0
     overlap_m: Annotated[
         Meters,
         about(
-            "range from which on the receiver sees the whole beam; nearer, rain, snow, fog "
-            "and dust do not return more"
+            "range in meters beyond which the receiver sees the whole beam; at closer range, "
+            "returns from rain, snow, fog and dust do not become stronger"
         ),
     ] = 10.0
     range_at_threshold_m: Annotated[
         Meters,
         about(
-            "standard deviation of the range of a return at the threshold of "
-            "detection, meters; falls as its energy grows, added in squares",
+            "standard deviation of the range, in meters, of a return at the detection threshold; "
+            "inversely proportional to the energy, and added in quadrature",
             0.05,
         ),
     ] = 0.0
     walk_m: Annotated[
         float,
         about(
-            "range walk: a return 1.65 times as strong as the threshold of detection "
-            "appears so much nearer, one 10,000 times as strong 4.3 times as much",
+            "range walk, which is the distance in meters by which a return at 1.65 times the "
+            "detection threshold appears closer; 4.3 times as large at 10,000 times the threshold",
             0.02,
             ge=0,
             le=10,
@@ -93,7 +93,8 @@ class Noise:
     false_alarm_hz: Annotated[
         float,
         about(
-            "rate of false alarms, dark counts and sun, while the receiver waits for returns",
+            "rate of false alarms from dark counts and sunlight in Hz, while the receiver waits "
+            "for returns",
             200.0,
             ge=0,
             le=1e9,
@@ -102,23 +103,24 @@ class Noise:
     stray_light: Annotated[
         UnitShare,
         about(
-            "blooming of retro-reflectors: share of their light that a beam 1 degree "
-            "beside them receives; falls with the square of the angle",
+            "blooming of retroreflectors, as the fraction of their light that a beam 1 degree "
+            "away receives; decreases with the square of the angle",
             1e-6,
         ),
     ] = 0.0
 
     crosstalk: Annotated[
-        bool, about("whether it receives pulses of the other sensors of the survey")
+        bool, about("whether the sensor receives pulses from other sensors in the survey")
     ] = False
     velocity_m_s: Annotated[
-        float, about("standard deviation of radial velocities, m/s", ge=0, le=1000)
+        float, about("standard deviation of the radial velocity in m/s", ge=0, le=1000)
     ] = 0.0
     saturation: Annotated[
         float | None,
         about(
-            "signal that fills the receiver, in thresholds of detection: stronger pulses are "
-            "clipped and wider, and hide what is close; by default none",
+            "signal that saturates the receiver, as a multiple of the detection threshold; "
+            "stronger pulses are clipped and widened, and hide returns close to them (default: no "
+            "saturation)",
             100.0,
             ge=1,
             le=1e12,
@@ -127,13 +129,26 @@ class Noise:
     channel_bias_m: Annotated[
         Meters | Several[Bias],
         allowed("a number from 0 to 1000, or a list of numbers, one for each channel"),
-        about("constant errors of channels' ranges, meters: standard deviation, or one for each"),
+        about(
+            "constant range errors of the channels in meters, as a standard deviation or as one "
+            "value per channel"
+        ),
     ] = 0.0
-    warm_up_m: Annotated[Bias, about("error of ranges at the start, which decays, meters")] = 0.0
-    warm_up_s: Annotated[DecayTime, about("time in which the error falls to 37 %, seconds")] = 600.0
-    ripple_deg: Annotated[AngleSigma, about("greatest error of azimuths, as the head turns")] = 0.0
-    ripple_cycles: Annotated[int, about("repetitions in a revolution", ge=1, le=100_000)] = 1
-    ripple_phase_deg: Annotated[AngleDeg, about("phase where the head is at azimuth 0")] = 0.0
+    warm_up_m: Annotated[
+        Bias, about("range error in meters at the start of the warm-up, which decays exponentially")
+    ] = 0.0
+    warm_up_s: Annotated[
+        DecayTime, about("time in seconds in which the warm-up error decays to 37 %")
+    ] = 600.0
+    ripple_deg: Annotated[
+        AngleSigma, about("amplitude in degrees of the periodic azimuth error of a rotating head")
+    ] = 0.0
+    ripple_cycles: Annotated[
+        int, about("number of periods of the azimuth error per revolution", ge=1, le=100_000)
+    ] = 1
+    ripple_phase_deg: Annotated[
+        AngleDeg, about("phase of the azimuth error in degrees at azimuth 0")
+    ] = 0.0
 
     def __post_init__(self) -> None:
         if np.ndim(self.channel_bias_m):
@@ -156,14 +171,14 @@ class Noise:
 
     @property
     def threshold(self) -> float:
-        """Energy at which half of the returns are detected, or 0 without a threshold."""
+        """Energy at which half of the returns are detected, or 0 if there is no detection range."""
         if self.detection_range_m is None:
             return 0.0
         return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     @property
     def full(self) -> float:
-        """Signal level at which the receiver saturates."""
+        """Energy at which the receiver saturates, or infinity if it never saturates."""
         return inf if self.saturation is None else self.saturation * self.threshold
 
     @property
@@ -173,10 +188,10 @@ class Noise:
 
     @property
     def moves_ranges(self) -> bool:
-        """Whether ranges deviate."""
+        """Whether measured ranges differ from the true ranges."""
         random = self.range_m, self.range_per_m, self.range_at_threshold_m
         return any((*random, self.walk_m, self.channel_bias_m, self.warm_up_m))
 
     def named(self, name: str) -> Noise:
-        """Return the noise for a named sensor, whose name seeds its random numbers."""
+        """Return a copy of the noise with a seed that also depends on the name of a sensor."""
         return replace(self, seed=named_seed(self.seed, name))

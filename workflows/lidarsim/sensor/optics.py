@@ -35,7 +35,7 @@ AngleMrad = Annotated[float, Field(ge=0, le=1000)]
 # Full angle of a beam's cone, at 1/e² of the maximum; or two angles, across and up.
 Divergence = Annotated[
     AngleMrad | Annotated[Sequence[AngleMrad], Field(min_length=2, max_length=2)],
-    allowed("from 0 to 1000, or two such numbers as [across, up]"),
+    allowed("from 0 to 1000, or two such numbers as [horizontal, vertical]"),
 ]
 Diameter = Annotated[float, Field(ge=0, le=10)]
 Pulse = Annotated[float, Field(ge=0, le=1e6)]
@@ -48,25 +48,29 @@ class Optics:
     """Optical parameters and range resolution of a sensor."""
 
     wavelength_nm: Annotated[
-        float, about("wavelength of the laser; 905 if no source states it", ge=200, le=20_000)
+        float, about("wavelength of the laser in nanometers; 905 if unknown", ge=200, le=20_000)
     ] = 905.0
     divergence_mrad: Annotated[
-        Divergence | None, about("full angle of the beam, or two, across and up; None if unknown")
+        Divergence | None,
+        about(
+            "full divergence angle of the beam in mrad, or a horizontal and a vertical angle; None "
+            "if unknown"
+        ),
     ] = None
-    pulse_ns: Annotated[Pulse, about("length of a pulse")] = 5.0
+    pulse_ns: Annotated[Pulse, about("duration of a pulse in nanoseconds")] = 5.0
     resolution_m: Annotated[
         Precision | None,
-        about("step of ranges, the default for rounding positions; None if no source states it"),
+        about("range resolution in meters, the default precision of positions; None if unknown"),
     ] = None
-    beam_profile: Annotated[
-        Profile, about("how light is spread over the beam, where it has sub-rays")
-    ] = "even"
+    beam_profile: Annotated[Profile, about("distribution of light over the sub-rays of a beam")] = (
+        "even"
+    )
     exit_diameter_m: Annotated[Diameter, about("width of the beam where it leaves the sensor")] = (
         0.0
     )
     reflectivity: Annotated[
         Literal[tuple(SCALES)],  # type: ignore[valid-type]
-        about("scale of the column reflectivity; Velodyne's if no source states it"),
+        about("scale of the column `reflectivity`; Velodyne's if unknown"),
     ] = "velodyne"
 
     def __post_init__(self) -> None:
@@ -77,10 +81,10 @@ class Optics:
 @dataclass(frozen=True)
 @checked_fields
 class Returns:
-    """Sub-rays of a beam, and the returns that the sensor reports for a pulse.
+    """Sub-rays of each beam, and the returns that the sensor reports for each pulse.
 
     The mode "dual" reports the strongest and the last return, or the two strongest returns if the
-    last return is the strongest. The mode "two_strongest" reports the two strongest returns.
+    last return is the strongest. The mode "two_strongest" always reports the two strongest returns.
 
     Raises
     ------
@@ -89,46 +93,66 @@ class Returns:
     """
 
     mode: Annotated[
-        Mode, about("returns reported for a pulse; dual: strongest and last", "dual")
+        Mode,
+        about(
+            "returns that are reported per pulse; dual reports the strongest and the last", "dual"
+        ),
     ] = "strongest"
     subrays: Annotated[
         Literal[SUBRAYS],  # type: ignore[valid-type]
-        about("rays in a beam: 1, 7, 19, 37, 61, … 217; auto by performance", 1),
+        about(
+            "number of rays per beam: 1, 7, 19, 37, 61, … 217 (default: 1, or 7 if performance is "
+            "datasheet)",
+            1,
+        ),
     ] = 1
     divergence_mrad: Annotated[
         Divergence | None,
-        about("full angle of the beam, or two, across and up; by default the sensor's", 3.0),
+        about(
+            "full divergence angle of the beam in mrad, or a horizontal and a vertical angle "
+            "(default: from the sensor)",
+            3.0,
+        ),
     ] = None
     pulse_ns: Annotated[
         Pulse | None,
         about(
-            "length of the pulse, in waveforms at half of its maximum: surfaces less "
-            "than half of it apart are one return; by default the sensor's, or 5",
+            "duration of the pulse in nanoseconds, at half maximum for waveforms; surfaces that "
+            "are less than half of the pulse length apart merge into one return (default: from the "
+            "sensor, otherwise 5)",
             5.0,
         ),
     ] = None
     beam_profile: Annotated[
         Profile | None,
-        about("how light is spread over the beam; by default the sensor's, or even", "gaussian"),
+        about(
+            "distribution of light over the beam (default: from the sensor, otherwise even)",
+            "gaussian",
+        ),
     ] = None
     exit_diameter_m: Annotated[
         Diameter | None,
-        about("width of the beam where it leaves the sensor; by default the sensor's, or 0", 0.01),
+        about(
+            "diameter of the beam in meters where it leaves the sensor (default: from the sensor, "
+            "otherwise 0)",
+            0.01,
+        ),
     ] = None
     waveform: Annotated[
         Processing,
         about(
-            "how returns are found in the waveform: peaks, or gaussian decomposition; "
-            "none: hits within half of the pulse are one return"
+            "how returns are extracted from the waveform: peaks detects its peaks, and gaussian "
+            "decomposes it into Gaussians; with none, no waveform is computed, and hits within "
+            "half of the pulse length merge into one return"
         ),
     ] = "none"
     sample_ns: Annotated[
-        float, about("time between two samples of the waveform", ge=0.001, le=1000)
+        float, about("sampling interval of the waveform in nanoseconds", ge=0.001, le=1000)
     ] = 1.0
     bandwidth_mhz: Annotated[
         float | None,
         about(
-            "bandwidth of the receiver of waveforms, at -3 dB; by default without limit",
+            "bandwidth (-3 dB) of the waveform receiver in MHz (default: unlimited)",
             300.0,
             ge=0.1,
             le=1e6,
@@ -142,32 +166,37 @@ class Returns:
     def divergence(self, optics: Optics) -> float:
         """Return the full divergence angle of the beam, in radians.
 
+        If the angles across and up differ, the result is their geometric mean.
+
         Raises
         ------
         LidarError
-            If the beam has several sub-rays, and its divergence is unknown.
+            If the beam has several sub-rays but its divergence is unknown.
         """
         across, up = self._divergences(optics)
         return across if across == up else float(np.sqrt(across * up))
 
     def min_gap_m(self, optics: Optics) -> float:
-        """Return the minimum distance between two returns in meters, half of the pulse length."""
+        """Return the minimum distance between two separate returns, in meters.
+
+        This distance is half the length of the pulse.
+        """
         return LIGHT_M_NS * self.length_ns(optics) / 2
 
     def beam(self, optics: Optics) -> Beam:
-        """Return the sub-rays of a sensor's beam.
+        """Return the sub-rays of the beam of a sensor.
 
         Raises
         ------
         LidarError
-            If the beam has several sub-rays, and its divergence is unknown.
+            If the beam has several sub-rays but its divergence is unknown.
         """
         profile = optics.beam_profile if self.beam_profile is None else self.beam_profile
         divergences = self._divergences(optics)
         return Beam.from_divergences(self.subrays, divergences, profile, self.exit_m(optics))
 
     def exit_m(self, optics: Optics) -> float:
-        """Return the width of the beam at the sensor in meters, or 0 if it is unknown."""
+        """Return the beam width at the sensor's exit in meters, or 0 if it is unknown."""
         return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
     def _divergences(self, optics: Optics) -> tuple[float, float]:
@@ -187,7 +216,7 @@ class Returns:
         return across / 1000, up / 1000
 
     def length_ns(self, optics: Optics) -> float:
-        """Return the length of the pulse in nanoseconds."""
+        """Return the pulse length in nanoseconds."""
         return optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
 
     def system_ns(self, optics: Optics) -> float:
@@ -199,7 +228,7 @@ class Returns:
         Raises
         ------
         LidarError
-            If the samples are too far apart for the waveform.
+            If the interval between samples is too long to resolve the waveform.
         """
         response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
         sigma = hypot(self.length_ns(optics) / FWHM, response)

@@ -26,13 +26,26 @@ from .optics import LIGHT_M_NS, Optics, Returns
 from .packet_settings import Identifier, PacketSettings
 
 RaysPerRevolution = Annotated[
-    int, about("for a grid: azimuths in a revolution", ge=1, le=10_000_000)
+    int, about("number of azimuths per revolution, for a regular grid", ge=1, le=10_000_000)
 ]
-Layers = Annotated[int, about("for a grid: elevations (rings)", ge=1, le=MAX_CHANNELS)]
-Fov = Annotated[float, about("for a grid: degrees, half of it below the horizon", ge=0, le=180)]
+Layers = Annotated[
+    int, about("number of elevations (rings), for a regular grid", ge=1, le=MAX_CHANNELS)
+]
+Fov = Annotated[
+    float,
+    about(
+        "vertical field of view in degrees, half of it below the horizon, for a regular grid",
+        ge=0,
+        le=180,
+    ),
+]
 Sector = Annotated[
     float,
-    about("for a grid: degrees that a revolution sweeps, half of it left of +x", gt=0, le=360),
+    about(
+        "horizontal field of view in degrees, half of it to the left of +x, for a regular grid",
+        gt=0,
+        le=360,
+    ),
 ]
 SAMPLED_FIRINGS = 2000  # firings that give the field of view
 MAX_GAP_DEG = 5.0  # between neighboring azimuths of a sensor that looks all around
@@ -45,12 +58,12 @@ MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 class Sensor:
     """A lidar sensor, which consists of beams and a head that moves them.
 
-    Each firing fires all beams once.
+    All beams are fired once per firing.
 
     To define another kind of sensor, use other beams or another head, or write a subclass that
     overrides `directions`, `origins` or `begins_ns`. No other code has to be changed. A sensor is
-    identified by its fields (see `lidarpool.base.fingerprint`), so store everything on which its
-    rays depend in fields.
+    identified by its fields (see `lidarpool.base.fingerprint`), so any data that affects the rays
+    must be stored in fields.
 
     Parameters
     ----------
@@ -59,14 +72,14 @@ class Sensor:
     head
         The mechanism that moves the beams.
     min_range_m, max_range_m
-        Minimum and maximum range in meters. Other returns are ignored, and rays pass through
-        surfaces at shorter range.
+        Minimum and maximum range in meters. Returns outside this interval are ignored, and rays
+        pass through surfaces that are closer than the minimum range.
     name
-        Name of the sensor model for reports; by default the name of the class.
+        Name of the sensor model for reports. The default is the name of the class.
     optics
         Optical parameters and range resolution.
     start_ns
-        Start of the head in nanoseconds after the start of the survey or station.
+        Time at which the head starts, in nanoseconds since the start of the survey or station.
     noise, returns
         Defaults for surveys with this sensor. They are not part of its fingerprint.
     packets
@@ -143,12 +156,12 @@ class Sensor:
     def with_packets(
         self, ports: Mapping[str, int], identifiers: Mapping[str, Identifier]
     ) -> Sensor:
-        """Return a copy of the sensor with other packet ports and identifiers.
+        """Return a copy of the sensor in which some packet ports and identifiers are replaced.
 
         Raises
         ------
         LidarError
-            If the sensor has no packets.
+            If the sensor has no packet format.
         """
         if self.packets is None:
             raise LidarError(f"{self.model} has no packet format. Remove packets.")
@@ -178,25 +191,25 @@ class Sensor:
         *,
         horizontal_fov_deg: Sector = 360.0,
     ) -> Sensor:
-        """Return a spinning sensor with evenly spaced azimuths and elevations.
+        """Create a spinning sensor with evenly spaced azimuths and elevations.
 
         Azimuth 0 is the +x axis of the sensor, and azimuths increase counterclockwise as seen from
-        above. Channel 0 is the lowest.
+        above. Channel 0 is the lowest channel.
 
         Parameters
         ----------
         rays_per_revolution
             Number of firings per revolution.
         layers
-            Number of channels, evenly spaced over the vertical field of view, both ends included. A
-            single channel points straight forward.
+            Number of channels, which are evenly spaced over the vertical field of view, including
+            both ends. A single channel points straight forward.
         vertical_fov_deg
-            Vertical field of view in degrees, in [0, 180], half of it below the horizon. A value of
-            0 is only possible for a single layer, as in a 2D scanner.
+            Vertical field of view in degrees, in [0, 180], centered on the horizon. A value of 0 is
+            only possible for a single layer, as in a 2D scanner.
         step_deg
             Rotation per time step in degrees, in (0, 360].
         min_range_m, max_range_m
-            Minimum and maximum range in meters. Other returns are ignored.
+            Minimum and maximum range in meters. Returns outside this interval are ignored.
         rate_hz
             Revolutions per second.
         horizontal_fov_deg
@@ -229,7 +242,7 @@ class Sensor:
 
     @property
     def gate_s(self) -> float:
-        """Time in seconds for which the receiver waits for returns of a pulse."""
+        """Time in seconds for which the receiver waits for the returns of a pulse."""
         return 2e-9 * (self.max_range_m - self.min_range_m) / LIGHT_M_NS
 
     @property
@@ -248,16 +261,18 @@ class Sensor:
         return self.head.period
 
     def firings(self, step: int) -> tuple[int, int]:
-        """Return the half-open range of the firings in a time step.
+        """Return the half-open range of the firing indices in a time step.
 
-        Successive steps have no gap or overlap; numbers continue from revolution to revolution.
+        The ranges of consecutive steps neither overlap nor leave gaps. Indices continue across
+        revolutions.
         """
         return self.head.firings(step)
 
     def revolutions(self, steps: ArrayLike) -> Ints:
-        """Return the index of the revolution or frame in which each time step (k,) starts.
+        """Return the index of the revolution or frame in which each time step starts.
 
-        A head without `rate_hz`, such as a user's, makes a revolution in each step.
+        `steps` and the result have shape (k,). If the head has no `rate_hz`, as is possible for
+        custom heads, each step counts as one revolution.
         """
         numbers = np.asarray(steps, np.int64)
         rate_hz = getattr(self.head, "rate_hz", None)
@@ -275,7 +290,7 @@ class Sensor:
         return float(self.head.times_ns(np.array([self.firings(number)[0]]))[0])
 
     def steps_of_revolution(self, number: int) -> range:
-        """Return the time steps of a revolution or frame.
+        """Return the range of time steps in a revolution or frame.
 
         Examples
         --------
@@ -308,13 +323,18 @@ class Sensor:
         return bisect_left(range(upper + 1), number, lo=lower, key=revolution_of)
 
     def directions(self, firings: Ints) -> Floats:
-        """Return the ray directions of firings (k,) in the sensor frame. Shape (k, channels, 3)."""
+        """Return the ray directions of several firings in the sensor frame.
+
+        For `firings` of shape (k,), the result has shape (k, channels, 3). Directions are unit
+        vectors.
+        """
         return self._rotated(firings, self.ahead)
 
     def origins(self, firings: Ints) -> Floats | None:
-        """Return the ray origins of firings (k,) in the sensor frame, in meters.
+        """Return the ray origins of several firings in the sensor frame, in meters.
 
-        None if all rays start at the sensor's center.
+        For `firings` of shape (k,), the result has shape (k, channels, 3). It is None if all rays
+        start at the sensor origin.
         """
         if not self.beams.origin.any():
             return None
@@ -322,7 +342,10 @@ class Sensor:
 
     @cached_property
     def ahead(self) -> Floats:
-        """Unit directions of the beams in the head frame at azimuth 0. Shape (channels, 3)."""
+        """Unit vectors along the beams in the head frame at azimuth 0.
+
+        The shape is (channels, 3).
+        """
         beams = self.beams
         up, level = sin_cos(beams.elevation)
         sin, cos = sin_cos(beams.azimuth)
@@ -335,10 +358,11 @@ class Sensor:
         return origin[0] if (origin == origin[0]).all() else None
 
     def spins(self, firings: Ints) -> Floats | None:
-        """Return the cosines and sines of the head angles at firings (k,). Shape (2, k).
+        """Return the cosines and sines of the head angles at several firings.
 
-        Angles are about the z axis of the head frame; `axes` rotates it to the sensor frame. None
-        if the rays are not beams that such a head rotates.
+        For `firings` of shape (k,), the result has shape (2, k). The head rotates about the z axis
+        of its frame, and `axes` transforms the head frame to the sensor frame. The result is None
+        if a subclass computes the rays in another way.
         """
         kind = type(self)
         if kind.directions is not Sensor.directions or kind.origins is not Sensor.origins:
@@ -366,17 +390,23 @@ class Sensor:
         return turned(rotated.reshape(-1, 3), self.axes).reshape(rotated.shape)
 
     def begins_ns(self, firings: Ints) -> Floats:
-        """Return the start times of firings (k,) in nanoseconds since the start of the station."""
+        """Return the start times of several firings in nanoseconds since the start of the station.
+
+        `firings` and the result have shape (k,).
+        """
         return self.start_ns + self.head.times_ns(firings)
 
     def times_ns(self, firings: Ints) -> Ints:
-        """Return the ray times of firings (k,) in nanoseconds since the start of the station."""
+        """Return the firing times of all rays in nanoseconds since the start of the station.
+
+        For `firings` of shape (k,), the result has shape (k, channels) and is rounded to integers.
+        """
         times = self.begins_ns(firings)[:, None] + self.beams.time_ns
         return np.rint(times).astype(np.int64)
 
     @property
     def lead_ns(self) -> float:
-        """Time of the first beam within a firing in nanoseconds."""
+        """Time of the earliest beam within a firing, in nanoseconds."""
         return float(self.beams.time_ns.min())
 
 

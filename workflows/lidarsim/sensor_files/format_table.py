@@ -79,7 +79,7 @@ class SensorFormat:
         Raises LidarError if a package that the module needs is not installed.
         """
         for package in self.packages:
-            need(package, self.extra, f"Sensors in the format {self.name} are read and written")
+            need(package, self.extra, f"The sensor format {self.name}")
         return getattr(import_module(self.module), name)
 
 
@@ -108,11 +108,11 @@ FORMATS: tuple[SensorFormat, ...] = (
         ("times", "min_range", "max_range", "rate"),
         module="mujoco_rays",
     ),
-    _row("mjcf", ".xml", "rangefinders of MuJoCo", ("origins", "max_range"), reads=False),
+    _row("mjcf", ".xml", "MuJoCo rangefinders", ("origins", "max_range"), reads=False),
     _row(
         "sdf",
         ".sdf",
-        "gpu_lidar of Gazebo",
+        "Gazebo gpu_lidar",
         ("channels", "min_range", "max_range", "rate"),
         by_ending=True,
         reads=False,
@@ -120,7 +120,7 @@ FORMATS: tuple[SensorFormat, ...] = (
     _row(
         "warp",
         ".py",
-        "a Python file of arrays, for Isaac Lab, mjlab and Genesis",
+        "a Python file with arrays for Isaac Lab, mjlab and Genesis",
         ("times", "origins", "min_range", "max_range", "rate"),
         module="warp_module",
         by_ending=True,
@@ -135,7 +135,7 @@ FORMATS: tuple[SensorFormat, ...] = (
     _row(
         "omnilidar",
         ".usda",
-        "OmniLidar of Isaac Sim",
+        "Isaac Sim OmniLidar",
         ("times", "channels", "min_range", "max_range", "rate"),
         by_ending=True,
         reads=False,
@@ -144,13 +144,13 @@ FORMATS: tuple[SensorFormat, ...] = (
         "helios",
         (".xml",),
         "lidarsim.sensor.helios_scanner",
-        "a scanner of HELIOS++",
+        "a HELIOS++ scanner",
         frozenset(PROPERTIES) - {"returns"},
         reads=False,
         describes=True,
     ),
-    _row("npz", ".npz", "arrays of NumPy", _COLUMNS, module="ray_npz", by_ending=True),
-    _row("livox", ".csv", "scan_mode of Livox's plug-in for Gazebo", ("times",)),
+    _row("npz", ".npz", "NumPy arrays", _COLUMNS, module="ray_npz", by_ending=True),
+    _row("livox", ".csv", "scan_mode of the Livox plug-in for Gazebo", ("times",)),
     _row("csv", ".csv", "a table of rays", _COLUMNS, module="ray_csv", by_ending=True),
     _row(
         "parquet",

@@ -46,7 +46,7 @@ def is_livox(text: str) -> bool:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Read the rays from a Livox list, or return None if the file has another format."""
+    """Read rays from a Livox scan pattern, or return None if the file has another format."""
     text = read_text(path)
     return rays_of_text(text) if is_livox(text) else None
 

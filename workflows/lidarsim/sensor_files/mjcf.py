@@ -46,7 +46,7 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
     ]
     lines = [
         f"<mujoco model={quoteattr(rays.name)}>",
-        f"  <!-- Axes of the body lidar: {AXES}. Sites are in the order of firing. -->",
+        f"  <!-- Axes of the body lidar: {AXES}. Sites are in firing order. -->",
         *(f"  <!-- Not in this file: {remark(clause)}. -->" for clause in left_out),
         "  <worldbody>",
         '    <body name="lidar">',

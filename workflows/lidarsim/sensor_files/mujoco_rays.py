@@ -64,21 +64,21 @@ def _python_text(rays: FiredRays, left_out: Sequence[str]) -> str:
         "_PHI": array_code(np.radians(rays.elevations_deg), "<f8"),
         "_TIMES_NS": times_code(rays),
     }
-    title = "Angles of the rays of {name} for MuJoCo-LiDAR, as lidarpool wrote them."
+    title = "Ray angles of {name} for MuJoCo-LiDAR, written by lidarpool."
     return python_text(rays, title, _WORDS, left_out, _FUNCTIONS, arrays)
 
 
 def read(path: Path) -> FiredRays | None:
-    """Read the rays from the arrays `theta` and `phi`.
+    """Read rays from the arrays `theta` and `phi`.
 
-    Returns None for other arrays and for Python files.
+    The result is None for a Python file, and for a file that contains neither of these arrays.
 
     Raises
     ------
     ValueError
-        If an array is missing or not known, or numbers are not finite.
+        If an array is missing or unknown, or if a value is not finite.
     LidarError
-        If the content is larger than the memory.
+        If the content exceeds the memory limit.
     """
     if path.suffix.lower() == _PYTHON:
         return None  # code is not run

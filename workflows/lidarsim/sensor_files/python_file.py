@@ -26,7 +26,7 @@ import zlib
 import numpy as np
 
 NAME = {name!r}
-RATE_HZ = {rate_hz!r}  # frames a second
+RATE_HZ = {rate_hz!r}  # frames per second
 MIN_RANGE_M = {min_range_m!r}
 MAX_RANGE_M = {max_range_m}
 FRAMES = {frames}  # in this file; frame FRAMES is frame 0 again

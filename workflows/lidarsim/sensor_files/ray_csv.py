@@ -50,7 +50,7 @@ def is_ray_table(text: str) -> bool:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Read the rays from a text table (`rays_of_text`)."""
+    """Read rays from a text table, as described in `rays_of_text`."""
     return rays_of_text(read_text(path))
 
 

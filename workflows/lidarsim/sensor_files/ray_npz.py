@@ -37,14 +37,14 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def read(path: Path) -> FiredRays | None:
-    """Read the rays from an .npz file, or return None if the arrays have another format.
+    """Read rays from an .npz file, or return None if its arrays have another format.
 
     Raises
     ------
     ValueError
-        If an array or the header cannot be used.
+        If an array or the header is invalid.
     LidarError
-        If the content is larger than the memory.
+        If the content exceeds the memory limit.
     """
     arrays = read_arrays(path)
     if HEADER not in arrays and "direction_x" not in arrays and "azimuth_deg" not in arrays:

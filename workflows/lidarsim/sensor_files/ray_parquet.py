@@ -42,14 +42,14 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
 
 
 def read(path: Path) -> FiredRays | None:
-    """Read the rays from a Parquet table.
+    """Read rays from a Parquet table.
 
     Raises
     ------
     ValueError
-        If the file is not of Parquet, or a column cannot be used.
+        If the file is not a Parquet file, or if a column is invalid.
     LidarError
-        If the rays take more than the memory.
+        If the rays exceed the memory limit.
     """
     try:
         allowance = Allowance(check_input(path), "write it again with fewer rays")

@@ -65,14 +65,14 @@ def _matrices(rays: FiredRays) -> Floats:
 
 
 def read(path: Path) -> FiredRays | None:
-    """Read the rays from RGL arrays, or return None if the arrays have another format.
+    """Read rays from RGL arrays, or return None if the arrays have another format.
 
     Raises
     ------
     ValueError
-        If the arrays have other shapes, or numbers are not finite.
+        If an array has the wrong shape, or if a value is not finite.
     LidarError
-        If the content is larger than the memory.
+        If the content exceeds the memory limit.
     """
     arrays = read_arrays(path)
     if "rays" not in arrays:

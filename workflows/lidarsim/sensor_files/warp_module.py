@@ -35,6 +35,6 @@ def write(path: Path, rays: FiredRays, left_out: Sequence[str]) -> Sequence[str]
         "_TIMES_NS": times_code(rays),
         "_ORIGINS": origins,
     }
-    title = "Rays of {name}, as lidarpool wrote them."
+    title = "Rays of {name}, written by lidarpool."
     write_text_of(path, python_text(rays, title, _WORDS, left_out, _FUNCTIONS, arrays))
     return left_out

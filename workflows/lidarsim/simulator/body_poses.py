@@ -133,7 +133,7 @@ def _followed_matrices(table: Floats, count: int, times_s: ArrayLike) -> BodyPos
             f"at times (samples,), but has the shape {table.shape}."
         )
     _check_count(len(table), count)
-    with prefixed("poses, of all bodies in turn"):
+    with prefixed("poses (flattened over bodies and times)"):
         check_matrices(table.reshape(-1, 4, 4))
     tracks = Track.from_matrices(times, table)
     return BodyPoses(table[:, 0, :3, 3], table[:, 0, :3, :3], tracks)

@@ -175,6 +175,6 @@ def numbers(ray: Integers) -> Ints:
 
 
 def runs(ray: Integers) -> tuple[Ints, Ints]:
-    """Return the starts and lengths of runs of returns from the same ray."""
+    """Return the start and length of each run of returns from the same ray."""
     starts = np.flatnonzero(np.diff(ray, prepend=-1))
     return starts, np.diff(starts, append=len(ray))

@@ -46,22 +46,24 @@ StartSeconds = Annotated[float | None, Field(ge=0, lt=MAX_START_S)]
 
 
 class Scanner:
-    """A simulated sensor in a scene, which runs in this process without a cluster or files.
+    """A simulated sensor that scans a scene in the current process, without a cluster or files.
 
-    The results are bit-identical to those of a survey: sweep `number` is the revolution (or frame)
-    with this number in a survey along the same trajectory. It has the same random numbers if the
-    sensor is the first sensor of the survey. Scanners with the same name and the same noise seed
-    have the same random numbers. Threads can share a scanner. A pickled copy, for example in a Dask
-    task, returns the same results. It builds its own acceleration structures and continues with
-    the sweep numbers of the scanner.
+    The results are bit-identical to those of a survey along the same trajectory: sweep `number` is
+    the revolution (or frame) of the survey with this number. The random numbers are also the same
+    if the sensor is the first sensor of the survey. Scanners with the same name and the same noise
+    seed use the same random numbers.
+
+    Several threads can share a scanner. A pickled copy, for example in a Dask task, returns the
+    same results. The copy builds its own acceleration structures and continues with the sweep
+    numbers of the original scanner.
 
     Parameters
     ----------
     scene
         The scene to scan.
     sensor
-        The lidar, or a `Mounted` lidar on a platform. For a `Mounted` lidar, poses are poses of the
-        platform.
+        The lidar, or a `Mounted` lidar on a platform. For a `Mounted` lidar, all poses are poses of
+        the platform.
     name
         Name of the sensor, on which all of its random numbers depend. Use different names for the
         sensors of a robot. A `Mounted` lidar already has a name.
@@ -72,11 +74,12 @@ class Scanner:
     spray_g_m3
         As in `Survey`.
     backend
-        "cuda", "tiles", "numpy", or "auto" for the first of the three that can be used.
+        Ray-casting backend: "cuda", "tiles", "numpy", or "auto" for the first of the three that is
+        available.
     threads
-        Number of CPU threads for ray casting; None for all cores.
+        Number of CPU threads for ray casting. If None, all cores are used.
     device
-        Index of the CUDA device; None for the current device.
+        Index of the CUDA device. If None, the current device is used.
 
     Raises
     ------
@@ -191,12 +194,15 @@ class Scanner:
 
     @property
     def survey(self) -> Survey:
-        """Survey of one time step with the sensor, columns, returns and noise of the scanner."""
+        """Survey of a single time step, with the sensor and the options of the scanner."""
         return self._rig.survey
 
     @property
     def origin(self) -> Floats:
-        """Local origin of the scene in world coordinates, in meters. Shape (3,)."""
+        """Local origin of the scene in world coordinates, in meters.
+
+        The shape is (3,).
+        """
         return self._rig.scene.origin
 
     @property
@@ -210,7 +216,7 @@ class Scanner:
     ) -> tuple[float, float]:
         """Return the firing times of the first and the last beam of a sweep, in seconds.
 
-        `number` and `start_s` are as in `sweep`.
+        `number` and `start_s` are the same as in `sweep`, but `number` is 0 by default.
         """
         rig = self._rig
         specs, _ = self._scans_of(rig, number, start_s)
@@ -232,17 +238,14 @@ class Scanner:
         ----------
         pose
             Pose of a stationary sensor, or trajectory of a moving sensor, in local scene
-            coordinates. Along a trajectory, each beam is fired from the pose at the time of the
-            beam.
+            coordinates. Along a trajectory, each beam is fired from the pose at its firing time.
         number
             Number of the revolution or frame, starting at 0. It determines the random numbers and
-            the firings, because a revolution starts at the azimuth where the previous one ended.
-            By default, each call uses the firings and times of revolution 0 with new random
-            numbers.
+            the firings, because a revolution starts at the azimuth where the previous one ended. By
+            default, each call uses the firings and times of revolution 0 with new random numbers.
         start_s
             Start of the revolution in seconds since the start of the trajectories of the sensor and
-            the actors. The default is `number` times the duration of a revolution, as in a
-            survey.
+            the actors. The default is `number` times the duration of a revolution, as in a survey.
 
         Returns
         -------
@@ -290,33 +293,33 @@ class Scanner:
         number: SweepNumber | None = None,
         start_s: StartSeconds = None,
     ) -> Floats32:
-        """Return the range images that the sensor measures from several poses.
+        """Simulate the range images that the sensor measures from several poses.
 
-        This is the fastest method, because no points are computed.
+        This is the fastest method, because it does not compute points.
 
         Parameters
         ----------
         poses
             A pose or a list of poses; positions (k, 3) in meters; or matrices (k, 4, 4) from the
-            frame of the sensor, or of its platform, to the scene frame. The sensor is stationary
-            at each pose.
+            frame of the sensor, or of its platform, to the scene frame. The sensor is stationary at
+            each pose.
         number
-            Number of the revolution, as in `sweep`. The image at pose i has the random numbers of
+            Number of the revolution, as in `sweep`. The image at pose i uses the random numbers of
             revolution ``number + i``.
         start_s
-            Start of the revolution in seconds, which determines the poses of actors, as in
-            `sweep`.
+            Start of the revolution in seconds, which determines the poses of actors, as in `sweep`.
 
         Returns
         -------
-        float32 (k, firings, channels)
-            Range of the nearest reported return of each ray in meters; inf without a return.
+        float32 array of shape (k, firings, channels)
+            Range of the nearest reported return of each ray in meters, or inf if there is no
+            return.
 
         Raises
         ------
         LidarError
-            If the poses have none of these forms, a number is not finite, or a matrix mirrors or
-            deforms.
+            If `poses` has an unsupported form, a number is not finite, or a matrix is not a rigid
+            transform.
         """
         positions, rotations = _poses_of(poses)
         with self._casting() as rig:
@@ -344,29 +347,30 @@ class Scanner:
         Sweeps in progress use the earlier poses.
 
         Moving several bodies in a single call is faster than moving them one by one, with the same
-        result. If a body cannot be moved, none of them is moved.
+        result. If a body cannot be moved, none of the bodies is moved.
 
         Parameters
         ----------
         name
             Name of an actor, or of an object that is a `SceneInstance` in the scene, such as a copy
-            in a scenario; or a list of k names.
+            in a scenario. To move several bodies, pass a list of k names.
         pose
             New pose of the mesh frame in local scene coordinates: a `Pose`, a position, or a matrix
-            (4, 4). Instances keep their scale. For an actor, it can also be a trajectory, which
-            the actor follows from time 0. For k names, pass a list of these, positions (k, 3), or
-            matrices (k, 4, 4). Arrays are faster than lists.
+            (4, 4). Instances keep their scale. For an actor, it can also be a trajectory, which the
+            actor follows from time 0. For k names, pass a list of k poses, an array of positions
+            (k, 3), or an array of matrices (k, 4, 4). Arrays are faster than lists.
         times_s
-            (samples,): times of poses within a sweep in seconds, ascending, on the time scale of
-            `start_s`. If it is set, `pose` contains matrices (samples, 4, 4), or
-            (k, samples, 4, 4) for k names, and each beam uses the poses of the actors at the time
-            of the beam. Between two poses, actors move at constant velocity and angular velocity.
+            Times of poses within a sweep in seconds, in ascending order, on the time scale of
+            `start_s`. Shape (samples,). If `times_s` is set, `pose` must be an array of matrices of
+            shape (samples, 4, 4), or (k, samples, 4, 4) for k names. Each beam then uses the poses
+            of the actors at its firing time. Between two poses, actors move at constant velocity
+            and angular velocity.
 
         Raises
         ------
         LidarError
             If the actor or instance does not exist, a name occurs twice, an instance would move
-            during a sweep, or a rotation mirrors or deforms.
+            during a sweep, or a matrix is not a rigid transform.
 
         Examples
         --------

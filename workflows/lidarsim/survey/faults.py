@@ -38,9 +38,9 @@ _KIND_FIELDS: dict[str, tuple[str, ...]] = {
 @dataclass(frozen=True)
 @checked_fields
 class Fault:
-    """Temporary fault of a sensor.
+    """A temporary fault of a sensor, such as a dirty window or lost packets.
 
-    The labels describe the true scene and list the active faults.
+    Faults do not affect labels, which describe the true scene and list the active faults.
 
     Raises
     ------
@@ -49,20 +49,31 @@ class Fault:
     """
 
     kind: Annotated[FaultKind, about("kind of fault")]
-    from_s: Annotated[Time, about("start, seconds since the survey's start")] = 0.0
-    to_s: Annotated[Time | None, about("end; by default the survey's end")] = None
-    sensor: Annotated[Text | None, about("name of the faulty sensor; by default all")] = None
-    transmission: Annotated[UnitShare | None, about("of dirt: share of energy, out and back")] = (
-        None
-    )
-    azimuth_deg: Annotated[
-        Two[AngleDeg] | None, about("of dirt: start and end, counter-clockwise")
+    from_s: Annotated[Time, about("start time in seconds after the start of the survey")] = 0.0
+    to_s: Annotated[
+        Time | None,
+        about("end time in seconds after the start of the survey (default: end of the survey)"),
     ] = None
-    elevation_deg: Annotated[MinMax[AngleDeg] | None, about("of dirt: lowest and highest")] = None
-    channels: Annotated[Channels | None, about("dead channels; 0 is the lowest")] = None
-    share: Annotated[UnitShare | None, about("share of packets that are lost")] = None
-    packet: Annotated[Count | None, about("consecutive firings in a packet")] = None
-    by_s: Annotated[Shift | None, about("of a time jump: added to stamps, seconds")] = None
+    sensor: Annotated[Text | None, about("name of the faulty sensor (default: all sensors)")] = None
+    transmission: Annotated[
+        UnitShare | None,
+        about("fraction of the energy that dirt transmits on the way out and back"),
+    ] = None
+    azimuth_deg: Annotated[
+        Two[AngleDeg] | None,
+        about("start and end azimuth of the dirt in degrees, counterclockwise"),
+    ] = None
+    elevation_deg: Annotated[
+        MinMax[AngleDeg] | None, about("lowest and highest elevation of the dirt in degrees")
+    ] = None
+    channels: Annotated[
+        Channels | None, about("channels that are dead; 0 is the lowest channel")
+    ] = None
+    share: Annotated[UnitShare | None, about("fraction of packets that are lost")] = None
+    packet: Annotated[Count | None, about("number of consecutive firings per packet")] = None
+    by_s: Annotated[
+        Shift | None, about("offset in seconds that a time jump adds to timestamps")
+    ] = None
 
     def __post_init__(self) -> None:
         for name, value in self.words().items():  # labels have them as JSON
@@ -74,7 +85,9 @@ class Fault:
         for name in sorted((present ^ {*kind_fields}) - optional):
             advice = f"Remove {name}" if name in present else f"Set {name}"
             takes = (
-                f"takes {joined([*kind_fields])}" if kind_fields else "takes only from_s and to_s"
+                f"supports {joined([*kind_fields])}"
+                if kind_fields
+                else "supports only from_s and to_s"
             )
             raise LidarError(f"A fault of kind {self.kind!r} {takes}. {advice}.")
         if self.to_s is not None and self.to_s <= self.from_s:
@@ -83,30 +96,48 @@ class Fault:
             )
 
     def words(self) -> dict[str, Any]:
-        """Return the fields that are not None as a dict."""
+        """Return all fields that are not None as a dict."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @property
     def span_ns(self) -> tuple[float, float]:
-        """Start and end of the fault in nanoseconds since the start of the survey."""
+        """Start and end of the fault in nanoseconds since the start of the survey.
+
+        The end is infinite if `to_s` is None.
+        """
         return self.from_s * 1e9, inf if self.to_s is None else self.to_s * 1e9
 
     def during(self, starts_ns: Floats | Ints, stops_ns: Floats | Ints | None = None) -> Bools:
-        """Return a mask of the times or intervals during which the fault is active."""
+        """Return a mask of the times or time intervals at which the fault is active.
+
+        Times are in nanoseconds since the start of the survey.
+        """
         stops_ns = starts_ns if stops_ns is None else stops_ns
         begin, end = self.span_ns
         return np.asarray((stops_ns >= begin) & (starts_ns < end))
 
     def drops(self, firings: Ints, seed: int, station: int, number: int) -> Bools:
-        """Return a mask of the firings (n,) that belong to dropped packets.
+        """Return a mask of the firings that belong to dropped packets.
 
-        `number` is the number of this fault in its survey, `seed` the seed of the sensor's noise.
+        Parameters
+        ----------
+        firings
+            Indices of the firings. Shape (n,).
+        seed
+            Seed of the sensor's noise.
+        station
+            Index of the station.
+        number
+            Index of this fault in its survey.
         """
         packets = firings // (self.packet or 1)
         return np.asarray(uniform(seed, PACKET, station, packets, number) < (self.share or 0.0))
 
     def jumps_ns(self, times_ns: Floats | Ints) -> Ints:
-        """Return the shift of the timestamps at times (n,) in nanoseconds."""
+        """Return the error of the timestamps at several times, in nanoseconds.
+
+        Times and results have shape (n,). The error is zero while the fault is inactive.
+        """
         return self.during(times_ns) * np.int64(round((self.by_s or 0) * 1e9))
 
 

@@ -72,12 +72,13 @@ class Mounted:
     mount
         Pose of the sensor in the platform frame.
     name
-        Name of the sensor, required if there are several sensors. All random numbers of the sensor
-        depend on it.
+        Name of the sensor, which is required if there are several sensors. All random numbers of
+        the sensor depend on it.
     steps
-        Number of time steps at each station; by default that of the survey.
+        Number of time steps at each station. The default is the number in the survey.
     returns, noise
-        Returns and noise of this sensor; by default those of the survey, or else of the sensor.
+        Returns and noise of this sensor. The defaults are those of the survey, or otherwise those
+        of the sensor.
     unseen
         Names of objects that are invisible to the sensor, such as its own housing; * and ? are
         wildcards. Rays pass through these objects.
@@ -100,7 +101,7 @@ class Mounted:
 class ScanSpec:
     """The firings of a sensor in one time step.
 
-    A scan is the unit of ordering and of exactly-once delivery.
+    Scans are the units that are ordered and delivered exactly once.
 
     Parameters
     ----------
@@ -117,7 +118,7 @@ class ScanSpec:
     channels
         Number of channels of the sensor.
     ahead
-        Offset between the index that selects the random numbers and the index of the scan.
+        Offset that is added to `scan` to obtain the index that selects the random numbers.
     repeats
         For a scan of a frozen sensor, the first scan of the sweep that is repeated, and the first
         scan of the sweep that it replaces.
@@ -140,7 +141,7 @@ class ScanSpec:
         return (self.firings[1] - self.firings[0]) * self.channels
 
     def shifted(self, start_ns: int, ahead: int) -> ScanSpec:
-        """Return the scan with another station start and other random numbers."""
+        """Return a copy of the scan with another station start and another random number offset."""
         spec = object.__new__(type(self))  # `replace` takes five times as long
         vars(spec).update(vars(self), start_ns=start_ns, ahead=ahead)
         return spec
@@ -158,7 +159,7 @@ class CloudOptions:
         int,
         FILLED_IN,
         about(
-            "keep every n-th hit of a scan; by default every hit",
+            "keep only every n-th hit of a scan (default: every hit)",
             5,
             ge=1,
             le=1_000_000,
@@ -168,14 +169,16 @@ class CloudOptions:
         Precision,
         FILLED_IN,
         about(
-            "step in meters that points are rounded to; by default the sensor's resolution of "
-            "ranges; if it states none 0.001, and in Python 0.01",
+            "precision in meters to which coordinates are rounded (default: range resolution of "
+            "the sensor, otherwise 0.001, or 0.01 in Python)",
             0.001,
         ),
     ] = None  # type: ignore[assignment]
     coordinates: Annotated[
         Literal[COORDINATES],  # type: ignore[valid-type]
-        about("world; or sensor: the sensor frame at the firing, as in sensor drivers"),
+        about(
+            "frame of the coordinates: world, or sensor for the sensor frame at the time of firing"
+        ),
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
@@ -189,8 +192,7 @@ class CloudOptions:
     waveform_samples: Annotated[
         int,
         about(
-            "samples of the waveform that are recorded around each return, for LAS and "
-            "LAZ; 0 for none",
+            "number of waveform samples to record around each return, for LAS and LAZ; 0 for none",
             80,
             ge=0,
             le=4096,
@@ -200,7 +202,7 @@ class CloudOptions:
         datetime | None,
         written_as(Annotated[AwareDatetime, Strict(False)] | None),
         about(
-            "when the survey starts, with its time zone, for LAS, LAZ and bags",
+            "start time of the survey with a time zone, for LAS, LAZ and bags",
             "2026-11-21T10:00:00Z",
         ),
     ] = None
@@ -217,9 +219,9 @@ class SensorSweeps(NamedTuple):
 @dataclass(frozen=True)
 @checked_fields
 class Survey(CloudOptions, Weather):
-    """All scans of the sensors on a platform.
+    """A simulated survey of a scene with one or more sensors on a platform.
 
-    The scans of a sensor are in time order, and all scans of a sensor come before the scans of the
+    Scans are ordered by sensor: all scans of a sensor, in time order, come before the scans of the
     next sensor. Use the column `time` to find simultaneous points.
 
     With several sensors, the cloud always contains the column `sensor`. Without materials, all
@@ -230,29 +232,29 @@ class Survey(CloudOptions, Weather):
     sensor
         The lidar, if there is a single sensor without a mount.
     poses
-        Poses of the sensor or platform, one after the other, each as a `Pose` or as x, y, z.
+        Consecutive poses of the sensor or platform, each as a `Pose` or as x, y, z.
     steps
-        Number of time steps at each pose; 36 by default. Along a `Track`, the default covers its
-        entire duration.
+        Number of time steps at each pose. The default is 36. Along a `Track`, the default covers
+        its entire duration.
     trajectory
         Trajectory of a moving platform, as an alternative to `poses`.
     sensors
         `Mounted` sensors, as an alternative to `sensor`. Several sensors must have different names.
     materials
-        Materials of objects, or of faces by the names of their materials. If several entries apply
-        to a face, the first one is used.
+        Materials of objects or of individual faces. Faces are selected by the names of their
+        materials in the scene file. If several entries apply to a face, the first one is used.
     returns
-        Sub-rays of a beam, and the returns that are reported for a pulse; by default those of the
-        sensor.
+        Sub-rays of each beam, and the returns that are reported for each pulse. The default is that
+        of the sensor.
     noise
-        Noise of ranges and angles, and lost returns; by default those of the sensor.
+        Noise of ranges and angles, and lost returns. The default is that of the sensor.
     navigation
-        IMU and GNSS receiver of the platform, whose samples are written next to the cloud.
+        IMU and GNSS receiver of the platform, whose samples are written to files next to the cloud.
     faults
         Sensor faults, such as dirt or lost packets.
     classes
-        Names of the semantic classes, {number: name}, for reports and files. If set, the cloud
-        contains the column `class`.
+        Mapping from numbers to names of semantic classes, for reports and files. If it is set, the
+        cloud contains the column `class`.
     epsg
         EPSG code of the world coordinates, which is written to files that support it. To place a
         scene with local coordinates in the world, use `Scene.georeferenced`.
@@ -478,28 +480,28 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def path(self) -> Trajectory:
-        """Trajectory of the platform, or its poses as stations."""
+        """Trajectory of the platform, which has one station per pose if `poses` is set."""
         assert self.trajectory is not None  # the poses have a trajectory by default
         return self.trajectory
 
     @cached_property
     def carried(self) -> tuple[Mounted, ...]:
-        """Sensors with their mounts, including a sensor that was passed as `sensor`."""
+        """Mounted sensors, including a sensor that was passed as `sensor`."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @property
     def carrier(self) -> str:
-        """Name of the first sensor, which seeds the instruments of the platform."""
+        """Name of the first sensor, which determines the seeds of the platform's instruments."""
         return self.carried[0].name
 
     @cached_property
     def returns_each(self) -> tuple[Returns, ...]:
-        """Return settings of each sensor."""
+        """The `Returns` of each sensor."""
         return tuple(carried.returns or self.returns for carried in self.carried)
 
     @cached_property
     def noise_each(self) -> tuple[Noise, ...]:
-        """Noise of each sensor, seeded by the name of the sensor."""
+        """Noise of each sensor, with a seed that depends on the name of the sensor."""
         return tuple((carried.noise or self.noise).named(carried.name) for carried in self.carried)
 
     @cached_property
@@ -515,7 +517,7 @@ class Survey(CloudOptions, Weather):
         return self.extinction_at(sensor.optics.wavelength_nm)
 
     def air(self, number: int) -> Air:
-        """Return the properties of the air for a sensor with the given index."""
+        """Return the properties of the air for the sensor with the given index."""
         optics = self.carried[number].sensor.optics
         divergence = self.returns_each[number].divergence(optics)
         overlap_m = self.noise_each[number].overlap_m
@@ -569,7 +571,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def sweeps_each(self) -> tuple[SensorSweeps, ...]:
-        """Sweeps of each sensor."""
+        """First scan, start time and end time of all sweeps of each sensor."""
         sweeps = []
         stations = np.arange(self.path.stations)[:, None]
         for number, carried in enumerate(self.carried):
@@ -594,7 +596,10 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def sweep_stops(self) -> Ints:
-        """Exclusive end of the scan range of each sweep, ascending. int64 of shape (sweeps,)."""
+        """Index one past the last scan of each sweep, in ascending order.
+
+        The shape is (sweeps,), and the dtype is int64.
+        """
         firsts = np.concatenate([sweeps.firsts for sweeps in self.sweeps_each])
         return np.append(firsts[1:], self.scan_count)
 
@@ -602,12 +607,12 @@ class Survey(CloudOptions, Weather):
     def sweep_count(self) -> int:
         """Number of sweeps, which are revolutions, or frames of sensors without a rotating head.
 
-        The last sweep of a sensor at a station may be a part of a revolution.
+        The last sweep of a sensor at a station can be incomplete.
         """
         return sum(len(sweeps.firsts) for sweeps in self.sweeps_each)
 
     def sweeps_within(self, start: int, stop: int) -> int:
-        """Return the number of sweeps that end within a range of scans."""
+        """Return the number of sweeps that end in a range of scans."""
         before, until = np.searchsorted(self.sweep_stops, (start, stop), "right")
         return int(until - before)
 
@@ -622,7 +627,7 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def station_ns(self) -> int:
-        """Duration of a station in nanoseconds, until the last sensor has finished."""
+        """Time in nanoseconds that all sensors need to finish their scans at a station."""
         return max(
             round(firing_start_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
             for carried, steps in zip(self.carried, self.steps_each, strict=True)
@@ -636,7 +641,10 @@ class Survey(CloudOptions, Weather):
         return (self.path.stations - 1) * self.station_ns + last
 
     def scan(self, index: int) -> ScanSpec:
-        """Return the scan with the given index. Scans are ordered by sensor, station and step."""
+        """Return the scan with the given index.
+
+        Scans are ordered by sensor, station and step.
+        """
         sensor = bisect_right(self._firsts, index) - 1
         station, step = divmod(index - self._firsts[sensor], self.steps_each[sensor])
         lidar = self.carried[sensor].sensor
@@ -644,7 +652,10 @@ class Survey(CloudOptions, Weather):
         return ScanSpec(index, station, lidar.firings(step), start, sensor, lidar.channels)
 
     def faults_of(self, sensor: int, *kinds: FaultKind) -> dict[int, Fault]:
-        """Return the faults of a sensor that have one of the given kinds, by index in `faults`."""
+        """Return the faults of the given kinds that affect a sensor.
+
+        The keys are indices into `faults`.
+        """
         name = self.carried[sensor].name
         return {
             index: fault
@@ -653,10 +664,11 @@ class Survey(CloudOptions, Weather):
         }
 
     def sent_scan(self, index: int) -> ScanSpec:
-        """Return the scan that a sensor sends as scan `index`. A frozen sensor repeats an old one.
+        """Return the scan that a sensor sends as scan `index`.
 
-        A sweep that starts while the sensor is frozen repeats the last sweep that started before.
-        The older scan follows from times alone, on whichever worker scans are cast.
+        A frozen sensor repeats older scans: a sweep that starts while the sensor is frozen repeats
+        the last sweep that started before the fault. The repeated scan depends only on times, so
+        every worker selects the same scan.
         """
         spec = self.scan(index)
         frozen = self.faults_of(spec.sensor, "frozen").values()
@@ -679,13 +691,13 @@ class Survey(CloudOptions, Weather):
         return (self.scan(index) for index in range(self.scan_count))
 
     def pose(self, index: int) -> Pose:
-        """Return the pose of the sensor at the start of scan `index`."""
+        """Return the pose of the sensor at the start of the scan with the given index."""
         spec = self.scan(index)
         time = self.begins_ns(index) - spec.start_ns
         return self.path.pose(spec.station, time).compose(self.carried[spec.sensor].mount)
 
     def begins_ns(self, index: int) -> float:
-        """Return the start of scan `index` in nanoseconds since the start of the survey."""
+        """Return the start time of a scan in nanoseconds since the start of the survey."""
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
         return spec.start_ns + firing_start_ns(sensor, spec.firings[0]) + sensor.lead_ns

@@ -38,9 +38,9 @@ MIXED_UP = (
     f"sweeps ({SWEEPS_FILE}). Use both from one run, and keep the order."
 )
 # Descriptions of the frame of points in files.
-COMPENSATED = "points in the sensor's axes at the start of the sweep: motion is compensated"
-AS_FIRED = "points in the sensor's axes at the firing of each: motion is not compensated"
-IN_WORLD = "points in the axes of the world"
+COMPENSATED = "points in the sensor frame at the start of the sweep (motion is compensated)"
+AS_FIRED = "points in the sensor frame at the time of firing (motion is not compensated)"
+IN_WORLD = "points in world coordinates"
 _ACTORS_AT_START = "; points of actors are moved to the start of the sweep"
 _NO_KNOTS = np.empty((0, 7), np.float32)
 _PIECE = 250_000  # points that a thread or task reads at a time; several may read

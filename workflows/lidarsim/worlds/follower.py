@@ -39,9 +39,8 @@ class Follower:
     """A lidar in a world that is controlled by another program.
 
     `sweep` and `ranges` scan the world as if it were stationary, which is the fastest method.
-    `step` collects the time steps of a moving world and simulates each sweep once its last beam has
-    been fired. Each beam then uses the poses of the sensor and of the bodies at the time of the
-    beam.
+    `step` records the time steps of a moving world, and simulates each sweep once its last beam has
+    been fired. Each beam then uses the poses of the sensor and of the bodies at its firing time.
 
     Parameters
     ----------
@@ -52,7 +51,7 @@ class Follower:
         The lidar, or a `Mounted` lidar on a platform.
     static
         Stationary meshes and instances in world coordinates. `step` requires at least one.
-    options
+    **options
         Options of `Scanner`, such as columns, noise, threads, and the names of `unseen` bodies.
 
     Raises
@@ -136,9 +135,9 @@ class Follower:
         Parameters
         ----------
         pose
-            (4, 4): matrix from the frame of the sensor, or of its platform, to the world.
+            Matrix from the frame of the sensor, or of its platform, to the world. Shape (4, 4).
         matrices
-            (k, 4, 4): matrices from the frames of the bodies to the world, in meters.
+            Matrices from the frames of the bodies to the world, in meters. Shape (k, 4, 4).
         number
             Number of the sweep, as in `Scanner.sweep`. By default, each call has new noise.
 
@@ -150,8 +149,8 @@ class Follower:
         Raises
         ------
         LidarError
-            If the number of matrices differs from the number of bodies, or if a matrix mirrors or
-            deforms.
+            If the number of matrices differs from the number of bodies, or if a matrix is not a
+            rigid transform.
         """
         sensor_pose = _matrices(pose, 1)
         self._place(_matrices(matrices, len(self._bodies)))
@@ -163,24 +162,26 @@ class Follower:
     def ranges(
         self, poses: ArrayLike, matrices: ArrayLike = (), *, number: int | None = None
     ) -> Floats32:
-        """Return the ranges that sensors measure in the current state of the world.
+        """Simulate the range images that the sensor measures in the current state of the world.
 
         Parameters
         ----------
         poses
-            (s, 4, 4): matrices from the sensor frame to the world, for s poses of the sensor.
+            Matrices from the frame of the sensor, or of its platform, to the world, for s poses.
+            Shape (s, 4, 4).
         matrices, number
             As in `sweep`.
 
         Returns
         -------
-        float32 (s, firings, channels)
-            Ranges in meters; inf without a return (see `Scanner.ranges`).
+        float32 array of shape (s, firings, channels)
+            Ranges in meters, or inf if there is no return (see `Scanner.ranges`).
 
         Raises
         ------
         LidarError
-            As in `sweep`.
+            If the number of matrices differs from the number of bodies, or if a matrix is not a
+            rigid transform.
         """
         sensor_poses = _matrices(poses, None)
         self._place(_matrices(matrices, len(self._bodies)))
@@ -190,28 +191,29 @@ class Follower:
         """Record a time step of the world, and return the sweeps completed since the last step.
 
         The first sweep starts at the first step, and each further sweep starts where the previous
-        one ends. If the time is before the last step, for example after the world was reset, a
-        new first sweep starts.
+        one ends. If the time is before the last step, for example because the world was reset, all
+        earlier steps are discarded and a new first sweep starts.
 
         Parameters
         ----------
         time_s
-            Time of the world in seconds.
+            Time in the world in seconds.
         pose
-            (4, 4): matrix from the frame of the sensor, or of its platform, to the world.
+            Matrix from the frame of the sensor, or of its platform, to the world. Shape (4, 4).
         matrices
-            (k, 4, 4): matrices from the frames of the bodies to the world, in meters. Between two
-            steps, bodies move at constant velocity and angular velocity.
+            Matrices from the frames of the bodies to the world, in meters. Shape (k, 4, 4). Between
+            two steps, bodies move at constant velocity and angular velocity.
 
         Returns
         -------
-        The completed sweeps; usually none or one.
+        list of Cloud
+            The completed sweeps; usually none or one.
 
         Raises
         ------
         LidarError
-            If the number of matrices differs from the number of bodies, a matrix mirrors or
-            deforms, or the world contains nothing stationary.
+            If the number of matrices differs from the number of bodies, a matrix is not a rigid
+            transform, or the world contains nothing stationary.
         """
         if self._start_s is None or (
             self._steps and time_s < self._start_s + self._steps[-1].time_s
@@ -229,7 +231,7 @@ class Follower:
         return list(self._ended_sweeps())
 
     def reset(self) -> None:
-        """Discard all steps, so that the next step starts the first sweep."""
+        """Discard all recorded steps, so that the next step starts a new first sweep."""
         self._steps.clear()
         self._start_s = None
         self._number = 0

@@ -24,30 +24,31 @@ _log = logging.getLogger(__name__)
 class MujocoScanner:
     """A lidar in a MuJoCo world.
 
-    The body on which the lidar is mounted is invisible to it, as for MuJoCo rangefinders. The class
-    only reads the arrays of the model and the data, from MuJoCo 3.2 or later, and does not import
-    MuJoCo.
+    The lidar does not see the body on which it is mounted, as is the case for MuJoCo rangefinders.
+    The class only reads the arrays of the model and the data, which must come from MuJoCo 3.2 or
+    later. It does not import MuJoCo.
 
     Parameters
     ----------
     model
-        An `mjModel`. Later changes of its geoms have no effect.
+        An `mjModel`. Later changes to its geoms have no effect.
     sensor
         The lidar, or a `Mounted` lidar on the body or site.
     body, site
-        Name or ID of the body or site whose frame is the frame of the lidar (x forward, z up). A
-        list defines several lidars of the same model, for `ranges`.
+        Name or ID of the body or site whose frame is the frame of the lidar (x forward, z up). To
+        simulate several lidars of the same model with `ranges`, pass a list.
     groups
-        Groups of geoms that are visible to the lidar. Group 3 usually contains duplicates for
-        collision detection.
+        Geom groups that are visible to the lidar. Group 3 usually contains duplicates for collision
+        detection.
     exclude
         Names of bodies and geoms, or IDs of bodies, that are invisible to the lidar.
     objects
-        Whether the column `object` distinguishes bodies or geoms. Geoms take longer.
+        Whether the column `object` distinguishes bodies ("body") or geoms ("geom"). Sweeps take
+        longer with "geom".
     sag_m
         Maximum distance in meters between the triangles and the surface of cylinders and capsules.
-        For spheres and ellipsoids, it is twice as large.
-    options
+        For spheres and ellipsoids, the maximum distance is twice as large.
+    **options
         Options of `Scanner`, such as columns, materials, noise and threads.
 
     Raises
@@ -95,13 +96,13 @@ class MujocoScanner:
         if objects not in ("body", "geom"):
             raise LidarError(f"objects must be 'body' or 'geom', but is {objects!r}.")
         if not sag_m > 0:
-            raise LidarError(f"sag_m must be above 0, but is {sag_m}.")
+            raise LidarError(f"sag_m must be greater than 0, but is {sag_m}.")
         excluded_bodies, excluded_geoms = excluded(model, exclude)
         # The world, body 0, cannot carry a lidar that would not see it.
         unseen = [*excluded_bodies, *(carrier for carrier in carriers.tolist() if carrier)]
         choice = Choice(tuple(groups), unseen, excluded_geoms, objects, sag_m)
         if soft := soft_bodies(model):
-            _log.warning("the model has %s, which the lidar does not see", soft)
+            _log.warning("the model has %s, which the lidar ignores", soft)
         bodies = bodies_of(model, choice)
         self._bodies: Indices = np.array([item.body for item in bodies.moving], np.intp)
         if not bodies.static and not bodies.moving:
@@ -141,13 +142,15 @@ class MujocoScanner:
         return self.follower.sweep(self._pose(data), self._matrices(data), number=number)
 
     def ranges(self, data: Any, *, number: int | None = None) -> Floats32:
-        """Return the ranges that the lidars measure in the state of an `mjData`.
+        """Simulate the range images that the lidars measure in the state of an `mjData`.
+
+        The parameters are the same as in `sweep`.
 
         Returns
         -------
-        float32 (firings, channels), or (lidars, firings, channels)
-            Ranges in meters; inf without a return. The first axis exists if `body` or `site` is a
-            list.
+        float32 array of shape (firings, channels) or (lidars, firings, channels)
+            Ranges in meters, or inf if there is no return. The axis of lidars exists only if `body`
+            or `site` is a list.
         """
         poses = self._poses(data)
         images = self.follower.ranges(poses, self._matrices(data), number=number)
@@ -157,7 +160,8 @@ class MujocoScanner:
         """Record a simulation step, and return the sweeps completed since the last step.
 
         Call `step` after each `mj_step`. Each beam uses the poses of the lidar and of the bodies at
-        the time of the beam. If the time is before the last step, a new first sweep starts.
+        its firing time. If the time is before the last step, all earlier steps are discarded and a
+        new first sweep starts.
 
         Raises
         ------

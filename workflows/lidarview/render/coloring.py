@@ -20,9 +20,12 @@ MAX_UNNAMED_LABELS = 12  # labels without names that have a color each
 MAX_COLORS = 1 << 16  # limit for labels
 
 # Columns that are composed of others (`values_of`).
-RGB = Column("rgb", "uint32", "", "colors of the surfaces")
+RGB = Column("rgb", "uint32", "", "surface colors")
 NORMALS = Column(
-    "normals", "uint32", "", "directions of the surfaces: x red, y green, z blue, -1 dark, 1 bright"
+    "normals",
+    "uint32",
+    "",
+    "surface normals: x is red, y is green, z is blue; dark is -1, bright is 1",
 )
 _COMPOSED = {RGB.name: (RGB, COLORS), NORMALS.name: (NORMALS, NORMAL)}  # {name: (column, parts)}
 MATERIAL = "material"  # name of the column

@@ -14,7 +14,7 @@ from lidarsim.scene.scene_mesh import triangle_areas
 from .coloring import TURBO
 from .theme import UNSEEN, rgb
 
-HITS_TITLE = "hits per square meter; gray: none"  # title of the scale
+HITS_TITLE = "hits per square meter (gray: no hits)"  # title of the scale
 _GRID_LEVELS = 24  # levels of a grid whose cells are half as wide each time
 _MIN_HITS = 12  # hits that suffice for an estimate of density; points in a cell of the grid
 _MAX_ROUNDS = 12

@@ -23,7 +23,7 @@ from .theme import mapped
 TIMES_S = (0.1, 0.5, 2.0)
 CELL_DEG = 0.28  # cell of the coverage: the width of a beam of Livox
 FIELD_S = 4.0  # cells that are met in this time are the field of view
-CONVENTIONS = "azimuth: degrees from x, forward, to y, left; elevation: above the xy plane"
+CONVENTIONS = "azimuth in degrees from x (forward) to y (left); elevation above the xy plane"
 _COVERED = to_rgb(theme.OBJECT_COLORS[0])
 _FIRST_FIRINGS = 8  # firings of sensors of several channels
 _MAX_FRAME_RAYS = 300_000  # limit for a frame; a longer frame has every n-th firing
@@ -80,7 +80,8 @@ def pattern_page(sensor: Sensor) -> Page:
     if isinstance(sensor, LineSensor):
         page = beam_page(sensor)
         page.note(
-            "angle: 0 is down, positive angles are left of the flight; rays lie in the yz plane"
+            "angle: 0 points down, positive angles point left of the flight direction; rays lie in "
+            "the yz plane"
         )
         return page
     pattern = _pattern_of(sensor)
@@ -110,8 +111,8 @@ def pattern_page(sensor: Sensor) -> Page:
     details = [f"{channels} · {CONVENTIONS}"]
     if has_shares:
         details.append(
-            f"shares of the field of view, the cells of {CELL_DEG:g}° that rays meet within "
-            f"{FIELD_S:g} s"
+            f"percentages of the field of view, that is, of the {CELL_DEG:g}° cells that rays "
+            f"reach within {FIELD_S:g} s"
         )
     page.title(sensor.model, *details)
     return page
@@ -184,7 +185,7 @@ def _coverages(met_s: Floats, has_shares: bool) -> list[tuple[str, Bools]]:
         times_s = [*members]
         words = f"after {listed([f'{seconds:g}' for seconds in times_s])} s"
         if times_s[1:]:
-            words += ": the same directions"
+            words += ": identical coverage"
         if has_shares:
             words += f": {100 * count / field:.0f} %"
         coverages.append((words, covered[times_s[0]]))
@@ -230,10 +231,10 @@ def _draw_frame(page: Page, axes: Axes, sensor: Sensor, pattern: _Pattern) -> No
         page, axes, (pattern.azimuths_deg, pattern.elevations_deg), pattern.times_s, scale, area
     )
     colors = mapped(COLORS, np.linspace(0, 1, 256))
-    page.color_bar(colors, scale.norm, f"time of a ray, {unit}")
+    page.color_bar(colors, scale.norm, f"ray time, {unit}")
     words = "one frame" if sensor.cycle == "frame" else "one revolution"
     if pattern.every > 1:
-        words += f", each {pattern.every}th firing"
+        words += f", 1 of {pattern.every} firings"
     page.heading(axes, words)
 
 
@@ -250,7 +251,7 @@ def _draw_firings(page: Page, axes: Axes, sensor: Sensor) -> None:
     _draw_rays(page, axes, (azimuths_deg, angles_deg[1]), times_s, stretched, 8.0)
     axes.autoscale()
     duration = f"{per_s * last_s:,.0f} {unit}"
-    page.heading(axes, f"the first {_FIRST_FIRINGS} firings, {duration}, from the first color on")
+    page.heading(axes, f"first {_FIRST_FIRINGS} firings, {duration}, with the full color range")
 
 
 def _draw_rays(

@@ -428,7 +428,7 @@ class Page:
         LidarError
             If the folder does not exist or is not writable.
         """
-        advice = "choose a folder that exists, can be written to and has room"
+        advice = "choose an existing, writable folder with enough free space"
         with explained(f"The picture {path} could not be written", advice):
             Storage.at(path.parent, durable=False).write(path.name, self.png())
 

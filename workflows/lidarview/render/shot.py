@@ -282,7 +282,8 @@ class _OpenScene(NamedTuple):
         width, depth, _ = np.ptp(self.box, axis=0)
         cut = self.cut_height
         top = self.uncut.origin[2] + (self.box[1, 2] if cut is None else cut)
-        return f" · drawn: {width:,.0f} × {depth:,.0f} m around what moves, below z = {top:,.0f} m"
+        area = f"{width:,.0f} × {depth:,.0f} m around the trajectories"
+        return f" · shown: {area}, below z = {top:,.0f} m"
 
 
 def _open_scene(

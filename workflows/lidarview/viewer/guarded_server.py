@@ -147,10 +147,10 @@ class _GuardedRequest(HTTPMessageDelegate):
 
 
 async def _refuse(stream: IOStream, refusal: Refusal, method: str) -> None:
-    """Answer by a refusal, and end the connection.
+    """Send a refusal, and end the connection.
 
-    What the client still sends is thrown away, until the client or the server closes the
-    connection: a connection that is closed before is reset, and the answer with it.
+    Further data from the client is discarded until the client or the server closes the connection.
+    Closing it earlier would reset the connection, and the client might lose the response.
     """
     body = refusal.reason.encode()
     headers = {
@@ -178,5 +178,5 @@ def _too_large(headers: HTTPHeaders) -> Refusal | None:
     size = headers.get("Content-Length", "0")
     is_number = size.isascii() and size.isdecimal()
     if is_number and (len(size) > _MAX_DIGITS or int(size) > MAX_BODY_BYTES):
-        return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the body is too large")
+        return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "the request body is too large")
     return None

@@ -16,7 +16,7 @@ from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES
 from lidarsim.columns.table import Column
 
-RESULT = Column("result", "uint8", "", "result that the point is of", kind="label")
+RESULT = Column("result", "uint8", "", "result that contains the point", kind="label")
 STATION = Column("station", "int64", "", "station from which the point was scanned", kind="label")
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 

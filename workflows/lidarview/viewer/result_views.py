@@ -82,8 +82,8 @@ def join_views(
     ]
     if in_sensor_axes:
         raise LidarError(
-            f"{in_sensor_axes[0]} has points in the axes of its sensors, which "
-            "fit no other result: show it alone, or run it with cloud.coordinates: world."
+            f"{in_sensor_axes[0]} contains points in sensor coordinates, which cannot be combined "
+            "with other results. View it alone, or run it again with `cloud.coordinates: world`."
         )
     names = [path.resolve().name for path in paths]
     names = names if len({*names}) == len(names) else [str(path) for path in paths]
@@ -110,14 +110,17 @@ def open_result(path: Path, downloads: Downloads | None = None) -> View:
     A scene or sweeps that cannot be read are noted only. LidarError for a missing or damaged cloud.
     """
     if not path.exists():
-        raise MissingFileError(f"{path} does not exist: give the folder of a result, or a cloud.")
+        raise MissingFileError(
+            f"{path} does not exist. Pass a result folder or a point cloud file."
+        )
     title = f"{path.resolve().name} - lidarpool"
     if not path.is_dir():
         return View(CloudFile(path), title=title, downloads=downloads)
     cloud = path / CLOUD
     if not cloud.exists():
         raise LidarError(
-            f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
+            f"{path} does not contain {CLOUD}. Pass a result folder (the `--out` folder of a run) "
+            "or a point cloud file."
         )
     scene_file = path / PICTURE_FILE
     sweeps_file = path / SWEEPS_FILE
@@ -128,6 +131,6 @@ def open_result(path: Path, downloads: Downloads | None = None) -> View:
         sweeps = Sweeps.load(sweeps_file) if sweeps_file.exists() else None
         pictured = PictureContent.load(scene_file) if scene_file.exists() else None
     except LidarError as error:
-        note = f"The cloud is shown without all that belongs to it. {error}"
+        note = f"Some parts of the result are not shown. {error}"
     file = CloudFile(cloud, pictured.extra_columns if pictured else ())
     return View(file, pictured, sweeps, note, title, downloads=downloads)

@@ -126,12 +126,12 @@ class SlowQuestions:
 
     @asynccontextmanager
     async def slot(self) -> AsyncIterator[None]:
-        """Hold a slot during the body, after waiting.
+        """Wait for a slot, and hold it while the body runs.
 
-        Raises HTTPError if too many questions wait.
+        Raises HTTPError if too many requests are pending.
         """
         if self._waiting >= MAX_WAITING:
-            raise HTTPError(503, "too many slow questions wait")
+            raise HTTPError(503, "too many slow requests are pending")
         self._waiting += 1
         try:
             await self._free.acquire()
@@ -158,7 +158,7 @@ class _Guarded(RequestHandler):
     def log_exception(self, *error: Any) -> None:
         """Log errors that are not the client's."""
         if not isinstance(error[1], HTTPError):
-            _LOGGER.error("the page's question was not answered", exc_info=error)
+            _LOGGER.error("A request from the page failed", exc_info=error)
 
 
 class _File(_Guarded, StaticFileHandler):
@@ -271,7 +271,7 @@ class _Guard:
         token = "".join(path.split("/")[1:2])
         is_good_once = token in self._page.good_once
         if not is_good_once and not compare_digest(self._page.token.encode(), token.encode()):
-            return Refusal(HTTPStatus.NOT_FOUND, "there is no such page")
+            return Refusal(HTTPStatus.NOT_FOUND, "this page does not exist")
         reason = refusal(
             headers,
             self._names,
@@ -379,8 +379,9 @@ def frame_of(page: PageServer, words: str) -> str:
     if hub := os.environ.get(_HUB):  # 127.0.0.1 in a frame would be the reader's own machine
         url = f"{hub.rstrip('/')}/proxy/{page.port}/{page.token}/"
         words += (
-            " It is shown through jupyter-server-proxy; without that, connect with ssh -L "
-            f"{page.port}:{HOST}:{page.port} and the machine's name, and open the address."
+            " The frame requires jupyter-server-proxy. Without it, run ssh -L "
+            f"{page.port}:{HOST}:{page.port} HOST on your computer, where HOST is the name of this "
+            "machine, and open the address."
         )
     link = f'<a href="{url}" target="_blank">{words}</a>'
     return f'{link}<br><iframe src="{url}" style="width:100%;height:640px;border:0"></iframe>'

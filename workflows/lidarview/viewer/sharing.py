@@ -74,11 +74,13 @@ def share(
     """
     for file, suffixes in (film, tuple(_FILMS)), (page, (".html",)):
         if file and file.suffix not in suffixes:
-            raise LidarError(f"{file} does not end with {' or '.join(suffixes)}: rename it.")
+            raise LidarError(f"{file} has an unsupported extension. Use {' or '.join(suffixes)}.")
         if file and not file.parent.is_dir():  # films take seconds to draw
-            raise LidarError(f"{file} cannot be written: there is no folder {file.parent}.")
+            raise LidarError(
+                f"{file} cannot be written, because the folder {file.parent} does not exist."
+            )
     if not len(PointFinder(view.points, view.origin).find(1000)[0]):
-        raise LidarError("There are no points to show: rays hit nothing.")
+        raise LidarError("There are no points to show, because no ray hit a surface.")
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     for file in filter(None, (film, page)):
@@ -87,7 +89,7 @@ def share(
             if writing is not None:
                 show = stack.enter_context(writing(f"writing {file.name}"))
             content = page_of(view, show) if file == page else film_of(view, file.suffix, show)
-        with explained(f"{file} cannot be written", "give another place"):
+        with explained(f"{file} cannot be written", "choose another path"):
             Storage.at(file.parent, durable=False).write(file.name, content)
         click.echo(click.format_filename(file))
 
@@ -245,7 +247,7 @@ def page_of(view: View, show: WritingProgress = _show_nothing) -> bytes:
     while len(cloud := _packed(*_thinned(view, max_points))) > free_bytes:
         max_points = int(max_points * min(0.9, 0.95 * max(free_bytes, 0) / len(cloud)))
         if max_points < 1000:
-            raise LidarError("Even without points the page has 25 MB: use lidarpool view only.")
+            raise LidarError("The page exceeds 25 MB even without points. Omit `--export`.")
     script = '<script type="text/plain" data-question="{}">{}</script>\n'
     texts = [script.format(*pair) for pair in (answers | {"cloud?": cloud}).items()]
     return page.replace("</body>", "".join([*texts, "</body>"])).encode()

@@ -75,7 +75,7 @@ _MAX_BEYOND = 0.5  # points farther outside the middle 99 % than this share of i
 _MAX_COLORINGS = 64  # color scales that are kept, of columns and filters
 _MAX_NAMES = 2000  # named values of a column that a menu of the page lists
 _NS = 1e9
-IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
+IN_SENSOR_AXES = "The points are in sensor coordinates, so the scene is not shown."
 CLOUD = "cloud.ply"
 
 
@@ -436,8 +436,8 @@ class View:
             MAX_POINTS, *self._read_selection(arguments), None, abandoned
         )
         if count > MAX_POINTS:
-            message = f"{count:,} points are more than {MAX_POINTS:,}: filter or clip them, or use"
-            return {"error": f"{message} lidarpool export for all."}, {}
+            message = f"The selection has {count:,} points; the limit is {MAX_POINTS:,}. Filter or"
+            return {"error": f"{message} clip the points, or use `lidarpool export`."}, {}
         columns = {column.name: points.values(column.name, rows) for column in points.table}
         world_positions = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
         extra_columns = tuple(column for column in points.table if column.name not in TABLE)
@@ -691,7 +691,7 @@ def _read_limits(text: str) -> tuple[float, float]:
     """
     lower, upper = map(float, text.split(","))
     if not -math.inf < lower < upper < math.inf:
-        raise ValueError(f"{text!r} are no ends of a color scale")
+        raise ValueError(f"{text!r} is not a valid color range; expected LOWEST,HIGHEST")
     return lower, upper
 
 

@@ -56,7 +56,7 @@ _LATCHED = Qos(
     liveliness_lease_duration=QosTime(0, 0),
     avoid_ros_namespace_conventions=False,
 )
-_UNSTAMPED = "has no timestamps, so its sweeps have the times at which they were recorded"
+_UNSTAMPED = "has no timestamps, so the recording times are used instead"
 _MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
 
 

@@ -94,32 +94,32 @@ def fit(
     intensity: str | None = None,
     white: Annotated[float, Field(gt=0)] | None = None,
 ) -> Fit:
-    """Fit the performance of a sensor to recorded sweeps.
+    """Fit the performance parameters of a sensor to recorded sweeps.
 
-    The sensor is stationary, or the recorded place is known as a scene.
+    The sensor must be stationary, unless a scene of the recorded place and the poses are available.
 
     Parameters
     ----------
     recording
         Sweeps in any format that `compare` supports, or a cloud in memory that has sweeps.
     model
-        Sensor model, by name or file. Values that the recording does not determine are taken from
-        the model. By default, the model is a sensor with the recorded beams.
+        Name or file of a sensor model. Values that cannot be determined from the recording are
+        taken from this model. By default, a model with the recorded beams is used.
     scene
-        The recorded place as a scene. By default, the surfaces are taken from the recording, and
-        the sensor must be stationary.
+        Scene of the recorded place. By default, the surfaces are estimated from the recording,
+        which requires a stationary sensor.
     pose
-        Pose of the sensor in the scene, as one pose, as one pose for each sweep, or as matrices of
-        shape (n, 4, 4). By default, the poses are taken from the recording. If it has none, the
-        sensor is at the origin of the scene. A result has a pose for each pulse. Otherwise, a pose
-        applies to a whole sweep.
+        Pose of the sensor in the scene: a single pose, one pose for each sweep, or matrices of
+        shape (n, 4, 4). By default, the poses are taken from the recording. If it has no poses, the
+        sensor is placed at the origin of the scene. A result has a pose for each pulse. In other
+        recordings, a pose applies to a whole sweep.
     sensor, intensity
-        Name of the sensor, or topic of a bag, if the recording has several; and the column with the
-        intensities, which is ``intensity`` by default.
+        Name of the sensor (or topic of a bag) if the recording contains several sensors, and name
+        of the column that contains the intensities. The default column is ``intensity``.
     white
         Intensity that the sensor reports for a white surface, if the intensity does not depend on
-        the range. By default, the value of Velodyne and Ouster sensors is used for their
-        recordings, and the value is unknown for others.
+        the range. By default, recordings of Velodyne and Ouster sensors use the value of these
+        sensors, and the value is unknown for other recordings.
 
     Returns
     -------
@@ -132,7 +132,7 @@ def fit(
         If the recording cannot be read, has no sweeps or rings, or contains several sensors; if the
         sensor moves, but the scene or the poses are unknown; or if scipy is missing.
     """
-    need("scipy", "fit", "Sensor models are fitted")
+    need("scipy", "fit", "Fitting sensor models")
     named = None if model is None else read_model(model)  # before the recording, which takes long
     if not isinstance(recording, Recording):
         recording = open_recording(recording, sensor, intensity, name="the recording")
@@ -144,7 +144,9 @@ def fit(
         measured = measure_standing(recording, white, loaded, poses)
     elif loaded is None:
         raise LidarError(
-            moving_message(recording.name, speed, "Pass the scene of its poses with `--scene`")
+            moving_message(
+                recording.name, speed, "Pass the scene to which its poses refer with `--scene`"
+            )
         )
     else:
         measured = measure_moving(recording, white, loaded, poses)

@@ -165,7 +165,7 @@ def _check_rays(count: int, name: str) -> None:
     if count < MIN_RAYS:
         raise LidarError(
             f"{name} has only {count} rays on smooth surfaces, but at least {MIN_RAYS} are "
-            "required. Record walls or a floor, with points in the sensor frame."
+            "required. Use a recording of walls or a floor, with points in the sensor frame."
         )
 
 

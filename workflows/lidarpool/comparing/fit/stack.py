@@ -72,8 +72,7 @@ class SweepStack:
         cells = _CommonCells.read(recording)
         if len(cells.numbers) < recording.count:
             notes.append(
-                f"{len(cells.numbers):,} of {recording.count:,} sweeps are used, which are "
-                "evenly distributed"
+                f"{len(cells.numbers):,} evenly spaced sweeps out of {recording.count:,} are used"
             )
         for index in range(len(cells.numbers)):
             cells.read_sweep(recording, index)
@@ -82,7 +81,7 @@ class SweepStack:
         has_return = np.isfinite(values[0]).any(axis=0)
         if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
             notes.append(
-                f"{rounded(100 * gaps, 2)} % of the sweeps consists of gaps, caused by lost "
+                f"{rounded(100 * gaps, 2)} % of the cells in the sweeps are gaps, caused by lost "
                 "packets or truncated sweeps. Gaps are not counted as lost pulses"
             )
         directions, azimuth_offsets = _mean_directions(values, elevation_deg, cells.step_deg)

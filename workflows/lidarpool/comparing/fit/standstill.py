@@ -55,9 +55,9 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
     changes = np.abs(np.diff(stack.ranges, axis=0))
     if (change := finite_median(changes, (0, 1, 2))) > _MAX_CHANGE_M:
         raise LidarError(
-            f"{name} has ranges that change by a median of {rounded(change, 2)} m between "
-            "sweeps, which no motion of the sensor explains. Use points in meters, recorded "
-            "in a stationary environment."
+            f"The ranges in {name} change by a median of {rounded(change, 2)} m between sweeps, "
+            "which sensor motion cannot explain. Use points in meters that were recorded in a "
+            "stationary environment."
         )
     return stack
 
@@ -84,9 +84,9 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
     if speed.turn_deg > 0:
         amounts.append(f"{rounded(speed.turn_deg, 2)}°")
     return (
-        f"{name} was recorded by a moving sensor, which moves by {' and '.join(amounts)} "
-        f"between sweeps. {advice}, use sweeps of a stationary sensor, or use a single sweep "
-        "to fit the bias of its rings."
+        f"{name} was recorded by a sensor that moves by {' and '.join(amounts)} between sweeps. "
+        f"{advice}, use sweeps from a stationary sensor, or use a single sweep to fit only the "
+        "ring biases."
     )
 
 
@@ -138,8 +138,8 @@ def _check_drift(stack: SweepStack, name: str) -> None:
     drift_m = range_scatter(stack, lag)
     if drift_m > _DRIFT_FACTOR * step_m + _DRIFT_M:
         raise LidarError(
-            f"{name} has ranges that drift: smooth surfaces change by {rounded(step_m, 2)} m "
-            f"between consecutive sweeps, but by {rounded(drift_m, 2)} m over {lag} sweeps. "
-            "Either the sensor or its environment moves, or the sensor warms up. Use sweeps "
-            "of a warm, stationary sensor."
+            f"The ranges in {name} drift: on smooth surfaces, they change by "
+            f"{rounded(step_m, 2)} m between consecutive sweeps, but by {rounded(drift_m, 2)} m "
+            f"over {lag} sweeps. Either the sensor or its environment is moving, or the sensor "
+            "is warming up. Use sweeps from a stationary sensor that has warmed up."
         )

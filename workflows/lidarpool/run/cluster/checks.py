@@ -236,7 +236,9 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None
     can_write = partial(_check_installed, written)
     for address, answer in ask_workers(client, can_write, writing).items():
         if isinstance(answer, LidarError):
-            raise LidarError(f"The worker at {address}: {answer}") from answer
+            raise LidarError(
+                f"The worker at {address} cannot write the results. {answer}"
+            ) from answer
 
 
 def _check_installed(formats: Iterable[Format]) -> None:
@@ -256,9 +258,10 @@ def common_software(
     if earlier and dict(earlier) not in answers.values():
         address, installed = next(iter(answers.items()))
         raise LidarError(
-            "The run was started with different software than the casting workers have. "
-            f"The worker at {address} has {difference(installed, earlier)}. Continue the run with "
-            "the earlier software, or remove it with `--restart` (`remove_run` in Python)."
+            "The software on the casting workers differs from the software with which the run "
+            f"was started. The worker at {address} has {difference(installed, earlier)}. "
+            "Continue the run with the earlier software, or remove it with `--restart` "
+            "(`remove_run` in Python)."
         )
     counts = Counter(tuple(answer.items()) for answer in answers.values())
     common = max(counts, key=lambda items: (counts[items], items))
@@ -309,7 +312,7 @@ def common_backend(
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))
     for address, reasons in answers.items():
-        if reason := reasons.get(requested, "it has no backend of that name"):
+        if reason := reasons.get(requested, "it has no backend with this name"):
             raise LidarError(
                 f"Backend {requested!r} cannot be used on the casting worker at {address}: "
                 f"{reason}. {advice}"

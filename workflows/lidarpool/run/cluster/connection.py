@@ -182,7 +182,7 @@ def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator
         try:
             yield client
         except TooFewWorkersError as error:
-            error.add_note("If jobs of the queue failed, see their logs.")
+            error.add_note("If queued jobs failed, see their logs.")
             raise
 
 

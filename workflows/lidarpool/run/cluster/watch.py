@@ -124,9 +124,9 @@ class Watch:
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
         """Report a paused worker at its first appearance."""
         note = (
-            f"Dask paused worker {worker['name']} of partition {partition}, whose memory limit is "
-            f"{format_bytes(worker['memory_limit'])}. Other workers take over its work until "
-            "memory is free"
+            f"Dask paused worker {worker['name']} of partition {partition}, because its memory "
+            f"is nearly full (limit: {format_bytes(worker['memory_limit'])}). Other workers take "
+            "over its work until it resumes"
         )
         if note not in self.notes:
             self.notes.append(note)

@@ -433,9 +433,9 @@ class CastingWorkers:
             )
             if self._in_state(WorkerState.REFUSED).keys() >= self.locations.members:
                 raise LidarError(
-                    f"No worker of partition {self._partition.name!r} has the software of the run. "
-                    f"The worker at {address} has {differs}. Install the same versions on all "
-                    "workers."
+                    f"No worker of partition {self._partition.name!r} has the software that the "
+                    f"run requires. The worker at {address} has {differs}. Install the same "
+                    "versions on all workers."
                 )
             return
         slots = identity["resources"].get(self._partition.name, 1)

@@ -305,9 +305,9 @@ class Dispatcher:
         if len(killers) >= policies.MAX_KILLS:
             names = ", ".join(scans_in_words(killer.first, killer.stop) for killer in killers)
             error = JobError(
-                f"{len(killers)} casting workers in a row died in their first batch ({names})"
-                f"{self._workers.memory_clause(worker)}. The scene may need more memory than "
-                "they have. See their logs, or try a different backend."
+                f"{len(killers)} casting workers in a row died while casting their first batch "
+                f"({names}){self._workers.memory_clause(worker)}. The scene may need more memory "
+                "than they have. See their logs, or try a different backend."
             )
             self.failed.setdefault(batch.job, error)
 

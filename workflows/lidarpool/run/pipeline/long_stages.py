@@ -119,8 +119,9 @@ class LongStages:
     @property
     def notes(self) -> list[str]:
         """Notes for the user."""
-        workers = f"{', '.join(sorted(self._hidden))} of partition {self.partition.name}"
-        note = f"{workers} cannot access {self._storage.url}, so the driver wrote their parts"
+        noun = "worker" if len(self._hidden) == 1 else "workers"
+        workers = f"{noun} {', '.join(sorted(self._hidden))} of partition {self.partition.name}"
+        note = f"{workers} cannot access {self._storage.url}, so the driver wrote the parts"
         return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
@@ -232,7 +233,7 @@ class LongStages:
         self.waiting = False
         if self._waited_from is not None:
             self._notes.append(
-                f"the survey waited {now_s - self._waited_from:.1f} s until other runs released "
+                f"the survey waited {now_s - self._waited_from:.1f} s for other runs to release "
                 f"{slot_count} slots of partition {self.partition.name}"
             )
         for name in self._names:
@@ -329,9 +330,9 @@ class LongStages:
         if self._closed_at is None:
             pipes = ", ".join(repr(pipe.name) for pipe in self._pipes)
             raise LidarError(
-                f"Stage {name} ended too early because a different client closed, failed or "
+                f"Stage {name} ended too early, because a different client closed, failed or "
                 f"deleted a Queue or Variable of this run ({pipes}). Repeat the run without "
-                "changing them."
+                "modifying these objects."
             )
 
     def _count_death(self, name: str, worker: str) -> None:

@@ -170,7 +170,7 @@ Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 @dataclass(frozen=True)
 class ScanFrame:
-    """Scan of a survey whose points have been stored. Frames are delivered in scan order.
+    """Scan of a survey, delivered in scan order once its points have been stored.
 
     Parameters
     ----------
@@ -204,11 +204,11 @@ class ScanFrame:
 
     @property
     def time_ns(self) -> float:
-        """Start of the scan in nanoseconds since the start of the survey."""
+        """Start time of the scan in nanoseconds since the start of the survey."""
         return self._survey.begins_ns(self.scan)
 
     def points(self) -> Cloud:
-        """Points of this scan, which are read from its part.
+        """Read the points of this scan from its part.
 
         Raises
         ------
@@ -222,14 +222,14 @@ class ScanFrame:
 
         Returns
         -------
-        int64 array of shape (triangles,), for `Scene.faces`, then for the triangles of each
-        instance, then for the triangles of each actor.
+        int64 array of shape (triangles,). It contains the counts for `Scene.faces`, followed by
+        those for the triangles of each instance, and then of each actor.
 
         Raises
         ------
         LidarError
-            If the survey does not store the column `triangle` or thins out its hits, or if the part
-            cannot be read.
+            If the survey does not store the column `triangle`, if `keep_every` is greater than 1,
+            or if the part cannot be read.
 
         Examples
         --------

@@ -149,7 +149,9 @@ class RunDatabase:
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
         for first, stop, *counts, cells in self._rows(query, number):
             if not scans.start <= first < stop <= scans.stop:
-                raise ValueError(f"a part has scans {first} to {stop} of {scans}")
+                raise ValueError(
+                    f"a part contains scans {first} to {stop}, which are not in {scans}"
+                )
             name = part_name(self.meta["mark"], number, first, stop)
             box = json.loads(cells)
             point_count, size, hit_count = counts
@@ -335,7 +337,7 @@ class RunDatabase:
 
     def _mark_ended(self, number: int, ended: bool = True) -> None:
         if not 0 <= number < MAX_JOBS:
-            raise ValueError(f"{number} is not the number of a job")
+            raise ValueError(f"{number} is not a valid job number")
         if number >= len(self._ended):
             self._ended.extend(bytes(number + 1 - len(self._ended)))
         self.ended_count += ended - self._ended[number]
@@ -434,8 +436,8 @@ def read_parts_location(path: Path) -> tuple[str, str] | None:
             tables = {name for (name,) in sql.execute("SELECT name FROM sqlite_master")}
             if tables and not tables >= {"meta", "parts", "trials"}:
                 raise LidarError(
-                    f"{path} is not the database of a run. Move it elsewhere, or choose a "
-                    "different folder."
+                    f"{path} is not a run database. Move it elsewhere, or choose a different "
+                    "folder."
                 )
             rows = sql.execute("SELECT name, value, crc FROM meta").fetchall()
             if any(_crc32(name, value) != crc for name, value, crc in rows):

@@ -344,8 +344,8 @@ class RunStore:
         if not self.committed_in_words:
             return AUTO_TAKES
         return (
-            f"The scans in {self.location} were cast with this backend. Continue where it is "
-            f"available, or remove them with {_DROP}."
+            f"The scans in {self.location} were cast with this backend. Continue the run where "
+            f"this backend is available, or remove the scans with {_DROP}."
         )
 
     def rows(self) -> Iterator[JobRow]:
@@ -520,10 +520,10 @@ def parts_of(location: Storage, parts_location: str) -> Storage:
 
 @checked
 def remove_run(folder: str | Path | Storage) -> None:
-    """Remove a stored run and its parts, and no other files.
+    """Remove a stored run and its parts, but no other files.
 
     The parts are removed even if they are stored in a different location. If the database is
-    damaged, only parts in the folder of the run are found.
+    damaged, only the parts in the folder of the run can be found.
 
     Parameters
     ----------
@@ -533,8 +533,8 @@ def remove_run(folder: str | Path | Storage) -> None:
     Raises
     ------
     LidarError
-        If another run uses the database, the files cannot be removed, or a file of the run is a
-        symbolic link.
+        If another run is using the database, if the files cannot be removed, or if a file of the
+        run is a symbolic link.
     """
     location = Storage.at(folder)
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:

@@ -27,7 +27,7 @@ from ...scenario.campaign_sections import is_campaign
 from ...scenario.scenario import Scenario
 
 MATERIAL = TABLE["material"]
-_PREVIEW = "This is a preview before the run, with the points of the first sweep of each sensor."
+_PREVIEW = "This preview was simulated before the run and shows the first sweep of each sensor."
 
 
 def scenario_view(

@@ -65,23 +65,23 @@ def show(
     Parameters
     ----------
     scanner
-        The scanner, or several scanners with names in one scene.
+        Scanner to show, or several named scanners in the same scene.
     to
         Address and port to listen on, as ADDRESS:PORT. By default, the port is 8080 on 127.0.0.1,
         or another port if it is in use.
     browser
-        Whether to open a browser if there is a desktop.
+        Whether to open a browser if the machine has a desktop.
 
     Returns
     -------
     ScannerPage
-        A context manager. Pass each sweep and its pose to its method `show`. Its method `close`
-        ends the page.
+        A context manager. Its `show` method displays a sweep at a pose, and its `close` method
+        closes the page.
 
     Raises
     ------
     LidarError
-        If the address cannot be used, or scanners have the same name.
+        If the address cannot be used, or if several scanners have the same name.
 
     Examples
     --------

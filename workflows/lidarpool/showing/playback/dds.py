@@ -116,7 +116,7 @@ def _ipv4_address(host: str) -> str:
     try:
         infos = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
     except (OSError, UnicodeError) as error:
-        raise LidarError(f"The host {host} of `--to` does not exist. {advice}") from error
+        raise LidarError(f"The host {host} of `--to` cannot be resolved. {advice}") from error
     address = str(infos[0][4][0])
     if ipaddress.ip_address(address).is_multicast:
         raise LidarError(f"The address {host} of `--to` is a multicast address. {advice}")

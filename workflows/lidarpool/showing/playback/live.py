@@ -49,23 +49,24 @@ def play(
     Parameters
     ----------
     scanner
-        The scanner, with the columns of `Packets`. The sweeps of a pose or trajectory are cast in
-        parallel, one on each core, so ``threads=1`` is fastest in this case.
+        Scanner, which must have the columns of `Packets`. If a pose or trajectory is passed, its
+        sweeps are simulated in parallel, one on each core, so ``threads=1`` is fastest in this
+        case.
     trajectory
         Pose of a stationary sensor, trajectory of a moving sensor, or a function that returns the
         pose or trajectory of the sweep that starts at a given time in seconds. At the end of a
-        trajectory, `play` returns. The function is called in this thread, up to one sweep before
-        that time. Poses may jump.
+        trajectory, `play` returns. The function is called in the calling thread, up to one sweep
+        before the sweep starts. Consecutive poses can be far apart.
     to, api
         Destination of the packets, and address on which the sensor interface listens, as HOST or
         HOST:PORT, as for `lidarpool play`.
     rate
-        Playback speed. For example, 0.5 takes twice as long.
+        Playback speed. For example, playback at 0.5 takes twice as long.
     duration_s
         Duration in seconds of scanner time. By default, it is the length of the trajectory. Without
         a trajectory, packets are sent until Ctrl-C.
     start
-        Date and time of time 0 for the stamps, as in `Survey`.
+        Date and time that correspond to time 0 in the timestamps, as in `Survey`.
     ready, note
         Functions that are called with the addresses once the scanner is ready, and with notes for
         the user.
@@ -78,8 +79,8 @@ def play(
     Raises
     ------
     LidarError
-        If the scanner lacks a column, the packets of the sensor are not supported, or an address
-        cannot be used.
+        If the scanner lacks a column, if the packets of the sensor are not supported, or if an
+        address cannot be used.
 
     Examples
     --------

@@ -126,8 +126,8 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
     for name in (CLOUD, SWEEPS_FILE):
         if not (folder / name).exists():
             raise LidarError(
-                f"{source} contains no {name}. Specify a scenario, or the folder of a "
-                "finished run, as passed to `--out`."
+                f"{source} contains no {name}. Specify a scenario, or the output folder of a "
+                "finished run."
             )
     sweeps = Sweeps.load(folder / SWEEPS_FILE)
     cloud = CloudFile(folder / CLOUD)

@@ -196,8 +196,8 @@ class Transmitter:
                     self._services.append(service.description)
                 elif stream.api_given:
                     raise LidarError(
-                        f"`--api` cannot be used with {stream.model}, because it has no "
-                        "interface that listens. Remove `--api`."
+                        f"`--api` cannot be used with {stream.model}, because no HTTP or command "
+                        "interface is simulated for this sensor. Remove `--api`."
                     )
                 self.sender.redirect(number, stream.destination, stream.source_address)
             self._stack = stack.pop_all()

@@ -137,7 +137,7 @@ class Foxglove(_InViewer):
     Parameters
     ----------
     scanner
-        The scanner, or the first of several scanners in one scene.
+        Scanner to show, or the first of several scanners in the same scene.
     to
         Address and port to listen on, as ADDRESS:PORT. The address must be local to this machine.
         By default, the port is 8765 on 127.0.0.1, or another port if it is in use.
@@ -145,8 +145,8 @@ class Foxglove(_InViewer):
     Raises
     ------
     LidarError
-        If foxglove-sdk is missing (extra `live`), the address cannot be used, or the address can be
-        reached from other machines.
+        If foxglove-sdk is not installed (extra `live`), if the address cannot be used, or if the
+        address can be reached from other machines.
     """
 
     @checked

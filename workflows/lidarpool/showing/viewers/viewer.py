@@ -115,7 +115,7 @@ class Address(NamedTuple):
             with suppress(LidarError):
                 cls(LOOPBACK, candidate)._check_free(count)
                 return cls(LOOPBACK, candidate)
-        raise LidarError(f"All ports from {port} on are in use. Specify an address and a port.")
+        raise LidarError(f"No free port was found from {port} on. Specify an address and a port.")
 
     @classmethod
     def _parse(cls, text: str, port: int) -> Address:

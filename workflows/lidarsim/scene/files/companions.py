@@ -67,6 +67,6 @@ def image_file(mesh: Path, name: str, options: ReadOptions, allowance: Allowance
 def outside(name: str) -> str:
     """Return a clause on a file that may not be read."""
     return (
-        f"takes data from {name[-80:]!r}, but only files in its own folder are read: name a folder "
-        "that holds that file as assets"
+        f"takes data from {name[-80:]!r}, but only files in its own folder are read. Set assets "
+        "to the folder that contains that file"
     )

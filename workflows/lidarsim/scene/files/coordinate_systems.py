@@ -136,7 +136,10 @@ def need_registry(purpose: str) -> None:
     Raises LidarError if not. `purpose` starts the error.
     """
     if not has_registry():
-        raise LidarError(f"{purpose} by rasterio: {install_command('lidarpool[geo]')}.")
+        raise LidarError(
+            f"{purpose} requires rasterio, which is not installed. Run "
+            f"{install_command('lidarpool[geo]')}."
+        )
 
 
 def crs_of_text(text: str) -> Any:
@@ -498,19 +501,19 @@ def scale_problem(system: str, x: float, y: float, *, in_system: bool = True) ->
     if scale is None or scale.is_true:
         return ""
     if (area := missed_area(horizontal, x, y)) is not None:
-        return f"whose area of use ({area}) is not where the coordinates are"
+        return f"whose area of use ({area}) does not include the coordinates"
     clause = f"whose meter is {scale} long on the ground here"
     if scale.is_even and in_system:
         factor = f"{(scale.shortest + scale.longest) / 2:.6g}"
-        clause += f": scale [{factor}, {factor}, 1] makes its lengths true"
+        clause += f" (scale [{factor}, {factor}, 1] corrects the lengths)"
     return clause
 
 
 def world_advice(x: float, y: float, z: float) -> str:
     """Return advice, a sentence without a period, on a file that states a map offset."""
     return (
-        f"Alternatively, world.origin [{x:.12g}, {y:.12g}, {z:.9g}] leaves the scene and the "
-        "poses of a scenario unchanged and writes output files in this system"
+        f"Alternatively, set world.origin to [{x:.12g}, {y:.12g}, {z:.9g}], which leaves the "
+        "scene and the poses of a scenario unchanged and writes output files in this system"
     )
 
 
@@ -528,7 +531,7 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
         return f"EPSG:{epsg}, {OF_THE_WORLD}" if epsg in WORLD_EPSG else ""
     crs = crs_of_code(epsg)
     if crs is None:
-        return f"EPSG:{epsg}, a code that rasterio does not know"
+        return f"EPSG:{epsg}, which is unknown to rasterio"
     name = f"EPSG:{epsg} ({projjson(crs)['name']})"
     horizontal, _ = horizontal_part(crs)
     if not horizontal.is_projected or horizontal.linear_units_factor[1] != 1:
@@ -537,13 +540,13 @@ def target_problem(epsg: int, x: float, y: float, *, why_there: str = "") -> str
         return f"{name}, {OF_THE_WORLD}"
     scale = ground_scale(horizontal, x, y)
     if scale is None:
-        return f"{name}, which does not reach to x {x:.9g}, y {y:.9g}"
+        return f"{name}, which is not defined at x {x:.9g}, y {y:.9g}"
     if scale.is_true:
         return ""
-    advice = "choose a system for this place"
+    advice = "Use a system for this location"
     if place := longitude_latitude(horizontal, x, y):
-        advice = f"EPSG:{zone_in_meters(*place)} has true meters there"
-    return f"{name}, whose meter is {scale} long at x {x:.9g}, y {y:.9g}{why_there}: {advice}"
+        advice = f"Use EPSG:{zone_in_meters(*place)}, which is true to scale there"
+    return f"{name}, whose meter is {scale} long at x {x:.9g}, y {y:.9g}{why_there}. {advice}"
 
 
 def is_utm(epsg: int) -> bool:

@@ -30,10 +30,10 @@ def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray
     data = read_input(path)
     row_size = 4 * len(names)
     if len(data) % row_size:
-        other_format = f" ({_NUSCENES_ENDING} has {NUSCENES[-1]} as well)" if names is KITTI else ""
+        other_format = f" (and {NUSCENES[-1]} in {_NUSCENES_ENDING})" if names is KITTI else ""
         raise ValueError(
-            f"{path.name} has {len(data):,} bytes, but a multiple of {row_size} was expected: "
-            f"{', '.join(names)} as float32{other_format}"
+            f"{path.name} has {len(data):,} bytes, but a multiple of {row_size} was expected. A "
+            f"point consists of {', '.join(names)} as float32{other_format}"
         )
     rows = np.frombuffer(data, "<f4").reshape(-1, len(names))
     columns: dict[str, AnyArray] = dict(zip(names, rows.T.copy(), strict=True))

@@ -73,10 +73,10 @@ def read_gltf(data: bytes, path: Path, options: ReadOptions) -> Content:
         content = reader.animated_content(options.animation)
     content.unit_m = 1.0
     content.up_axis = "y"
-    content.turned = "as glTF asks"
+    content.turned = "as glTF requires"
     notes = [*reader.visibility_notes(), *extension_notes(header)]
     if notes and not content.meshes:
-        raise MeshFileError(f"contains no triangles that can be read: it {'; it '.join(notes)}")
+        raise MeshFileError(f"contains no readable triangles, because it {'; it '.join(notes)}")
     content.notes = [*notes, *materials.notes.lines(), *reader.motion_notes()]
     asset = header.get("asset", {})
     content.generator = str(asset.get("generator", ""))
@@ -184,7 +184,9 @@ class _NodeReader:
         """
         visible = extension(data, VISIBILITY).get("visible", True)
         if not isinstance(visible, bool):
-            raise ValueError(f"node {index} has {visible!r} as {VISIBILITY}.visible")
+            raise ValueError(
+                f"{VISIBILITY}.visible of node {index} must be true or false, but is {visible!r}"
+            )
         if not visible:
             self._hidden_nodes[index] = printable(str(data.get("name") or f"node {index}"))
         return not visible
@@ -195,7 +197,10 @@ class _NodeReader:
             return []
         names = [*self._hidden_nodes.values()]
         nodes = plural(len(names), "hidden node")
-        return [f"has {nodes} ({VISIBILITY}), left out with all below: {listed(names)}"]
+        return [
+            f"has {nodes} ({VISIBILITY}). Hidden nodes and their descendants were skipped: "
+            f"{listed(names)}"
+        ]
 
     def _copies(self, attributes: dict[str, Any]) -> Floats | None:
         """Return matrices (k, 4, 4) of the copies of a node's mesh, or None without copies."""
@@ -207,11 +212,14 @@ class _NodeReader:
             natural(self._file.part("accessors", index)["count"]) for index in indices.values()
         ]
         if len({*counts}) > 1:
-            raise ValueError(f"the attributes of {INSTANCING} have {counts} rows")
+            raise ValueError(
+                f"the attributes of {INSTANCING} must have the same number of rows, but have "
+                f"{counts}"
+            )
         if counts[0] > MAX_NODES:
             raise MeshFileError(
-                f"places a mesh {counts[0]:,} times by {INSTANCING}, of at most {MAX_NODES:,}: "
-                "export it in parts"
+                f"places a mesh {counts[0]:,} times with {INSTANCING}, but the limit is "
+                f"{MAX_NODES:,}. Export it in parts"
             )
         self._allowance.take(2 * 128 * counts[0])
         rows = {
@@ -223,15 +231,20 @@ class _NodeReader:
         """Return notes on animations that are not played, or on masks of an animated scene."""
         posed_count = self._posed.cache_info().currsize
         animation_count = len(self._file.header.get("animations", ()))
-        meshes = f", of {plural(posed_count, 'bent mesh', 'bent meshes')}" * bool(posed_count)
+        meshes = (f" with {plural(posed_count, 'deformed mesh', 'deformed meshes')}") * bool(
+            posed_count
+        )
         if self._channels:
             if not self._materials.have_masks:
                 return []
-            return ["is animated, so it is solid where its images are transparent"]
+            return ["is animated, so transparent areas of its images are treated as opaque"]
         if not animation_count:
             return []
-        advice = "all stands still; actors move by animation: NAME"
-        return [f"has {plural(animation_count, 'animation')}{meshes}: {advice}"]
+        advice = (
+            "Animations are not played in the static scene. To play one, set `animation: NAME` "
+            "on an actor"
+        )
+        return [f"has {plural(animation_count, 'animation')}{meshes}. {advice}"]
 
     def _weights(self, index: int, node: dict[str, Any]) -> tuple[float, ...]:
         """Return the weights of the morph targets of a node's mesh."""
@@ -241,7 +254,10 @@ class _NodeReader:
         if (animated := self._channels.get((index, "weights"))) is not None:
             counts = [len(primitive.get("targets", ())) for primitive in mesh["primitives"]]
             if animated.shape[1] not in counts:
-                raise ValueError(f"node {index} has {animated.shape[1]} animated weights")
+                raise ValueError(
+                    f"node {index} has {animated.shape[1]} animated weights, which does not match "
+                    "the number of morph targets of its mesh"
+                )
             return tuple(animated[self._frame].tolist())
         return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
 
@@ -296,7 +312,7 @@ class _NodeReader:
         """Return matrices (j, 4, 4) of a skin's joints, from mesh to scene, by glTF 2.0, 3.7.3."""
         skin_data = self._file.part("skins", skin)
         if not skin_data.get("joints"):
-            raise MeshFileError("has a skin without joints. Export it again, or without the skin")
+            raise MeshFileError("has a skin without joints. Export it without the skin")
         worlds = np.array([self._world(joint) for joint in skin_data["joints"]])
         if (inverse := skin_data.get("inverseBindMatrices")) is not None:
             columns = self._file.accessor(inverse).astype(np.float64)[: len(worlds)]
@@ -315,7 +331,10 @@ class _NodeReader:
             weights = self._file.accessor(attributes[f"WEIGHTS{number}"]).astype(np.float64)
             for joint, weight in zip(rows.T, weights.T, strict=True):
                 if joint.max(initial=0) >= len(joints):
-                    raise ValueError(f"a vertex has joint {joint.max()} of {len(joints)}")
+                    raise ValueError(
+                        f"a vertex refers to joint {joint.max()}, but there are {len(joints)} "
+                        "joints"
+                    )
                 blend += weight[:, None, None] * joints[joint]
                 total += weight
         unweighted = np.flatnonzero(total <= 0)  # other readers move these by the first joint

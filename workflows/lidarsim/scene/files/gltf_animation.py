@@ -36,7 +36,7 @@ def find_animation(animations: list[dict[str, Any]], name: str) -> dict[str, Any
             "contains no animations. Export it with animations, or remove animation"
         )
     if name and name not in names:
-        hint = did_you_mean(name, names).strip() or f"there are {', '.join(names[:8])}"
+        hint = did_you_mean(name, names).strip() or f"the animations are {', '.join(names[:8])}"
         raise MeshFileError(f"has no animation {name!r} ({hint})")
     return animations[names.index(name) if name else 0]
 
@@ -51,7 +51,7 @@ def keys_of(animation: Mapping[str, Any], read: Callable[[Any], AnyArray]) -> tu
     """
     times = [read(sampler["input"])[:, 0].astype(np.float64) for sampler in animation["samplers"]]
     if any((np.diff(t) <= 0).any() or not np.isfinite(t).all() for t in times):
-        raise ValueError("the times of an animation must be ascending")
+        raise ValueError("the keyframe times of an animation must be finite and increasing")
     return min((t[0] for t in times), default=0.0), max((t[-1] for t in times), default=0.0)
 
 
@@ -77,7 +77,10 @@ def sample_channels(
         values = read(sampler["output"]).astype(np.float64)
         values = values.reshape(len(keys), _VALUES[kind], -1)
         if values.shape[2] != WIDTHS.get(path, values.shape[2]):
-            raise ValueError(f"keys of a {path} have {values.shape[2]} numbers, not {WIDTHS[path]}")
+            raise ValueError(
+                f"keyframes of a {path} must have {WIDTHS[path]} numbers, but have "
+                f"{values.shape[2]}"
+            )
         channels[target["node"], path] = _sampled(keys, values, at_s, kind, path == "rotation")
     return channels
 

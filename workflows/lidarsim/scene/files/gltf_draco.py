@@ -31,7 +31,7 @@ def _draco_counts(data: bytes) -> tuple[int, int]:
     """
     magic, version, kind, method, flags = struct.unpack_from("<5sHBBH", data)
     if magic != b"DRACO" or kind != 1 or method > 1:
-        raise ValueError("its Draco data are not a mesh")
+        raise ValueError("its Draco data is not a mesh")
     if version != 0x0202 or flags & 0x8000:
         raise MeshFileError(
             "has Draco data with metadata or with a version other than 2.2, which is not "

@@ -37,7 +37,7 @@ _WITHOUT_SHAPE = re.compile(
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_OLD = "is glTF 1.0, which is not supported: convert it to glTF 2.0"
+_OLD = "is glTF 1.0, which is not supported. Convert it to glTF 2.0"
 V = TypeVar("V")
 
 
@@ -49,7 +49,7 @@ def chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         if version == 1:
             raise MeshFileError(_OLD)
         if len(data) < total:
-            raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
+            raise MeshFileError(f"is truncated: it declares {total} bytes, but has {len(data)}")
         body = data[28 + size : total]
         data = data[20 : 20 + size].rstrip(b"\0")  # some programs pad it with these
     elif data[:1] not in b"{[ \t\r\n":
@@ -85,7 +85,11 @@ def extension_notes(header: dict[str, Any]) -> list[str]:
     """Return a note on the extensions that a file uses and does not require, if any is unknown."""
     names = dict.fromkeys(printable(str(name))[:60] for name in header.get("extensionsUsed", ()))
     unknown = [name for name in names if not (_READ.match(name) or _WITHOUT_SHAPE.match(name))]
-    return [f"uses extensions that are not read: {listed(unknown, 8)}"] if unknown else []
+    return (
+        [f"uses extensions that are not supported and were ignored: {listed(unknown, 8)}"]
+        if unknown
+        else []
+    )
 
 
 def root_nodes(header: dict[str, Any]) -> list[int]:
@@ -136,7 +140,7 @@ class GltfFile:
         count = natural(accessor["count"])
         if accessor["type"] not in _WIDTHS or accessor["componentType"] not in _TYPES:
             raise ValueError(
-                f"accessor {index} has the type {accessor['type']!r} of "
+                f"accessor {index} has the type {accessor['type']!r} with components of type "
                 f"{accessor['componentType']!r}, which glTF does not define"
             )
         width = _WIDTHS[accessor["type"]]
@@ -174,7 +178,9 @@ class GltfFile:
         if not count:
             return np.empty((0, width), kind)
         if stride * (count - 1) + row > len(view):
-            raise ValueError(f"{count:,} elements announced, {len(view):,} bytes there")
+            raise ValueError(
+                f"{count:,} elements are declared, but their buffer has only {len(view):,} bytes"
+            )
         return np.ndarray((count, width), kind, view, strides=(stride, kind.itemsize))
 
     def view(self, index: int) -> memoryview:
@@ -190,7 +196,8 @@ class GltfFile:
         if uri is None:
             if index:
                 raise MeshFileError(
-                    "has a buffer without content, like compressed files. Decompress it first"
+                    "has a buffer without content, which is typical of compressed files. "
+                    "Decompress the file first"
                 )
             content = self._body
         elif uri.startswith("data:"):
@@ -199,8 +206,8 @@ class GltfFile:
             content = self._buffer_file(uri)
         if len(content) < buffer["byteLength"]:
             raise MeshFileError(
-                f"takes {buffer['byteLength']:,} bytes from {uri[:80] if uri else 'itself'!r}, "
-                f"which is cut short: it has {len(content):,}"
+                f"requires {buffer['byteLength']:,} bytes from {uri[:80] if uri else 'itself'!r}, "
+                f"which is truncated to {len(content):,}"
             )
         return content
 
@@ -209,8 +216,8 @@ class GltfFile:
         target = named_file(self.path, uri, self._options, allow_moved=False)
         if target is None:
             raise MeshFileError(
-                f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "
-                "as .glb"
+                f"takes data from {uri[:80]!r}, which does not exist. Copy this file to the "
+                "folder of the model, or export the model as .glb"
             )
         self.allowance.add_file(target)
         return read_input(target)
@@ -245,5 +252,5 @@ def natural(number: Any) -> int:
     Raises ValueError for a negative number or no integer.
     """
     if type(number) is not int or number < 0:
-        raise ValueError(f"{number!r} is given as an index or a count")
+        raise ValueError(f"an index or a count must be a non-negative integer, but is {number!r}")
     return number

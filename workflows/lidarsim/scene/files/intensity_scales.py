@@ -68,5 +68,8 @@ def from_zero(intensities: AnyArray) -> tuple[AnyArray, str]:
         return intensities, ""
     if low >= LEICA_LOWEST and high <= _LEICA_HIGHEST and high - low >= _MIN_LEICA_SPAN:
         return intensities - LEICA_LOWEST, ""
-    clause = f"has intensities from {low:g} to {high:g} on an unknown scale: {low:g} counts as 0"
+    clause = (
+        f"has intensities from {low:g} to {high:g} on an unknown scale. They were shifted so that "
+        f"{low:g} becomes 0"
+    )
     return intensities - low, clause

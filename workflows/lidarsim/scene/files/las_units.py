@@ -80,8 +80,8 @@ _UNIT_NAMES = {  # names as files spell them, lower case, with spaces for "_" an
 _DATUMS = range(5001, 5300)  # in a vertical system's key by GeoTIFF 1.0: datums, without units
 # Commands and functions that read a cloud have unit; compare has two clouds.
 _OVERRIDE = (
-    "Specify it with --unit, or with --unit-a and --unit-b of compare (unit=, unit_a= and unit_b= "
-    "in Python)"
+    "Specify the unit with --unit, or with --unit-a and --unit-b for compare (unit=, unit_a= and "
+    "unit_b= in Python)"
 )
 
 
@@ -134,15 +134,15 @@ class CoordinateUnits:
             return ""
         if not self.vertical_stated:
             return (
-                f"is in the unit {self.horizontal.name} and was converted to meters; it states no "
-                f"unit of heights, so they are assumed to have the same unit. Otherwise, "
+                f"was converted from {self.horizontal.name} to meters. It does not state a unit "
+                "for heights, which are assumed to have the same unit. If they do not, "
                 f"s{_OVERRIDE[1:]}"
             )
         if self.horizontal == self.vertical:
-            return f"is in the unit {self.horizontal.name} and was converted to meters"
+            return f"was converted from {self.horizontal.name} to meters"
         return (
-            f"is in the unit {self.horizontal.name} with heights in the unit {self.vertical.name}, "
-            "and was converted to meters"
+            f"was converted to meters from {self.horizontal.name}, with heights in "
+            f"{self.vertical.name}"
         )
 
 
@@ -203,8 +203,8 @@ def wkt_units(text: str) -> CoordinateUnits:
                 f"its coordinates are {kind} ({name[:80]}). {advice_to_project(None)}."
             )
         raise ValueError(
-            f"its coordinate system begins with {node.keyword[:20]!r}, and WKT of a projection was "
-            "expected"
+            f"its coordinate system begins with {node.keyword[:20]!r}, but the WKT of a projected "
+            "system was expected"
         )
     unit = _length_unit(horizontal)
     if unit is None:
@@ -353,7 +353,7 @@ def units_of_keys(keys: Mapping[int, float]) -> CoordinateUnits | None:
     unit = _unit_of_code(keys.get(_LINEAR_UNIT))
     heights = None
     if keys.get(_LINEAR_UNIT) == USER_DEFINED and _LINEAR_UNIT_SIZE in keys:
-        unit = CoordinateUnit("of its own", keys[_LINEAR_UNIT_SIZE])
+        unit = CoordinateUnit("custom units", keys[_LINEAR_UNIT_SIZE])
     if projected not in (0, USER_DEFINED) and unit is None:
         system = units_of_epsg(projected)
         unit = system.horizontal
@@ -409,8 +409,8 @@ def _wkt_of_epsg(code: int) -> str:
     """Return a system of the EPSG registry as WKT."""
     if not has_registry():
         raise LidarError(
-            f"its coordinate system EPSG:{code} has an unknown unit. {_OVERRIDE}, or look the "
-            f"unit up with the extra geo: {install_command('lidarpool[geo]')}."
+            f"its coordinate system EPSG:{code} has an unknown unit. {_OVERRIDE}. To look up the "
+            f"unit instead, run {install_command('lidarpool[geo]')}."
         )
     crs = crs_of_code(code)
     if crs is None:

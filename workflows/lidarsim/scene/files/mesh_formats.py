@@ -97,7 +97,7 @@ class MeshFormat:
             options = self._named(options, type)
         if options is not None and self.plugin is not None and (flaw := _flaw(options)):
             raise LidarError(
-                f"{self.plugin} has options that {flaw}: install another version of "
+                f"{self.plugin} has options that {flaw}. Install a different version of "
                 f"{self.plugin.distribution}."
             )
         return options
@@ -113,12 +113,12 @@ class MeshFormat:
 def _flaw(options: type) -> str:
     """Return why a class cannot be the options of a format, as a clause, empty if it can."""
     if not (is_dataclass(options) and is_section(options)):
-        return "are no dataclass with checked_fields"
+        return "are not a dataclass with checked_fields"
     for entry in fields(options):
         if entry.default is MISSING:
             return f"have no default for {entry.name}"
         if entry.name in _SHARED:
-            return f"have {entry.name}, an option of all formats"
+            return f"redefine {entry.name}, an option of all formats"
     return ""
 
 
@@ -138,7 +138,7 @@ _READ = (
 # Tables of further packages, each a tuple `MESH_FORMATS`. A package need not be installed.
 _TABLES = ("lidarscenes.files.formats",)
 
-_POINTS = "make a mesh of it by lidarpool scene points"
+_POINTS = "convert it to a mesh with lidarpool scene points"
 
 _NOT_READ = (
     MeshFormat(
@@ -151,12 +151,12 @@ _NOT_READ = (
     MeshFormat((".csv", ".txt"), advice=f"if it is a point cloud, {_POINTS}"),
     MeshFormat(
         (".pcap", ".pcapng", ".mcap", ".bag", ".db3", ".osf"),
-        advice="it is a recording, write its points as .ply, .pcd or .las and make a mesh of "
-        "these by lidarpool scene points",
+        advice="it is a recording. Write its points to a .ply, .pcd or .las file, and convert this "
+        "file to a mesh with lidarpool scene points",
     ),
     MeshFormat(
         (".step", ".stp", ".iges", ".igs", ".brep", ".fcstd"),
-        advice="it is a CAD model, make a mesh of it, for example .stl or .glb from FreeCAD",
+        advice="it is a CAD model. Export it as a mesh, for example as .stl or .glb from FreeCAD",
     ),
     MeshFormat(
         (".dwg", ".skp"),
@@ -164,13 +164,13 @@ _NOT_READ = (
     ),
     MeshFormat(
         (".gml",),
-        advice="it is a city model, convert it to CityJSON: citygml-tools to-cityjson IN.gml",
+        advice="it is a city model. Convert it to CityJSON with citygml-tools to-cityjson IN.gml",
     ),
     MeshFormat(
         (".osm",),
-        advice="it is a map, make a mesh of its buildings, for example by blosm in Blender",
+        advice="it is a map. Create a mesh of its buildings, for example with Blosm in Blender",
     ),
-    MeshFormat((".mjcf",), advice="MuJoCo reads its models from .xml: give it that ending"),
+    MeshFormat((".mjcf",), advice="MuJoCo models must have the extension .xml. Rename the file"),
 )
 
 
@@ -251,8 +251,8 @@ def _row_of_plugin(plugin: Plugin) -> MeshFormat:
         raise plugin.lacks("read")
     if plugin.name not in row.endings:
         raise LidarError(
-            f"{plugin} is a MeshFormat of {' '.join(row.endings)}: name the plug-in after one of "
-            "these endings."
+            f"{plugin} is a MeshFormat for {' '.join(row.endings)}. Name the plug-in after one of "
+            "these extensions."
         )
     return replace(row, plugin=plugin)
 
@@ -309,9 +309,9 @@ def lacking(row: MeshFormat | None, options: Iterable[str]) -> str:
     parts = []
     for having, group in groups.items():
         kind = "options" if group[1:] else "an option"
-        parts.append(f"no {joined(group)}" + (f", {kind} of {having}" if having else ""))
+        parts.append(joined(group) + (f" ({kind} of {having})" if having else ""))
     hint = did_you_mean(groups[""][0], names) if "" in groups else ""
-    return f"has {'; '.join(parts)}: leave out {joined(lacks)}.{hint}"
+    return f"does not support {', '.join(parts)}. Remove {joined(lacks)}.{hint}"
 
 
 def option_names(row: MeshFormat | None) -> tuple[str, ...]:

@@ -17,18 +17,21 @@ from ..transform import Transform
 LengthUnit = Annotated[
     Literal["um", "mm", "cm", "dm", "m", "km", "in", "ft", "yd", "mi"] | None,  # of UNITS_M
     about(
-        "length unit of the file, or of a raster's heights; by default the one it states, else "
-        "meters"
+        "length unit of the file, or of the heights in a raster (default: from the file, "
+        "otherwise meters)"
     ),
 ]
 UpAxis = Annotated[
     Literal["x", "y", "z"] | None,
-    about("axis of the file that points up; by default that of its format"),
+    about("axis of the file that points up (default: defined by the file format)"),
 ]
 OpacityMode = Literal["mask", "ignore"]
 Opacity = Annotated[
     OpacityMode,
-    about("mask: light passes where the image of a material is transparent; ignore: nowhere"),
+    about(
+        "mask lets light pass where the image of a material is transparent; ignore disregards "
+        "the transparency of images"
+    ),
 ]
 
 

@@ -93,7 +93,7 @@ class Objects(NamedTuple):
         if self.actors:
             names = ", ".join(actor.name for actor in self.actors[:3])
             names += ", …" * (len(self.actors) > 3)
-            tell(f"{names}: taken where they are at first, and still")
+            tell(f"{names}, but all objects are treated as static at their first pose")
         return (*self.static, *map(_mesh_at_start, self.actors))
 
 
@@ -218,8 +218,9 @@ def _in_world(
             )
     if reaches_m:
         content.notes.append(
-            f"has objects farther than anything on Earth ({max(reaches_m.values()):.3g} m from the "
-            f"origin), which are left out: {listed([*reaches_m])}; check their units and placement"
+            f"has objects farther than anything on Earth ({max(reaches_m.values()):.3g} m from "
+            f"the origin), which were skipped: {listed([*reaches_m])}. Check their units and "
+            "placement"
         )
     return Objects(tuple(static), tuple(actors))
 
@@ -230,7 +231,7 @@ def _tell_notes(
     """Call `tell` with a line on objects that were left out, and with the notes of the reader."""
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
-        tell(f"{path} has objects without an area, which are left out: {names}.")
+        tell(f"{path} has objects without an area, which were skipped: {names}.")
     for note in content.notes:
         tell(f"{path} {note}.")
     if content.unit_note and not unit_given:
@@ -297,16 +298,16 @@ def _tell_axes(
     if content.turned and content.up_axis == "y":
         doubt = _seems_to_lie(content, meshes)
         other_axis = "z"
-        statement = f"was turned from Y-up to Z-up, {content.turned}{doubt}"
+        statement = f"was rotated from Y-up to Z-up, {content.turned}{doubt}"
     elif path.suffix.lower() == ".obj":  # without axes, and Y-up as often as not
-        statement = "states no axes and is taken as Z-up"
+        statement = "does not state its axes and is assumed to be Z-up"
         doubt = ""
         other_axis = "y"
     else:
         return
     note = (
-        f'{path.name} {statement}; if it lies on its side, give <file.up_axis="{other_axis}">; set '
-        "up_axis to silence this note"
+        f'{path.name} {statement}. If it lies on its side, set <file.up_axis="{other_axis}">. To '
+        "silence this note, set up_axis explicitly"
     )
     if axes is not None:
         axes(note)
@@ -319,11 +320,11 @@ def _tell_axes(
 def _seems_to_lie(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
     """Return the reason why a file rotated from Y-up seems to have been Z-up, or empty."""
     if "trimesh" in content.generator:
-        return ", and trimesh wrote it, which keeps the axes that it is given"
+        return ", but was written by trimesh, which does not convert axes"
     lower = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
     x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - lower
     if 2 * y < min(x, z):
-        return f", and is {rounded(x)} m wide, {rounded(z)} m high and {rounded(y)} m thick now"
+        return f", and is now {rounded(x)} m wide, {rounded(z)} m high and {rounded(y)} m thick"
     return ""
 
 
@@ -359,9 +360,9 @@ def _end_missing(error: Exception, data: bytes) -> CutShortError | None:
             return CutShortError(f"its JSON ends in line {error.lineno}, column {error.colno}")
     elif isinstance(error, zipfile.BadZipFile):
         if data.startswith(_ZIP) and _ZIP_END not in data:
-            return CutShortError("it is an archive without its list of files, with which it ends")
+            return CutShortError("it is an archive without the list of files at its end")
     elif isinstance(error, EOFError):
-        return CutShortError("its packed content ends too early")
+        return CutShortError("its compressed content ends too early")
     return None
 
 
@@ -380,7 +381,9 @@ def _checked_content(row: MeshFormat, path: Path, data: bytes, options: ReadOpti
             raise MeshFileError(problem)
     content = row.reader(data, path, options)
     if row.plugin is not None and not isinstance(content, Content):
-        raise LidarError(f"{row.plugin} read {type(content).__name__}, not Content.")
+        raise LidarError(
+            f"{row.plugin} must return Content, but returned {type(content).__name__}."
+        )
     if content.meshes or content.moving:
         return content
     if content.skipped:
@@ -402,12 +405,13 @@ def _format_to_read(path: Path) -> MeshFormat:
     if row is not None:
         raise LidarError(f"{path} cannot be read. {as_sentence(row.advice)}")
     further = "".join(
-        f"; {package} reads more: {install_command('lidarpool')}" for package in missing_packages()
+        f". To read the formats of {package}, run {install_command('lidarpool')}"
+        for package in missing_packages()
     )
     raise LidarError(
-        f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that can be "
-        f"read; these are: {' '.join([*endings(), *plugin_endings()])} (a scenario has the ending "
-        f".yaml){further}."
+        f"{path} has the extension {path.suffix or '(none)'}, which is not a supported mesh "
+        f"format. The supported extensions are {' '.join([*endings(), *plugin_endings()])}, and "
+        f".yaml for a scenario{further}."
     )
 
 
@@ -428,20 +432,20 @@ def _bytes_of(path: Path, max_bytes: int | None) -> bytes:
 
 # {expression for the start of a file that is no mesh: advice}
 _FOREIGN = {
-    rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is packed: unpack it first",
-    rb"(?i)\s*(<!doctype html|<html)": "is a web page: download the file itself",
+    rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is compressed. Decompress it first",
+    rb"(?i)\s*(<!doctype html|<html)": "is a web page. Download the file itself",
 }
 
 
 def _other_format(path: Path, data: bytes) -> str:
     """Return a sentence on the format that a refused file starts like, or empty."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return " It begins like text in UTF-16: save it as UTF-8."
+        return " It appears to be encoded in UTF-16. Save it as UTF-8."
     if path.suffix.lower() in SCAN_READERS and not is_text_raster(path):
-        return " If it is a point cloud, make a mesh of it by lidarpool scene points."
+        return " If it is a point cloud, convert it to a mesh with lidarpool scene points."
     likely = endings_for(data)
     if likely and path.suffix.lower() not in likely:
-        return f" It begins like a {' or '.join(likely)} file: give it that ending."
+        return f" It appears to be a {' or '.join(likely)} file. Change its extension."
     return ""
 
 

@@ -152,7 +152,7 @@ class MtlMaterials:
                 try:
                     path = named_file(self._mesh, name, self._options)
                 except MeshFileError:
-                    reason = "outside its folder, name the folder of that file as assets"
+                    reason = "outside the folder of the mesh; set assets to the folder of this file"
                     self.notes.missing_files.append(f"{name} ({reason})")
                     continue
                 if path not in read:

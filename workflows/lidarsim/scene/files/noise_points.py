@@ -34,10 +34,13 @@ class LeftOut(NamedTuple):
         if self.withheld:
             kinds.append(f"{plural(self.withheld, 'withheld point')}")
         if self.noise:
-            kinds.append(f"{plural(self.noise, 'point')} of noise (classes 7 and 18)")
-        verb = "is" if sum(self) == 1 else "are"
-        keeps = f"--keep-noise (in Python keep_noise=True) keeps {'it' if verb == 'is' else 'them'}"
-        return f"{' and '.join(kinds)} {verb} left out: {keeps}" if kinds else ""
+            kinds.append(f"{plural(self.noise, 'noise point')} (classes 7 and 18)")
+        verb = "was" if sum(self) == 1 else "were"
+        keeps = (
+            f"To keep {'it' if verb == 'was' else 'them'}, use --keep-noise (keep_noise=True in "
+            "Python)"
+        )
+        return f"{' and '.join(kinds)} {verb} skipped. {keeps}" if kinds else ""
 
 
 def usable_points(

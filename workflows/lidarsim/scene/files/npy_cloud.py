@@ -14,7 +14,9 @@ from ...base.input_files import check_input, open_input
 from ...base.words import printable
 from .cloud_scan import CloudScan, with_usual_names
 
-_EXPECTED = "an array (points, 3 or more), or records with the fields x, y and z, were expected"
+_EXPECTED = (
+    "Expected an array (n, k) with at least three columns, or records with the fields x, y and z"
+)
 
 
 def read_npy_cloud(path: Path) -> list[CloudScan]:
@@ -43,7 +45,7 @@ def read_npy_cloud(path: Path) -> list[CloudScan]:
         names = ["x", "y", "z", *(f"column_{index + 1}" for index in range(3, rows.shape[1]))]
         columns = dict(zip(names, rows.T, strict=True))
     else:
-        raise ValueError(f"its array has the shape {array.shape}: {_EXPECTED}")
+        raise ValueError(f"its array has the shape {array.shape}. {_EXPECTED}")
     with np.errstate(invalid="ignore", over="ignore"):  # NaN of any kind, and long doubles
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     return [CloudScan(positions, columns)]
@@ -64,7 +66,7 @@ def _fields(records: AnyArray) -> dict[str, AnyArray]:
         columns |= {f"{name}_{index}": column for index, column in enumerate(numbers.T)}
     columns = with_usual_names(columns)
     if not {*"xyz"} <= columns.keys():
-        raise ValueError(f"its fields are {printable(', '.join(columns))}: {_EXPECTED}")
+        raise ValueError(f"its fields are {printable(', '.join(columns))}. {_EXPECTED}")
     return columns
 
 
@@ -75,12 +77,14 @@ def _read_array(file: BinaryIO, size: int) -> AnyArray:
     """
     shape, is_fortran, kind = _read_header(file)
     if not _holds_numbers(kind):
-        raise ValueError(f"its array has the type {printable(str(kind))[:80]!r}: {_EXPECTED}")
+        raise ValueError(f"its array has the type {printable(str(kind))[:80]!r}. {_EXPECTED}")
     announced = math.prod(shape) * kind.itemsize
     there = size - file.tell()
     if announced != there:
         failure = CutShortError if there < announced else ValueError
-        raise failure(f"its array {shape} has {announced:,} bytes, and {there:,} are there")
+        raise failure(
+            f"its array of shape {shape} requires {announced:,} bytes, but {there:,} are present"
+        )
     array: AnyArray = np.frombuffer(file.read(), kind)
     array = array.astype(kind.newbyteorder("="))
     return array.reshape(shape, order="F" if is_fortran else "C")
@@ -99,7 +103,7 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     version = (*file.read(2),)
     if version not in readers:
         raise ValueError(
-            f"it has the version {version} of .npy, but only 1.0 and 2.0 are supported"
+            f"it has version {version} of the .npy format, but only 1.0 and 2.0 are supported"
         )
     try:
         shape, is_fortran, kind = readers[version](file)

@@ -107,8 +107,8 @@ def read_pcd(path: Path) -> list[CloudScan]:
     if missing := [axis for axis in "xyz" if axis not in columns]:
         names = ", ".join(field.name for field in header.fields)
         raise ValueError(
-            f"its FIELDS are {printable(names)}: x, y and z are required, with one number each, "
-            f"but the file has no {', '.join(missing)}"
+            f"its FIELDS are {printable(names)}, but it has no {', '.join(missing)}. The fields "
+            "x, y and z are required, with one number each"
         )
     with np.errstate(invalid="ignore"):  # NaN of any kind may be invalid
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
@@ -174,11 +174,13 @@ def _parse_header(data: bytes, encoding: str) -> _Header:
         keyword = {"COLUMNS": "FIELDS"}.get(words[0].upper(), words[0].upper())
         if keyword not in _KEYWORDS:
             raise ValueError(
-                f"line {number} of its header begins with {printable(words[0])[:40]!r}: "
-                f"{', '.join(_KEYWORDS)} and DATA were expected"
+                f"line {number} of its header begins with {printable(words[0])[:40]!r}, but "
+                f"{', '.join(_KEYWORDS)} or DATA was expected"
             )
         if keyword in entries:
-            raise ValueError(f"its header has {keyword} in line {entries[keyword][0]} and {number}")
+            raise ValueError(
+                f"its header repeats {keyword} in lines {entries[keyword][0]} and {number}"
+            )
         entries[keyword] = number, words[1:]
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise ValueError(
@@ -208,19 +210,18 @@ def _fields(entries: _Entries) -> list[_Field]:
     for keyword, words in (("SIZE", sizes), ("TYPE", letters), ("COUNT", counts)):
         if len(words) != len(names):
             raise ValueError(
-                f"the lines FIELDS and {keyword} of its header differ in length, {len(names)} and "
-                f"{len(words)}"
+                f"its header has {len(names)} entries in FIELDS, but {len(words)} in {keyword}"
             )
     for name, letter, size, count in zip(names, letters, sizes, counts, strict=True):
         if (letter, size) not in _KINDS or count < 1:
             raise ValueError(
-                f"its field {printable(name)[:40]!r} has TYPE {letter[:20]}, SIZE {size} and COUNT "
-                f"{count}: F of 4 or 8 bytes, I or U of 1, 2, 4 or 8 bytes, and a COUNT of 1 or "
-                "more were expected"
+                f"its field {printable(name)[:40]!r} has TYPE {letter[:20]}, SIZE {size} and "
+                f"COUNT {count}. Expected F with 4 or 8 bytes, or I or U with 1, 2, 4 or 8 bytes, "
+                "and a COUNT of at least 1"
             )
     if (numbers := sum(counts)) > _MAX_NUMBERS:
         raise ValueError(
-            f"{numbers:,} numbers for each point announced, of at most {_MAX_NUMBERS:,}"
+            f"its header declares {numbers:,} numbers per point, but the limit is {_MAX_NUMBERS:,}"
         )
     return [
         _Field(name, _KINDS[letter, size], count)
@@ -257,8 +258,8 @@ def _whole_numbers(
     number, words = entries[keyword]
     if not all(word.isdecimal() for word in words) or count not in (None, len(words)):
         raise ValueError(
-            f"line {number} of its header is {printable(' '.join([keyword, *words]))[:60]!r}: "
-            f"{'a whole number' if count == 1 else 'whole numbers'} of at least 0 expected"
+            f"line {number} of its header is {printable(' '.join([keyword, *words]))[:60]!r}. "
+            f"Expected {'a whole number' if count == 1 else 'whole numbers'} of at least 0"
         )
     return list(map(int, words))
 
@@ -280,8 +281,8 @@ def _viewpoint(entries: _Entries) -> tuple[float, ...]:
     length = float(np.sqrt((values[3:] ** 2).sum())) if values.shape == (7,) else np.nan
     if not (np.isfinite(values).all() and abs(length - 1) <= _MAX_QUATERNION_ERROR):
         raise ValueError(
-            f"line {number} of its header is {printable(' '.join(['VIEWPOINT', *words]))[:80]!r}: "
-            "a position x y z and a quaternion w x y z of length 1 were expected"
+            f"line {number} of its header is {printable(' '.join(['VIEWPOINT', *words]))[:80]!r}. "
+            "Expected a position x y z and a quaternion w x y z of length 1"
         )
     return (*values[:3].tolist(), *(values[3:] / length).tolist())
 
@@ -301,7 +302,9 @@ def _read_binary(header: _Header, body: memoryview) -> list[AnyArray]:
     _check_length(header, row_size, len(body))
     size = row_size * header.points
     if remaining := len(bytes(body[size:]).strip(b"\0\r\n\t ")):
-        raise ValueError(f"{header.points:,} points announced, and {remaining:,} bytes follow them")
+        raise ValueError(
+            f"{header.points:,} points are declared, but {remaining:,} bytes follow them"
+        )
     rows = np.frombuffer(body[:size], _row_type(header.fields, row_size))
     return [rows[str(index)] for index in range(len(header.fields))]
 
@@ -326,8 +329,8 @@ def _check_length(header: _Header, row_size: int, size: int) -> None:
     """
     if header.points * row_size > size:
         raise CutShortError(
-            f"{header.points:,} points of {row_size} bytes are declared, but "
-            f"{size // max(row_size, 1):,} are there"
+            f"{header.points:,} points of {row_size} bytes are declared, but only "
+            f"{size // max(row_size, 1):,} are present"
         )
 
 
@@ -337,7 +340,7 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
     PCL leaves padding out of what it packs, other programs do not.
     """
     if len(body) < 8:
-        raise CutShortError("the sizes of its packed points are missing")
+        raise CutShortError("the sizes of its compressed points are missing")
     packed_size, size = struct.unpack("<II", body[:8])
     stored = [field for field in header.fields if field.name != _PADDING]
     full_size = header.points * sum(field.size for field in header.fields)
@@ -345,12 +348,13 @@ def _read_compressed(header: _Header, body: memoryview, file_size: int) -> list[
         stored = header.fields
     elif size != header.points * sum(field.size for field in stored):
         raise ValueError(
-            f"{header.points:,} points announced, which have {full_size:,} bytes, and its packed "
-            f"points announce {size:,}"
+            f"{header.points:,} points with {full_size:,} bytes are declared, but its compressed "
+            f"points declare {size:,} bytes"
         )
     if 8 + packed_size > len(body):
         raise CutShortError(
-            f"{packed_size:,} bytes of packed points announced, and {len(body) - 8:,} are there"
+            f"{packed_size:,} bytes of compressed points are declared, but only {len(body) - 8:,} "
+            "are present"
         )
     Allowance(file_size, _SMALLER).take(size)
     content = _unpacked(body[8 : 8 + packed_size], size)
@@ -393,11 +397,13 @@ def _read_text(header: _Header, body: memoryview) -> list[AnyArray]:
     names = [name for field in header.fields for name in _column_names(field)]
     lines = bytes(body).rstrip().count(b"\n") + 1
     if lines < header.points:
-        raise CutShortError(f"{header.points:,} points announced, and {lines:,} lines follow")
+        raise CutShortError(
+            f"{header.points:,} points are declared, but only {lines:,} lines follow"
+        )
     reader = RowReader(names, range(len(names)))
     values = reader.read(io.TextIOWrapper(io.BytesIO(body), "utf-8", "replace"), header.lines + 1)
     if len(values) != header.points:
-        raise ValueError(f"{header.points:,} points announced, and {len(values):,} lines follow")
+        raise ValueError(f"{header.points:,} points are declared, but {len(values):,} lines follow")
     arrays = []
     start = 0
     for field in header.fields:
@@ -436,8 +442,8 @@ def _as_type(values: Floats, field: _Field) -> AnyArray:
     stop = float(limits.max) + (field.kind[2] != "8")  # limits of 64 bits are rounded up as floats
     if not ((numbers % 1 == 0) & (numbers >= lowest) & (numbers < stop)).all():
         raise ValueError(
-            f"its field {printable(field.name)[:40]!r} has other numbers than whole ones from "
-            f"{limits.min} to {limits.max}, which its TYPE and SIZE announce"
+            f"its field {printable(field.name)[:40]!r} must contain whole numbers from "
+            f"{limits.min} to {limits.max}, according to its TYPE and SIZE"
         )
     return numbers.astype(field.kind)
 

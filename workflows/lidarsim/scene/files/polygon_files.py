@@ -247,20 +247,19 @@ def _obj_mistake(data: bytes, with_colors: bool) -> str | None:
             count += 1
             colors = words[-3:] if with_colors and len(words) >= 6 else []
             if len(words) < 3 or not all(map(_is_real, [*words[:3], *colors])):
-                return f"line {number} is '{_shown(line)}', and three numbers were expected after v"
+                return f"line {number} is '{_shown(line)}', but three numbers were expected after v"
         elif key == b"f":
             vertices = [word.partition(b"/")[0] for word in words]
             if not all(re.fullmatch(rb"[-+]?\d+", vertex) for vertex in vertices):
                 return (
-                    f"line {number} is '{_shown(line)}', and numbers of vertices were expected "
-                    "after f"
+                    f"line {number} is '{_shown(line)}', but vertex numbers were expected after f"
                 )
             if not all(
                 1 <= int(vertex) <= total or -count <= int(vertex) < 0 for vertex in vertices
             ):
                 return (
-                    f"line {number} is '{_shown(line)}', which refers to a missing vertex, of "
-                    f"{total:,}"
+                    f"line {number} is '{_shown(line)}', which refers to a missing vertex. The "
+                    f"file has {total:,} vertices"
                 )
     return None
 
@@ -345,8 +344,8 @@ def _off_lines(text: bytes, first_line: int) -> tuple[list[_NumberedLine], list[
     if len(lines) != points + polygons:
         failure = CutShortError if len(lines) < points + polygons else ValueError
         raise failure(
-            f"{points:,} vertices and {polygons:,} faces announced, each in a line of its own, and "
-            f"{len(lines):,} lines there"
+            f"{points:,} vertices and {polygons:,} faces are declared, each in a separate line, "
+            f"but there are {len(lines):,} lines"
         )
     return lines[:points], lines[points:]
 
@@ -383,7 +382,9 @@ def _off_faces(lines: Sequence[_NumberedLine], count: int) -> tuple[Ints, Ints]:
         if len(rows) != size or (rows and not 0 <= min(rows) <= max(rows) < count):
             raise ValueError(
                 _off_mistake(
-                    number, words, f"a number of corners and as many vertices, 0 to {count - 1:,},"
+                    number,
+                    words,
+                    f"a number of corners and that many vertex numbers from 0 to {count - 1:,}",
                 )
             )
         corners.extend(rows)
@@ -393,7 +394,7 @@ def _off_faces(lines: Sequence[_NumberedLine], count: int) -> tuple[Ints, Ints]:
 
 def _off_mistake(number: int, words: Sequence[bytes], expected: str) -> str:
     """Return the message on a line that is wrong."""
-    return f"line {number} is '{_shown(b' '.join(words))}', and {expected} were expected"
+    return f"line {number} is '{_shown(b' '.join(words))}', but {expected} were expected"
 
 
 def _color_shares(colors: Floats) -> Floats:
@@ -424,7 +425,7 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
     solids = re.split(rb"^[ \t]*solid\b", text, flags=re.MULTILINE | re.IGNORECASE)[1:]
     if not solids:
         raise MeshFileError(
-            f"announces {announced:,} triangles and has {max(0, len(data) - 84) // 50:,}: it is "
+            f"declares {announced:,} triangles but has {max(0, len(data) - 84) // 50:,}. It is "
             "truncated, or not an .stl file"
         )
     meshes: list[SceneMesh] = []
@@ -441,7 +442,8 @@ def read_stl(data: bytes, path: Path, options: ReadOptions) -> Content:
         if len(vertices) != 3 * facets:
             raise ValueError(
                 _stl_mistake(text)
-                or f"a solid has {len(vertices):,} vertices, and {facets:,} facets of three each"
+                or f"a solid has {len(vertices):,} vertices, but {facets:,} facets of three "
+                "vertices each"
             )
         meshes += _stl_mesh(as_text(head.strip()) or path.stem, vertices)
     return Content(meshes)
@@ -457,9 +459,9 @@ def _stl_mistake(text: bytes) -> str | None:
         elif key == b"vertex":
             count += 1
             if len(words) < 3 or not all(map(_is_real, words[:3])):
-                return f"line {number} is '{_shown(line)}', and vertex x y z was expected"
+                return f"line {number} is '{_shown(line)}', but vertex x y z was expected"
         elif key == b"endfacet" and count != 3:
-            return f"the facet that ends in line {number} has {count} vertices, and not three"
+            return f"the facet that ends in line {number} has {count} vertices instead of three"
     return None
 
 
@@ -478,7 +480,7 @@ _PLY_TYPES = {
 }  # fmt: skip
 _PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _PLY_LINE = (
-    "and format, element NAME COUNT, property TYPE NAME, property list TYPE TYPE NAME or comment "
+    "but format, element NAME COUNT, property TYPE NAME, property list TYPE TYPE NAME or comment "
     "was expected"
 )
 _PLY_LISTS = ("vertex_indices", "vertex_index")
@@ -600,8 +602,8 @@ def _ply_header(data: bytes) -> _PlyHeader:
     header_match = header_match or re.match(rb"ply\r(.*?\r)??end_header\r", data, re.DOTALL)
     if not header_match:
         if data.startswith(b"ply"):
-            raise CutShortError("its header has no line end_header")
-        raise ValueError("its first line is not 'ply', with which the header of a .ply begins")
+            raise CutShortError("its header has no end_header line")
+        raise ValueError("its first line is not 'ply'")
     elements: list[_Element] = []
     comments: list[str] = []
     order = ""
@@ -647,13 +649,13 @@ def _ply_rows(header: _PlyHeader) -> _PlyRows:
     start = 0
     for element in elements:
         if element.count and not element.properties:
-            raise ValueError(f"rows of {element.name[:20]} announced, without content")
+            raise ValueError(f"rows of {element.name[:20]} are declared, but without properties")
         reader = _PlyElementReader(element, order or "=", body)
         rows[element.name], start = reader.read(start)
     remaining = body[start:].strip(b"\0\r\n\t ") if order else body[start:]
     if remaining:
         surplus = f"{len(remaining):,} bytes" if order else f"{len(remaining) // 8:,} numbers"
-        raise ValueError(f"{surplus} more than announced")
+        raise ValueError(f"{surplus} more than declared")
     return rows
 
 
@@ -747,8 +749,8 @@ class _PlyElementReader:
                 (size,) = struct.unpack_from(self._order + np.dtype(length).char, body, offset)
                 if not (0 <= size < np.inf and size == int(size)):
                     raise ValueError(
-                        f"a list of {element.name[:20]} has the length {size:g}, and a whole "
-                        "number from 0 on was expected"
+                        f"a list in {element.name[:20]} has the length {size:g}, but a whole "
+                        "number of at least 0 was expected"
                     )
                 offset += int(length[1])
                 size = int(size)
@@ -762,5 +764,5 @@ class _PlyElementReader:
         """Return the error of a body that ends within the rows."""
         count = self._element.count
         return CutShortError(
-            f"{count:,} rows of {self._element.name[:20]} announced, and there are fewer"
+            f"{count:,} rows of {self._element.name[:20]} are declared, but there are fewer"
         )

@@ -179,8 +179,8 @@ def check_corners(corners: Ints, vertex_count: int) -> None:
     """
     if len(corners) and not 0 <= corners.min() <= corners.max() < vertex_count:
         raise ValueError(
-            f"faces refer to vertices {corners.min()} to {corners.max()}, counted from 0, of "
-            f"{vertex_count}"
+            f"faces refer to vertices {corners.min()} to {corners.max()}, counted from 0, but "
+            f"there are {vertex_count} vertices"
         )
 
 

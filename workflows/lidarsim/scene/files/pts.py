@@ -79,12 +79,12 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
         return CloudScan(np.zeros((0, 3)), {})
     first = next_line(lines)
     if first is None:
-        raise CutShortError(f"line {number} announces {count:,} points, but none follow")
+        raise CutShortError(f"line {number} declares {count:,} points, but none follow")
     names = names_of_cells(first, _NAMES)
     texts = (line for _, line in chain([first], lines))
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
     if count is not None and len(values) < count:
-        raise CutShortError(f"line {number} announces {count:,} points, but {len(values):,} follow")
+        raise CutShortError(f"line {number} declares {count:,} points, but {len(values):,} follow")
     return CloudScan(values[:, :3], point_columns(values, names))
 
 
@@ -98,7 +98,7 @@ def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) ->
     if count not in names:
         expected = " or ".join(" ".join(cells) for cells in names.values())
         raise ValueError(
-            f"line {number} is {printable(line)[:60]!r}, which has {plural(count, 'cell')}: "
+            f"line {number} is {printable(line)[:60]!r}, which has {plural(count, 'cell')}, but "
             f"{expected} was expected"
         )
     return names[count]

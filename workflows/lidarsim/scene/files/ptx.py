@@ -32,9 +32,9 @@ _HEADER_LINES = (  # numbers of each line, and their meaning
     (1, "the number of columns"),
     (1, "the number of rows"),
     (3, "the position of the scanner"),
-    (3, "the scanner's axis x"),
-    (3, "the scanner's axis y"),
-    (3, "the scanner's axis z"),
+    (3, "the x axis of the scanner"),
+    (3, "the y axis of the scanner"),
+    (3, "the z axis of the scanner"),
     (4, "the first row of the transformation"),
     (4, "the second row of the transformation"),
     (4, "the third row of the transformation"),
@@ -77,15 +77,15 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> CloudScan:
         following = next_line(lines)
         if following is None:
             raise CutShortError(
-                f"its header of ten lines from line {start} on has "
-                f"{plural(len(header), 'line')}, and {meaning} was expected next"
+                f"its header of ten lines, which starts in line {start}, has only "
+                f"{plural(len(header), 'line')}. Expected {meaning} next"
             )
         header.append(_header_numbers(following, width, meaning))
     (columns,), (rows,), position = header[:3]
     if min(columns, rows) < 0 or columns % 1 or rows % 1:
         raise ValueError(
-            f"line {start} and the next are {columns:g} and {rows:g}: the numbers of columns and "
-            "rows were expected"
+            f"line {start} and the next line are {columns:g} and {rows:g}, but the numbers of "
+            "columns and rows were expected"
         )
     count = int(columns) * int(rows)
     pose = _pose(np.array(header[6:]), start)
@@ -105,8 +105,8 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> CloudScan:
     if len(values) < count:
         following_points = f"{len(values):,} follow" if len(values) else "there are fewer"
         raise CutShortError(
-            f"line {start} and the next announce {int(columns):,} x "
-            f"{int(rows):,} points, and {following_points}"
+            f"line {start} and the next line declare {int(columns):,} x {int(rows):,} points, but "
+            f"{following_points}"
         )
     values = values[values[:, :3].any(axis=1)]
     return CloudScan(values[:, :3], point_columns(values, names), pose, scanner)
@@ -130,8 +130,8 @@ def _header_numbers(entry: tuple[int, str], width: int, meaning: str) -> list[fl
         values = []
     if len(values) != width or not np.isfinite(values).all():
         raise ValueError(
-            f"line {number} is {printable(line)[:60]!r}: {meaning} was expected, "
-            f"{plural(width, 'number')}"
+            f"line {number} is {printable(line)[:60]!r}, but {meaning} "
+            f"({plural(width, 'number')}) was expected"
         )
     return values
 
@@ -146,7 +146,7 @@ def _pose(matrix: Floats, start: int) -> Floats:
     error = np.abs(matmul(rotation, rotation.T) - np.eye(3)).max()
     if error > _MAX_ROTATION_ERROR or not np.array_equal(matrix[:, 3], [0, 0, 0, 1]):
         raise ValueError(
-            f"the transformation of the header that begins with line {start} is not a rotation "
-            "(three rows that end with 0) and a position (a row that ends with 1)"
+            f"the transformation in the header that starts in line {start} must be a rotation "
+            "(three rows that end with 0) followed by a position (a row that ends with 1)"
         )
     return affine(rotation.T, matrix[3, :3])

@@ -25,8 +25,8 @@ from ..scene_mesh import Cutout, SceneMesh, compacted, stacked
 from .polygons import check_corners
 
 # Advice on a file that unpacks to too much, without and with an animation.
-SMALLER = "export it in parts, or as .ply"
-SHORTER = "shorten its animation or simplify its mesh"
+SMALLER = "Export it in parts, or as .ply"
+SHORTER = "Shorten its animation, or simplify its mesh"
 # A mesh becomes instances if that saves as many triangles; triangles of faces are cast faster.
 SHARED_TRIANGLES = 100_000
 MAX_NODES = 200_000  # nodes of a scene, counting every instance
@@ -159,8 +159,8 @@ def placed_nodes(
         # A few lines can make any number of nodes.
         if visited + len(stack) > MAX_NODES:
             raise MeshFileError(
-                f"has nodes that contain each other, or copies, more than {MAX_NODES:,} in all: "
-                "export it in parts"
+                f"has more than {MAX_NODES:,} nodes and copies, or nodes that contain each other. "
+                "Export it in parts"
             )
         matrix = matmul(parent_matrix, node.matrix)
         path = (*path[1 - _MAX_PATH_NAMES :], node.name) if node.name else path
@@ -200,21 +200,21 @@ def placed_content(placed: Sequence[PlacedNode], *, copy_all: bool = False) -> C
     ]
     if (total := sum(copied_bytes)) > memory_share():
         raise MeshFileError(
-            f"places {len(copied_bytes):,} objects, which would take {bytes_of(total)}, of at most "
-            f"{bytes_of(memory_share())}, a quarter of the memory: {SMALLER}"
+            f"places {len(copied_bytes):,} objects, which require {bytes_of(total)}. The limit is "
+            f"{bytes_of(memory_share())}, a quarter of the memory. {SMALLER}"
         )
     triangles = sum(n * len(mesh.faces) for mesh, n in uses.items())
     if triangles > MAX_TRIANGLES:
         raise MeshFileError(
-            f"places {len(placed):,} objects of {triangles:,} triangles in all, of at most "
-            f"{MAX_TRIANGLES:,}: {SMALLER}"
+            f"places {len(placed):,} objects with a total of {triangles:,} triangles, but the "
+            f"limit is {MAX_TRIANGLES:,}. {SMALLER}"
         )
     matrices = np.array([node.matrix for node in placed]).reshape(-1, 4, 4)
     valid = np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
     if not valid.all():
         _, matrix, name, _ = placed[int(valid.argmin())]
         raise MeshFileError(
-            f"places {name[:80]!r} by a matrix that is not a valid transform: {matrix.tolist()}"
+            f"places {name[:80]!r} with a matrix that is not a valid transform: {matrix.tolist()}"
         )
     ranks = rank(matrices[:, :3, :3]).tolist()
     for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
@@ -256,7 +256,9 @@ def bake_animation(
             pose_arrays = [np.empty((count, *vertices.shape)) for vertices in vertices_now]
         allowance.used_bytes = used_bytes
         if list(map(len, vertices_now)) != [len(poses[0]) for poses in pose_arrays]:
-            raise MeshFileError(f"has other vertices in pose {index}: leave out animation")
+            raise MeshFileError(
+                f"has a different number of vertices in pose {index}. Remove animation"
+            )
         for poses, vertices in zip(pose_arrays, vertices_now, strict=True):
             poses[index] = vertices
     step_s = (times_s[-1] - times_s[0]) / (count - 1)

@@ -200,8 +200,8 @@ class StatedSystem:
         if self.crs is None or self.crs.is_projected:
             return ""
         if is_geocentric(self.crs):
-            return f"is in {self.name}, geocentric"
-        return f"is in {self.name}, of angles" if self.crs.is_geographic else ""
+            return f"has geocentric coordinates ({self.name})"
+        return f"has angular coordinates ({self.name})" if self.crs.is_geographic else ""
 
     @property
     def is_true_by_name(self) -> bool | None:
@@ -239,9 +239,12 @@ class StatedSystem:
             return up_m, ""
         if horizontal.is_projected:
             name, meters = horizontal.linear_units_factor
-            note = f"states no unit of heights, which are taken in the unit {name} of x and y"
+            note = (
+                "does not state a unit for heights, which are assumed to be in the unit of x and "
+                f"y ({name})"
+            )
             return float(meters), note if meters != 1 else ""
-        return 1.0, "states no unit of heights, which are taken in meters"
+        return 1.0, "does not state a unit for heights, which are assumed to be in meters"
 
     @property
     def name(self) -> str:
@@ -252,9 +255,7 @@ class StatedSystem:
             return f"EPSG:{self._code}"
         projected = r'(?i)PROJ(?:CS|CRS|ECTEDCRS)\s*[\[(]\s*"([^"]*)"'
         quoted = re.search(projected, self.text) or re.search(r'"([^"]*)"', self.text)
-        return (
-            printable(quoted[1] if quoted else self.text)[:80] or "a coordinate system of its own"
-        )
+        return printable(quoted[1] if quoted else self.text)[:80] or "a custom coordinate system"
 
     @property
     def _has_name(self) -> bool:
@@ -295,7 +296,7 @@ def stated_meters(
     if unit is not None or system is None:
         meter = UNITS_M[unit or "m"]
         problem = "" if system is None else system.angles or _scale_of(system, positions).problem
-        note = f"{problem}; its coordinates are taken in {unit} of true length, as you say"
+        note = f"{problem}. As specified, its coordinates are read in {unit} without a correction"
         return (meter, meter, meter), [note] if problem else []
     scale = _scale_of(system, positions)
     if scale.problem:
@@ -319,16 +320,22 @@ def check_metric_format(system: StatedSystem | None, positions: Floats) -> list[
     if system is None:
         return []
     if system.crs is not None and is_geocentric(system.crs):
-        raise LidarError(f"it is in {system.name}, geocentric. {advice_to_project(None)}.")
+        raise LidarError(
+            f"its coordinates are geocentric ({system.name}). {advice_to_project(None)}."
+        )
     meter = system.horizontal_m
     if meter is None:
-        return [f"states the coordinate system {system.name!r}, and is taken in meters"]
+        return [
+            f"states the coordinate system {system.name!r}, but its coordinates are read in meters"
+        ]
     scale = _scale_of(system, positions / meter)
     if scale.problem:
         raise LidarError(f"it {scale.problem}. {advice_to_project(scale.epsg)}.")
     notes = [scale.note] if scale.note else []
     if meter != 1.0:
-        notes.append(f"is in {system.name}, and is taken in meters, as its format has them")
+        notes.append(
+            f"is in {system.name}, but its coordinates are read in meters, as its format requires"
+        )
     return notes
 
 
@@ -353,8 +360,8 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
         if (area := missed_area(horizontal, *middle.tolist())) is not None:
             x, y = middle.tolist()
             problem = (
-                f"states {system.name}, whose area of use ({area}) is not at its x {x:.9g}, "
-                f"y {y:.9g}, so that it may state the wrong system"
+                f"states {system.name}, but its coordinates (x {x:.9g}, y {y:.9g}) are outside "
+                f"the area of use ({area}), so the stated system may be wrong"
             )
         return _Scale(problem, suggested_epsg(horizontal, *middle.tolist()))
     corners = np.array([positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)])
@@ -363,7 +370,7 @@ def _scale_of(system: StatedSystem, positions: Floats) -> _Scale:
     if error <= MAX_SCALE_ERROR:
         return _Scale(note=_place_note(system, middle))
     return _Scale(
-        note=f"is so wide that lengths of {system.name} are wrong by {error:.1%} at its edges"
+        note=f"is so large that lengths in {system.name} are wrong by {error:.1%} at its edges"
     )
 
 
@@ -374,7 +381,7 @@ def _place_note(system: StatedSystem, middle: Floats) -> str:
     """
     x, y = middle.tolist()
     area = outside_system(system.epsg, x, y) if system.epsg is not None else ""
-    return f"has coordinates, x {x:,.9g}, y {y:,.9g}, outside {area}" if area else ""
+    return f"has coordinates (x {x:,.9g}, y {y:,.9g}) outside {area}" if area else ""
 
 
 def _scale_by_name(system: StatedSystem) -> _Scale:
@@ -383,8 +390,12 @@ def _scale_by_name(system: StatedSystem) -> _Scale:
     if is_true:
         return _Scale()
     if is_true is None:
-        why = "" if has_registry() else f": {install_command('lidarpool[geo]')} to have it checked"
-        return _Scale(note=f"is in {system.name}, whose scale is taken as true{why}")
+        why = (
+            ""
+            if has_registry()
+            else (f". To check the scale, run {install_command('lidarpool[geo]')}")
+        )
+        return _Scale(note=f"is in {system.name}, whose scale is assumed to be true{why}")
     return _Scale(f"is in {system.name}, whose meters are not true to scale")
 
 
@@ -414,7 +425,7 @@ class Reprojection:
     """
 
     def __init__(self, system: StatedSystem | None, epsg: int) -> None:
-        need_registry("clouds are brought to another coordinate system")
+        need_registry("Transforming a cloud to another coordinate system")
         if system is None:
             raise LidarError(
                 f"it states no coordinate system, so it cannot be transformed to EPSG:{epsg}. "
@@ -426,12 +437,12 @@ class Reprojection:
             raise LidarError(f"its coordinate system {system.name!r} is unknown to PROJ.")
         target = crs_of_code(epsg)
         if target is None:
-            raise LidarError(f"EPSG:{epsg} is unknown to PROJ. Use the code of another system.")
+            raise LidarError(f"EPSG:{epsg} is unknown to PROJ. Use the code of a different system.")
         self._epsg = epsg
         self._target, _ = horizontal_part(target)
         self._is_geocentric = is_geocentric(source)
         self._source = source if self._is_geocentric else horizontal_part(source)[0]
-        self.notes = [f"was brought from {system.name} to EPSG:{epsg}"]
+        self.notes = [f"was transformed from {system.name} to EPSG:{epsg}"]
         self._height_m = 1.0
         if not self._is_geocentric:
             self._height_m, note = system.height_m()
@@ -467,7 +478,8 @@ class Reprojection:
 
     def _no_place(self) -> LidarError:
         return LidarError(
-            f"points of it have no place in EPSG:{self._epsg}: give the code of another system."
+            f"it contains points that cannot be transformed to EPSG:{self._epsg}. Use the code of "
+            "a different system."
         )
 
 

@@ -228,10 +228,13 @@ def _names(head: _Head, first_cells: Sequence[str], separator: str | None) -> li
         return ["x", "y", "z", *(f"column_{index + 1}" for index in range(3, count))]
     hint = ""
     if separator == "," and count > len(names):
-        hint = "; decimal commas are read beside another separator, such as a semicolon"
+        hint = (
+            ". To use decimal commas, separate the columns with a different character, such as a "
+            "semicolon"
+        )
     raise ValueError(
         f"line {head.names_line} names {plural(len(names), 'column')} "
-        f"({printable(', '.join(names))}), and line {head.first_line} has "
+        f"({printable(', '.join(names))}), but line {head.first_line} has "
         f"{plural(count, 'cell')}{hint}"
     )
 
@@ -245,13 +248,13 @@ def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, fl
     words = [column.words for column in columns]
     if _QUATERNION.issubset(words):
         raise ValueError(
-            f"line {head.names_line} names a quaternion ({printable(', '.join(names))}): it is a "
-            "trajectory, not a point cloud"
+            f"line {head.names_line} names a quaternion ({printable(', '.join(names))}), so the "
+            "file is a trajectory, not a point cloud"
         )
     if not {_AXES.get(word) for word in words} >= {"x", "y", "z"}:
         raise ValueError(
-            f"line {head.names_line} names latitude and longitude, and x and y in a unit of length "
-            "were expected: project it"
+            f"line {head.names_line} names latitude and longitude, but x and y in a unit of "
+            "length were expected. Project the cloud first"
         )
     indices = []
     units_m = []
@@ -261,8 +264,8 @@ def _axes(head: _Head, names: Sequence[str]) -> tuple[list[int], tuple[float, fl
         unit = columns[index].unit
         if unit is not None and unit not in UNITS_M:
             raise ValueError(
-                f"line {head.names_line} names {printable(names[index])!r}: {axis} in a unit of "
-                f"length was expected ({', '.join(UNITS_M)})"
+                f"line {head.names_line} names {printable(names[index])!r}, but {axis} in a unit "
+                f"of length was expected ({', '.join(UNITS_M)})"
             )
         indices.append(index)
         units_m.append(1.0 if unit is None else UNITS_M[unit])
@@ -310,7 +313,8 @@ def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
     if head.announced is not None and len(values) != head.announced:
         failure = CutShortError if len(values) < head.announced else ValueError
         raise failure(
-            f"{plural(head.announced, 'point')} announced, and {plural(len(values), 'line')} there"
+            f"the header declares {plural(head.announced, 'point')}, but the number of lines is "
+            f"{len(values):,}"
         )
     if head.names is not None:
         return
@@ -322,13 +326,14 @@ def _check_rows(head: _Head, reader: RowReader, values: Floats) -> None:
         )
     if _are_poses(values):
         raise ValueError(
-            "its lines are poses: it is a trajectory, not a point cloud. If it is a point cloud, "
+            "its lines appear to be the poses of a trajectory. If the file is a point cloud, "
             "name its columns in a header"
         )
     counts_points = len(values) >= _MANY_POINTS and (np.diff(values[:, 0]) == 1).all()
     if width > 3 and counts_points and values[0, 0] in (0, 1):
         raise ValueError(
-            "its first column numbers the points. Name the columns in a header, as in id x y z"
+            "its first column appears to number the points. Name the columns in a header, as in "
+            "id x y z"
         )
 
 

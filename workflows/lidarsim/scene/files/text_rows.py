@@ -135,11 +135,14 @@ class RowReader:
         """Return the message on a line with too few or too many cells."""
         names = printable(", ".join(self.names))
         message = (
-            f"line {line_number} has {plural(len(cells), 'cell')}, and {len(self.names)} were "
+            f"line {line_number} has {plural(len(cells), 'cell')}, but {len(self.names)} were "
             f"expected ({names})"
         )
         if self.separator == "," and len(cells) > len(self.names):
-            message += "; decimal commas are read beside another separator, such as a semicolon"
+            message += (
+                ". To use decimal commas, separate the columns with a different character, such "
+                "as a semicolon"
+            )
         return message
 
 

@@ -385,12 +385,13 @@ def firing_times(ray, start, subrays, firing_starts, delays, times):
 
 @compiled()
 def merge(ray, triangle, nearest, actors, output):
-    """Write the nearest hits of rays, on static bodies and actors, to `output`, `JoinedHits`.
+    """Merge hits on static bodies with hits on actors, and return the number of hits.
 
-    `ray` and `triangle` (k,) are hits on static bodies, in the order of rays. `nearest` are the
-    nearest hits of all rays on actors, `raybeam.crossing.Nearest`: the body is the actor, or below
-    0 for rays that miss all actors, whose distance is then the distance to static bodies. `actors`
-    are `ActorTriangles`. Returns the number of hits.
+    The nearest hit of each ray is written to `output`, which is a `JoinedHits`. `ray` and
+    `triangle` (k,) are the hits on static bodies, in ray order. `nearest` is a
+    `raybeam.crossing.Nearest` with one entry per ray. In `nearest`, the body is the actor, or
+    negative if the ray hits no actor or hits a static body first. For such rays, the distance is
+    that to the static body. `actors` is an `ActorTriangles`.
     """
     hit_actors = nearest.body
     i = 0

@@ -12,8 +12,8 @@ from ...sensor.noise import Noise
 from ..returns import PulseReturns
 from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 
-ACROSS = Purpose(2, "noise of a beam's direction, across")
-UP = Purpose(3, "noise of a beam's direction, up")
+ACROSS = Purpose(2, "horizontal noise of a beam direction")
+UP = Purpose(3, "vertical noise of a beam direction")
 
 
 class AngleNoiseStep(PulseStep):

@@ -30,7 +30,7 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 if TYPE_CHECKING:
     from .stray_loops import ReceivedSpots
 
-FOREIGN_PULSE = Purpose(23, "noise of the energy of another sensor's pulse")
+FOREIGN_PULSE = Purpose(23, "energy noise of a pulse from another sensor")
 CROSSTALK = CAUSES.index("crosstalk")
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter

@@ -11,7 +11,7 @@ from ...sensor.noise import THRESHOLD_SIGMAS, Noise
 from ..returns import PulseReturns, numbers
 from .step import PulseBatch, PulseStep, Role, Setup
 
-DETECTION = Purpose(4, "noise of a return's energy")
+DETECTION = Purpose(4, "energy noise of a return")
 LOSS = Purpose(5, "whether a return is lost")
 
 

@@ -16,7 +16,7 @@ from ..casting.actor_trajectories import ActorTrajectories
 from ..casting.motion import CastPoses
 from ..casting.surfaces import Surfaces
 
-VELOCITY = Purpose(40, "noise of a return's radial velocity")
+VELOCITY = Purpose(40, "radial velocity noise of a return")
 BLOCK_HITS = 1 << 13  # hits that are computed at a time, to fit a cache
 
 

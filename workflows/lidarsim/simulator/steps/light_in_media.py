@@ -33,8 +33,8 @@ from ..casting.scene_caster import SceneCaster
 from ..casting.surfaces import Surfaces
 from ..returns import selected
 
-LEAF = Purpose(30, "depth of leaves that light gets through")
-CROWN = Purpose(31, "crown of the leaf, of crowns that overlap")
+LEAF = Purpose(30, "depth to which light penetrates leaves")
+CROWN = Purpose(31, "crown that a leaf belongs to, where crowns overlap")
 MAX_MEDIA = 8  # media around a point that are stored
 MAX_PROBES = 256  # surfaces that a search for the media around a point passes
 UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # direction of search, unlike edges of usual models

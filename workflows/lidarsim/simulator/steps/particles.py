@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from .random_loops import RandomKeys
 
 FOG_CELL = Purpose(10, "cell of fog with the highest peak")
-FOG_PLACE = Purpose(11, "place of the peak in its cell")
-PARTICLES = Purpose(12, "number of particles that a beam meets")
+FOG_PLACE = Purpose(11, "position of the peak in its cell")
+PARTICLES = Purpose(12, "number of particles that a beam hits")
 PARTICLE_RANGE = Purpose(13, "range of a particle")
 PARTICLE_DIAMETER = Purpose(14, "diameter of a particle")
-PARTICLE_SUBRAY = Purpose(15, "sub-ray that meets a particle")
+PARTICLE_SUBRAY = Purpose(15, "sub-ray that hits a particle")
 AIR = CAUSES.index("air")
 QUANTILES = 1 << 16  # equal shares of a distribution, in tables
 CACHED_TABLES = 32  # kept because a scanner builds its casters again whenever an object is moved
@@ -438,7 +438,10 @@ def highest_probabilities(signals: Floats) -> Floats:
 
 
 def single(table: Floats) -> Floats:
-    """Round to single precision, where the error functions of C libraries are the same."""
+    """Round a table to single precision.
+
+    In single precision, the error functions of different C libraries have the same results.
+    """
     return table.astype(np.float32).astype(np.float64)
 
 

@@ -11,8 +11,8 @@ from ...sensor.noise import Noise
 from ..returns import PulseReturns, required
 from .step import PulseBatch, PulseStep, Role, Setup
 
-RANGE = Purpose(1, "noise of a return's range")
-CHANNEL = Purpose(60, "a channel's error of range")
+RANGE = Purpose(1, "range noise of a return")
+CHANNEL = Purpose(60, "range error of a channel")
 
 
 class RangeNoiseStep(PulseStep):

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from .spray_loops import Crossings, SprayBoxes
 
 SPRAY_DEPTH = Purpose(16, "depth of spray until the next clump")
-SPRAY_SUBRAY = Purpose(17, "sub-ray that meets a clump")
+SPRAY_SUBRAY = Purpose(17, "sub-ray that hits a clump")
 SPRAY_DIAMETER = Purpose(18, "diameter of a drop of spray")
 SPRAY = CAUSES.index("spray")
 BOX_NS = 1e8  # time between boxes of a vehicle

@@ -134,7 +134,7 @@ class Setup:
             If the steps are not chosen yet.
         """
         if self.roles is None:
-            raise RuntimeError("only a step of Role.FRAME may apply because others do")
+            raise RuntimeError("only a step with Role.FRAME may depend on which other steps apply")
         return bool(self.roles & roles)
 
     def faults(self, *kinds: FaultKind) -> dict[int, Fault]:

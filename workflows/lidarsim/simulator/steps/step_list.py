@@ -111,7 +111,7 @@ def add_step(step: type[PulseStep], before: type[PulseStep] | None = None) -> No
     for role, first, last in _SPANS:
         if role in step.role and not STEPS.index(first) < position <= STEPS.index(last):
             raise ValueError(
-                f"step {step.__name__} of {role} must be after {first.__name__} and not after "
+                f"step {step.__name__} with {role} must be after {first.__name__}, but not after "
                 f"{last.__name__}"
             )
     if Role.AIMS in step.role and position > STEPS.index(CastStep):

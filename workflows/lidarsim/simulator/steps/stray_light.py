@@ -25,7 +25,7 @@ from .step import Memory, PulseBatch, PulseStep, Role, Setup, Sizes
 if TYPE_CHECKING:
     from .stray_loops import RayCells, RetroTriangles, StrayLight
 
-STRAY = Purpose(22, "noise of stray light's energy")
+STRAY = Purpose(22, "energy noise of stray light")
 BLOOMING = CAUSES.index("blooming")
 NEAREST_TRIANGLES = 4  # number of triangles of a cluster, nearest by angle, compared with a ray
 CLUSTER_M = 1.0  # size of a cluster of triangles, which are compared with rays together

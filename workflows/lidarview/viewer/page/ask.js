@@ -19,12 +19,12 @@ async function answerTo(what, address, signal) {
     try {
       const answer = await fetch(address, { signal });
       if (answer.ok) return await answer.arrayBuffer();
-      words = `The server could not answer "${what}" (${answer.status} ${answer.statusText}). The terminal of the command shows the reason.`;
+      words = `The request "${what}" failed (${answer.status} ${answer.statusText}). See the terminal for the reason.`;
       if (answer.status < 500) throw new Error(words);
     } catch (error) {
       if (!(error instanceof TypeError)) throw error;
     }
-    if (!pause) throw words ? new Error(words) : new TypeError("The server of this page has stopped.");
+    if (!pause) throw words ? new Error(words) : new TypeError("The server for this page has stopped.");
     await new Promise((done) => setTimeout(done, pause));
   }
 }
@@ -52,7 +52,7 @@ function held(question) {
 
 async function read(question) {
   const place = inFile(question);
-  if (!place) throw new Error(`${question}: not in this file`);
+  if (!place) throw new Error(`This file does not contain the answer to "${question}".`);
   const bytes = Uint8Array.from(atob(place.textContent), (letter) => letter.charCodeAt(0));
   return unpacked(await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer());
 }

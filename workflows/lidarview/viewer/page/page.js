@@ -554,7 +554,7 @@ const TOOLS = {
 
 function buildTools() {
   const tools = Object.entries(TOOLS).map(([name, [title]]) => [name, iconButton(name, title, () => setTool(name))]);
-  const clip = iconButton("clip", "Clip box (B): drag its faces", () => showClipBox(!chosen.clipBox));
+  const clip = iconButton("clip", "Clip box (B): drag the faces", () => showClipBox(!chosen.clipBox));
   $("tools").replaceChildren(...tools.map(([, press]) => press), clip);
   panel.tools = { ...Object.fromEntries(tools), clip };
   tellTools();

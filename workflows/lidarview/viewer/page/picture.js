@@ -708,7 +708,7 @@ export class Picture {
     const [unit, size] = length >= 1000 ? ["km", 1000] : length >= 1 ? ["m", 1] : length >= 0.01 ? ["cm", 0.01] : ["mm", 0.001];
     this.scale.firstChild.textContent = `${+(length / size).toPrecision(2)} ${unit}`;
     this.scale.lastChild.style.width = `${Math.round(length / meters)}px`;
-    this.scale.title = this.isParallel ? "scale" : "scale at the focus of the camera";
+    this.scale.title = this.isParallel ? "scale" : "scale at the camera target";
   }
 
   // -- the mouse -------------------------------------------------------------------------
