@@ -281,7 +281,7 @@ def test_ptx_without_a_transformation_has_the_position_of_its_scanner(tmp_path):
         (
             "1 0 0 0.5",
             "1 0 0 0.5 9",
-            "line 11 is '1 0 0 0\.5 9', which has 5 cells, but x y z intensity",
+            r"line 11 is '1 0 0 0\.5 9', which has 5 cells, but x y z intensity",
         ),
     ],
 )
