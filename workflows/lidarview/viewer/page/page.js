@@ -1091,7 +1091,7 @@ async function grow() {
 
 function tellRun(told) {
   const since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
-  const pace = told.rate && !told.over ? `, ${told.rate}  ${told.left && `${told.left} left`}` : "";
+  const pace = told.rate && !told.over ? `, ${told.rate}${told.left && `, ${told.left} left`}` : "";
   const [, done, whole] = told.stages.at(-1) ?? [];
   if (told.title) document.title = `${told.over || !whole ? "" : `${Math.floor((100 * done) / whole)}% `}${told.title}${told.title === "lidarpool" ? "" : " - lidarpool"}`;
   sayState(told.over || (!NARROW.matches && told.points) ? "" : told.state);
