@@ -219,7 +219,7 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     data = {"scene": {"files": ["b.stl"]}, "poses": [[0, 0, 0]]}
     given = Scenario.from_data(data, folder=tmp_path)
     [warning] = implausibilities(build(given))
-    assert "only the back faces of its surfaces" in warning
+    assert "only the back faces of surfaces" in warning
     assert "To view the scene from outside, use poses: [{position: [" in warning
     data["poses"] = [[0, 0, 9]]
     assert implausibilities(build(Scenario.from_data(data, folder=tmp_path))) == []

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from trimesh import Trimesh, creation
 from trimesh.transformations import rotation_matrix
 
@@ -80,27 +81,38 @@ def warnings_of(folder: Path, meshes: list[SceneMesh] | None = None, **scenario:
 
 
 @pytest.mark.parametrize(
-    ("meshes", "position", "warning"),
+    ("meshes", "position", "warning", "free"),
     [
-        (TOWN, (0, 0, -5), "the sensor is below the scene at (0.000, 0.000, -5.000). Check z"),
-        (TOWN, (0, 0, -0.3), "the sensor is below the scene"),
-        (SLAB, (0, 0, -5), "the sensor is below the scene"),
-        (SLAB, (0, 0, -0.5), "the sensor is inside the closed body"),
+        (
+            TOWN,
+            (0, 0, -5),
+            "the sensor is below the scene at (0.000, 0.000, -5.000). Check z",
+            "[0.0, 0.0, 2.0]",
+        ),
+        (TOWN, (0, 0, -0.3), "the sensor is below the scene", "[0.0, 0.0, 2.0]"),
+        (SLAB, (0, 0, -5), "the sensor is below the scene", "[0.0, 0.0, 1.0]"),
+        (SLAB, (0, 0, -0.5), "the sensor is inside the closed body 'Slab'", ""),
         (
             TOWN,
             (20, 0, 2),
-            "the sensor is inside the closed body 'House' at (20.000, 0.000, 2.000) and",
+            "the sensor is inside the closed body 'House' at (20.000, 0.000, 2.000). It hits",
+            "[26.0, 0.0, 2.0]",
         ),
-        (TOWN, (-20, 0, 2), "the sensor is inside the closed body"),
-        (TOWN, (0, 20, 1), "the sensor is inside the closed body"),
-        (TOWN, (0, -30, 1), "the sensor is inside the closed body"),
+        (TOWN, (-20, 0, 2), "the sensor is inside the closed body 'Shell'", "[-14.0, 0.0, 2.0]"),
+        (TOWN, (0, 20, 1), "the sensor is inside the closed body 'Car'", "[0.0, 21.5, 1.0]"),
+        (TOWN, (0, -30, 1), "the sensor is inside the closed body 'Wall'", "[0.71, -29.29, 1.0]"),
     ],
     ids=["below", "just below", "slab", "in slab", "house", "no bottom", "car", "wall"],
 )
-def test_a_sensor_under_the_scene_or_in_a_body(tmp_path, meshes, position, warning):
+def test_a_sensor_under_the_scene_or_in_a_body(tmp_path, meshes, position, warning, free):
     warnings = warnings_of(tmp_path, meshes, poses=[[*position]])
     assert len(warnings) == 1 and warnings[0].startswith(warning)
-    assert "To view the scene from outside, use poses: [{position: [" in warnings[0]
+    found = f"The nearest free position found is {free}"
+    extent = "The body extends from (-50.00, -50.00, -1.00) to (50.00, 50.00, 0.00)"
+    assert (found if free else extent) in warnings[0]
+    assert "from outside" not in warnings[0]
+    if free:
+        assert warnings_of(tmp_path, poses=[yaml.safe_load(free)], scene="scene.glb") == []
 
 
 def test_a_drive_into_a_body_names_body_and_time_and_offers_no_poses(tmp_path):
@@ -108,7 +120,9 @@ def test_a_drive_into_a_body_names_body_and_time_and_offers_no_poses(tmp_path):
     [warning] = warnings_of(tmp_path, TOWN, **into)
     assert re.match(
         r"the sensor is inside the closed body 'Shell' at \d+ of 24 tested positions, first at "
-        r"\(-\d\d\.\d{3}, 0\.000, 2\.000\), 1\.\d+ s after the start and hits",
+        r"\(-\d\d\.\d{3}, 0\.000, 2\.000\), 1\.\d+ s after the start\. It hits "
+        r"only the back faces of surfaces\. "
+        r"The body extends from \(-25\.00, -4\.00, 0\.00\) to \(-15\.00, 4\.00, 6\.00\)",
         warning,
     )
     assert "poses" not in warning
@@ -117,6 +131,10 @@ def test_a_drive_into_a_body_names_body_and_time_and_offers_no_poses(tmp_path):
 def test_one_bad_position_of_several_is_counted(tmp_path):
     [warning] = warnings_of(tmp_path, TOWN, poses=[[0, 0, 2], [0, 20, 1], [5, 5, 1]])
     assert " at 1 of 3 tested positions, first at (0.000, 20.000, 1.000)" in warning
+    assert "The nearest free position found for pose 2 is [0.0, 21.5, 1.0]" in warning
+    shifted = {"poses": [[0, 20, 0.5], [5, 5, 0]], "mount": [0, 0, 0.5]}
+    [warning] = warnings_of(tmp_path, TOWN, **shifted)
+    assert "The nearest free position found for pose 1 is [0.0, 21.5, 0.5]" in warning
 
 
 @pytest.mark.parametrize(

@@ -222,9 +222,22 @@ def _inside_note(
     if surroundings is None or not surroundings.views(positions).in_a_body:
         return ""
     return (
-        "the sensor is inside a closed body and hits only the back faces of its surfaces. "
+        "the sensor is inside a closed body. It hits only the back faces of surfaces. "
         f"{seen_from(scene, carried)}"
     )
+
+
+def free_above(scene: Scene, surroundings: Surroundings, position: Floats) -> Floats | None:
+    """Return the lowest free local position (3,) above a surface at x and y of a position, or None.
+
+    It is as high above the surface as the second of the default poses.
+    """
+    x, y, _ = position + scene.origin
+    for height in np.sort(heights_at(_draw_instances(scene, position), x, y)) - scene.origin[2]:
+        above = np.array([*position[:2], height + _HEIGHTS_M[1]])
+        if surroundings.is_free(above):
+            return above
+    return None
 
 
 def seen_from(scene: Scene, carried: Mounted) -> str:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarscenes.procedural.surroundings import Surroundings
+from lidarscenes.procedural.surroundings import Body, Surroundings
 from lidarsim.base.arrays import Bools, Floats
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import as_scenario, printable, rounded
@@ -21,7 +21,7 @@ from lidarsim.simulator.casting.visibility import static_key, unseen_objects, wi
 from lidarsim.survey.survey import Survey
 
 from .build import Built
-from .default_poses import seen_from, surroundings_of
+from .default_poses import free_above, on_one_line, seen_from, surroundings_of
 from .georeference import place_problem
 
 GROUND_SPEED_M_S = 150.0  # faster than trains, except on test tracks
@@ -73,6 +73,7 @@ class _SensorPosition(NamedTuple):
     time_ns: float
     position: Floats  # (3,), local coordinates
     sensor: int  # number of the sensor
+    station: int
 
 
 def implausibilities(built: Built) -> list[str]:
@@ -114,7 +115,9 @@ def _sample_positions(survey: Survey) -> list[_SensorPosition]:
         stations = [(n, 0.0) for n in even_indices(path.stations, _POSITIONS).tolist()]
     stations = [stations[i] for i in even_indices(len(stations), max(1, _POSITIONS // len(mounts)))]
     return [
-        _SensorPosition(time, np.array(path.pose(station, time).compose(mount).position), sensor)
+        _SensorPosition(
+            time, np.array(path.pose(station, time).compose(mount).position), sensor, station
+        )
         for station, time in stations
         for sensor, mount in mounts
     ]
@@ -131,24 +134,26 @@ def _position_warnings(
         pairs = [(seen_by[sample.sensor], sample.position) for sample in samples]
         under = np.array([seen is not None and seen.is_covered(xyz) for seen, xyz in pairs])
         inside = np.array([seen is not None and seen.in_a_body(xyz) for seen, xyz in pairs])
-        advice = ""  # other poses replace poses, and no trajectory
-        if (under | inside).any() and not survey.path.moves:
-            advice = f". {seen_from(scene, survey.carried[0])}"
         if under.any():
+            first = samples[int(under.argmax())]
+            seen = seen_by[first.sensor]
+            assert seen is not None  # it is below objects of these
+            free = None if survey.path.moves else free_above(scene, seen, first.position)
             yield (
                 f"the sensor is below the scene{where(under)}. Check z, the heights and `up_axis`"
-                f"{advice}"
+                f"{_moved_pose(scene, survey, first, free)}"
             )
         inside &= ~under
         if inside.any():
             first = samples[int(inside.argmax())]
             seen = seen_by[first.sensor]
             assert seen is not None  # it is inside a body of these
+            body = seen.body_around(first.position)
+            way_out = _way_out(scene, survey, seen, first, body)
             yield (
-                "the sensor is inside the closed body "
-                f"{printable(seen.name_around(first.position))!r}{where(inside)} and hits only the "
-                f"back faces of its surfaces{advice}. If the body is the sensor housing, add its "
-                "name to `unseen` of the sensor"
+                f"the sensor is inside the closed body {printable(body.name)!r}{where(inside)}. It "
+                f"hits only the back faces of surfaces{way_out}. If the body is the sensor housing, "
+                "add its name to `unseen` of the sensor"
             )
     for actor, name in enumerate(scene.object_names[len(scene.names) :]):
         masks = (unseen[sample.sensor] for sample in samples)
@@ -159,6 +164,31 @@ def _position_warnings(
                 f"the sensor is inside {name}{where(inside)}. Check its mount and the "
                 "trajectories, or add the name to `unseen` of the sensor"
             )
+
+
+def _way_out(
+    scene: Scene, survey: Survey, seen: Surroundings, first: _SensorPosition, body: Body
+) -> str:
+    """Return sentences, starting with a period, on a pose outside a body around a position."""
+    if not survey.path.moves:
+        if (free := seen.free_position(first.position)) is not None:
+            return _moved_pose(scene, survey, first, free)
+        if body.is_whole_scene:
+            return f". {seen_from(scene, survey.carried[0])}"
+    lower, upper = (", ".join(f"{x:,.2f}" for x in corner) for corner in body.bounds + scene.origin)
+    return f". The body extends from ({lower}) to ({upper})"
+
+
+def _moved_pose(scene: Scene, survey: Survey, sample: _SensorPosition, free: Floats | None) -> str:
+    """Return a sentence, starting with a period, with the pose whose sensor is at a free position.
+
+    It is empty without such a position.
+    """
+    if free is None:
+        return ""
+    pose = survey.path.pose(sample.station).position + scene.origin + free - sample.position
+    number = f" for pose {sample.station + 1}" * (survey.path.stations > 1)
+    return f". The nearest free position found{number} is {on_one_line(np.round(pose, 2).tolist())}"
 
 
 def _surroundings_of_sensors(

@@ -32,6 +32,7 @@ _LEAVES = 0.4  # maximum openness of leaves
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
 _MIN_ROOM_WIDTH_M = 2.0
 _MAX_ROOM_HEIGHT_M = 15.0
+_WHOLE = 0.9  # share of the scene's sides that a body spans which is the whole scene
 # The room of a scene spans this share of the scene along each axis; smaller bodies are in it.
 _SPANS = 1 / 3
 # Directions by their z: up to 10 degrees above the horizon, within 60 degrees of straight up, and
@@ -43,6 +44,9 @@ _COVERED = 0.9
 _WIDELY_COVERED = 0.95
 # Share of directions with surfaces inside a body; a flat surface fills at most half.
 _AROUND = 0.6
+# Distances and number of directions in which free positions are searched.
+_STEPS_M = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0)
+_DIRECTIONS = 16
 
 
 def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
@@ -76,6 +80,15 @@ class Views:
         """Whether surfaces are around, with only their backs visible."""
         enclosed = np.mean(np.isfinite(self.distance)) > _AROUND
         return bool(enclosed and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """The object around a position."""
+
+    name: str
+    bounds: Floats  # (2, 3): lower and upper corner, local coordinates in meters
+    is_whole_scene: bool  # whether the scene has hardly anything else
 
 
 class Surroundings:
@@ -142,15 +155,46 @@ class Surroundings:
         closed = np.isfinite(views.distance[raised]).all() and views.hit[raised].any()
         return bool(closed and not spans and np.mean(views.back[raised & views.hit]) > 1 - 1 / RAYS)
 
-    def name_around(self, position: ArrayLike) -> str:
-        """Return the name of the object that surrounds a local position (3,), "" for none.
+    def body_around(self, position: ArrayLike) -> Body:
+        """Return the object whose surfaces the most directions from a local position (3,) meet.
 
-        It is the object whose surfaces the most directions meet.
+        The position must see a surface.
         """
         points = np.tile(np.asarray(position, np.float64).reshape(3), (RAYS, 1))
         hits = self._caster.cast(points, directions_around(RAYS))
-        owners = self._scene.face_object[hits.triangle[hits.hit]]
-        return self._scene.names[int(np.bincount(owners).argmax())] if len(owners) else ""
+        owner = int(np.bincount(self._scene.face_object[hits.triangle[hits.hit]]).argmax())
+        faces = self._scene.faces[self._scene.face_object == owner]
+        corners = self._scene.vertices[faces].reshape(-1, 3)
+        bounds = np.array([corners.min(axis=0), corners.max(axis=0)])
+        sides = np.ptp(bounds, axis=0)
+        whole = bool((sides >= _WHOLE * np.ptp(self._scene.bounds, axis=0)).all())
+        return Body(self._scene.names[owner], bounds, is_whole_scene=whole)
+
+    def free_position(self, position: ArrayLike) -> Floats | None:
+        """Return the nearest free position (3,) of a grid around a local position, or None.
+
+        The grid is level and within the scene. At a free position, the ground or a floor is
+        visible below, and no surface is close.
+        """
+        start = np.asarray(position, np.float64).reshape(3)
+        lower, upper = self._scene.bounds
+        for step_m in _STEPS_M:
+            for angle in np.arange(_DIRECTIONS) * 2 * np.pi / _DIRECTIONS:
+                moved = start + step_m * np.array([np.cos(angle), np.sin(angle), 0.0])
+                if ((moved > lower) & (moved < upper))[:2].all() and self.is_free(moved):
+                    return moved
+        return None
+
+    def is_free(self, position: ArrayLike) -> bool:
+        """Return whether a local position (3,) has ground below and no surfaces around or close."""
+        views = self.views(position)
+        below = np.mean((views.hit & ~views.back)[views.directions[:, 2] < 0])
+        return bool(
+            below >= _GROUND
+            and views.distance.min() >= CLEAR_M
+            and not self.in_a_body(position)
+            and not self.is_covered(position)
+        )
 
     def is_covered(self, position: ArrayLike) -> bool:
         """Return whether a local position (3,) is under the scene: ground above, and empty below.
