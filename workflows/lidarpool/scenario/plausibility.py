@@ -152,8 +152,8 @@ def _position_warnings(
             way_out = _way_out(scene, survey, seen, first, body)
             yield (
                 f"the sensor is inside the closed body {printable(body.name)!r}{where(inside)}. It "
-                f"hits only the back faces of surfaces{way_out}. If the body is the sensor housing, "
-                "add its name to `unseen` of the sensor"
+                f"hits only the back faces of surfaces{way_out}. If the body is the sensor "
+                "housing, add its name to `unseen` of the sensor"
             )
     for actor, name in enumerate(scene.object_names[len(scene.names) :]):
         masks = (unseen[sample.sensor] for sample in samples)
