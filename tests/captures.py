@@ -43,7 +43,8 @@ def pcapng(
         size = struct.pack(f"{order}I", 12 + len(body))
         return struct.pack(f"{order}I", kind) + size + body + size
 
-    option = struct.pack(f"{order}HHB3xHH", 9, 1, resolution, 0, 0)
+    # Its name, its resolution, and the end.
+    option = struct.pack(f"{order}HH4sHHB3xHH", 2, 4, b"eth0", 9, 1, resolution, 0, 0)
     parts = [
         block(0x0A0D0D0A, struct.pack(f"{order}IHHq", 0x1A2B3C4D, 1, 0, -1)),
         block(1, struct.pack(f"{order}HHI", 105, 0, 0)),  # a second interface

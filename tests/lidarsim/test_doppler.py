@@ -174,6 +174,25 @@ def test_a_mirror_that_moves_counts_twice():
     np.testing.assert_allclose(returns.radial_velocity[seen], -6 * cosine, rtol=1e-9)
 
 
+def test_an_actor_that_a_mirror_shows_has_its_velocity():
+    # Light that goes ahead to the mirror at 10 m meets the actor behind the sensor.
+    way = Track([0, 2], [[-20, 0, 0], [-14, 0, 0]], np.tile([0, 0, 0, 1.0], (2, 1)))
+    actor = Actor(wall("Actor", 0, (-9, 9), (-9, 9)), way)
+    survey = Survey(
+        Sensor.grid(180, 3, 20.0, step_deg=360), poses=[(0, 0, 0)], steps=1,
+        columns=["radial_velocity"],
+        materials=[Material("Mirror", specular_reflectance=1), Material("*")],
+    )  # fmt: skip
+    scene = Scene.from_meshes([wall("Mirror", 10, (-9, 9), (-9, 9))]).with_actors([actor])
+    returns = found_of(Rig(scene, survey, "numpy"))
+    seen = returns.directions[:, 0] > 0.8
+    assert seen.sum() > 20
+    cosine = returns.directions[seen, 0]
+    times = returns.time[seen] / 1e9
+    np.testing.assert_allclose(returns.range[seen], (20 + 20 - 3 * times) / cosine, rtol=1e-6)
+    np.testing.assert_allclose(returns.radial_velocity[seen], -3 * cosine, rtol=1e-9)
+
+
 @pytest.mark.extended
 def test_sub_rays_of_a_plain_beam_see_what_one_ray_sees():
     sensor = Sensor.grid(90, 8, 40.0, step_deg=90)

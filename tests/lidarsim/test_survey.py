@@ -250,6 +250,14 @@ def test_a_carrier_that_stands_turns_in_the_last_second(smooth):
     assert np.allclose(np.gradient(turned, at)[1:-1], rates[1:-1], atol=0.5)
 
 
+def test_a_platform_turns_during_the_whole_of_a_short_stop():
+    places = [[0, 0, 0], [3, 0, 0], [3, 0, 0], [3, 3, 0], [3, 3, 0], [6, 3, 0]]
+    track = Track([0, 1, 1.6, 2.6, 3.0, 4.0], places)
+    times_s = np.array([0.99, 1.0, 1.3, 1.6, 2.5, 2.6, 2.8, 3.0, 3.5])
+    yaws = yaws_of(track.poses(0, times_s * 1e9)[1])
+    assert yaws == pytest.approx([0, 0, 45, 90, 90, 90, 45, 0, 0], abs=1e-6)
+
+
 def test_a_carrier_that_rises_keeps_its_heading():
     for smooth in (False, True):
         rise = [[0, 0, 0], [0, 3, 0], [0, 3, 0], [0, 3, 5], [0, 3, 5]]
