@@ -133,10 +133,6 @@ class Scene:
     boxes
         float64 (n, 2, 3): lower and upper corner of the bounding box of each instance, in local
         coordinates of the scene.
-    to_scene
-        float64 (n, 3, 4): matrix of each instance, which transforms from the local coordinates of
-        the mesh to those of the scene. It is the inverse of `matrices`, except for rounding. None
-        if the scene is plain.
     mesh_frames
         Frame of the mesh of each instance. None if the scene is plain.
     """
@@ -146,7 +142,6 @@ class Scene:
     frame: Frame
     matrices: Floats | None
     boxes: Floats
-    to_scene: Floats | None = None
     mesh_frames: MeshFrames | None = None
 
     @property
@@ -345,16 +340,12 @@ def _nested_scene(
     matrices = np.empty((len(mesh), 3, 4))
     matrices[:, :, :3] = inverse * (scale / frame.scale)[:, None, None]
     matrices[:, :, 3] = _product(inverse, offset) * scale[:, None]
-    to_scene = np.empty((len(mesh), 3, 4))
-    to_scene[:, :, :3] = rotation_scale * (frame.scale / scale)[:, None, None]
-    to_scene[:, :, 3] = offset * -frame.scale
     return Scene(
         meshes=meshes,
         mesh=mesh,
         frame=frame,
         matrices=matrices.reshape(-1, 12),
         boxes=boxes,
-        to_scene=to_scene,
         mesh_frames=mesh_frames,
     )
 
