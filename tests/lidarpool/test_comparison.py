@@ -434,8 +434,12 @@ def test_one_of_several_sensors_is_chosen(tmp_path):
         (tmp_path, "sensors front and rear/left"),
         (bag, "/front/points and /rear"),
     ):
-        with pytest.raises(LidarError, match=rf"{names}.*Choose one of them with `--sensor`"):
+        with pytest.raises(LidarError, match=rf"{names}.*Choose one of them with `--sensor-a`\.$"):
             compare(place, tmp_path, sensor_b="front")
+        with pytest.raises(LidarError, match=rf"{names}.*Choose one of them with `--sensor-b`\.$"):
+            compare(tmp_path, place, sensor_a="front")
+        with pytest.raises(LidarError, match=rf"{names}.*Choose one of them with `--sensor`\.$"):
+            open_recording(place)
     found = compare(bag, tmp_path, sensor_a="/rear_left/points", sensor_b="rear/left").figures
     assert found["pairs"] == 3 and found["distances"]["a_to_b"]["max_m"] < 2e-3
 
@@ -536,6 +540,36 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told, scans_in_r
     lost = image["no_return"]
     assert (image["residual"]["cells"], lost["in_a_only"]) == (there.sum(), (~there).sum())
     assert lost["in_b_only"] == 0
+
+
+@pytest.mark.parametrize("name", ["mcap", "rosbag2", "pcd"])
+def test_compensated_sweeps_are_told_from_sweeps_as_fired(tmp_path, name):
+    """A platform at 8 m/s moves by 0.8 m during a sweep, which only one of the files removes."""
+    track = lidarpool.Track([0, 1], [[0, 0, 1], [8, 0, 1]])
+    sweeps = Sweeps.from_survey(Survey(SENSOR, trajectory=track, steps=36), Scene.seed())
+    scan, channel = np.divmod(np.arange(36 * LAYERS), LAYERS)
+    way = directions(10 * scan, np.linspace(-30, 30, LAYERS)[channel])
+    columns = {"scan": scan, "channel": channel, "object": 0 * scan, "intensity": 0.5 + 0.0 * scan}
+    columns["time"] = scan * 2_777_778
+    made = Cloud(way * 12 + [0, 0, 1], columns)
+    result, fired, compensated = (tmp_path / kind for kind in ("result", "fired", "compensated"))
+    for folder in (result, fired, compensated):
+        folder.mkdir()
+    Format("ply").write(result / "cloud.ply", made, sweeps)
+    sweeps.save(result / "sweeps.npz")
+    file = Format(name).row.file
+    Format(name).write(fired / file, made, sweeps)
+    Format(name, compensated=True).write(compensated / file, made, sweeps)
+    for a, b in ((result, fired / file), (fired / file, compensated / file)):
+        found = compare(a, b).figures
+        first, second = (b, a) if a == fired / file else (a, b)
+        assert f"{first} is compensated for the motion" in found["notes"][0]
+        assert f"but {second} contains points as fired" in found["notes"][0]
+        assert "`lidarpool export RESULT --format mcap`" in found["notes"][0]
+        assert found["distances"]["a_to_b"]["max_m"] > 0.5
+    same = compare(result, compensated / file).figures
+    assert not any("as fired" in note for note in same["notes"])
+    assert same["distances"]["a_to_b"]["max_m"] < 2e-3
 
 
 # -- what is wrong --------------------------------------------------------------------------------

@@ -9,15 +9,19 @@ import numpy as np
 
 from lidarsim.base.arrays import AnyArray
 from lidarsim.base.extras import reading
+from lidarsim.base.input_files import open_input
 from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.scene.colors import as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
+from lidarsim.sweeps.sweeps import states_compensation
 
 from . import pieces
 from .file_points import FilePoints, of_scans
 from .recording import NoiseFilter, Read, Recording, RecordingSource
+
+_COMMENT_BYTES = 1000  # of the first line that is searched
 
 
 class Pieces(pieces.Pieces):
@@ -84,8 +88,18 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
         return scan.positions, scan.columns, scan.pose
 
     return source.recording(
-        len(files), read, meters=source.chosen_meters(), noise_filter=NoiseFilter()
+        len(files),
+        read,
+        meters=source.chosen_meters(),
+        noise_filter=NoiseFilter(),
+        compensated=_stated_compensation(files[0]),
     )
+
+
+def _stated_compensation(path: Path) -> bool | None:
+    """Return what the comment of a file of `Pieces` states, or None for other files."""
+    with open_input(path) as file:
+        return states_compensation(file.readline(_COMMENT_BYTES).decode(errors="replace"))
 
 
 def read_points(path: Path) -> FilePoints:

@@ -48,10 +48,14 @@ class SweepFiles(NamedTuple):
 
 
 class SeveralSensorsError(LidarError):
-    """The recording has several sensors or topics, and none is chosen."""
+    """The recording has several sensors or topics, and none is chosen.
 
-    def __init__(self, message: str, names: Sequence[str]) -> None:
-        super().__init__(message)
+    `contents` is a sentence that names them, and `option` the option that chooses one.
+    """
+
+    def __init__(self, contents: str, names: Sequence[str], option: str = "--sensor") -> None:
+        super().__init__(f"{contents} Choose one of them with `{option}`.")
+        self.contents = contents
         self.names = names
 
 
@@ -160,6 +164,9 @@ class Recording:
     noise_filter: NoiseFilter | None = None  # applied by `read`; None if nothing is left out
     # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
     fired: Callable[[int], FiredPoints] | None = None
+    # Whether sweeps are stated to be compensated for the motion of the sensor; None if unknown, or
+    # if the sensor does not move.
+    compensated: bool | None = None
 
     @property
     def intensity_name(self) -> str:
@@ -402,6 +409,8 @@ def open_cloud(
         fields["firing_key"] = fingerprint(
             key, saved.scans[indices], saved.begins_ns[indices], poses
         )
+    if len(saved.knots):
+        fields["compensated"] = saved.coordinates == "world"
     fields |= {"times": lambda: times, "frame_poses": frame_poses, "fired": read_fired}
     return Recording(name, len(indices), read_sweep, intensity, **fields)
 
@@ -444,11 +453,7 @@ def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> st
     if not available:
         raise LidarError(f"{name} contains no {kind}. Record at least one.")
     if chosen is None:
-        raise SeveralSensorsError(
-            f"{name} contains the {kind} {joined(available)}. Choose one of them with "
-            "`--sensor`, or with `--sensor-a` and `--sensor-b` in a comparison.",
-            available,
-        )
+        raise SeveralSensorsError(f"{name} contains the {kind} {joined(available)}.", available)
     hint = did_you_mean(chosen, available)
     raise LidarError(f"{name} does not contain {chosen!r}.{hint} {contents}")
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -21,7 +22,7 @@ from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
 
 from ..base.neighbors import nearest
-from ..clouds.recording import RecordedPoints, Recording
+from ..clouds.recording import RecordedPoints, Recording, SeveralSensorsError
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..recordings.opening import open_recording
@@ -105,12 +106,14 @@ def compare(
         raise LidarError(
             f"`distances_m` is {list(distances_m)}; it must contain positive lengths in meters."
         )
-    first = open_recording(
-        a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
-    )
-    second = open_recording(
-        b, sensor_b, intensity_b, name="cloud B", unit=unit_b, keep_noise=keep_noise
-    )
+    with _sensor_chosen_by("--sensor-a"):
+        first = open_recording(
+            a, sensor_a, intensity_a, name="cloud A", unit=unit_a, keep_noise=keep_noise
+        )
+    with _sensor_chosen_by("--sensor-b"):
+        second = open_recording(
+            b, sensor_b, intensity_b, name="cloud B", unit=unit_b, keep_noise=keep_noise
+        )
     comparing = _Comparing((first, second), tuple(sorted(distances_m)), azimuth_deg)
     if not first.is_cloud and not second.is_cloud:
         pairs = _pair_sweeps(first, second, match)
@@ -122,6 +125,8 @@ def compare(
                 f"by {match} results in {plural(len(pairs), 'pair')}"
             )
         comparing.pairs = pairs
+        if {first.compensated, second.compensated} == {True, False}:
+            comparing.note(_motion_note(*sorted((first, second), key=lambda r: not r.compensated)))
         budget = MAX_VALUES // len(pairs)
         for number_a, number_b in pairs:
             pair = first.read_points(number_a), second.read_points(number_b)
@@ -140,6 +145,25 @@ def compare(
         comparing.note(f"distances are measured from {MAX_VALUES:,} points of each cloud")
     comparing.add_points(points_a, points_b, MAX_VALUES)
     return comparing.result()
+
+
+@contextmanager
+def _sensor_chosen_by(option: str) -> Iterator[None]:
+    """Name the option that chooses one of several sensors of A or B in the error for these."""
+    try:
+        yield
+    except SeveralSensorsError as error:
+        raise SeveralSensorsError(error.contents, error.names, option) from error
+
+
+def _motion_note(compensated: Recording, fired: Recording) -> str:
+    """Return a note on sweeps of which only the first are compensated for motion."""
+    return (
+        f"{compensated.name} is compensated for the motion of the sensor during each sweep, but "
+        f"{fired.name} contains points as fired, so the differences include this motion. Export "
+        "the result as fired with `lidarpool export RESULT --format mcap` and compare the file, or "
+        "export both with `--compensated`"
+    )
 
 
 def _choose_pairs(pairs: list[tuple[int, int]], sweeps: Sequence[int]) -> list[tuple[int, int]]:

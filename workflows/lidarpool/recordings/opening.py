@@ -126,4 +126,4 @@ def _open_data_set(source: RecordingSource) -> Recording:
         sweep = saved[number]
         return sweep.points, sweep.columns, sweep.pose
 
-    return source.recording(len(saved), read)
+    return source.recording(len(saved), read, compensated=True)

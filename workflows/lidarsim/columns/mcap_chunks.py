@@ -1,4 +1,4 @@
-"""Chunks of MCAP files, and packed bags: what they unpack to is known before they are unpacked.
+"""Records of MCAP files, and packed bags: what they unpack to is known before they are unpacked.
 
 After the specifications of MCAP (https://mcap.dev/spec) and of Zstandard (RFC 8878). LZ4, the other
 compression, unpacks to at most 255 times its size.
@@ -18,6 +18,7 @@ from ..base.input_files import input_size, open_input
 _MAGIC_BYTES = 8
 _CHUNK = 0x06
 _CHUNK_INDEX = 0x08
+_METADATA = 0x0C
 _RECORD = Struct("<BQ")  # kind, and length of the content
 _LENGTH_BYTES = 8  # bytes of the length of the packed messages
 _CHUNK_HEAD = Struct("<QQQII")  # first and last time, unpacked size, checksum, length of a name
@@ -61,6 +62,36 @@ def check_chunks(path: Path) -> None:
             totals[kind].take(unpacked_bytes)
 
 
+def read_metadata(path: Path) -> dict[str, dict[str, str]]:
+    """Read the metadata records of an MCAP file, {name of a record: its content}.
+
+    Records that are cut short are left out. OSError if the file cannot be read.
+    """
+    records: dict[str, dict[str, str]] = {}
+    if input_size(path) < _MAGIC_BYTES:
+        return records
+    with open_input(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        for kind, start, stop in _records(data):
+            if kind == _METADATA:
+                name, *texts = _strings(data[start:stop])
+                records[name] = dict(zip(texts[::2], texts[1::2], strict=False))
+    return records
+
+
+def _strings(content: bytes) -> Iterator[str]:
+    """Yield the strings of a metadata record: its name, then keys and values in turn."""
+    position = 0
+    is_first = True
+    while position + _NAME_LENGTH.size <= len(content):
+        (length,) = _NAME_LENGTH.unpack_from(content, position)
+        position += _NAME_LENGTH.size
+        yield content[position : position + length].decode(errors="replace")
+        position += length
+        if is_first:
+            position += _NAME_LENGTH.size  # length of the map
+            is_first = False
+
+
 def check_packed(path: Path) -> None:
     """Check that a file packed by Zstandard unpacks to no more than its size allows, on the disk.
 
@@ -74,11 +105,8 @@ def check_packed(path: Path) -> None:
     Allowance(size, _ADVICE, in_parts=True).take(unpacked_bytes)
 
 
-def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
-    """Yield the kind of each record of a chunk, and the bytes that the chunk may unpack to.
-
-    Libraries find chunks by their records, or by the records of an index, which may differ.
-    """
+def _records(data: mmap) -> Iterator[tuple[int, int, int]]:
+    """Yield the kind of each complete record, and the start and stop of its content."""
     position = _MAGIC_BYTES
     while position + _RECORD.size <= len(data):
         kind, length = _RECORD.unpack_from(data, position)
@@ -86,9 +114,18 @@ def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
         position = start + length
         if position > len(data):
             return
+        yield kind, start, position
+
+
+def _unpacked_sizes(data: mmap) -> Iterator[tuple[int, int]]:
+    """Yield the kind of each record of a chunk, and the bytes that the chunk may unpack to.
+
+    Libraries find chunks by their records, or by the records of an index, which may differ.
+    """
+    for kind, start, stop in _records(data):
         try:
             if kind == _CHUNK:
-                yield kind, _chunk_bytes(data, start, position)
+                yield kind, _chunk_bytes(data, start, stop)
             elif kind == _CHUNK_INDEX:
                 yield kind, _indexed_bytes(data, start)
         except struct.error:  # a record that is too short

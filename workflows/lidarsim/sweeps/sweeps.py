@@ -56,6 +56,20 @@ _JSON_FIELDS = (
 )  # fmt: skip
 
 
+def states_compensation(frame_text: str) -> bool | None:
+    """Return whether a description of a frame states that motion is compensated.
+
+    Returns None if it states neither.
+
+    Examples
+    --------
+    >>> states_compensation(COMPENSATED), states_compensation(AS_FIRED)
+    (True, False)
+    """
+    match = re.search(r"motion is (not )?compensated", frame_text)
+    return None if match is None else match[1] is None
+
+
 def numbered_places(positions: Floats) -> Ints:
     """Return a number from 1 for each position (n, 3), the same for equal positions: int64 (n,).
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -24,6 +25,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from lidarsim.base.arrays import AnyArray, Floats, Floats32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
+from lidarsim.base.input_files import read_input_text
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
     POINT_CLOUD,
@@ -34,9 +36,10 @@ from lidarsim.columns.bags import (
 )
 from lidarsim.columns.closing_bag import ClosingBag
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.mcap_chunks import read_metadata
 from lidarsim.motion.bag_trajectories import read_bag
 from lidarsim.motion.trajectory import Track
-from lidarsim.sweeps.sweeps import Sweeps
+from lidarsim.sweeps.sweeps import Sweeps, states_compensation
 
 from .. import sweep_reader
 from ..frame_names import survey_start_ns
@@ -256,7 +259,20 @@ def open_file(source: RecordingSource) -> Recording:
         times=times,
         frame_poses=frame_poses,
         notes=source.named(unstamped),
+        compensated=_stated_compensation(source.path),
     )
+
+
+def _stated_compensation(path: Path) -> bool | None:
+    """Return what the custom data of a bag of `write_rosbag2` state, or None for other bags.
+
+    rosbags reads custom data from folders only.
+    """
+    if path.is_dir():
+        text = read_input_text(path / "metadata.yaml", errors="replace")
+    else:
+        text = read_metadata(path).get("rosbag2", {}).get("serialized_metadata", "")
+    return states_compensation(re.sub(r"[\s\\]+", " ", text))  # YAML breaks long lines
 
 
 def open_folder(source: RecordingSource) -> Recording:
