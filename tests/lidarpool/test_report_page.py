@@ -325,6 +325,17 @@ def test_scanning_of_a_flight_is_on_its_lines(write):
     assert lines["count"] == 2
     assert lines["seconds"] == pytest.approx(16, abs=0.5)
     assert lines["length_m"] == pytest.approx(60 * 16, rel=0.04)
+    scanners = [
+        Mounted(load_sensor("airborne/riegl-vq780i"), name="first", steps=1),
+        Mounted(load_sensor("airborne/riegl-vq780i"), name="strip", steps=5 * 200 * 36),
+    ]
+    scanners = [replace(m, sensor=replace(m.sensor, start_ns=14e9)) for m in scanners]
+    text, report = write(survey=Survey(sensors=scanners, trajectory=track))
+    assert "<dt>scanning time on 1 flight line</dt>" in text
+    lines = report["parameters"]["flight_lines"]
+    assert lines["count"] == 1
+    assert lines["seconds"] == pytest.approx(5, abs=0.1)
+    assert lines["length_m"] == pytest.approx(60 * 5, rel=0.02)
     text, report = write(survey=Survey(Sensor.grid(), trajectory=track))
     assert re.search("<dd>20[^<]*</dd><dt>scanning time</dt>", text)
     assert report["parameters"]["flight_lines"] is None

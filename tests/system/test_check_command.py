@@ -389,9 +389,13 @@ def test_a_flight_is_told_by_its_lines_without_turns(check):
     told = check(text=json.dumps(scenario)).out
     model = scenario.pop("sensor")
     scenario["sensors"] = {"turn": {"model": model, "start_s": 12, "steps": 5400}}
-    [turn] = json.loads(check("--json", text=json.dumps(scenario)).out)["drive"]["sensors"]
+    drive = json.loads(check("--json", text=json.dumps(scenario)).out)["drive"]
+    [turn] = drive["sensors"]
+    assert drive["lines"] is None
     assert turn["meters_a_turn"] < 0.95 * scanner["meters_a_turn"], "it fires during the turn only"
-    assert re.search(r"^trajectory  .* s; 2 flight lines, [\d,]+ m in 1\d\.\d s$", told, re.M)
+    assert re.search(
+        r"^trajectory  .* s; 2 scanned flight lines, [\d,]+ m in 1\d\.\d s$", told, re.M
+    )
     assert re.search(r"the platform moves 0\.30\d m per cycle on the flight lines$", told, re.M)
 
 

@@ -12,7 +12,7 @@ from lidarsim.base.arrays import Bools, Bytes, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.straight_lines import StraightLines
-from lidarsim.sensor.sensor import LineSensor
+from lidarsim.sensor.sensor import LineSensor, Sensor
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
@@ -33,6 +33,35 @@ def flight_lines(survey: Survey) -> StraightLines | None:
     positions, _ = survey.path.poses(0, times_ns)
     lines = StraightLines.find(times_ns / 1e9, positions)
     return lines if len(lines.starts_s) else None
+
+
+def scanned_lines(survey: Survey) -> dict[str, float] | None:
+    """Return number, duration and length of the flight lines on which a scanner fires.
+
+    `seconds` and `length_m` are those while a scanner fires. None if no scanner fires on a line.
+    """
+    lines = flight_lines(survey)
+    if lines is None:
+        return None
+    spans = [
+        firing_span_s(mounted.sensor, steps)
+        for mounted, steps in zip(survey.carried, survey.steps_each, strict=True)
+        if isinstance(mounted.sensor, LineSensor)
+    ]
+    scanned = lines.seconds_within(spans)
+    if not scanned.any():
+        return None
+    return {
+        "count": int(np.count_nonzero(scanned)),
+        "seconds": float(scanned.sum()),
+        "length_m": float((lines.lengths_m * scanned / (lines.stops_s - lines.starts_s)).sum()),
+    }
+
+
+def firing_span_s(sensor: Sensor, steps: int) -> tuple[float, float]:
+    """Return the start and the end of the firings of a sensor in a number of time steps."""
+    _, firings = sensor.firings(steps - 1)
+    return sensor.start_ns / 1e9, sensor.begins_ns(np.array([firings])).item() / 1e9
 
 
 @dataclass(frozen=True, eq=False)

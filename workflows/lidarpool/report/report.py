@@ -22,7 +22,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.sensor import Sensor
 from lidarsim.survey.survey import CloudOptions, Survey
 
-from ..clouds.flight_lines import flight_lines
+from ..clouds.flight_lines import scanned_lines
 from ..plan.planning import Search
 from ..run.job_source import fields_of
 from ..run.pipeline.stage_names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
@@ -142,7 +142,6 @@ def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     """Describe the scene, the sensors and the options of a survey."""
     options = declared(survey, CloudOptions) | declared(survey, Weather)
-    lines = flight_lines(survey)
     del options["columns"]  # columns have a separate table
     sensors = [
         _sensor(mounted.sensor)
@@ -166,7 +165,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "poses": survey.path.stations,
         "duration_s": survey.duration_ns / 1e9,
         "trajectory_s": survey.duration_ns / 1e9 if survey.path.moves else None,
-        "flight_lines": lines and lines.summary(),
+        "flight_lines": scanned_lines(survey),
         "steps": survey.steps_each[0],
         "materials": len(survey.materials),
         "navigation": None if survey.navigation is None else asdict(survey.navigation),

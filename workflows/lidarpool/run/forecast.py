@@ -37,7 +37,7 @@ from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
-from ..clouds.flight_lines import flight_lines
+from ..clouds.flight_lines import firing_span_s, flight_lines, scanned_lines
 from ..clouds.navigation_files import instrument_bytes
 from ..scenario.build import Job
 from ..scenario.empty_cloud import EMPTY, empty_cloud_reason
@@ -305,8 +305,7 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
         sensor = carried.sensor
         firings = sensor.firings(steps - 1)[1]
         rate_hz = getattr(sensor.head, "rate_hz", None)
-        start_s = sensor.start_ns / 1e9
-        stop_s = sensor.begins_ns(np.array([firings])).item() / 1e9
+        start_s, stop_s = firing_span_s(sensor, steps)
         speed_m_s = float(np.diff(np.interp([start_s, stop_s], times_s, traveled_m))[0])
         speed_m_s /= stop_s - start_s
         if lines is not None:
@@ -325,7 +324,7 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     return {
         "seconds": seconds,
         "meters": float(traveled_m[-1]),
-        "lines": lines and lines.summary(),
+        "lines": scanned_lines(survey),
         "sensors": sensors,
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -53,9 +54,24 @@ class StraightLines(NamedTuple):
         speeds_m_s = self.lengths_m / (self.stops_s - self.starts_s)
         return float((speeds_m_s * within_s).sum() / within_s.sum())
 
-    def summary(self) -> dict[str, float]:
-        """Return number, total duration and total length of the lines as plain data."""
-        return {"count": len(self.starts_s), "seconds": self.seconds, "length_m": self.length_m}
+    def seconds_within(self, spans_s: Sequence[tuple[float, float]]) -> Floats:
+        """Return for how long each line (n,) is within any of several spans of time.
+
+        The ends of lines are known to 0.1 s: shorter overlaps count as none.
+
+        Examples
+        --------
+        >>> lines = StraightLines(np.array([0.0, 20]), np.array([10.0, 30]), np.array([600.0, 300]))
+        >>> lines.seconds_within([(0, 4), (2, 6), (18, 20.05)]).tolist()
+        [6.0, 0.0]
+        """
+        total = np.zeros(len(self.starts_s))
+        covered_to = -np.inf  # so that overlapping spans count once
+        for start, stop in sorted(spans_s):
+            first = np.maximum(self.starts_s, max(start, covered_to))
+            total += np.maximum(np.minimum(self.stops_s, stop) - first, 0)
+            covered_to = max(covered_to, stop)
+        return np.where(total > _STEP_S, total, 0.0)
 
     @classmethod
     def find(cls, times_s: Floats, positions: Floats) -> StraightLines:
