@@ -43,7 +43,7 @@ def areas(plan, scene):
     return {
         name: (visible, covered)
         for name, visible, covered in zip(
-            scene.names, plan.visible_m2, plan.covered_m2, strict=True
+            scene.names, plan.reachable_m2, plan.covered_m2, strict=True
         )
     }
 
@@ -97,7 +97,7 @@ def test_a_hall_may_be_modeled_by_its_outside_alone():
     scene = Scene.from_meshes([box("Hall", (8, 6, 3)), placed("Case", (1, 1, 2.5), (2.1, 1.1, 0))])
     plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
     # Inner sides of the hall, less what the case stands on; and the sides of the case.
-    assert plan.visible_m2 == pytest.approx([180 - 1, 10], rel=0.03)
+    assert plan.reachable_m2 == pytest.approx([180 - 1, 10], rel=0.03)
     assert (np.abs(plan.candidates[:, :2] - (2.1, 1.1)).max(axis=1) > 0.5).all()
 
 
@@ -109,8 +109,8 @@ def test_range_field_of_view_and_slant_limit_what_is_seen():
     def seen(sensor, slant_deg=90):
         return plan_stations(scene, sensor, count=1, spacing_m=1, slant_deg=slant_deg)
 
-    assert seen(EVERYWHERE).visible_m2[1] > 9
-    assert seen(Sensor.grid(vertical_fov_deg=180, max_range_m=50)).visible_m2[1] == 0
+    assert seen(EVERYWHERE).reachable_m2[1] > 9
+    assert seen(Sensor.grid(vertical_fov_deg=180, max_range_m=50)).reachable_m2[1] == 0
     # Below 30 degrees, or within 60 degrees of upright: a disc around the one place in the middle.
     middle = Scene.from_meshes([placed("Ground", (10, 10, 0.2), (0, 0, -0.2))])
     for sensor, slant_deg, expected in (
@@ -119,7 +119,7 @@ def test_range_field_of_view_and_slant_limit_what_is_seen():
     ):
         plan = plan_stations(middle, sensor, spacing_m=10, slant_deg=slant_deg)
         assert plan.stations.tolist() == [[0, 0, 1.7]]
-        assert plan.visible_m2[0] == pytest.approx(expected, rel=0.02)
+        assert plan.reachable_m2[0] == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.slow
@@ -133,7 +133,7 @@ def test_stations_are_in_world_coordinates_and_stand_on_pavements():
     plan = plan_stations(scene, EVERYWHERE, count=1, height_m=1.5)
     assert np.abs(plan.candidates[:, :2] - where[:2]).max() < 10
     assert plan.stations[0, 2] == pytest.approx(300 + 0.15 + 1.5)
-    assert plan.visible_m2[0] == 0 < plan.visible_m2[1]
+    assert plan.reachable_m2[0] == 0 < plan.reachable_m2[1]
 
 
 @pytest.mark.parametrize(
@@ -142,7 +142,7 @@ def test_stations_are_in_world_coordinates_and_stand_on_pavements():
         ({"count": 2, "coverage": 0.9}, "cannot be combined"),
         ({"coverage": 95.0}, "coverage must be .* but is 95.0"),
         ({"spacing_m": 0.001}, "larger spacing"),
-        ({"sensor": Sensor.grid(max_range_m=0.5)}, "Nothing is visible"),
+        ({"sensor": Sensor.grid(max_range_m=0.5)}, "Nothing is reachable"),
         ({"scene": Scene.from_meshes(POLES), "spacing_m": 3.0}, "No floor was found"),
         ({"scene": Scene.from_meshes(POLES[:1])}, "No free space was found on the floor"),
     ],
@@ -166,18 +166,46 @@ def test_targets_are_covered_and_other_objects_only_occlude():
     assert plan.targets.tolist() == [False, True, False]
     assert 2 <= len(plan.stations) <= 6
     # Three sides of 24 m²: neither the roof, nor the side behind the screen.
-    assert plan.visible_m2.tolist() == [0, pytest.approx(72, rel=0.02), 0]
-    assert plan.covered_m2[1] == pytest.approx(plan.coverage[-1] * plan.visible_m2[1])
+    assert plan.reachable_m2.tolist() == [0, pytest.approx(72, rel=0.02), 0]
+    assert plan.covered_m2[1] == pytest.approx(plan.coverage[-1] * plan.reachable_m2[1])
     open_scene = Scene.from_meshes(house[:2])
     unscreened = plan_stations(open_scene, EVERYWHERE, targets=["House"], count=1, **options)
-    assert unscreened.visible_m2[1] == pytest.approx(96, rel=0.02)
+    assert unscreened.reachable_m2[1] == pytest.approx(96, rel=0.02)
     with pytest.raises(
         LidarError, match=r"target 'Hose' does not match any object\. Did you mean 'House'\?"
     ):
         plan_stations(scene, EVERYWHERE, targets=["House", "Hose"])
-    with pytest.raises(LidarError, match="No target is visible"):
+    with pytest.raises(LidarError, match="No target is reachable"):
         buried = [*house, placed("Buried", (1, 1, 1), (0, 0, 1))]
         plan_stations(Scene.from_meshes(buried), EVERYWHERE, targets=["Buried"], **options)
+
+
+@pytest.mark.parametrize(("slant_deg", "is_noted"), [(80, False), (65, True)])
+def test_a_target_that_is_mostly_out_of_reach_is_noted(tmp_path, slant_deg, is_noted):
+    """A flat roof of 100 m², 0.5 m below the instrument.
+
+    At 65 degrees only points within 1.1 m of the instrument's foot are reachable, which is not on
+    the roof; at 80 degrees, points within 2.8 m.
+    """
+    parts = [
+        placed("Ground", (30, 30, 0.2), (0, 0, -0.2)),
+        placed("Roof", (10, 10, 1.2), (0, 0, 0)),
+    ]
+    write_scene(tmp_path / "site.glb", Scene.from_meshes(parts))
+    command = ["stations", str(tmp_path / "site.glb"), "--sensor", "riegl-vz400", "--target"]
+    command += ["Roof", "--slant", str(slant_deg), "--spacing", "1", "--count", "4"]
+    command += ["--out", str(tmp_path / "plan")]
+    told = json.loads(CliRunner().invoke(cli, [*command, "--json"]).stdout)
+    roof = told["objects"]["Roof"]
+    assert roof["area_m2"] == pytest.approx(2 * 100 + 4 * 12)
+    assert 0 < roof["covered_m2"] <= roof["reachable_m2"] < roof["area_m2"]
+    notes = [note for note in told["notes"] if "reachable from the candidate positions" in note]
+    assert bool(notes) == is_noted
+    text = CliRunner().invoke(cli, [*command, "--overwrite"]).stdout
+    assert re.search(r"^Roof +248\.0 m² +[\d.]+ m² +[\d.]+%$", text, re.M)
+    assert re.search(r"^object +area +reachable +covered$", text, re.M)
+    if is_noted:
+        assert notes[0].startswith(f"Only {roof['reachable_m2']:.1f} of 248.0 m² of Roof is ")
 
 
 def test_the_report_names_the_targets(tmp_path):
@@ -195,10 +223,12 @@ def test_the_report_names_the_targets(tmp_path):
     command += ["--slant", "90"]
     figures = json.loads(CliRunner().invoke(cli, [*command, "--json"]).stdout)
     assert [*figures["objects"]] == ["House"]
-    assert figures["seen_m2"] == pytest.approx(8, rel=0.1)  # the side that faces the station
+    assert figures["reachable_m2"] == pytest.approx(8, rel=0.1)  # the side that faces the station
     assert figures["covered"] == pytest.approx(0.2 / 2, rel=0.2)  # a strip of 0.2 m
     text = CliRunner().invoke(cli, [*command, "--target", "Tower"]).stdout
-    assert re.match(r"[\d,]+ m² of H\* and Tower are visible from 1 station, and [\d.]+% of", text)
+    assert re.match(
+        r"[\d,]+ m² of H\* and Tower are reachable from 1 station, and [\d.]+% of", text
+    )
     assert "Ground" not in text
 
 
@@ -213,12 +243,12 @@ def test_a_scan_is_compared_with_what_its_stations_see(tmp_path):
     figures = json.loads(CliRunner().invoke(cli, [*command, "--json"]).stdout)
     floor = figures["objects"]["Floor"]
     assert floor["covered_m2"] == pytest.approx(6.05 * 6, rel=0.03)
-    assert floor["seen_m2"] > 70 and figures["objects"]["West"]["covered_m2"] == 0
+    assert floor["reachable_m2"] > 70 and figures["objects"]["West"]["covered_m2"] == 0
     assert figures["covered"] == pytest.approx(
-        sum(entry["covered_m2"] for entry in figures["objects"].values()) / figures["seen_m2"]
+        sum(entry["covered_m2"] for entry in figures["objects"].values()) / figures["reachable_m2"]
     )
     assert (
-        " m² are visible from 2 stations"
+        " m² are reachable from 2 stations"
         in CliRunner().invoke(cli, [*command, "--within", "0.02"]).stdout
     )
 
@@ -271,7 +301,7 @@ def test_the_table_has_the_names_that_targets_match(tmp_path):
     np.save(tmp_path / "scan.npy", np.array([[3.0, 1.0, 0.0]]))
     command = ["stations", str(plan), "--cloud", str(tmp_path / "scan.npy"), "--target"]
     outcome = CliRunner().invoke(cli, [*command, "site_*"])
-    shown = re.findall(r"^(site_\w+) +[\d,.]+ m²", outcome.output, re.M)
+    shown = re.findall(r"^(site_\w+) +[\d,.]+ m² +[\d,.]+ m²", outcome.output, re.M)
     assert {*shown} == {f"site_{mesh.name}" for mesh in rooms()}
     refused = CliRunner().invoke(cli, [*command, "nor*"])
     assert str(refused.exception).endswith(" Similar names: site_North.")

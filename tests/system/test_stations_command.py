@@ -1,6 +1,7 @@
 """`lidarpool stations`: what it prints and writes for a hall with a column, and its errors."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -75,7 +76,7 @@ def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
     assert len(stations) >= 2 and {round(z, 3) for _, _, z in stations} == {1.7}
     shares = [one["coverage"] for one in told["stations"]]
     assert shares == sorted(shares) and shares[-2] < 0.9 <= shares[-1]
-    seen = [object_["visible_m2"] for object_ in told["objects"].values()]
+    seen = [object_["reachable_m2"] for object_ in told["objects"].values()]
     covered = [object_["covered_m2"] for object_ in told["objects"].values()]
     assert sum(covered) / sum(seen) == pytest.approx(shares[-1])
 
@@ -93,16 +94,32 @@ def test_a_mesh_needs_no_scenario_and_a_number_may_be_more_than_needed(hall, lid
     assert Scenario.load(hall / "stations-stations/stations.yaml").sensor.model == "velodyne/vlp16"
 
 
+def test_a_sensor_file_is_relative_to_the_folder_of_its_scenario(hall, lidarpool):
+    folder = hall / "plan"
+    folder.mkdir()
+    sensor = "name: Preview\nfirings_per_turn: 72\nrate_hz: 10\nrange_m: [0.5, 50]\n"
+    sensor += "beams: {elevation_deg: {first: -40, last: 60, count: 9}}\n"
+    (folder / "scan.yaml").write_text("scene: ../hall.glb\nsensor: preview.yaml\n")
+    arguments = ("stations", "plan/scan.yaml", "--count", "1", "--spacing", "4", "--out", "b")
+    outcome = lidarpool(*arguments)
+    assert outcome.code == 2
+    assert f"{Path('plan/preview.yaml')} does not exist." in outcome.err
+    (folder / "preview.yaml").write_text(sensor)
+    outcome = lidarpool(*arguments)
+    assert outcome.code == 0, outcome.err
+    assert Scenario.load(hall / "b/stations.yaml").sensor.model == "../plan/preview.yaml"
+
+
 @pytest.mark.extended
 def test_targets_are_in_all_that_is_written(hall, lidarpool):
     arguments = ("--sensor", "vlp16", "--count", "1", "--spacing", "2", "--slant", "85")
     targets = ("--target", "Wall-*", "--target", "Column")
     outcome = lidarpool("stations", "hall.glb", *arguments, *targets)
     assert outcome.code == 0, outcome.err
-    assert " m² of Wall-* and Column are visible\n" in outcome.out
+    assert " m² of Wall-* and Column are reachable (within" in outcome.out
     assert "Floor" not in outcome.out and "Column " in outcome.out
     head = (hall / "hall-stations/stations.yaml").read_text()
-    assert "% of the\n# visible surface of Wall-* and Column." in head
+    assert "% of the\n# reachable area of Wall-* and Column." in head
     assert pixels_of_kind(hall / "hall-stations/stations.png", OTHER) > 10_000
 
 
@@ -156,7 +173,7 @@ def test_the_picture_agrees_with_the_table(tmp_path, lidarpool):
     outcome = lidarpool("stations", *arguments, "--height", "4", "--count", "100", "--json")
     assert outcome.code == 0, outcome.err
     table = json.loads(outcome.out)["objects"]
-    assert all(entry["covered_m2"] == entry["visible_m2"] > 90 for entry in table.values())
+    assert all(entry["covered_m2"] == entry["reachable_m2"] > 90 for entry in table.values())
     picture = tmp_path / "site-stations/stations.png"
     assert pixels_of_kind(picture, COVERED) > 100_000
     assert pixels_of_kind(picture, UNCOVERED) < 100

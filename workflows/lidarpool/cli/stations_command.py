@@ -34,6 +34,7 @@ PLAN_FILE = "stations.yaml"
 PICTURE_FILE = "stations.png"
 _SHOWN_OBJECTS = 12
 _MOST_OF_THE_AREA = 0.75  # share of an object that decides where the stations are
+_LITTLE_OF_THE_AREA = 0.25  # reachable share of a target that a note names
 
 
 def _share(text: str) -> float:
@@ -82,14 +83,18 @@ def _share(text: str) -> float:
     metavar="M",
     help="With --cloud, maximum distance in meters between a covered surface and a point.",
 )
-@click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
+@click.option(
+    "--count",
+    type=click.IntRange(1, 100),
+    help="Number of stations; cannot be combined with --coverage.",
+)
 @click.option(
     "--coverage",
     type=_share,
     metavar="SHARE",
     help=(
-        "Add stations until this share of the visible surface is covered, such as 95% (default: "
-        "add stations as long as each adds at least 1%, unless --count is passed)."
+        "Add stations until this share of the reachable area is covered, such as 95%; cannot be "
+        "combined with --count (default: add stations as long as each adds at least 1%)."
     ),
 )
 @click.option(
@@ -134,12 +139,13 @@ def stations(
     """Choose or evaluate the stations of a terrestrial scan.
 
     Stations are chosen one by one from candidate positions on the floor. The next station is always
-    the candidate that adds the most coverage, which is the covered share of the surface area that
-    is visible from at least one candidate. The output is a scenario with the stations, and a
-    picture of the surfaces that they cover.
+    the candidate that adds the most coverage, which is the covered share of the reachable area. A
+    surface is reachable if at least one candidate sees it within the range and the field of view of
+    the sensor, and within --slant. The output is a scenario with the stations, and a picture of the
+    surfaces that they cover.
 
-    With --cloud, no stations are chosen. Instead, the command computes which share of the surface
-    area visible from the stations in SCENARIO is close to a point of a result, or of any cloud that
+    With --cloud, no stations are chosen. Instead, the command computes which share of the area that
+    is reachable from the stations in SCENARIO is close to a point of a result, or of any cloud that
     `lidarpool compare` reads.
 
     \b
@@ -165,7 +171,7 @@ def stations(
         _show_coverage(scenario, cloud, settings["as_json"], within_m=within_m, **sight)
     else:
         scenario = Scenario.load(scene, of_mesh)
-        model = model or scenario.sensor.model
+        model = model or _scenario_model(scenario)
         if not model:
             raise click.UsageError(
                 f"`--sensor` is required, because {scene} does not specify a sensor model."
@@ -180,6 +186,14 @@ def stations(
                 "`--overwrite`."
             )
         _plan(scenario, model, folder, **settings)
+
+
+def _scenario_model(scenario: Scenario) -> str | None:
+    """Return the sensor model of a scenario; a sensor file is relative to the scenario's folder."""
+    model = scenario.sensor.model
+    if model is not None and scenario.sensor.has_own_model:
+        return str(scenario.path(model))
+    return model
 
 
 def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **settings: Any) -> None:
@@ -208,7 +222,9 @@ def _plan(scenario: Scenario, model: str, folder: Path, as_json: bool, **setting
     with terminal.status("drawing the picture"):
         draw_stations(plan).save(folder / PICTURE_FILE)
     shortfalls = [*_shortfalls(plan, settings["count"], settings["coverage"])]
-    if not settings["targets"]:
+    if settings["targets"]:
+        shortfalls += _unreachable_notes(built.scene.names, plan, "candidate positions")
+    else:
         shortfalls += _target_notes(plan, built)
     figures = _plan_figures(plan, built, sensor.model, [*notes, *shortfalls])
     note_lines = map("note: {}".format, shortfalls)
@@ -265,7 +281,7 @@ def _show_coverage(
     clouds = (
         recording.read_points(number, in_world=True).points for number in range(recording.count)
     )
-    with terminal.status("finding points near the visible surfaces"):
+    with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(
             built.scene,
             built.survey.carried[0].sensor,
@@ -275,9 +291,9 @@ def _show_coverage(
             within_m=within_m,
             slant_deg=slant_deg,
         )
-    if not coverage.seen_m2.any():
+    if not coverage.reachable_m2.any():
         raise LidarError(
-            f"No surface{_of_targets(targets)} is visible from the stations. Check their "
+            f"No surface{_of_targets(targets)} is reachable from the stations. Check their "
             "poses and the unit of the scene."
         )
     figures = _coverage_figures(coverage, built) | {
@@ -286,11 +302,11 @@ def _show_coverage(
         "notes": [*notes, *recording.left_out_notes],
     }
     head = (
-        f"{figures['seen_m2']:,.0f} m²{_of_targets(targets)} are visible from "
+        f"{figures['reachable_m2']:,.0f} m²{_of_targets(targets)} are reachable from "
         f"{plural(len(positions), 'station')}, and {figures['covered']:.1%} of this area is "
         f"within {within_m:g} m of a point"
     )
-    table = _object_lines(built.scene.names, coverage.seen_m2, coverage.covered_m2, "seen")
+    table = _object_lines(built.scene.names, coverage)
     note_lines = map("note: {}".format, recording.left_out_notes)
     options.show(figures, chain([head], table, note_lines), as_json)
 
@@ -306,16 +322,23 @@ def _station_positions(built: Built) -> Floats:
 def _coverage_figures(coverage: SurveyCoverage, built: Built) -> dict[str, Any]:
     """Return the figures of what a cloud covers for --json."""
     names = built.scene.names
-    rows = zip(names, coverage.targets, coverage.seen_m2, coverage.covered_m2, strict=True)
-    seen_m2 = float(coverage.seen_m2.sum())
+    reachable_m2 = float(coverage.reachable_m2.sum())
     return {
-        "seen_m2": seen_m2,
-        "covered": float(coverage.covered_m2.sum()) / seen_m2,
-        "objects": {
-            name: {"seen_m2": float(seen), "covered_m2": float(area)}
-            for name, is_target, seen, area in rows
-            if is_target
-        },
+        "reachable_m2": reachable_m2,
+        "covered": float(coverage.covered_m2.sum()) / reachable_m2,
+        "objects": _object_figures(names, coverage),
+    }
+
+
+def _object_figures(
+    names: Sequence[str], areas: StationPlan | SurveyCoverage
+) -> dict[str, dict[str, float]]:
+    """Return the areas of targets for --json."""
+    kinds = ("area_m2", "reachable_m2", "covered_m2")
+    return {
+        name: {kind: float(getattr(areas, kind)[index]) for kind in kinds}
+        for index, name in enumerate(names)
+        if areas.targets[index]
     }
 
 
@@ -347,14 +370,34 @@ def _of_targets(targets: Sequence[str]) -> str:
 
 def _target_notes(plan: StationPlan, built: Built) -> Iterator[str]:
     """Yield a note if all objects are covered, and one of them has most of the area."""
-    visible_m2 = plan.visible_m2
-    largest = int(visible_m2.argmax())
-    share = float(visible_m2[largest] / visible_m2.sum())
-    if share > _MOST_OF_THE_AREA and (visible_m2 > 0).sum() > 1:
+    reachable_m2 = plan.reachable_m2
+    largest = int(reachable_m2.argmax())
+    share = float(reachable_m2[largest] / reachable_m2.sum())
+    if share > _MOST_OF_THE_AREA and (reachable_m2 > 0).sum() > 1:
         yield (
-            f"{printable(built.scene.names[largest])} accounts for {share:.0%} of the visible "
+            f"{printable(built.scene.names[largest])} accounts for {share:.0%} of the reachable "
             "area, so it largely determines the stations. To cover other objects, select them with "
             "`--target`"
+        )
+
+
+def _unreachable_notes(
+    names: Sequence[str], areas: StationPlan | SurveyCoverage, positions: str
+) -> Iterator[str]:
+    """Yield a note if most of the area of some targets is unreachable from `positions`."""
+    is_unreachable = areas.targets & (areas.reachable_m2 < _LITTLE_OF_THE_AREA * areas.area_m2)
+    order = (-areas.area_m2).argsort(kind="stable")
+    few = [
+        f"{areas.reachable_m2[k]:,.1f} of {areas.area_m2[k]:,.1f} m² of {printable(names[k])}"
+        for k in order[is_unreachable[order]].tolist()
+    ]
+    if few:
+        more = len(few) - _SHOWN_OBJECTS
+        shown = few if more <= 0 else [*few[:_SHOWN_OBJECTS], f"little of {more:,} others"]
+        yield (
+            f"Only {joined(shown)} {'is' if len(few) == 1 else 'are'} reachable from the "
+            f"{positions}, and the coverage does not count the rest. The rest is hidden, out of "
+            "range or outside the field of view, or its angle of incidence exceeds `--slant`"
         )
 
 
@@ -370,8 +413,8 @@ def _shortfalls(plan: StationPlan, count: int | None, coverage: float | None) ->
         )
     if count is not None and len(plan.stations) < count:
         yield (
-            f"{len(plan.stations)} of {count} stations already cover all surfaces that are visible "
-            "from the candidate positions"
+            f"{len(plan.stations)} of {count} stations already cover all surfaces that are "
+            "reachable from the candidate positions"
         )
 
 
@@ -406,7 +449,7 @@ def _stations_scenario(
     }
     head = (
         f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen. "
-        f"They cover {plan.coverage[-1]:.1%} of the\n# visible surface{_of_targets(targets)}. "
+        f"They cover {plan.coverage[-1]:.1%} of the\n# reachable area{_of_targets(targets)}. "
         "Each station scans one revolution in steps of 10 degrees.\n"
     )
     for warning in warnings:
@@ -418,7 +461,6 @@ def _stations_scenario(
 def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]) -> dict[str, Any]:
     """Return the figures of a plan for --json."""
     names = built.scene.names
-    rows = zip(names, plan.targets, plan.visible_m2, plan.covered_m2, strict=True)
     return {
         "sensor": sensor,
         "places": len(plan.candidates),
@@ -427,11 +469,7 @@ def _plan_figures(plan: StationPlan, built: Built, sensor: str, notes: list[str]
             {"position": [round(float(part), 3) for part in position], "coverage": float(share)}
             for position, share in zip(plan.stations, plan.coverage, strict=True)
         ],
-        "objects": {
-            name: {"visible_m2": float(visible), "covered_m2": float(covered)}
-            for name, is_target, visible, covered in rows
-            if is_target
-        },
+        "objects": _object_figures(names, plan),
         "epsg": built.survey.epsg,
         "world_origin": [*built.scenario.world.origin],
         "notes": notes,
@@ -443,8 +481,8 @@ def _plan_lines(plan: StationPlan, built: Built, targets: Sequence[str]) -> Iter
     names = built.scene.names
     yield (
         f"{plural(len(plan.candidates), 'candidate position')} on a grid of "
-        f"{plan.spacing_m:g} m, from which {plan.visible_m2.sum():,.0f} "
-        f"m²{_of_targets(targets)} are visible"
+        f"{plan.spacing_m:g} m, from which {plan.reachable_m2.sum():,.0f} "
+        f"m²{_of_targets(targets)} are reachable (within range, field of view and slant)"
     )
     yield "station        x          y          z   covered     added"
     previous_share = 0.0
@@ -453,27 +491,27 @@ def _plan_lines(plan: StationPlan, built: Built, targets: Sequence[str]) -> Iter
         gain = share - previous_share
         yield f"{number:7} {x:10,.2f} {y:10,.2f} {z:10,.2f} {share:9.1%} {gain:9.1%}"
         previous_share = share
-    yield from _object_lines(names, plan.visible_m2, plan.covered_m2, "visible")
-    blind = int((plan.targets & (plan.visible_m2 == 0)).sum())
+    yield from _object_lines(names, plan)
+    blind = int((plan.targets & (plan.reachable_m2 == 0)).sum())
     if blind:
-        yield f"not visible from any candidate position: {plural(blind, 'object')}"
+        yield f"not reachable from any candidate position: {plural(blind, 'object')}"
     yield from options.world_lines(built.survey.epsg, built.scenario.world.origin)
 
 
-def _object_lines(
-    names: Sequence[str], visible_m2: Floats, covered_m2: Floats, heading: str
-) -> Iterator[str]:
-    """Yield a table of the covered area of objects, the largest uncovered area first."""
-    uncovered_m2 = visible_m2 - covered_m2
-    order = [k for k in (-uncovered_m2).argsort(kind="stable").tolist() if visible_m2[k] > 0]
+def _object_lines(names: Sequence[str], areas: StationPlan | SurveyCoverage) -> Iterator[str]:
+    """Yield a table of the areas of objects, the largest uncovered area first."""
+    uncovered_m2 = areas.reachable_m2 - areas.covered_m2
+    order = (-uncovered_m2).argsort(kind="stable").tolist()
+    order = [k for k in order if areas.reachable_m2[k] > 0]
     shown = order[:_SHOWN_OBJECTS]
     labels = [printable(name) for name in names]  # in full, as --target expects them
     groups = [(labels[k], [k]) for k in shown]
     if further := order[_SHOWN_OBJECTS:]:
         groups.append((f"{len(further):,} others", further))
     width = max(6, *(len(label) for label, _ in groups))
-    yield f"{'object':<{width}} {heading:>12}   covered"
+    yield f"{'object':<{width}} {'area':>12} {'reachable':>12}   covered"
     for label, members in groups:
-        visible = visible_m2[members].sum()
-        covered = covered_m2[members].sum()
-        yield f"{label:<{width}} {visible:9,.1f} m² {covered / visible:9.1%}"
+        area, reachable, covered = (
+            kind[members].sum() for kind in (areas.area_m2, areas.reachable_m2, areas.covered_m2)
+        )
+        yield f"{label:<{width}} {area:9,.1f} m² {reachable:9,.1f} m² {covered / reachable:9.1%}"

@@ -18,6 +18,7 @@ from lidarsim.base.validation import checked
 from lidarsim.base.words import name_hint
 from lidarsim.media.materials import rows_named
 from lidarsim.scene.scene import Scene
+from lidarsim.scene.scene_mesh import triangle_areas
 from lidarsim.scene.simplified import SimplifiedScene
 from lidarsim.sensor import Sensor, Spin
 from raybeam import RayCaster
@@ -25,7 +26,7 @@ from raybeam import RayCaster
 from ..base.neighbors import nearest
 
 MAX_STATIONS = 100
-MIN_GAIN = 0.01  # share of the visible area that each adds, if no number or coverage is given
+MIN_GAIN = 0.01  # share of the reachable area that each adds, if no number or coverage is given
 _CANDIDATES = 600  # about this number, in a scene without obstacles
 _MAX_CANDIDATES = 50_000
 _MIN_SPACING_M = 0.5
@@ -107,7 +108,8 @@ def sensor_elevations(sensor: Sensor) -> tuple[float, float]:
 class StationPlan:
     """Stations in the order of their choice, and the area that they cover.
 
-    Coverage is by area, of the sides of surfaces of the targets that at least one candidate sees.
+    Coverage is the share of the reachable area: the sides of surfaces of the targets that at least
+    one candidate sees, within the range, the field of view and the angle of incidence.
     """
 
     stations: Floats  # (s, 3) world meters
@@ -115,7 +117,8 @@ class StationPlan:
     candidates: Floats  # (c, 3) world meters
     spacing_m: float  # spacing of the candidates
     targets: Bools  # (objects,) whether an object is to be covered; other objects only occlude
-    visible_m2: Floats  # (objects,) area of targets that candidates see
+    area_m2: Floats  # (objects,) area of targets; twice this is reachable if both sides are
+    reachable_m2: Floats  # (objects,) area of targets that candidates see
     covered_m2: Floats  # (objects,) area of targets that the stations see
     scene: Scene  # the planned scene: all triangles, without instances and actors
     sight: Sight
@@ -129,7 +132,8 @@ class SurveyCoverage:
     """
 
     targets: Bools  # (objects,) whether the area of an object counts
-    seen_m2: Floats  # (objects,) area that the stations see
+    area_m2: Floats  # (objects,) area of targets; twice this is reachable if both sides are
+    reachable_m2: Floats  # (objects,) area that the stations see
     covered_m2: Floats  # (objects,) area of that with a point of the cloud nearby
 
 
@@ -182,7 +186,7 @@ def plan_stations(
     >>> from lidarpool import Sensor, box
     >>> room = Scene.from_meshes([box("Room", (8, 6, 3))])
     >>> plan = plan_stations(room, Sensor.grid(vertical_fov_deg=180), slant_deg=90)
-    >>> len(plan.stations), plan.visible_m2.round().tolist()
+    >>> len(plan.stations), plan.reachable_m2.round().tolist()
     (1, [180.0])
     """
     if count is not None and coverage is not None:
@@ -196,7 +200,7 @@ def plan_stations(
     visibility = _visibility(_sample_surfaces(scene, is_target), sight, positions)
     if not len(visibility.area_m2):
         raise LidarError(
-            f"{'No target' if targets else 'Nothing'} is visible from the {len(positions):,} "
+            f"{'No target' if targets else 'Nothing'} is reachable from the {len(positions):,} "
             f"candidate positions at a height of {height_m:g} m. Check the unit of the scene, "
             "the range of the sensor and the slant."
         )
@@ -211,7 +215,8 @@ def plan_stations(
         candidates=positions + scene.origin,
         spacing_m=spacing_m,
         targets=is_target,
-        visible_m2=np.bincount(owner, visibility.area_m2, objects).astype(np.float64),
+        area_m2=_object_areas(scene, is_target),
+        reachable_m2=np.bincount(owner, visibility.area_m2, objects).astype(np.float64),
         covered_m2=np.bincount(owner, covered_m2, objects).astype(np.float64),
         scene=scene,
         sight=sight,
@@ -261,7 +266,7 @@ def survey_coverage(
     >>> found = survey_coverage(
     ...     room, Sensor.grid(vertical_fov_deg=180), np.array([[0, 0, 1.5]]), [floor], slant_deg=90
     ... )
-    >>> found.seen_m2.round().tolist(), bool(48 <= found.covered_m2[0] < 54)
+    >>> found.reachable_m2.round().tolist(), bool(48 <= found.covered_m2[0] < 54)
     ([180.0], True)
     """
     is_target = _target_mask(scene.names, targets)
@@ -277,12 +282,13 @@ def survey_coverage(
     sides = np.stack(
         [sight.sides(p, samples.points, samples.normals) for p in positions - scene.origin]
     )
-    seen_m2 = samples.area_m2 * ((sides > 0).any(axis=0) + (sides < 0).any(axis=0).astype(int))
+    reachable_m2 = samples.area_m2 * ((sides > 0).any(axis=0) + (sides < 0).any(axis=0).astype(int))
     objects = len(scene.names)
     return SurveyCoverage(
         is_target,
-        np.bincount(samples.owner, seen_m2, objects).astype(np.float64),
-        np.bincount(samples.owner, seen_m2 * has_point, objects).astype(np.float64),
+        _object_areas(scene, is_target),
+        np.bincount(samples.owner, reachable_m2, objects).astype(np.float64),
+        np.bincount(samples.owner, reachable_m2 * has_point, objects).astype(np.float64),
     )
 
 
@@ -488,6 +494,12 @@ def _free_positions(scene: Scene, caster: RayCaster, positions: Floats) -> Ints:
     counts = np.bincount(inside + 1, minlength=len(scene.names) + 1)
     counts[0] = len(positions)
     return np.flatnonzero(free & (counts[inside + 1] > len(positions) / 2))
+
+
+def _object_areas(scene: Scene, is_target: Bools) -> Floats:
+    """Return the areas of the objects (n,), 0 for those that are no targets."""
+    areas = triangle_areas(scene.vertices[scene.faces])
+    return np.where(is_target, np.bincount(scene.face_object, areas, len(scene.names)), 0.0)
 
 
 class _SurfaceSamples(NamedTuple):

@@ -154,11 +154,15 @@ def explained(failure: str, advice: str = "") -> Iterator[None]:
 def converted(failure: str) -> Iterator[None]:
     """Turn an error of any class in the body into a LidarError: the failure, and the reason.
 
-    For files that users give, whose readers and libraries raise errors of many classes.
+    For files that users give, whose readers and libraries raise errors of many classes. If the file
+    that the failure names does not exist, the error says only that.
     """
     try:
         yield
     except Exception as error:
+        missing = str(error.filename) if isinstance(error, FileNotFoundError) else ""
+        if missing and missing in failure:
+            raise MissingFileError(f"{missing} does not exist.") from error
         reason = (
             message_of(error).rstrip(".") if isinstance(error, LidarError) else reason_of(error)
         )
