@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 import pye57
 import pytest
+import yaml
 from laspy.header import GpsTimeType
 from pypcd4.pypcd4 import PointCloud
 from rosbags.highlevel import AnyReader
@@ -528,13 +529,24 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
 ):
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
     with pytest.raises(
-        LidarError, match=r"kitti requires the columns reflectivity and class, which.*output\.write"
+        LidarError,
+        match=r"kitti requires the columns reflectivity and class, which.*`output: \{write: "
+        r"\[kitti\]\}`, or add reflectivity and class",
     ):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
     with pytest.raises(
         LidarError, match="mcap with the layout ouster requires the columns signal, time"
     ):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
+    for organized in (
+        Format("rosbag2", "robosense", organized=True),
+        Format("mcap", organized=True),
+        Format("pcd", compensated_actors=True),
+    ):
+        with pytest.raises(LidarError) as refused:
+            organized.check_columns(bare)
+        [entry] = re.findall(r"again with `output: (.*?)`, or add", str(refused.value))
+        assert Format.from_entry(yaml.safe_load(entry)["write"][0]) == organized
     (tmp_path / "cloud.laz").write_text("mine")
     with pytest.raises(LidarError, match=r"exists.* `--overwrite`"):
         Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)

@@ -96,16 +96,29 @@ def test_the_scenario_of_the_page_labels_its_points():
 
 
 @pytest.mark.parametrize(
-    ("materials", "notes"),
+    ("materials", "note"),
     [
-        ([], ["KITTI labels points by class, but all points have class 0. Set `class` in "]),
-        ([{"objects": "*", "class": 4}], []),
+        ([], "no object has a class, so all points have class 0. Set `class` in `materials`, "),
+        ([{"objects": "*", "class": 4}], ""),
+        (
+            [{"objects": ["Vase", "Cart"], "class": 4}, {"objects": "*"}],
+            "5 of 6 static objects have no class, so their points have class 0: ",
+        ),
+        (
+            [{"objects": "Cart", "class": 4}, {"objects": "*"}],
+            "6 of 6 static objects have no class, so their points have class 0: ",
+        ),
     ],
 )
-def test_labeled_formats_without_classes_are_noted(materials, notes):
-    data = {"scene": "seed", "output": {"write": ["kitti", "las"]}, "materials": materials}
-    told = [note for note in advice(build(Scenario.from_data(data))) if "class" in note]
-    assert len(told) == len(notes) and all(map(str.startswith, told, notes))
+@pytest.mark.parametrize(
+    "stored", [{"output": {"write": ["kitti", "las"]}}, {"cloud": {"columns": ["class"]}}, {}]
+)
+def test_classes_of_points_without_classes_of_objects_are_noted(materials, note, stored):
+    cart = {"name": "Cart", "box": [1, 1, 1], "at": [4, 0, 0.5]}
+    data = {"scene": "seed", "poses": [[0, 0, 1]], "actors": [cart], "materials": materials}
+    told = [one for one in advice(build(Scenario.from_data(data | stored))) if "class" in one]
+    assert len(told) == bool(note and stored)
+    assert all(one.startswith(f"points are labeled by class, but {note}") for one in told)
 
 
 def test_the_note_on_classes_without_names_says_what_to_give():

@@ -23,7 +23,7 @@ from ..run.forecast import forecast
 from ..run.job_source import fields_of, identity_of
 from ..run.options import RunOptions
 from ..run.pipeline.stage_names import GPU
-from ..scenario.advice import advice
+from ..scenario.advice import advice, unlabeled
 from ..scenario.build import Job, build
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import is_campaign
@@ -86,7 +86,8 @@ def forecast_scenario(
             file_format = campaign.keep.of_jobs
             figures["notes"] += file_format.contradictions(scenario.cloud.coordinates)
             figures["notes"] += file_format.renamed([*scenario.sensors])
-            figures["notes"] += file_format.unlabeled(job.survey)
+            if "class" in file_format.needs:
+                figures["notes"] += unlabeled(job.scene, job.survey)
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 
@@ -110,7 +111,8 @@ def _campaign_figures(
     warnings: list[str] = []
     errors: list[tuple[str, str]] = []  # name of a job, and an error
     last = campaign.count - 1
-    for job_number in dict.fromkeys(last * i // (FORECAST_JOBS - 1) for i in range(FORECAST_JOBS)):
+    numbers = dict.fromkeys(last * i // (FORECAST_JOBS - 1) for i in range(FORECAST_JOBS))
+    for job_number in numbers:
         name = campaign.name(job_number)
         try:
             figures = forecast_job(job_number)
@@ -128,6 +130,8 @@ def _campaign_figures(
         "notes": list(dict.fromkeys(notes)),
         "warnings": list(dict.fromkeys(warnings)),
         "count": campaign.count,
+        "checked": len(numbers),
+        "failed": [*dict.fromkeys(name for name, _ in errors)],
         "seed": campaign.seed,
         "choices": dict(campaign.choices),
         "splits": dict(campaign.splits),
@@ -170,6 +174,7 @@ def _campaign_lines(campaign: CampaignSpec, figures: dict[str, Any]) -> Iterator
     if campaign.splits:
         shares = ", ".join(f"{name} {share:.4g}" for name, share in campaign.splits.items())
         yield f"splits      {shares}"
+    yield f"checked     {figures['checked']:,} of {plural(campaign.count, 'job')}"
     for job in figures["jobs"]:
         yield f"job         {_in_words(job)}"
         points = ""
@@ -205,6 +210,7 @@ def _remarks(figures: dict[str, Any]) -> Iterator[str]:
 def _in_words(job: dict[str, Any]) -> str:
     """Return name, split and values of a job."""
     shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in job["values"].items()}
+    shown = {k: "none" if v is None else v for k, v in shown.items()}
     values = ", ".join(f"{name} {value}" for name, value in shown.items())
     split = f" ({job['split']})" if job["split"] else ""
     return f"{job['name']}{split}{': ' if values else ''}{values}"
@@ -263,7 +269,7 @@ def _drive_lines(drive: dict[str, Any]) -> Iterator[str]:
     lines = drive["lines"]
     of_lines = ""
     if lines:
-        of_lines = f"; {plural(lines['count'], 'flight line')}, "
+        of_lines = f"; {plural(lines['count'], 'scanned flight line')}, "
         of_lines += f"{lines['length_m']:,.0f} m in {lines['seconds']:,.1f} s"
     yield f"trajectory  {drive['meters']:,.2f} m in {drive['seconds']:,.3f} s{of_lines}"
     for sensor in drive["sensors"]:

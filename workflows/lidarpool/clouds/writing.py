@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +18,6 @@ from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
 from lidarsim.base.words import alternatives, joined
 from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
@@ -32,6 +31,9 @@ from .pieces import RangeWorkers, RangeWriter
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = ", ".join(f"{name} ({FORMATS[name].file})" for name in EXPORTS)
+# Columns of every cloud that users miss, and columns that store the strength of a return.
+_ALWAYS = ("channel", "object")
+_STRENGTHS = {"intensity", "reflectivity", "signal"}
 _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # schema for editors
 
 
@@ -191,12 +193,24 @@ class Format:
             return [name for name in names if name == "time" and self.compensated]
         return [name for name in names if name not in held_columns + optional_columns]
 
-    def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
-        """Return notes for the user on the cloud in this format."""
-        left_out = self.left_out(cloud, sweeps)
+    def notes(
+        self, cloud: CloudLike, sweeps: Sweeps, requested: Collection[str] | None = None
+    ) -> list[str]:
+        """Return notes for the user on the cloud in this format.
+
+        `requested` are the columns that the user asked for, if they are known. Columns that are
+        there for other formats are not missed.
+        """
+        left_out = [
+            name for name in self.left_out(cloud, sweeps) if self._is_missed(name, requested)
+        ]
         unnamed = [name for name in left_out if name in self.row.named]
-        never_held = ", ".join(name for name in left_out if name not in unnamed)
+        strengths = [name for name in self.needs if name in _STRENGTHS]
+        replaced = [name for name in left_out if strengths and name in _STRENGTHS]
+        never_held = ", ".join(name for name in left_out if name not in unnamed + replaced)
         notes = [f"{self.title} cannot store {never_held}"] if never_held else []
+        if replaced:
+            notes.append(f"{self.title} stores {joined(strengths)} instead of {joined(replaced)}")
         notes += [
             (
                 f"{self.title} can store {name} only if classes have names. Set `classes: {{1: "
@@ -206,19 +220,13 @@ class Format:
         ]
         return [*notes, *self.contradictions(sweeps.coordinates), *self.renamed(sweeps.sensors)]
 
-    def unlabeled(self, survey: Survey) -> list[str]:
-        """Return a note if the format labels points by class, and nothing in a survey has one."""
-        if "class" not in self.row.needs:
-            return []
-        if any(material.semantic_class for material in survey.materials):
-            return []
-        return [
-            (
-                f"{self.title} labels points by class, but all points have class 0. Set `class` "
-                "in `materials`, `copies`, `actors` or `traffic`, and name the classes in "
-                "`classes`; see docs/how-to/labels.md"
-            )
-        ]
+    def _is_missed(self, name: str, requested: Collection[str] | None) -> bool:
+        """Return whether a user misses a column that the format cannot hold."""
+        if name in ("scan", "sensor"):  # sweeps and sensors are separate files, scans or topics
+            return False
+        if requested is not None:
+            return name in (*_ALWAYS, "class") or name in requested
+        return name != "ray" and name not in _STRENGTHS
 
     def renamed(self, sensors: Sequence[str]) -> list[str]:
         """Return a note if sensors of these names, "" without one, have others in the format."""
@@ -285,13 +293,27 @@ class Format:
         cloud_columns = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in cloud_columns]:
             laid_out = f" with the layout {self.layout}" if self.row.layouts else ""
+            entry = f"`output: {{write: [{self._entry}]}}`"
             lacks = joined(missing)
             columns = "column" if len(missing) == 1 else "columns"
             raise LidarError(
                 f"The format {self.format}{laid_out} requires the {columns} {lacks}, which the "
-                f"cloud does not contain. Run the survey again with {self.format} in "
-                f"`output.write`, or add {lacks} to `cloud.columns`."
+                f"cloud does not contain. Run the survey again with {entry}, or add {lacks} to "
+                "`cloud.columns`."
             )
+
+    @property
+    def _entry(self) -> str:
+        """The entry of `output.write` with the columns of the format, as YAML."""
+        options = {
+            "layout": self.layout if self.row.layouts and self.layout != "velodyne" else "",
+            "organized": self.organized,
+            "compensated": self.compensated,
+            "compensated_actors": self.compensated_actors,
+        }
+        set_options = {name: value for name, value in options.items() if value}
+        words = [f"{name}: {str(value).lower()}" for name, value in set_options.items()]
+        return f"{{{', '.join([f'format: {self.format}', *words])}}}" if words else self.format
 
     def write(
         self,

@@ -76,6 +76,11 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         """True if the page, which shows the points from above, is written."""
         return self.extent != "cloud"
 
+    @property
+    def _requested(self) -> Sequence[str]:
+        """Columns that the user asked for, without those that only formats need."""
+        return self.survey.columns if self.scenario is None else self.scenario.cloud.columns
+
     @contextmanager
     def held(self) -> Iterator[None]:
         """Lock the folder while the body runs."""
@@ -227,7 +232,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 result = workers.recorded(result)
             report = make_report(result, counts)
             for output_format in self.formats:
-                report["notes"] += output_format.notes(result.points, sweeps)
+                report["notes"] += output_format.notes(result.points, sweeps, self._requested)
             if full_scales:
                 report["intensity_full_scale"] = full_scales
             if self._has_page:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from itertools import chain
@@ -17,6 +18,7 @@ from lidarsim.motion.headings import CORNER_M
 from lidarsim.motion.trajectory import Track, presence_ns
 from lidarsim.scene.files.mesh_formats import format_of
 from lidarsim.scene.files.meshfile import written_by_lidarpool
+from lidarsim.scene.scene import Scene
 from lidarsim.sensor.optics import TWO_RETURNS
 from lidarsim.simulator.steps.particles import WeatherStep
 from lidarsim.simulator.steps.step_list import setup_of
@@ -24,7 +26,8 @@ from lidarsim.survey.survey import START_FROM, Survey
 
 from ..clouds.laser_scan import has_planar_sensors
 from .build import Built
-from .scenario import Scenario
+from .georeference import missing_system
+from .scenario import Scenario, survey_of
 
 # Sizes of scenes in meters are between these. An .stl is mostly a part, in millimeters; an object
 # seen from outside is rarely longer than a bus. glTF is in meters, and some exporters write
@@ -47,14 +50,16 @@ def advice(built: Built) -> list[str]:
     """
     notes = built.findings.notes
     remarks = built.findings.remarks
-    axes = [f"{remark} (for a mesh file, `--up-axis AXIS`)" for remark in remarks[:1]]
+    axes = [_for_mesh(remark) if _is_of_mesh(built.scenario) else remark for remark in remarks[:1]]
     if others := len(remarks[1:]):
         axes = [f"{axes[0]}. The same applies to {plural(others, 'other file')}"]
     side = float(np.ptp(built.scene.bounds, axis=0).max())
     step = built.survey.precision_m
     every = built.survey.keep_every
     placed = "" if built.placing is None else built.placing.note
-    likely = filter(None, (_size_note(built, side), placed, _color_note(built)))
+    scene = built.scene.georeferenced(built.scenario.world.origin)
+    system = missing_system(scene, built.survey.epsg)
+    likely = filter(None, (_size_note(built, side), system, placed, _color_note(built)))
     scanners = [
         "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
         "`cloud.keep_every: 1`"
@@ -63,10 +68,9 @@ def advice(built: Built) -> list[str]:
         f"points are rounded to {step:g} m, but the scene is only {side:.3g} m long. Set a smaller "
         "`cloud.precision_m` in a scenario"
     ] * (side < MIN_STEPS * step)
-    unlabeled = [
-        note for entry in built.scenario.output.write for note in entry.unlabeled(built.survey)
-    ]
-    labels = (*unlabeled, *_unnamed_classes(built.survey))
+    labels = _unnamed_classes(built.survey)
+    if any(column.name == "class" for column in built.survey.stored_columns):
+        labels = chain(unlabeled(built.scene, built.survey), labels)
     settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
     light = (*_single_returns(built), *_dark_fog(built.survey))
     groups = (
@@ -74,6 +78,45 @@ def advice(built: Built) -> list[str]:
         *(settings, light, _timing_notes(built)),
     )
     return [as_scenario(line) for line in chain.from_iterable(groups)]
+
+
+def unlabeled(scene: Scene, survey: Survey) -> list[str]:
+    """Return a note on static objects without a class, for a cloud with the classes of points."""
+    kinds = scene.surface_kinds
+    table = MaterialTable.build(survey.materials, kinds, voxels=scene.has_voxels)
+    has_class = np.zeros(len(scene.object_names), np.bool_)
+    has_class[kinds.object[table.semantic_class > 0]] = True
+    if not has_class.any():
+        return [
+            (
+                "points are labeled by class, but no object has a class, so all points have class "
+                "0. Set `class` in `materials`, `copies`, `actors` or `traffic`, and name the "
+                "classes in `classes`; see docs/how-to/labels.md"
+            )
+        ]
+    without = [name for name, known in zip(scene.names, has_class, strict=False) if not known]
+    if not without:
+        return []
+    return [
+        (
+            f"points are labeled by class, but {len(without):,} of "
+            f"{plural(len(scene.names), 'static object')} have no class, so their points have "
+            f"class 0: {listed(without, 3)}. Set `class` in `materials`; see docs/how-to/labels.md"
+        )
+    ]
+
+
+def _is_of_mesh(scenario: Scenario) -> bool:
+    """Return whether a mesh file was passed in place of a scenario."""
+    files = [scenario.path(entry.file) for entry in scenario.scene.files]
+    return scenario.source in map(survey_of, files)
+
+
+def _for_mesh(remark: str) -> str:
+    """Return a remark on axes with the option of the command line in place of the field."""
+    return re.sub(r'<file\.up_axis="(\w)">', r"`--up-axis \1`", remark).replace(
+        "set up_axis explicitly", "pass `--up-axis` explicitly"
+    )
 
 
 def _unnamed_classes(survey: Survey) -> Iterator[str]:
