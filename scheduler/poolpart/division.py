@@ -141,7 +141,7 @@ async def declare(
     for name, rule in rules.items():
         steward.enter(name, rule)
         for worker in chosen[name]:
-            steward.put(seats[worker.address], name, rule.slots_of(worker))
+            steward.assign(seats[worker.address], name, rule.slots_of(worker))
     await features_settled()  # before the members get tasks, which lend slots
     members = [seats[worker.address] for group in chosen.values() for worker in group]
     await _expect_arrival(steward, members)
@@ -171,7 +171,7 @@ def _exists(steward: Steward, name: str, members: Sequence[Seat]) -> str:
         f"The rule does not select all workers that were started with the resource {name!r}. "
         f"Workers that are not selected: {names_of(members)}. {use}, pass a rule that "
         "selects all of these workers, such as `rest()`, or choose another name. A partition with "
-        f"another name and `minimum=0` can take workers from {name!r}, for example with "
+        f"another name and the rule `n_workers(1, minimum=0)` can take workers from {name!r} with "
         f"`partition.resize(1, source={name!r})`."
     )
 
@@ -218,7 +218,8 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
 # -- moving workers --------------------------------------------------------------------
 #
 # A worker that leaves gets no new tasks of its partition; waiting tasks go to other members,
-# running tasks end there; then it declares its new resources.
+# running tasks end there; then it declares its new resources. Borrowed workers, whose home is
+# another partition, leave first.
 
 
 async def grow(
@@ -227,15 +228,15 @@ async def grow(
     """Move workers into a partition and return their names."""
     check_count(_MOVES, count)
     steward.adopt(name)
-    return await _move(steward, _joining(steward, name, count, source), name, timeout_s)
+    joining = _joining(steward, name, count, source)
+    return await _move(steward, dict.fromkeys(joining, name), timeout_s)
 
 
 async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
     """Move workers out of a partition and return their names."""
     check_count(_MOVES, count)
     steward.adopt(name)
-    leaving = _leaving(steward, name, count)
-    return await _move(steward, leaving, _destination(steward, name), timeout_s)
+    return await _move(steward, _leaving(steward, name, count), timeout_s)
 
 
 async def resize(
@@ -251,17 +252,15 @@ async def resize(
             f"minimum is {rule.minimum}."
         )
     size = len(steward.members(name))  # includes members that are starting again
-    moving: list[Seat] = []
-    target: str | None = name
+    targets: dict[Seat, str | None] = {}
     if count > size:
-        moving = _joining(steward, name, count - size, source)
+        targets = dict.fromkeys(_joining(steward, name, count - size, source), name)
     elif count < size:
-        moving = _leaving(steward, name, size - count)
-        target = _destination(steward, name)
+        targets = _leaving(steward, name, size - count)
     # After a loss, the rule may ask for more workers than there are. Moving adds the difference.
     steward.resize(name, size - _asked(rule, size))
     try:
-        return await _move(steward, moving, target, timeout_s)
+        return await _move(steward, targets, timeout_s)
     finally:
         if name in steward.rules:
             minimum = min(rule.minimum, _asked(steward.rules[name], rule.minimum))
@@ -289,7 +288,8 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
     spare = [] if source else [seat for seat in steward.free() if steward.settled(seat)]
     if donor is not None and donor != name:
         members = _settled_members(steward, donor)
-        spare += members[: max(0, len(members) - steward.rules[donor].minimum)]
+        spared = max(0, len(members) - steward.rules[donor].minimum)
+        spare += _in_order(steward, members, name)[:spared]
     if len(spare) < count:
         available = f"only {workers_in_words(len(spare))}" if spare else "no workers"
         if source:
@@ -302,11 +302,11 @@ def _joining(steward: Steward, name: str, count: int, source: str | None) -> lis
             f"Partition {name!r} cannot grow by {workers_in_words(count)}, because {reason}. "
             f"Start more workers, or {advice}."
         )
-    return _by_load(steward, spare)[:count]
+    return _in_order(steward, spare, name)[:count]
 
 
-def _leaving(steward: Steward, name: str, count: int) -> list[Seat]:
-    """Return the seats of workers that can leave a partition.
+def _leaving(steward: Steward, name: str, count: int) -> dict[Seat, str | None]:
+    """Return the seats of workers that can leave a partition, with their destinations.
 
     Raises PoolError if fewer than its minimum would be left.
     """
@@ -317,31 +317,39 @@ def _leaving(steward: Steward, name: str, count: int) -> list[Seat]:
             f"Partition {name!r} cannot shrink by {workers_in_words(count)}, because it has "
             f"{workers_in_words(len(members))} and its minimum is {minimum}."
         )
-    return members[:count]
+    leaving = _in_order(steward, members)[:count]
+    return {seat: _destination(steward, seat) for seat in leaving}
 
 
-def _destination(steward: Steward, name: str) -> str | None:
-    """Return the partition of workers that leave a partition, or None for no partition."""
-    target = steward.remainder()
-    return None if target == name else target
+def _destination(steward: Steward, seat: Seat) -> str | None:
+    """Return the partition of a worker that leaves its partition, or None for no partition.
+
+    A borrowed worker returns to its home, and other workers go to the partition with the rule
+    `rest`. Workers that leave this partition are in none.
+    """
+    if seat.partition == (remainder := steward.remainder()):
+        return None
+    home = steward.home(seat)
+    return remainder if home == seat.partition else home or remainder
 
 
 async def _move(
-    steward: Steward, seats: Sequence[Seat], target: str | None, timeout_s: float
+    steward: Steward, targets: Mapping[Seat, str | None], timeout_s: float
 ) -> list[str]:
-    """Move workers to a partition, or out of all partitions if `target` is None.
+    """Move workers to partitions, or out of all partitions if the target is None.
 
     Returns the names of the workers. Raises PoolError if tasks of a worker do not end in time. Such
     a worker stays where it is.
     """
-    origins = {seat: (seat.partition, seat.slots) for seat in seats}
-    for seat in seats:
+    origins = {seat: (seat.partition, seat.slots) for seat in targets}
+    for seat, target in targets.items():
         steward.resize(seat.partition, -1)
         steward.resize(target, 1)
         steward.put(seat, target)
-    late = await steward.arrive(seats, timeout_s)
+    late = await steward.arrive(targets, timeout_s)
     for seat in late:
         origin, slots = origins[seat]
+        target = targets[seat]
         if seat.partition != target or (origin and origin not in steward.rules):
             continue  # another client has moved it, or dissolved its partition
         steward.resize(target, -1)
@@ -350,32 +358,38 @@ async def _move(
     if late:
         await steward.arrive(late, _STAY_S)  # so that they can be moved again at once
         raise PoolError(
-            f"{len(late)} of {workers_in_words(len(seats))} could not be moved within "
+            f"{len(late)} of {workers_in_words(len(targets))} could not be moved within "
             f"{timeout_s:g} s. A worker is not moved while it runs tasks or does not respond. "
             f"These workers stay in their partition: {names_of(late)}. Wait for their tasks, or "
             "pass a longer `timeout_s`."
         )
-    return [seat.info.name for seat in seats if not seat.removed]
+    return [seat.info.name for seat in targets if not seat.removed]
 
 
 def _settled_members(steward: Steward, name: str) -> list[Seat]:
-    """Return the members that may be moved, by load.
+    """Return the members that may be moved.
 
     Members that are just arriving do not count: they may return to their former partition.
     """
-    members = [seat for seat in steward.members(name) if steward.settled(seat)]
-    return _by_load(steward, members)
+    return [seat for seat in steward.members(name) if steward.settled(seat)]
 
 
-def _by_load(steward: Steward, seats: Sequence[Seat]) -> list[Seat]:
-    """Sort seats by the load of their workers, and put workers with long-running tasks last."""
+def _in_order(
+    steward: Steward, seats: Sequence[Seat], destination: str | None = None
+) -> list[Seat]:
+    """Sort seats by the order in which their workers are moved to a destination.
 
-    def load(seat: Seat) -> tuple[int, int]:
-        """Return the numbers of long-running tasks and of all tasks of a worker."""
+    Workers whose home is the destination come first, then workers without a partition and borrowed
+    workers. Among these, the least busy workers come first, and those with long-running tasks last.
+    """
+
+    def order(seat: Seat) -> tuple[bool, bool, int, int]:
         worker = steward.scheduler.workers[seat.info.address]
-        return len(worker.long_running), len(worker.processing)
+        is_home = seat.partition is not None and steward.home(seat) == seat.partition
+        returns = destination is not None and steward.home(seat) == destination
+        return not returns, is_home, len(worker.long_running), len(worker.processing)
 
-    return sorted(seats, key=load)
+    return sorted(seats, key=order)
 
 
 # -- dissolving partitions ------------------------------------------------------------------------
@@ -406,6 +420,9 @@ async def dissolve(
     seats = [seat for seat in steward.seats.values() if _belongs(seat, dissolved)]
     for name in dissolved:
         del steward.rules[name]
+        for seat in steward.seats.values():
+            if seat.home == name:  # also if another partition has borrowed the worker
+                seat.home = None
         # At once, even if the client dies or workers do not answer.
         lower(scheduler, name)
     release(scheduler, dissolved, client_id, had_rule=True)
@@ -416,7 +433,9 @@ async def dissolve(
             feature.end_all(scheduler)
         release_statistics(scheduler)
     for seat in seats:
-        steward.put(seat, None)
+        home = steward.home(seat)
+        steward.resize(home, 1)
+        steward.assign(seat, home)
     lift_restrictions(scheduler, dissolved)  # lost results are recomputed on any worker
     await features_settled()  # then tasks lend no more
     # An absent worker comes back as it was started.

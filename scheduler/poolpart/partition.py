@@ -648,6 +648,10 @@ class Partition:
         `n_workers`, the number in the rule increases accordingly. To restore the former size after
         a worker was lost, use `resize`.
 
+        Workers that were started in this partition, or that its rule has selected, are moved first.
+        They are followed by workers that the source has borrowed from other partitions, and then by
+        the workers with the lowest load.
+
         Parameters
         ----------
         workers
@@ -721,14 +725,17 @@ class Partition:
     def shrink(self, workers: int = 1, *, timeout_s: float = 60.0) -> list[str]:
         """Move workers out of this partition while tasks run, and return their names.
 
-        The workers with the lowest load are moved to the partition with the rule `rest`. If no
-        partition has this rule, they no longer belong to any partition. They first finish their
-        tasks, as described for `grow`.
+        Workers that this partition has borrowed leave first, and return to the partition that they
+        were started in or that a rule has selected them for. Further workers, those with the lowest
+        load first, are moved to the partition with the rule `rest`. If no other partition has this
+        rule, they no longer belong to any partition. All workers first finish their tasks, as
+        described for `grow`.
 
         Raises
         ------
         PoolError
-            If fewer workers than the minimum would remain, or if tasks do not finish in time.
+            If fewer workers than the minimum would remain, or if tasks do not finish in time. The
+            minimum is 0 for a partition that workers were started with.
 
         Examples
         --------
@@ -799,7 +806,11 @@ class Partition:
         return bool(on_scheduler(self.client, want, name=self.name, **asking))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
-        """Dissolve this partition, in the same way as `Pool.dissolve` dissolves all partitions."""
+        """Dissolve this partition, in the same way as `Pool.dissolve` dissolves all partitions.
+
+        Workers that this partition has borrowed return to the partition that they were started in
+        or that a rule has selected them for. Other workers declare their original resources again.
+        """
         ask_to_dissolve(self.client, [self.name], timeout_s)
 
 

@@ -56,6 +56,9 @@ class Seat:
     declared: Resources = field(default_factory=dict)  # resources at the worker's last reply
     is_declaring: bool = False  # a request to declare resources is under way
     partition: str | None = None
+    # Partition that the worker was started in or that a rule chose for it. Moving a worker does not
+    # change its home: another partition has only borrowed it.
+    home: str | None = None
     slots: float = 0  # slots for the partition
     # It joined after the division, and the rules are to choose its partition: for the first time,
     # or again if it is in the remainder.
@@ -116,6 +119,16 @@ class Steward(SchedulerPlugin):
         original = {r: slots for r, slots in seat.original.items() if r not in self._names}
         return {**original, seat.partition: seat.slots}
 
+    def home(self, seat: Seat) -> str | None:
+        """Return the existing partition that a worker goes back to, or None."""
+        started_in = (name for name, slots in seat.original.items() if slots)
+        return next((name for name in (seat.home, *started_in) if name in self.rules), None)
+
+    def assign(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
+        """Put a worker into the partition that is its home from now on."""
+        seat.home = name
+        self.put(seat, name, slots)
+
     def put(self, seat: Seat, name: str | None, slots: float | None = None) -> None:
         """Record the partition of a worker or, with None, that the worker is in no partition.
 
@@ -158,7 +171,7 @@ class Steward(SchedulerPlugin):
             )
         self.enter(name, Rule(minimum=0))
         for seat in members:
-            self.put(seat, name, seat.original[name])
+            self.assign(seat, name, seat.original[name])
 
     def resize(self, name: str | None, change: int) -> None:
         """Change the number of workers that the rule `n_workers` of a partition asks for.
@@ -196,7 +209,7 @@ class Steward(SchedulerPlugin):
         if seat.key in former_keys:
             expect(scheduler, scheduler.workers[worker], seat.partition)
         elif declared:
-            self.put(seat, declared[0], seat.original[declared[0]])
+            self.assign(seat, declared[0], seat.original[declared[0]])
         else:
             seat.unplaced = not any(seat.original.values())
         self.settle([seat])
@@ -260,7 +273,7 @@ class Steward(SchedulerPlugin):
         groups = {name: [member.info for member in self.members(name)] for name in self.rules}
         name = partition_for(seat.info, self.rules, groups)
         if moves := name not in (None, seat.partition):
-            self.put(seat, name)
+            self.assign(seat, name)
             seat.by_rule = True
         seat.unplaced = name is None
         return moves

@@ -136,6 +136,43 @@ def test_one_partition(start):
     assert known(client) == before
 
 
+def test_borrowed_workers_return_when_their_partition_is_dissolved(start):
+    workers = {**{f"lidar-{i}": {"resources": {"LIDAR": 2}} for i in range(2)}, "a": {}, "b": {}}
+    client = start(workers)
+    before = known(client)
+    pool = Pool.from_client(client)
+    plan = pool.divide({"PLAN": n_workers(1, minimum=0)})["PLAN"]
+    made = declared(client)
+    assert len(plan.resize(3, source="LIDAR")) == 2
+    plan.dissolve()
+    assert declared(client) == {"lidar-0": {"LIDAR": 2}, "lidar-1": {"LIDAR": 2}, "a": {}, "b": {}}
+    parts = pool.divide({"A": named("a"), "PLAN": n_workers(1)})
+    parts["PLAN"].grow(1, source="LIDAR")
+    parts["A"].grow(1, source="LIDAR")
+    assert len(pool["LIDAR"]) == 0
+    pool["LIDAR"].dissolve()  # its workers stay where they are
+    assert (len(parts["A"]), len(parts["PLAN"])) == (2, 2)
+    parts["PLAN"].dissolve()
+    parts["A"].dissolve()
+    assert declared(client) == {**made, "a": {}, "b": {}}
+    assert known(client) == before
+
+
+def test_workers_return_to_the_partition_that_a_rule_selected_them_for(start):
+    client = start({name: {} for name in "abc"})
+    parts = Pool.from_client(client).divide(
+        {"A": n_workers(2, minimum=0), "B": n_workers(1), "C": rest()}
+    )
+    before = declared(client)
+    parts["B"].grow(2, source="A")
+    assert (parts["A"].stats().target, parts["B"].stats().target) == (0, 3)
+    parts["B"].dissolve()
+    assert {name: slots for name, slots in declared(client).items() if slots} == {
+        name: slots for name, slots in before.items() if slots == {"A": 1}
+    }
+    assert parts["A"].stats().target == 2
+
+
 def test_tasks_that_have_not_ended_are_waited_for(start, wait_until):
     client = start({"a": {}, "b": {}})
     pool = Pool.from_client(client)

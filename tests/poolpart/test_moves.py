@@ -261,6 +261,65 @@ def test_a_cluster_that_was_divided_when_it_was_started(start):
     assert set(client.cluster.scheduler.plugins) == plugins
 
 
+GPU_AND_OTHER = {
+    "gpu-0": {"resources": {"GPU": 1}},
+    **{f"other-{i}": {"resources": {"OTHER": 1}} for i in range(3)},
+}
+
+
+@pytest.mark.parametrize(
+    "give_back",
+    [
+        lambda gpu, other: gpu.resize(1),
+        lambda gpu, other: gpu.shrink(2),
+        lambda gpu, other: other.grow(2, source="GPU"),
+        lambda gpu, other: other.resize(3, source="GPU"),
+    ],
+    ids=["resize", "shrink", "grow", "resize the source"],
+)
+def test_borrowed_workers_are_given_back_and_own_workers_stay(start, give_back, wait_until):
+    client = start(GPU_AND_OTHER)
+    before = declared(client)
+    parts = Pool.from_client(client).partitions()
+    borrowed = parts["GPU"].resize(3, source="OTHER")
+    # Tasks make the borrowed workers busier than the worker of the GPU.
+    tasks = [parts["GPU"].submit(time.sleep, 0.5, workers=name) for name in borrowed]
+    scheduler = client.cluster.scheduler
+    wait_until(lambda: sum(len(w.processing) for w in scheduler.workers.values()) == 2)
+    assert sorted(give_back(parts["GPU"], parts["OTHER"])) == sorted(borrowed)
+    client.gather(tasks)
+    assert declared(client) == before
+
+
+def test_borrowed_workers_leave_for_a_third_partition_first(start):
+    client = start(GPU_AND_OTHER)
+    pool = Pool.from_client(client)
+    gpu = pool["GPU"]
+    borrowed = gpu.grow(2, source="OTHER")
+    plan = pool.divide({"PLAN": n_workers(2, minimum=0)})["PLAN"]
+    assert sorted(plan.resize(2, source="GPU")) == sorted(borrowed)
+    assert members(gpu) == ["gpu-0"]
+    assert plan.resize(3, source="GPU") == ["gpu-0"]
+    assert gpu.grow(1, source="PLAN") == ["gpu-0"]  # not one of the borrowed workers
+    assert sorted(plan.resize(0)) == sorted(borrowed)  # they return to OTHER
+    assert len(pool["OTHER"]) == 3
+
+
+def test_workers_that_a_rule_selected_stay_and_workers_of_the_rest_return(divided):
+    _, parts = divided
+    own = members(parts["B"])
+    given = parts["B"].grow(2, source="A") + parts["B"].grow(1)
+    assert sorted(parts["B"].resize(1)) == sorted(given)
+    assert members(parts["B"]) == own
+    assert [len(part) for part in parts.values()] == [3, 1, 2]
+
+
+def test_a_partition_that_workers_were_started_with_may_become_empty(start):
+    pool = Pool.from_client(start({"a": {"resources": {"A": 1}}, "b": {}}))
+    assert pool["A"].resize(0) == ["a"]
+    assert {name: len(part) for name, part in pool.partitions().items()} == {"A": 0}
+
+
 @pytest.mark.extended
 def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch):
     parts = Pool.from_client(nannies).divide({"A": per_host(1), "B": rest()})
