@@ -585,7 +585,7 @@ class Results(Iterator[Any]):
 
 
 def _wait_of(stage: Stage) -> WorkerWait:
-    return WorkerWait(stage.partition, "A map", stage.empty_s)
+    return WorkerWait(stage.partition, "The map", stage.empty_s)
 
 
 def _of_item(error: BaseException | None) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Any, NamedTuple
@@ -24,7 +24,8 @@ class Rule:
         Number of tasks that each worker runs at the same time. By default, its number of threads.
     minimum
         Minimum number of workers. A partition cannot be created with fewer workers, and moving
-        workers to other partitions never leaves it with fewer.
+        workers to other partitions never leaves it with fewer. Partitions that workers were started
+        with have no rule, and a minimum of 0.
     exclusive
         Whether to keep other tasks off the workers, which are tasks without a partition,
         collections, and tasks of other users. Other tasks that are already assigned to a worker
@@ -248,22 +249,26 @@ def divide(
     notes: dict[str, str] = {}
     for name, (rule, free, workers) in _choices(rules, pool).items():
         chosen[name] = workers
+        earlier_rules = len(chosen) - 1
         if len(workers) < rule.minimum:
             raise PoolError(
                 f"Partition {name!r} requires at least {workers_in_words(rule.minimum)}, but its "
-                f"rule selects {len(workers)}. {_advice(rule, free, pool)}"
+                f"rule selects {len(workers)}. {_advice(rule, free, pool, earlier_rules)}"
             )
         if isinstance(rule, per_gpu) and free and not any(worker.gpus for worker in free):
             notes[name] = NO_GPU
         if isinstance(rule, n_workers) and len(workers) < rule.workers:
+            source = _largest_partition(worker for worker in pool if worker not in free)
+            move = f", and `resize(…, source={source!r})` moves existing workers into it"
             notes[name] = (
                 f"The partition has {len(workers)} of the {workers_in_words(rule.workers)} that "
-                "its rule requests. Workers that join the cluster later are added to it."
+                f"its rule requests. Workers that join the cluster later are added to it"
+                f"{move if source else ''}."
             )
         if isinstance(rule, Named) and (missing := rule.missing(workers)):
             notes[name] = (
-                "The partition does not have all workers that its rule names. Missing: "
-                f"{', '.join(map(repr, missing))}."
+                "The partition does not have all workers that its rule names. "
+                f"{_whereabouts(missing, pool)}"
             )
     return chosen, notes
 
@@ -315,36 +320,81 @@ def shortfalls(
     }
 
 
-def _advice(rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo]) -> str:
-    """Return advice about a rule that has too few workers."""
+def _whereabouts(missing: Sequence[str], pool: Sequence[WorkerInfo]) -> str:
+    """Return why the named workers cannot be selected: they are elsewhere, or do not exist."""
+    by_name = {name: worker for worker in pool for name in (worker.name, worker.address)}
+    absent = [name for name in missing if name not in by_name]
+    # {names of partitions, or "" for a worker that an earlier rule has selected: workers}
+    elsewhere: dict[str, list[str]] = {}
+    for name in missing:
+        if name in by_name:
+            partitions = " and ".join(map(repr, sorted(by_name[name].partitions)))
+            elsewhere.setdefault(partitions, []).append(name)
+    sentences = []
+    for partitions, names in elsewhere.items():
+        is_one = len(names) == 1
+        verb = "belongs" if is_one else "belong"
+        place = f"already {verb} to partition {partitions}"
+        if not partitions:
+            place = f"{'is' if is_one else 'are'} selected by another rule"
+        sentences.append(f"{'Worker' if is_one else 'Workers'} {_listed(names)} {place}.")
+    if absent:
+        present = sorted((worker.name for worker in pool), key=lambda name: (len(name), name))
+        sentences.append(
+            f"The pool has no worker named {_listed(absent)}. Existing workers: "
+            f"{_listed(present) or 'none'}."
+        )
+    return " ".join(sentences)
+
+
+def _largest_partition(workers: Iterable[WorkerInfo]) -> str:
+    """Return the partition that most of the workers belong to, or "" if they belong to none."""
+    sizes = Counter(name for worker in workers for name in sorted(worker.partitions))
+    return max(sizes, key=sizes.__getitem__, default="")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return up to nine names for a message."""
+    return ", ".join(map(repr, names[:9])) + (", …" if len(names) > 9 else "")
+
+
+def _advice(
+    rule: Rule, free: Sequence[WorkerInfo], pool: Sequence[WorkerInfo], earlier_rules: int
+) -> str:
+    """Return advice about a rule that has too few workers, with the number of rules before it."""
     if isinstance(rule, n_workers) and rule.workers < rule.minimum:
         return (
             f"The rule allows at most {workers_in_words(rule.workers)}. Increase this number, or "
             f"pass `minimum={rule.workers}`."
         )
     elsewhere = [worker for worker in pool if worker.partitions and worker not in free]
-    advice = ""
-    if elsewhere:
-        resources = sorted({resource for worker in elsewhere for resource in worker.partitions})
-        verb = "declares" if len(elsewhere) == 1 else "declare"
-        advice = (
-            f" {workers_in_words(len(elsewhere))} already {verb} the "
-            f"resource{'s' if len(resources) > 1 else ''} {', '.join(map(repr, resources[:9]))}, "
-            "and a worker can belong to only one partition. To divide these workers again, "
-            "dissolve their partitions. To move workers of another partition, including workers "
-            "that were started with `--resources`, create this partition with `minimum=0` and "
-            f"call `resize`, for example `partition.resize(1, source={resources[0]!r})`."
-        )
-    if not isinstance(rule, Named):
+    sentences = []
+    if isinstance(rule, Named):
+        elsewhere = [w for w in elsewhere if {w.name, w.address} & {*rule.names}]
+        sentences.append(_whereabouts(rule.missing(rule.choose(free)), pool))
+    else:
         verb = "is" if len(free) == 1 else "are"
-        return (
+        reorder = ", or place this partition before the others" if earlier_rules else ""
+        sentences.append(
             f"{len(free)} of {len(pool)} workers {verb} available to this partition. "
-            f"Start more workers, or place this partition before the others.{advice}"
+            f"Start more workers{reorder}."
         )
-    present = ", ".join(repr(worker.name) for worker in pool[:9])
-    ending = ", …." if len(pool) > 9 else "."
-    names = ", ".join(map(repr, rule.names))
-    return f"The rule selects {names}, but the pool contains {present}{ending}{advice}"
+    if elsewhere:
+        source = _largest_partition(elsewhere)
+        if not isinstance(rule, Named):
+            names = sorted({name for worker in elsewhere for name in worker.partitions})
+            verb = "declares" if len(elsewhere) == 1 else "declare"
+            sentences.append(
+                f"{workers_in_words(len(elsewhere))} already {verb} the "
+                f"resource{'s' if len(names) > 1 else ''} {_listed(names)}."
+            )
+        sentences.append(
+            "A worker can belong to only one partition. To divide these workers again, dissolve "
+            "their partitions. To move workers of another partition, including workers that were "
+            "started with `--resources`, create this partition with `n_workers(1, minimum=0)` and "
+            f"call `resize`, for example `partition.resize(1, source={source!r})`."
+        )
+    return " ".join(sentences)
 
 
 def partition_for(

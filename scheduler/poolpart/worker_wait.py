@@ -22,7 +22,7 @@ class WorkerWait:
     partition
         Name of the partition.
     waiting
-        What waits, as the beginning of a sentence, such as "A map".
+        What waits, as the beginning of a sentence, such as "The map".
     seconds
         Longest wait while no worker is there, and none is expected; `math.inf` for ever.
     """
@@ -57,7 +57,7 @@ class WorkerWait:
             )
         if time.monotonic() - self._since >= self._seconds:
             raise PoolError(
-                f"Partition {self._partition!r} has no workers. {self._waiting} has waited for "
+                f"Partition {self._partition!r} has no workers. {self._waiting} waited "
                 f"{self._seconds:g} s, and no worker is starting. Start workers with "
                 f'`--resources "{self._partition}=1"`, move workers with `Partition.grow`, or pass '
                 "a longer `empty_s`."

@@ -63,7 +63,7 @@ def test_of_a_partition_whose_only_worker_left_for_good(start, monkeypatch):
     leave(client, "a")
     pipe = Pipe("of-nobody", 3, client).create()
     pipe.put(-1)
-    message = "Partition 'A' has no workers. `for_each` has waited for 0.2 s"
+    message = "Partition 'A' has no workers. `for_each` waited 0.2 s"
     with pytest.raises(PoolError, match=message):
         Partition("A", client).for_each(pipe, abs, empty_s=0.2)
     with pytest.raises(PipeFailed, match=message):

@@ -385,12 +385,12 @@ def test_a_restart_of_the_cluster_ends_it(own_nannies):
 def test_a_partition_without_workers_is_told_of(client, caplog, empty_s, limit):
     with caplog.at_level(logging.WARNING, "poolpart"):
         results = Partition("nobody", client).map(twice, range(10), empty_s=empty_s)
-    assert f"Partition 'nobody' has no workers. A map waits{limit} for a worker." in caplog.text
+    assert f"Partition 'nobody' has no workers. The map waits{limit} for a worker." in caplog.text
     results.close()
 
 
 WAITED = (
-    r"Partition '{}' has no workers\. A map has waited for {:g} s, and no worker is "
+    r"Partition '{}' has no workers\. The map waited {:g} s, and no worker is "
     r'starting\. Start workers with `--resources "{}=1"`, move workers with `Partition\.grow`, or '
     r"pass a longer `empty_s`\."
 )

@@ -114,9 +114,10 @@ def test_rules_for_a_partition_that_workers_were_started_with(start):
         pool.divide({"CPU": n_workers(1), "OTHER": rest()})
     message = (
         r"0 of 3 workers are available to this partition\. Start more workers, or place this "
-        r"partition before the others\. 2 workers already declare the resource 'CPU', "
+        r"partition before the others\. 2 workers already declare the resource 'CPU'\. "
         r".* dissolve their partitions\. .*"
-        r" with `minimum=0` and call `resize`, for example `partition\.resize\(1, source='CPU'\)`"
+        r" with `n_workers\(1, minimum=0\)` and call `resize`, for example "
+        r"`partition\.resize\(1, source='CPU'\)`"
     )
     with pytest.raises(PoolError, match=message):
         pool.divide({"ALL": n_workers(1), "OTHER": n_workers(1)})
@@ -212,7 +213,7 @@ def test_a_pool_that_is_divided_twice_does_not_give_one_worker_to_two(start):
     _, rest = pool.partition("Q", n_workers=1)
     assert sorted(map(list, declared(client).values())) == [["P"], ["P"], ["Q"]]
     assert rest.names == []
-    with pytest.raises(PoolError, match="3 workers already declare the resources 'P', 'Q'"):
+    with pytest.raises(PoolError, match="Workers 'a', 'b' already belong to partition 'P'"):
         pool.partition("R", workers=["a", "b"])
 
 

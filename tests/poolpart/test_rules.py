@@ -49,8 +49,10 @@ def test_fewer_than_the_minimum():
     with pytest.raises(PoolError, match=message):
         divide({"P": n_workers(2), "Q": per_host(1)}, pool)
     assert names({"P": n_workers(2), "Q": per_host(1, minimum=0)}, pool)["Q"] == []
-    with pytest.raises(PoolError, match=r"selects 'c', but the pool contains 'a', 'b'"):
+    with pytest.raises(PoolError, match=r"no worker named 'c'\. Existing workers: 'a', 'b'\.$"):
         divide({"P": named("c")}, pool)
+    with pytest.raises(PoolError, match=r"workers are available .* Start more workers\.$"):
+        divide({"P": per_host(1, minimum=2)}, pool)
     with pytest.raises(PoolError, match="requires at least 3 workers, but its rule selects 2"):
         divide({"P": rest(minimum=3)}, pool)
 
@@ -77,8 +79,36 @@ def test_workers_that_a_rule_names_and_that_are_not_there():
     rules = {"P": named("a", "tcp://b", 3)}
     _, notes = divide(rules, [worker("a"), worker("b")])
     assert notes == {
-        "P": "The partition does not have all workers that its rule names. Missing: '3'."
+        "P": "The partition does not have all workers that its rule names. The pool has no worker "
+        "named '3'. Existing workers: 'a', 'b'."
     }
+
+
+def test_named_workers_that_belong_elsewhere_are_reported_with_their_partition():
+    pool = [worker(f"lidar-{i}", LIDAR=1) for i in (10, 1, 0)] + [worker("gpu-0", "x", GPU=1)]
+    with pytest.raises(PoolError) as caught:
+        divide({"PLAN": named("lidar-0", "lidar-1", "nobody")}, pool)
+    assert str(caught.value).startswith(
+        "Partition 'PLAN' requires at least 1 worker, but its rule selects 0. Workers 'lidar-0', "
+        "'lidar-1' already belong to partition 'LIDAR'. The pool has no worker named 'nobody'. "
+        "Existing workers: 'gpu-0', 'lidar-0', 'lidar-1', 'lidar-10'. "
+        "A worker can belong to only one"
+    )
+    assert "`partition.resize(1, source='LIDAR')`" in str(caught.value)
+    with pytest.raises(PoolError, match="Worker 'a' is selected by another rule"):
+        divide({"P": named("a"), "Q": named("a")}, [worker("a")])
+
+
+def test_the_largest_partition_is_suggested_as_source():
+    pool = [worker("gpu-0", "x", GPU=1), *(worker(f"cpu-{i}", CPU=1) for i in range(3))]
+    with pytest.raises(PoolError, match=r"`n_workers\(1, minimum=0\)` .* source='CPU'\)`"):
+        divide({"PLAN": n_workers(1)}, pool)
+    _, notes = divide({"PLAN": n_workers(2, minimum=0)}, pool)
+    assert notes["PLAN"] == (
+        "The partition has 0 of the 2 workers that its rule requests. Workers that join the "
+        "cluster later are added to it, and `resize(…, source='CPU')` moves existing workers into "
+        "it."
+    )
 
 
 @pytest.mark.parametrize("number", [{"workers": 1.5}, {"workers": 1, "slots": 0}])
