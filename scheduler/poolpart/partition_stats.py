@@ -11,6 +11,7 @@ from .rules import workers_in_words
 
 COUNTS = ("waiting", "queued", "running", "done", "failed")  # task states, in the order of tables
 _HEAD_OF_STAGES = ("stage", *COUNTS, "seconds")
+NO_PARTITION = "no partition"  # row of workers without a partition, and of ordinary Dask tasks
 _HEAD_OF_PARTITIONS = ("partition", "workers", "slots", "busy", *COUNTS, "seconds")
 
 
@@ -118,7 +119,7 @@ class PartitionStats(StageStats):
 
     def _repr_html_(self) -> str:
         """Return the tables that notebooks show: the partition, and its stages."""
-        name = self.name or "remainder"
+        name = self.name or NO_PARTITION
         row = [name, self.workers, self.slots, self.busy, *self._figures]
         tables = html_table("Partition", _HEAD_OF_PARTITIONS, [row])
         if self.stages:

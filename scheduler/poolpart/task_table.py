@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex, overload
 
 from .errors import PoolError
 from .html_table import html_paragraph, html_table, shown_seconds, text_table
@@ -66,6 +66,7 @@ class TaskTable(tuple[TaskRow, ...]):
     newest first.
 
     `since` is the time in UTC when counting began. Tasks that finished earlier are not included.
+    A slice of a table is a table as well.
 
     Examples
     --------
@@ -82,6 +83,19 @@ class TaskTable(tuple[TaskRow, ...]):
         """
         table = cls(sorted(rows, key=lambda row: min(STATES.index(row.state), _ENDED)))
         table.since = since
+        return table
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> TaskRow: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> TaskTable: ...
+
+    def __getitem__(self, index: SupportsIndex | slice) -> TaskRow | TaskTable:
+        if not isinstance(index, slice):
+            return super().__getitem__(index)
+        table = type(self)(super().__getitem__(index))
+        table.since = self.since
         return table
 
     def __repr__(self) -> str:

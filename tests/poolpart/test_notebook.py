@@ -35,7 +35,7 @@ def test_a_table_of_partitions_and_a_link_to_the_open_page(pool):
     assert unescape(text).startswith('<table>\n<caption style="text-align: left"><Pool: workers 3')
     assert rows_of(text) == {
         "CPU": ["2", "3", "0", "0", "0", "0", "3", "0"],
-        "remainder": ["1", "1", "0", "0", "0", "0", "0", "0"],
+        "no partition": ["1", "1", "0", "0", "0", "0", "0", "0"],
     }
     assert "pool.page()" in text
     assert "href" not in text

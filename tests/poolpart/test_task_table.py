@@ -9,7 +9,7 @@ from distributed import wait
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition
-from poolpart.task_table import KEPT
+from poolpart.task_table import KEPT, TaskRow, TaskTable
 
 CLUSTER = {"A-0": {"resources": {"A": 2}, "nthreads": 2}, "B-0": {"resources": {"B": 1}}}
 
@@ -26,6 +26,18 @@ def after(*_):
 
 def broken(_):
     raise ValueError("two\nlines")
+
+
+def test_a_slice_of_a_table_is_a_table():
+    since = datetime(2026, 11, 29, tzinfo=UTC)
+    table = TaskTable.from_rows(
+        [TaskRow("done", f"t-{i}", "t", "A-0", 1) for i in range(5)] * 6, since
+    )
+    assert table[1] == table[1:2][0] == TaskRow("done", "t-1", "t", "A-0", 1)
+    assert isinstance(table[2:4], TaskTable) and table[2:4].since == since
+    assert [row.key for row in table[2:4]] == ["t-2", "t-3"]
+    assert repr(table[:2]).splitlines()[1].split()[:3] == ["done", "t-0", "t"]
+    assert "The first 20 of 30 tasks" in repr(table) and "The first" not in repr(table[:2])
 
 
 @pytest.fixture

@@ -24,7 +24,7 @@ from ..html_table import WORDS, shown_seconds
 from ..internals.names import PAGE, require
 from ..internals.scheduler import serve, serve_no_longer
 from ..membership import partition_names, release_statistics
-from ..partition_stats import COUNTS, StageStats
+from ..partition_stats import COUNTS, NO_PARTITION, StageStats
 from ..pipe_states import pipes_of
 from ..stats import NAME as STATISTICS
 from ..stats import (
@@ -115,7 +115,7 @@ def page_of(scheduler: Any) -> bytes:
 
 
 def _shown(partition: str) -> str:
-    return partition or "remainder"
+    return partition or NO_PARTITION
 
 
 def _counts(stats: StageStats) -> list[object]:
@@ -136,7 +136,7 @@ def _worker(worker: Any) -> list[object]:
 
 
 def _by_partition_and_name(row: list[object]) -> tuple[bool, str, int, str]:
-    """Return the key that sorts rows of workers, with the remainder last, and 10 behind 9."""
+    """Return the key that sorts rows of workers: 10 behind 9, and those of no partition last."""
     name = str(row[0])
     partition = str(row[1])
     return partition == _shown(""), partition, len(name), name

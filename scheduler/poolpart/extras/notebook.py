@@ -12,7 +12,7 @@ from ..adapting import adaptive_names
 from ..errors import PoolError
 from ..html_table import html_paragraph, html_table
 from ..membership import has_rule, partition_names
-from ..partition_stats import COUNTS, PartitionStats
+from ..partition_stats import COUNTS, NO_PARTITION, PartitionStats
 from ..pipe_states import pipes_of
 from ..stats import stats_of
 from ..workers import on_scheduler
@@ -29,7 +29,7 @@ _OPENER = "Pool.from_client(client).page()"
 
 
 def table_of_partitions(client: Client, title: str) -> str:
-    """Return the HTML of a table of the partitions that workers declare, and of the remainder.
+    """Return the HTML of a table of all partitions, and of what belongs to no partition.
 
     The link to the page follows if the page is open. Only `title` is shown where the scheduler does
     not answer.
@@ -91,7 +91,7 @@ def _ask(client: Client, look: Callable[..., Any], **arguments: Any) -> tuple[An
 
 def _row(stats: PartitionStats) -> list[object]:
     """Return the figures of a partition in the order of the columns."""
-    return [stats.name or "remainder", *(getattr(stats, column) for column in _HEAD[1:])]
+    return [stats.name or NO_PARTITION, *(getattr(stats, column) for column in _HEAD[1:])]
 
 
 def _all_partitions(dask_scheduler: Any = None) -> tuple[list[Sequence[object]], bool]:
