@@ -71,7 +71,8 @@ class Pipe:
     name
         Name of the pipe, which must be unique on the cluster. Include a random part.
     capacity
-        Maximum number of queued items. While the pipe is full, `put` waits.
+        Maximum number of queued items. While the pipe is full, `put` waits. Each consumer may hold
+        as many items again, because it takes all queued items with one request.
     client
         Client to use. By default, a task uses the client of its worker.
     producers

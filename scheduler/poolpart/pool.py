@@ -182,7 +182,10 @@ class Pool:
                     "`Pool.divide` to create partitions."
                 )
             names = ", ".join(map(repr, parts))
-            raise PoolError(f"There is no partition {name!r}. Existing partitions: {names}.")
+            raise PoolError(
+                f"There is no partition {name!r}. Existing partitions: {names}. Create it with "
+                f'`Pool.divide`, or start workers with `--resources "{name}=1"`.'
+            )
         if part.note and name not in self._noted:
             self._noted.add(name)
             logger.warning("Partition %r: %s", name, part.note)
@@ -214,8 +217,9 @@ class Pool:
         """Return all partitions of the cluster by name, including those without workers.
 
         These are the partitions that a division has created, adaptive partitions, and the
-        partitions that workers were started with. A partition of the last kind has a `note` if a
-        worker's number of slots differs from its number of threads.
+        partitions that workers were started with. A partition of the last kind is not listed while
+        none of its workers is running, unless workers were moved into or out of it. It has a `note`
+        if a worker's number of slots differs from its number of threads.
 
         Examples
         --------

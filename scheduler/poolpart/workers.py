@@ -30,7 +30,8 @@ class WorkerInfo:
     name, address, host
         Name, address and host of the worker. When its nanny restarts a worker, an explicitly set
         name stays the same. The address changes, and with it the default name, which is derived
-        from the address.
+        from the address. The name is always a string. Workers of a `LocalCluster` have integers as
+        names, so compare it with ``str(get_worker().name)`` in a task.
     nthreads
         Number of threads.
     memory
