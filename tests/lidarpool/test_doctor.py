@@ -20,6 +20,7 @@ SOUND = {
     "backends": {"cuda": "CuPy is not installed", "tiles": "ready"},
     "open3d": "ready",
     "second_copy": "",
+    "cluster_fault": "",
 }
 
 
@@ -45,6 +46,7 @@ def test_nothing_is_wrong_without_a_gpu():
             "only 0.2 GiB of free space",
         ),
         ({"second_copy": "There are two copies"}, "There are two copies"),
+        ({"cluster_fault": "Too few slots", "gpus": ["GPU-1"]}, "Too few slots"),
         ({"open3d": "it lacks libGL", "gpus": ["GPU-1"]}, "it lacks libGL"),
     ],
 )

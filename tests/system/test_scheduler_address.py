@@ -27,6 +27,26 @@ def test_doctor_finds_the_workers_by_a_scheduler_file(lidarpool, tmp_path, optio
     assert outcome.code == 0 and "cluster: 1 worker on 1 host" in outcome.out
 
 
+@pytest.mark.parametrize(
+    ("slots", "fault"),
+    [
+        (4, ""),
+        (
+            3,
+            "Partition 'LIDAR' has 3 of the 4 required slots (for a run with default options). "
+            "Start workers with ",
+        ),
+    ],
+)
+def test_doctor_reports_a_cluster_with_too_few_slots(lidarpool, slots, fault):
+    with thread_cluster({"GPU": 1}, {"LIDAR": slots}) as cluster:
+        told = json.loads(
+            lidarpool("doctor", "--json", "--scheduler", cluster.scheduler_address).out
+        )
+    assert told["cluster_fault"][: len(fault) or None] == fault
+    assert told["fix_first"] or not fault
+
+
 def test_a_file_that_is_written_later_is_waited_for(tmp_path, monkeypatch):
     monkeypatch.setattr(scheduler_address, "_LOOK_EVERY_S", 0.01)
     file = tmp_path / "sched.json"

@@ -418,14 +418,17 @@ def doctor(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     from poolpart import Pool
 
     from ..run.cluster.connection import connected
-    from .doctor import advice_in_words, examine, in_words
+    from .doctor import advice_in_words, examine, find_cluster_fault, in_words
 
     found: Iterable[WorkerInfo] = ()
+    fault = ""
     if scheduler is not None:
         with connected(scheduler, files) as client:
-            found = Pool.from_client(client).workers
+            pool = Pool.from_client(client)
+            found = pool.workers
+            fault = find_cluster_fault(pool)
     workers = sorted(found, key=lambda worker: (sorted(worker.resources), worker.name))
-    figures = examine()
+    figures = examine(fault)
     figures["workers"] = [asdict(worker) for worker in workers]
     lines = in_words(figures)
     if scheduler is not None:

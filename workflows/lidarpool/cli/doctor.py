@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import CHECKOUT
+from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 from raybeam.compiled import HAS_CACHE
@@ -25,6 +26,9 @@ from raybeam.installation import install_command
 
 from ..base.open3d_module import load_open3d
 from ..report.report import versions
+from ..run.cluster.checks import slots_needed
+from ..run.pipeline.stage_names import GPU, LIDAR
+from ..scenario.sections import TaskOptions
 from .installed_copies import second_copy
 
 READY = "ready"
@@ -43,8 +47,11 @@ _MIN_MEMORY_GIB = 2.0  # least memory of a small run with its three processes
 _MIN_DISK_GIB = 1.0
 
 
-def examine() -> dict[str, Any]:
-    """Return the findings as plain data for JSON, with `fix_first` "" without a fault."""
+def examine(cluster_fault: str = "") -> dict[str, Any]:
+    """Return the findings as plain data for JSON, with `fix_first` "" without a fault.
+
+    `cluster_fault` is the result of `find_cluster_fault`, or "" without a cluster.
+    """
     figures: dict[str, Any] = {
         "versions": versions(),
         "machine": {
@@ -61,9 +68,20 @@ def examine() -> dict[str, Any]:
         "open3d": _open3d_state(),
         "extras": _extras(),
         "second_copy": second_copy(),
+        "cluster_fault": cluster_fault,
         "ports": {str(port): _port_state(port) for port in PORTS},
     }
     return {**figures, "fix_first": _fix_first(figures)}
+
+
+def find_cluster_fault(pool: Pool) -> str:
+    """Return why the workers of a cluster cannot run a scenario with default options, or ""."""
+    purpose = dict.fromkeys((GPU, LIDAR), "for a run with default options")
+    try:
+        pool.require(slots_needed(TaskOptions(), planning=False), purpose)
+    except PoolError as error:
+        return str(error).rstrip(".")
+    return ""
 
 
 def _open3d_state() -> str:
@@ -134,6 +152,8 @@ def _advice(figures: dict[str, Any]) -> Iterator[str]:
     for folder, free_gib in machine["disk_gib"].items():
         if free_gib < _MIN_DISK_GIB:
             yield f"The disk of {folder} has only {free_gib:.1f} GiB of free space. Free some space"
+    if figures["cluster_fault"]:
+        yield figures["cluster_fault"]
     if figures["gpus"] and backends["cuda"] != READY:
         yield f"The GPU of this machine is not used: {backends['cuda']}"
     if backends["tiles"] != READY:
