@@ -35,6 +35,15 @@ def rows_of(url):
     return {unescape(first): others for first, *others in cells}
 
 
+def all_rows(url, first):
+    """Cells of all rows of the page with this first cell."""
+    text = get(url)[2]
+    rows = [
+        re.findall(r"<td[^>]*>(.*?)</td>", row) for row in re.findall(r"<tr>(<td.*?)</tr>", text)
+    ]
+    return [cells[1:] for cells in rows if unescape(cells[0]) == first]
+
+
 def work(_=None):
     return str(get_worker().name)
 
@@ -79,6 +88,8 @@ def test_what_it_tells(client, wait_until):
     part = Partition("A", client)
     results = [part.submit(work, i) for i in range(6)]
     failing = part.submit(broken)
+    ordinary = [client.submit(work, i, pure=False) for i in range(3)]
+    client.gather(ordinary)
     with Pipe("frames-12345678", 5, client) as pipe:
         for item in range(3):
             pipe.put(item)
@@ -89,7 +100,10 @@ def test_what_it_tells(client, wait_until):
         pipe.fail("the reason")
         assert rows_of(url)["frames-12345678"] == ["3", "5", "failed: the reason"]
     assert rows["A"][:3] == ["1", "2", "0"]
-    assert rows["work"][:5] == ["A", "0", "0", "0", "6"]
+    assert sum(row[:5] == ["A", "0", "0", "0", "6"] for row in all_rows(url, "work")) == 1
+    # Ordinary tasks run on a worker of A, as P is exclusive: no workers, but tasks.
+    [no_partition] = all_rows(url, "no partition")
+    assert (no_partition[:3], no_partition[6]) == (["0", "0", "0"], "3")
     assert (rows["broken"][0], rows["broken"][5]) == ("A", "1")
     assert rows[NASTY][:2] == ["A", "2"]
     assert "<script>" not in get(url)[2]  # names of users stay text
