@@ -141,7 +141,7 @@ def test_notes_and_reasons_have_the_coordinates_of_the_scenario():
     reason = empty_cloud_reason(far.scene, far.survey)
     assert "The sensor starts at (900.000, 0.000, 1.000)" in reason and "500" not in reason
     built = build(Scenario.from_data({**PLAN, "world": {"origin": ORIGIN}}))
-    assert "500,000" not in " ".join(advice(built))
+    assert "500,000" not in " ".join(note for note in advice(built) if "projected" not in note)
 
 
 def placed_at(place, **world):
@@ -238,6 +238,40 @@ def test_results_of_python_note_the_place():
     assert job_of(world={"epsg": 25832, "origin": ORIGIN}).place_problem == ""
 
 
+def test_projected_coordinates_without_a_system_are_noted(tmp_path):
+    """The note and the axes of a mesh from the command line, and of a scenario with the mesh."""
+    x, y = ORIGIN
+    corners = [(0, 0, 0), (9, 0, 0), (0, 9, 0), (0, 0, 9)]
+    lines = [f"v {x + a} {y + b} {c}" for a, b, c in corners] + ["f 1 3 2", "f 1 2 4", "f 1 4 3"]
+    (tmp_path / "house.obj").write_text("\n".join(lines) + "\n")
+    plan = {"poses": [[x - 3, y - 3, 1]]}
+
+    def checked(name, **sections):
+        if sections:
+            data = {**plan, **sections}
+            (tmp_path / name).write_text(yaml.safe_dump(data))
+        outcome = CliRunner().invoke(cli, ["check", str(tmp_path / name), "--json"])
+        assert outcome.exit_code == 0, outcome.output
+        return json.loads(outcome.stdout)["notes"]
+
+    def noted(notes):
+        return [note for note in notes if "probably projected coordinates" in note]
+
+    of_mesh = checked("house.obj")
+    [note] = noted(of_mesh)
+    assert note.startswith("the scene is at x 500,00") and "Set `world: {epsg: CODE}`" in note
+    [axes] = [note for note in of_mesh if "does not state its axes" in note]
+    assert "set `--up-axis y`. To silence this note, pass `--up-axis` explicitly" in axes
+    assert "up_axis:" not in axes
+    of_scenario = checked("far.yaml", scene="house.obj")
+    assert len(noted(of_scenario)) == 1
+    [axes] = [note for note in of_scenario if "does not state its axes" in note]
+    assert "set {file: …, up_axis: y}" in axes and "--up-axis" not in axes
+    assert not noted(checked("known.yaml", scene="house.obj", world={"epsg": 25832}))
+    near = {"scene": {"files": [{"file": "house.obj", "translation": [-x, -y, 0]}]}}
+    assert not noted(checked("near.yaml", **near, poses=[[-3, -3, 1]]))
+
+
 @pytest.mark.slow
 def test_stations_and_check_name_the_system(tmp_path):
     scenario = tmp_path / "room.yaml"
@@ -245,7 +279,10 @@ def test_stations_and_check_name_the_system(tmp_path):
     data = {**PLAN, "scene": {**ROOM, "ground": ground}, "world": {"epsg": 25832, "origin": ORIGIN}}
     scenario.write_text(yaml.safe_dump(data))
     shown = CliRunner().invoke(cli, ["check", str(scenario)]).output
-    assert "world       EPSG:25832; (500,000, 5,400,000, 0) m is added to the scenario's" in shown
+    assert (
+        "world       EPSG:25832 (ETRS89 / UTM zone 32N); (500,000, 5,400,000, 0) m is added"
+        in shown
+    )
     assert "x -7.00 to 7.00, y -6.00 to 6.00, z 0.00 to 3.00" in shown
     options = ["--sensor", "riegl-vz400", "--count", "1", "--out", f"{tmp_path}/plan", "--json"]
     outcome = CliRunner().invoke(cli, ["stations", str(scenario), *options])

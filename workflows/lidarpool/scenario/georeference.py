@@ -15,6 +15,7 @@ from lidarsim.scene.scene import Scene
 # from zero, and differ by less than this share. Local coordinates are near zero.
 _FAR_M = 50_000.0
 _SAME_SHARE = 0.2
+_PROJECTED_M = 100_000.0
 
 
 def check_epsg(epsg: int, scene: Scene) -> None:
@@ -61,6 +62,21 @@ def place_problem(scene: Scene, epsg: int | None) -> str:
             "coordinates, remove `world.origin`."
         )
     return ""
+
+
+def missing_system(scene: Scene, epsg: int | None) -> str:
+    """Return a note on a scene in projected coordinates of which the system is not stated, or "".
+
+    `scene` is at its place in the world. Coordinates of 100 km and more are likely projected.
+    """
+    middle = _middle(scene)
+    if epsg is not None or np.linalg.norm(middle) < _PROJECTED_M:
+        return ""
+    return (
+        f"the scene is at {_in_words(middle)}, which are probably projected coordinates, but no "
+        "coordinate system is set. Files such as LAS and LAZ will therefore not state one. Set "
+        "`world: {epsg: CODE}` in the scenario"
+    )
 
 
 def _middle(scene: Scene) -> Floats:

@@ -241,6 +241,12 @@ def crs_name(crs: Any) -> str:
     return f"EPSG:{code}" if name in UNNAMED else f"EPSG:{code} ({name})"
 
 
+def named_system(epsg: int) -> str:
+    """Return an EPSG code and, if rasterio is installed and knows the code, the system's name."""
+    crs = crs_of_code(epsg) if has_registry() else None
+    return f"EPSG:{epsg}" if crs is None else crs_name(crs)
+
+
 def transformed(source: Any, target: Any, points: Floats) -> Floats:
     """Return points (n, 2) or (n, 3) in another coordinate system.
 
