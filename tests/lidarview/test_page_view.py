@@ -222,7 +222,8 @@ def test_surfaces_have_the_colors_that_are_asked_for(cloud, pictured):
     assert gray["legend"] is None
     assert gray["roof_cut"] == pytest.approx(2)  # halfway up from the sensors
     hits, arrays = told(view, "surface", color="hits")
-    assert "hits per square meter" in hits["legend"]["title"]
+    lower = hits["legend"]["marks"][0]
+    assert hits["legend"]["title"] == f"hits per square meter (gray: fewer than {lower})"
     assert arrays["colors"].shape == arrays["corners"].shape
     objects, arrays = told(view, "surface", color="object")
     assert objects["legend"]["labels"][0][0] == "room"

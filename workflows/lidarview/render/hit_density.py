@@ -14,7 +14,6 @@ from lidarsim.scene.scene_mesh import triangle_areas
 from .coloring import TURBO
 from .theme import UNSEEN, rgb
 
-HITS_TITLE = "hits per square meter (gray: no hits)"  # title of the scale
 _GRID_LEVELS = 24  # levels of a grid whose cells are half as wide each time
 _MIN_HITS = 12  # hits that suffice for an estimate of density; points in a cell of the grid
 _MAX_ROUNDS = 12
@@ -70,6 +69,22 @@ def hit_colors(
         corner_density, (~is_counted & (hit_counts[owner] > 0))[:, None], limits
     )
     return pieces, owner, colors, limits
+
+
+def hits_title(limits: tuple[float, float]) -> str:
+    """Return the title of a scale with the ends `limits`: surfaces with fewer hits are gray.
+
+    Examples
+    --------
+    >>> hits_title((34.6, 9000.0))
+    'hits per square meter (gray: fewer than 35)'
+    """
+    return f"hits per square meter (gray: fewer than {density_label(limits[0])})"
+
+
+def density_label(density: float) -> str:
+    """Return hits per square meter as a label."""
+    return f"{density:.2g}" if density < 10 else f"{density:,.0f}"
 
 
 def _corner_means(pieces: Floats32, areas: Floats, density: Floats) -> Floats:

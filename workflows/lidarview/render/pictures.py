@@ -16,7 +16,7 @@ from lidarsim.scene.scene import Scene
 
 from . import theme
 from .coloring import TURBO, colors_of, values_of
-from .hit_density import HITS_TITLE, hit_colors
+from .hit_density import hit_colors, hits_title
 from .picture_page import LEGEND_ROWS, Page, robot_name
 from .shot import SurfaceView
 
@@ -90,7 +90,7 @@ def draw_hits(
     page = Page(shot.camera.size)
     axes = page.show(shot, shot.divided(pieces, owner).paint(colors, 0.5))
     page.lines(axes, shot, _choose_rays(shot, sample_rays).astype(np.float64), 0.45, 0.5)
-    page.color_bar(TURBO, LogNorm(*limits), HITS_TITLE)
+    page.color_bar(TURBO, LogNorm(*limits), hits_title(limits))
     if label := _sensor_label(shot):
         page.legend([], label, bbox_to_anchor=(0.842, 0.18))  # below the color bar
     page.title("Hits", f"{plural(round(hit_counts.sum()), 'hit')} · {shot.caption}", shot.models)

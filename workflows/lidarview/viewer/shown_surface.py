@@ -17,7 +17,7 @@ from ..render.coloring import (
     colors_of,
     colors_of_normals,
 )
-from ..render.hit_density import HITS_TITLE, hit_colors
+from ..render.hit_density import density_label, hit_colors, hits_title
 from ..render.surface import separate_objects
 from ..render.theme import mapped
 from .legends import Legend, legend_of, scale_legend
@@ -117,7 +117,7 @@ class ShownSurface:
         is_shown = self._replacements >= 0
         hits = np.bincount(self._replacements[is_shown], hit_counts[is_shown], len(self.corners))
         max_pieces = len(self.corners) + MAX_PIECES
-        corners, owner, colors, (lower, upper) = hit_colors(
+        corners, owner, colors, limits = hit_colors(
             self.coarse, self.corners, hits.astype(float), points, max_pieces
         )
         arrays: dict[str, AnyArray] = {
@@ -125,9 +125,9 @@ class ShownSurface:
             "objects": self._objects[owner],
             "colors": as_bytes(colors),
         }
-        densities = (lower, (lower * upper) ** 0.5, upper)
-        marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in densities]
-        return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
+        lower, upper = limits
+        marks = [density_label(n) for n in (lower, (lower * upper) ** 0.5, upper)]
+        return arrays, scale_legend(hits_title(limits), marks) if hits.any() else None
 
 
 def colors_for(
