@@ -451,7 +451,7 @@ def test_sweeps_of_data_sets(tmp_path, kind):
     found = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="front").figures
     assert found["pairs"] == found["a"]["sweeps"] == 15  # of five jobs
     assert found["distances"]["a_to_b"]["max_m"] == 0
-    assert "pairs with an empty sweep are skipped" in found["notes"]
+    assert "5 of 15 pairs of sweeps have an empty sweep and are skipped" in found["notes"]
     other = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="rear/left", sweeps=[3]).figures
     assert other["pairs"] == 1 and other["distances"]["a_to_b"]["median_m"] > 1
 
@@ -517,8 +517,15 @@ def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told, scans_in_r
         sweeps.save(tmp_path / name / "sweeps.npz")
     found = compare(tmp_path / "a", tmp_path / "b")
     image = found.figures["ranges"]
-    assert found.figures["pairs"] == 1 and found.figures["pictured"] == (0, 0)
+    assert found.figures["pairs"] == 1 and found.figures["pictured"] == [0, 0]
     assert len(found.save(tmp_path / "page")) == (6 if scans_in_rings else 4)
+    page = (tmp_path / "page/compare.html").read_text()
+    by_ray = told != "neither"
+    assert ("RMSE of the range residuals" in page) == by_ray
+    assert ("ranges are compared ray by ray" in page) == by_ray
+    assert ("A cell covers one ring" in page) == (scans_in_rings and not by_ray)
+    assert "Intensities are compared" not in page  # all are 0
+    assert found.figures["a"]["compared_sweeps"] is None
     if not scans_in_rings:
         (note,) = found.figures["notes"]
         assert "1 pair of sweeps cannot be shown as range images" in note
@@ -648,10 +655,16 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
     assert "<b>A &" not in page and "&lt;b&gt;A &amp; B" in page
     assert "<script" not in page and 'src="http' not in page and page.count("<svg") == 4
     assert page.count("data-ring=") == RINGS
+    assert ">−15.00°</td>" in page and "-15.00°" not in page
+    assert "the point closest to its center is used" in page and "ray by ray" not in page
+    assert "about 0.67 times the standard deviation" in page
+    assert "Intensities are compared by rank." in page  # both are energies
+    assert "RMSE of the range residuals" not in page
     plain = compare(Cloud(cloud().positions, {}), Cloud(cloud().positions, {}))
     left = plain.save(tmp_path / "out")  # no pictures of ranges and rings, nor those of before
     assert len(left) == 4 and {*left} == {*(tmp_path / "out").iterdir()}
-    assert "no sweeps" in (tmp_path / "out/compare.html").read_text()
+    page = (tmp_path / "out/compare.html").read_text()
+    assert "no sweeps" in page and "0.67 times" not in page and "Intensities are" not in page
 
 
 def test_range_images_are_yellow_where_it_is_near():

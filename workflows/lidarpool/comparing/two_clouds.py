@@ -246,6 +246,7 @@ class _Comparing:
         self.point_counts = np.zeros(2, np.int64)
         self.images: RangeImages | None = None  # of the first pair that has any
         self.pictured: tuple[int, int] | None = None  # pair of sweeps of `measured_points`
+        self.empty_pairs = 0  # number of pairs of which a sweep has no points
         # {why pairs of sweeps have no range images: number of these pairs}
         self.without_images: Counter[str] = Counter()
         self.measured_points: list[MeasuredPoints] = []
@@ -290,7 +291,7 @@ class _Comparing:
             self.pictured = self.pictured or numbers
             self._add_ranges(a, b, budget)
         else:
-            self.note("pairs with an empty sweep are skipped")
+            self.empty_pairs += 1
         self.add_points(a, b, budget)
 
     def add_points(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
@@ -415,8 +416,9 @@ class _Comparing:
             "versions": {"lidarpool": __version__},
             **self._source_figures(),
             "pairs": len(self.pairs),
-            "pictured": self.pictured,
+            "pictured": self.pictured and [*self.pictured],
             "notes": self.notes
+            + self._empty_notes()
             + self._image_notes()
             + [note for r in self.recordings for note in r.left_out_notes],
             "ranges": range_figures,
@@ -435,13 +437,18 @@ class _Comparing:
             key: {
                 "name": recording.name,
                 "sweeps": None if recording.is_cloud else recording.count,
-                "compared_sweeps": sorted({pair[number] for pair in self.pairs}),
+                "compared_sweeps": self._compared_sweeps(number),
                 "points": count,
             }
             for number, (key, recording, count) in enumerate(
                 zip("ab", self.recordings, counts, strict=True)
             )
         }
+
+    def _compared_sweeps(self, number: int) -> list[int] | None:
+        """Return the indices of the sweeps of A (0) or B (1) that were compared, None for all."""
+        indices = sorted({pair[number] for pair in self.pairs})
+        return None if len(indices) == self.recordings[number].count else indices
 
     def _intensity_figures(self, a: Floats, b: Floats, paired_by: str) -> dict[str, Any] | None:
         """Return figures of pairs of intensities (n,), or None without a rank correlation."""
@@ -469,6 +476,13 @@ class _Comparing:
             "chamfer_m": float(to_b.mean() + to_a.mean()),
             "f_scores": f_scores,
         }
+
+    def _empty_notes(self) -> list[str]:
+        """Return a note on pairs of sweeps that were skipped because a sweep is empty."""
+        if not self.empty_pairs:
+            return []
+        total = plural(len(self.pairs), "pair")
+        return [f"{self.empty_pairs:,} of {total} of sweeps have an empty sweep and are skipped"]
 
     def _image_notes(self) -> list[str]:
         """Return notes on pairs of sweeps without range images, and on what is compared then."""
