@@ -138,7 +138,7 @@ def draw(samples: Sequence[Sample]) -> Page:
         for start_s, partition, count, _ in WORK:
             if partition == name:
                 _annotate(page, tasks, f"{count} tasks of {name}", (start_s, count), colors[name])
-    tasks.set_ylabel("tasks to do")
+    tasks.set_ylabel("pending tasks")
     tasks.set_ylim(0, 1.22 * max(count for _, _, count, _ in WORK))
     for name, bottom, height in zip(NAMES, bottoms[1:], heights[1:], strict=True):
         axes = page.chart((0.085, bottom, 0.70, height), **limits)

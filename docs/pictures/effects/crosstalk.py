@@ -72,7 +72,7 @@ def picture(path: Path) -> None:
         above.text(x_m, -12, name, fontsize=9, ha="center")
     above.set(aspect="equal", xlabel="x, m", ylabel="y, m")
     above.legend(frameon=False, fontsize=8, loc="upper left")
-    above.set_title(f"points of A in {REVOLUTIONS} turns, walls in gray", fontsize=10)
+    above.set_title(f"points of A in {REVOLUTIONS} revolutions, walls in gray", fontsize=10)
     fields_mrad = np.array([2.0, 5, 10, 20, 40])
     gate_ns = 2 * (150 - 0.5) / LIGHT_M_NS
     waits = gate_ns * 1e-9 * (FIRINGS - 300) * OTHER_HZ  # pulses of B while A waits

@@ -118,7 +118,7 @@ def picture(path: Path) -> None:
     figure.colorbar(
         points,
         ax=map_axes,
-        label="radial velocity, m/s: blue comes nearer",
+        label="radial velocity, m/s (blue: approaching)",
         location="bottom",
         shrink=0.85,
         pad=0.02,
@@ -148,7 +148,7 @@ def picture(path: Path) -> None:
         "--",
         color=theme.SENSOR,
         lw=1.2,
-        label="$-v\\,\\cos\\,$azimuth: what stands still",
+        label="$-v\\,\\cos\\,$azimuth: stationary objects",
     )
     residual = velocity[~moving] + SPEED * np.cos(np.radians(azimuth[~moving])) * level[~moving]
     chart.set(
@@ -158,10 +158,10 @@ def picture(path: Path) -> None:
         ylabel="radial velocity, m/s",
     )
     chart.set_title(
-        f"less than 6° above or below; about the curve of what stands: {residual.std():.3f} m/s",
+        f"less than 6° above or below; deviation of stationary objects: {residual.std():.3f} m/s",
         fontsize=8.5,
     )
-    map_axes.set_title("one turn of an OS1-64, seen from above", fontsize=8.5)
+    map_axes.set_title("one revolution of an OS1-64, from above", fontsize=8.5)
     chart.grid(color=theme.LINE, lw=0.5)
     chart.legend(loc="lower left", fontsize=8, frameon=False)
     figure.savefig(path)

@@ -46,7 +46,7 @@ def picture(path: Path) -> None:
     above.plot(x[alarm], y[alarm], ".", ms=4, color=RED, label=f"{alarm.sum()} false alarms")
     above.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(-100, 100), ylim=(-100, 100))
     above.legend(frameon=False, fontsize=8, loc="upper right")
-    above.set_title("one turn of a VLP-16 in a yard, 20 kHz", fontsize=10)
+    above.set_title("one revolution of a VLP-16 in a yard, 20 kHz", fontsize=10)
     mean = 2 * NOISE.false_alarm_hz / LIGHT_M_S  # a meter
     edges = np.linspace(0, GATE_M, 31)
     middle = (edges[1:] + edges[:-1]) / 2

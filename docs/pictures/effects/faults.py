@@ -1,4 +1,4 @@
-"""Faults of a sensor: range images of a street, and a wall that a carrier approaches."""
+"""Faults of a sensor: range images of a street, and a wall that a vehicle approaches."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def image(survey: Survey) -> np.ndarray:
 
 
 def approach(*faults: Fault) -> tuple[np.ndarray, np.ndarray]:
-    """Return stamps, seconds, and ranges of a forward beam on a carrier that nears a wall."""
+    """Return stamps, seconds, and ranges of a forward beam on a vehicle that approaches a wall."""
     sensor = Sensor.grid(10, 1, 1, step_deg=360, horizontal_fov_deg=1)
     track = Track([0, SECONDS], [(0, 0, 0), (SPEED_M_S * SECONDS, 0, 0)])
     survey = Survey(sensor, trajectory=track, columns=["time"], faults=faults)
@@ -77,7 +77,7 @@ def picture(path: Path) -> None:
         axes.set_title(title, fontsize=9, loc="left")
         axes.set_yticks([0, 32, 63])
         axes.tick_params(labelsize=7)
-    axes.set_xlabel("firing of a turn", fontsize=8)
+    axes.set_xlabel("firing within a revolution", fontsize=8)
     (axes,) = charts.subplots(1, 1, squeeze=False)[0]
     frozen = Fault("frozen", 1, 2)
     for faults, color, words in (
@@ -86,8 +86,8 @@ def picture(path: Path) -> None:
         ((Fault("time_jump", 2.5, by_s=0.5),), RED, "time jump by 0.5 s at 2.5 s"),
     ):
         axes.plot(*approach(*faults), ".", ms=2 if faults else 5, color=color, label=words)
-    axes.set(xlabel="stamp, s", ylabel="range of a wall ahead, m")
-    axes.set_title(f"a carrier at {SPEED_M_S:g} m/s", fontsize=9)
+    axes.set(xlabel="timestamp, s", ylabel="range of a wall ahead, m")
+    axes.set_title(f"a vehicle at {SPEED_M_S:g} m/s", fontsize=9)
     axes.legend(frameon=False, fontsize=8, markerscale=4)
     axes.grid(alpha=0.25)
     save(figure, path)

@@ -79,7 +79,9 @@ def picture(path: Path) -> None:
     }
     for offset, name in labels.items():
         above.annotate(name, offset, fontsize=8)
-    above.set(aspect="equal", xlim=(-7, 22), ylim=(-9, 9.5), xlabel="ahead (m)", ylabel="left (m)")
+    above.set(
+        aspect="equal", xlim=(-7, 22), ylim=(-9, 9.5), xlabel="forward (m)", ylabel="left (m)"
+    )
     above.legend(fontsize=8, loc="lower left", framealpha=0.9, markerscale=1.5)
     above.set_title("a shop window from above, all returns", fontsize=10)
     degrees = np.arange(8, 88, 4)

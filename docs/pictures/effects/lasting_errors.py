@@ -54,19 +54,17 @@ def picture(path: Path) -> None:
         revolution["channel"], 100 * revolution["error"], ".", ms=1, color=GRAY, label="returns"
     )
     channel_means = [revolution["error"][revolution["channel"] == k].mean() for k in range(64)]
-    by_channel.plot(
-        100 * np.array(channel_means), "o", ms=3.5, color=BLUE, label="mean of a channel"
-    )
+    by_channel.plot(100 * np.array(channel_means), "o", ms=3.5, color=BLUE, label="channel mean")
     for sign in (-1, 1):
         by_channel.axhline(100 * sign * NOISE.channel_bias_m, color="k", lw=0.8, ls=":")
-    by_channel.set(xlabel="channel", ylabel="error of range, cm")
+    by_channel.set(xlabel="channel", ylabel="range error, cm")
     by_channel.set_title("channel_bias_m: 0.015 (dotted)", fontsize=9)
     slow = Sensor.grid(20, 1, 1, step_deg=360, rate_hz=0.05, horizontal_fov_deg=1)
     warm = errors(slow, replace(NOISE, channel_bias_m=0.0, ripple_deg=0.0), steps=150)
     by_time.plot(warm["time"] / 60, 100 * warm["error"], ".", ms=1.5, color=GRAY, label="returns")
     closed = 100 * NOISE.warm_up_m * np.exp(-warm["time"] / NOISE.warm_up_s)
     by_time.plot(warm["time"] / 60, closed, color=RED, lw=1.4, label=r"3 cm $e^{-t/600\,s}$")
-    by_time.set(xlabel="time since the start, min", ylabel="error of range, cm")
+    by_time.set(xlabel="time since the start, min", ylabel="range error, cm")
     by_time.set_title("warm_up_m: 0.03, warm_up_s: 600", fontsize=9)
     azimuth = np.linspace(0, 360, 721)
     for cycles, color in ((1, BLUE), (2, RED)):
@@ -74,7 +72,7 @@ def picture(path: Path) -> None:
         by_azimuth.plot(azimuth, error, color=color, label=f"ripple_cycles: {cycles}", lw=1.2)
     simulated = ripple(2)
     by_azimuth.plot(*simulated, ".", ms=3, color=GRAY, label="simulated, 2", zorder=3)
-    by_azimuth.set(xlabel="azimuth, °", ylabel="true less reported azimuth, °")
+    by_azimuth.set(xlabel="azimuth, °", ylabel="true − reported azimuth, °")
     by_azimuth.set_title("ripple_deg: 0.05", fontsize=9)
     for axes in (by_channel, by_time, by_azimuth):
         axes.grid(alpha=0.25)

@@ -1,4 +1,4 @@
-"""Allan deviations of a carrier's IMU that stands for hours, against their closed forms."""
+"""Allan deviations of the IMU of a vehicle that is stationary for hours, against their closed forms."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def outage(axes: Any, still: SimpleNamespace) -> None:
     sigma *= np.exp(-np.clip(np.linspace(0, 35, 701) - 25, 0, None))
     for sign in (-1, 1):
         axes.plot(np.linspace(0, 35, 701), sign * sigma, color=theme.INK, lw=1.2)
-    axes.set(xlabel="time, s", ylabel="error of position, east, m", xlim=(5, 35))
+    axes.set(xlabel="time, s", ylabel="position error, east, m", xlim=(5, 35))
     axes.set_title("40 outages from 10 to 25 s; black: one σ", fontsize=9)
 
 
@@ -113,7 +113,7 @@ def picture(path: Path) -> None:
         ylabel="Allan deviation of angular velocity, °/h",
         ylim=(total.min() * to_hour / 6, None),
     )
-    gyroscopes.set_title("gyroscopes of a carrier that stands", fontsize=9)
+    gyroscopes.set_title("gyroscopes of a stationary vehicle", fontsize=9)
     position_errors = np.concatenate([block.positions for block in fixes(still)])
     hours = np.arange(len(position_errors)) / GNSS.rate_hz / 3600
     colors = {"east": "#4477aa", "north": "#44aa77", "up": "#ee7733"}
@@ -122,8 +122,8 @@ def picture(path: Path) -> None:
     for sign in (-1, 1):
         positions.axhline(sign * GNSS.drift_vertical_m, color="#ee7733", lw=0.8, ls=":")
         positions.axhline(sign * GNSS.drift_horizontal_m, color="#4477aa", lw=0.8, ls=":")
-    positions.set(xlabel="time, h", ylabel="error of position, m", xlim=(0, HOURS))
-    positions.set_title("GNSS of the same carrier; dotted: one σ of the drift", fontsize=9)
+    positions.set(xlabel="time, h", ylabel="position error, m", xlim=(0, HOURS))
+    positions.set_title("GNSS of the same vehicle; dotted: one σ of the drift", fontsize=9)
     for axes in (gyroscopes, positions, outages):
         axes.grid(color=theme.LINE, lw=0.5)
     gyroscopes.legend(fontsize=7.5, frameon=False, loc="upper right")

@@ -67,8 +67,8 @@ def picture(path: Path) -> None:
     walk.plot([1, 1e6], [0, 0], "k:", lw=1, zorder=0, label="without")
     walk.set(xscale="log", ylabel="mean range − true range, cm")
     walk.legend(frameon=False, fontsize=8)
-    walk.set_title("walk: signs appear nearer", fontsize=10)
+    walk.set_title("walk: signs appear closer", fontsize=10)
     for axes in (scatter, walk):
-        axes.set_xlabel("energy E / threshold of detection T")
+        axes.set_xlabel("energy E / detection threshold T")
         axes.grid(alpha=0.25)
     figure.savefig(path)

@@ -115,7 +115,7 @@ def picture(path: Path) -> None:
     section.plot(0, HEIGHT, "^", color=INK, ms=8, zorder=7)
     section.text(0.25, HEIGHT, "sensor", va="center", fontsize=8, color=INK)
     section.set(xlim=(-7.5, 7.5), ylim=(-3.4, 3.4), xlabel="x (m)", ylabel="z (m)", aspect="equal")
-    section.set_title("A pool of 2 m, seen from 3 m above", fontsize=11, color=INK)
+    section.set_title("a pool, 2 m deep, from 3 m above", fontsize=11, color=INK)
     section.legend(fontsize=8, frameon=False, loc="upper right")
 
     floor = box("Floor", (-90, -90, -DEPTH - 1), (90, 90, -DEPTH))

@@ -120,9 +120,9 @@ def picture(path: Path) -> None:
     apart.plot(
         ratio, LIGHT_M_NS / 2 * closed, "k--", lw=1, zorder=0, label="wall as strong as the plate"
     )
-    apart.set(xscale="log", ylim=(0, 4), ylabel="least distance behind the plate, m")
+    apart.set(xscale="log", ylim=(0, 4), ylabel="minimum distance behind the plate, m")
     apart.legend(frameon=False, fontsize=8, loc="upper left")
-    apart.set_title("a wall told apart behind a plate", fontsize=10)
+    apart.set_title("a wall resolved behind a plate", fontsize=10)
     for axes in (widths, apart):
         axes.set_xlabel("signal / saturation")
     for axes in (pulse, widths, apart):

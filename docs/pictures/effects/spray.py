@@ -79,7 +79,7 @@ def picture(path: Path) -> None:
         views[name].set(xlim=(-25, 18), ylim=limits, xlabel="x (m)", ylabel=f"{axis} (m)")
         views[name].set_aspect("equal")
     views["above"].legend(fontsize=8, loc="upper left", framealpha=0.9, markerscale=4)
-    views["above"].set_title("a lorry at 90 km/h, 20 g/m³, from above", fontsize=10)
+    views["above"].set_title("a truck at 90 km/h, 20 g/m³, from above", fontsize=10)
     views["aside"].set_title("from the side", fontsize=10)
     # Beams across the way, 8 m from its middle, at places behind the lorry.
     count = 4000
@@ -121,8 +121,10 @@ def picture(path: Path) -> None:
         color=GRAY,
         label="exp(−x / 10 m)",
     )
-    axes.set(xlabel="behind the lorry (m)", ylabel="returns of a beam across", xlim=(0, 28))
-    axes.set_title("a beam from 8 m beside it", fontsize=10)
+    axes.set(
+        xlabel="distance behind the truck (m)", ylabel="returns of a beam across", xlim=(0, 28)
+    )
+    axes.set_title("a beam from 8 m to the side", fontsize=10)
     axes.legend(fontsize=8, frameon=False)
     axes.grid(alpha=0.25)
     figure.savefig(path)

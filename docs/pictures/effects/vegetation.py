@@ -123,7 +123,9 @@ def picture(path: Path) -> None:
     gaps.set_title("Gap fraction, leaf area index 1.8", fontsize=11, color=INK)
     gaps.legend(fontsize=8, frameon=False)
     depths.set(
-        xlabel="depth below the top (m)", ylabel="density of returns, of all pulses", xlim=(0, HIGH)
+        xlabel="depth below the top (m)",
+        ylabel="density of returns, as a share of all pulses",
+        xlim=(0, HIGH),
     )
     depths.set(ylim=(0, None))
     depths.set_title("First leaves at θ = 40°; lines: Beer–Lambert", fontsize=11, color=INK)

@@ -62,7 +62,7 @@ def picture(path: Path) -> None:
     moments.set(
         aspect="equal", xlabel="m; the sensor is on the left", ylabel="z, m", ylim=(-0.25, 1.9)
     )
-    label = "radial velocity, m/s: blue comes nearer"
+    label = "radial velocity, m/s (blue: approaching)"
     figure.colorbar(points, ax=moments, label=label, location="bottom", shrink=0.85, aspect=40)
     all_positions, seconds, velocities = map(np.concatenate, zip(*sweeps, strict=True))
     light = {"s": 0.6, "cmap": "viridis", "linewidths": 0}
@@ -70,6 +70,6 @@ def picture(path: Path) -> None:
     chart.axhline(-SPEED, color="black", lw=0.8, ls="--")
     chart.set(xlabel="time, s", ylabel="radial velocity, m/s", xlim=(0, SECONDS))
     figure.colorbar(shown, ax=chart, label="height, m", location="bottom", shrink=0.85, aspect=40)
-    moments.set_title("one person in four sweeps, from aside", fontsize=8.5)
+    moments.set_title("one person in four sweeps, side view", fontsize=8.5)
     chart.set_title(f"all points; dashed: the person's own {SPEED} m/s", fontsize=8.5)
     figure.savefig(path)
