@@ -1,4 +1,4 @@
-"""Allan deviations of the IMU of a vehicle that is stationary for hours, against their closed forms."""
+"""Allan deviations of the IMU of a stationary vehicle, against their closed forms."""
 
 from __future__ import annotations
 
