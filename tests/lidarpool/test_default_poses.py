@@ -10,10 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import yaml
+from click.testing import CliRunner
 from tests.shapes import block, level, quad, wall
 from trimesh import creation
 
 from lidarpool import Mounted, Scene, SceneInstance, SceneMesh, Sensor, Survey, load_sensor
+from lidarpool.cli.commands import cli
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.default_poses import place_sensor, poses_around
@@ -109,7 +112,9 @@ def test_the_default_grid_is_narrowed_to_an_object(tmp_path, mesh, points, rays)
     rig = Rig(built.scene, survey, "auto")
     hits = [sum(map(len, rig.cast(36 * n, 36 * (n + 1)))) for n in range(5)]
     assert sum(hits) == pytest.approx(points, rel=0.2)
-    assert "The default sensor is a grid of" in advice(built)[-1]
+    note, poses = advice(built)[-2:]
+    assert "The default sensor is a grid of" in note
+    assert yaml.safe_load(poses.partition("default poses are ")[2]) == built.placing.entries
     # The whole object is seen: no pose sees more of it without the narrow field of view.
     grid = built.placing.grid
     wide = {"vertical_fov_deg": 90, "horizontal_fov_deg": 90}
@@ -257,7 +262,26 @@ def test_files_of_our_own_need_no_unit_and_no_axes(tmp_path, suffix):
     scene = terrain(2_000, 0, 1000.0)
     write_scene(tmp_path / f"own{suffix}", scene)
     read = Scenario.load(tmp_path / f"own{suffix}")
-    assert advice(build(read)) == []
+    assert [note for note in advice(build(read)) if "default poses" not in note] == []
+
+
+def test_default_poses_are_listed_to_the_millimeter(tmp_path):
+    hall = creation.box((8, 6, 3))
+    hall.apply_translation((1 / 3, 0, 1.5 + 1 / 7))
+    (tmp_path / "hall.stl").write_bytes(hall.export(file_type="stl"))
+    scenario = Scenario.load(tmp_path / "hall.stl")
+    poses = [[0.333, 0.0, 0.893], [0.333, 0.0, 1.643], [0.333, 0.0, 2.393]]
+    built = build(scenario)
+    assert advice(built)[-1] == f"no poses are set, so the default poses are {poses}"
+    assert built.placing.entries == poses
+    assert init_poses(tmp_path) == poses
+
+
+def init_poses(folder: Path) -> list[list[float]]:
+    mesh = str(folder / "hall.stl")
+    outcome = CliRunner().invoke(cli, ["init", str(folder / "new"), "--mesh", mesh])
+    assert outcome.exit_code == 0
+    return yaml.safe_load((folder / "new" / "scenario.yaml").read_text())["poses"]
 
 
 CHECK = """

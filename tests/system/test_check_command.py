@@ -148,6 +148,19 @@ def test_it_tells_what_a_run_would_do_and_starts_nothing(check, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["s.yaml"]
 
 
+def test_the_performance_of_each_sensor_is_named(check):
+    assert "\nperformance ideal\n" in check().out
+    vlp16 = {"model": "velodyne/vlp16"}
+    by_sheet = vlp16 | {"performance": "datasheet"}
+    for changed, words in (
+        ({"sensors": {"roof": by_sheet, "nose": vlp16}}, "roof: datasheet; nose: ideal"),
+        ({"sensor": by_sheet, "noise": {"dropout": 0.1}}, "datasheet except for noise"),
+        ({"sensor": vlp16, "returns": {"mode": "dual"}}, "ideal except for returns"),
+    ):
+        scenario = {name: SHORT[name] for name in SHORT.keys() - {"sensor"}} | changed
+        assert f"\nperformance {words}\n" in check(text=json.dumps(scenario)).out
+
+
 def test_json_is_all_that_is_printed(check):
     outcome = check("--json")
     assert (outcome.code, outcome.err) == (0, "")

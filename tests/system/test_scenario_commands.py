@@ -133,6 +133,20 @@ def test_what_is_misspelt_is_answered_with_what_was_meant(arguments, meant, lida
     assert re.search(rf"Did you mean (one of: )?.*{meant}", outcome.err), outcome.err
 
 
+def test_sensors_states_when_the_data_sheet_applies(tmp_path, lidarpool):
+    (tmp_path / "mine.yaml").write_text(
+        (files("lidarsim.sensor") / "data" / "velodyne" / "vlp16.yaml").read_text()
+    )
+    for name, applies in (
+        ("velodyne/vlp16", "with performance: datasheet"),
+        ("mine.yaml", "unless performance is ideal"),
+    ):
+        lines = lidarpool("sensors", name).out.splitlines()
+        row = lines.index(f"data sheet   the noise and returns below apply {applies}")
+        assert lines[row + 1].startswith("noise        range_m: 0.03")
+    assert "data sheet   " not in lidarpool("sensors", "velodyne/vlp32c").out
+
+
 def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool):
     outcome = lidarpool("sensors")
     assert outcome.code == 0

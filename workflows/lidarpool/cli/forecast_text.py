@@ -259,6 +259,9 @@ def _survey_lines(job: Job, figures: dict[str, Any]) -> Iterator[str]:
         path = "along a trajectory"
     scans = scans_in_words(figures["scans"], figures["sweeps"])
     yield f"survey      {scans} {path}, {figures['rays']:,} rays ({pattern})"
+    performance = figures["performance"]
+    of_sensors = (f"{name}: " * bool(name) + words for name, words in performance.items())
+    yield f"performance {'; '.join(of_sensors)}"
     for name, unseen in figures["unseen"].items():
         by_sensor = f"by {name}, " * bool(name)
         yield f"unseen      {by_sensor}{plural(len(unseen), 'object')}: {listed(unseen)}"

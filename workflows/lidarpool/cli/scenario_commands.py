@@ -56,7 +56,6 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.advice import advice
     from ..scenario.build import build
-    from ..scenario.default_poses import as_entry
     from ..scenario.scenario import Scenario, mesh_data
     from ..scenario.schema import (
         SCENARIO_FILE,
@@ -81,7 +80,7 @@ def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every:
         notes = advice(built)
         if (placing := built.placing) is not None:
             note = placing.note
-            data["poses"] = [as_entry(pose) for pose in placing.poses]
+            data["poses"] = placing.entries
             data |= {"sensor": dict(placing.grid)} if placing.grid else {}
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -200,10 +199,11 @@ def check(
     """Validate a scenario and estimate points, memory and disk space.
 
     No workers are started. For a campaign, the varying values and five of the jobs are checked.
+    `lidarpool run` completes the other jobs of a campaign if some jobs cannot be run.
 
     The number of points is estimated by casting a sample of the rays in this process. A warning is
     printed for implausible poses, trajectories and noise. The exit code is 0 if the scenario can be
-    run, and 2 if it cannot.
+    run, and 2 if it cannot or, for a campaign, if a checked job cannot.
 
     \b
     Examples:
@@ -237,10 +237,13 @@ def check(
             options.show({"can_run": False, **reasons}, (), True)
         raise
     options.show(figures, lines, as_json)
+    subject = "scenario" if number is None else "job"
     if figures["reasons"]:
         reasons = figures["reasons"]
-        start = "The scenario cannot be run:\n" if reasons[1:] else "The scenario cannot be run. "
-        raise LidarError(start + "\n".join(reasons))
+        if "checked" in figures:
+            raise LidarError("\n".join([_failed_jobs(figures), *reasons]))
+        start = f"The {subject} cannot be run{':' if reasons[1:] else '.'}"
+        raise LidarError(start + ("\n" if reasons[1:] else " ") + "\n".join(reasons))
     if not as_json:
         words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         settings: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
@@ -250,9 +253,23 @@ def check(
         for name, value in settings.items():
             if value is not None and str(value) != "lidarpool-out":
                 words += [f"--{name}", str(value)]
-        click.echo(f"The scenario can be run: {shlex.join(words)}")
+        subject = "campaign" if "checked" in figures else subject
+        click.echo(f"The {subject} can be run: {shlex.join(words)}")
     if strict and figures["warnings"]:
         sys.exit(WARNED)
+
+
+def _failed_jobs(figures: dict[str, Any]) -> str:
+    """Return the line before the reasons why checked jobs of a campaign cannot be run."""
+    failed = len(figures["failed"])
+    checked = figures["checked"]
+    if failed < checked:
+        return f"{failed} of {checked} checked jobs cannot be run; the others can."
+    return (
+        f"None of the {checked} checked jobs can be run."
+        if failed > 1
+        else "The job cannot be run."
+    )
 
 
 def _free_target(target: Path | Storage) -> str:
@@ -583,6 +600,7 @@ def _list_models() -> None:
 
 def _show_model(name: str) -> None:
     """Print the figures of a model and their sources."""
+    from lidarsim.base.model_names import model_names, plugin_model_names
     from lidarsim.sensor.models import read_model, shown_noise
 
     described = read_model(name)
@@ -594,6 +612,14 @@ def _show_model(name: str) -> None:
         )
     if described.performance is not None:
         sheet = described.datasheet()
+        built_in = name in (*model_names(), *plugin_model_names())
+        lines.append(
+            (
+                "data sheet",
+                "the noise and returns below apply "
+                + ("with performance: datasheet" if built_in else "unless performance is ideal"),
+            )
+        )
         lines.append(("noise", shown_noise(sheet.noise)))
         lines.append(("returns", f"mode: {sheet.returns.mode}, subrays: {sheet.returns.subrays}"))
         lines += [("unknown", ", ".join(sheet.missing))] if sheet.missing else []

@@ -138,7 +138,9 @@ _mesh_options = combine(
         shell_complete=completion.sensors,
     ),
     _mesh_reading_options,
-    _mesh_list_option("pose", "Position of the sensor in meters", metavar="X,Y,Z", type=_position),
+    _mesh_list_option(
+        "pose", "Position of the sensor in meters; can be repeated", metavar="X,Y,Z", type=_position
+    ),
     _mesh_list_option(
         "columns",
         "Additional columns of the point cloud, such as range,intensity",
@@ -284,9 +286,11 @@ def _scheduler_address(
 
 def world_lines(epsg: int | None, origin: Sequence[float]) -> Iterator[str]:
     """Yield a line on the coordinate system of what is written, and on its origin."""
+    from lidarsim.scene.files.coordinate_systems import named_system
+
     if epsg is None and not any(origin):
         return
-    system = "no EPSG code" if epsg is None else f"EPSG:{epsg}"
+    system = "no EPSG code" if epsg is None else named_system(epsg)
     added = ", ".join(f"{value:,.12g}" for value in origin)
     moved = f"; ({added}) m is added to the coordinates of the scenario" if any(origin) else ""
     yield f"world       {system}{moved}"

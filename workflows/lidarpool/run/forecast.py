@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,9 +19,12 @@ from distributed.system import MEMORY_LIMIT
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError, Mistakes
 from lidarsim.base.storage import Storage
+from lidarsim.base.words import joined
 from lidarsim.columns.cloud import CHUNK_POINTS
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.simplified import DRAWN_TRIANGLES
+from lidarsim.sensor.noise import Noise
+from lidarsim.sensor.optics import Returns
 from lidarsim.simulator.casting.scene_caster import check_backend_here
 from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.simulator.memory import (
@@ -128,6 +132,7 @@ def forecast(
         "objects": len(job.scene.object_names),
         "triangles": job.scene.triangles,
         "masked": list(job.scene.masked),
+        "performance": _performance(job.survey),  # {name of a sensor: "ideal" or "datasheet"}
         "unseen": _unseen(job),  # {name of a sensor: names of the objects that it does not see}
         "bounds": _bounds_in_scenario(job.scene).tolist(),
         "epsg": job.survey.epsg,
@@ -271,6 +276,20 @@ def _memory_mistakes(available_bytes: int, required_bytes: int) -> list[str]:
         "workers (`pool.gpu`), `batch_mb`, `rays_per_revolution` or `planning.particles`, or use "
         "a machine with more memory."
     ]
+
+
+def _performance(survey: Survey) -> dict[str, str]:
+    """Return whether each sensor is ideal or as in its data sheet, by the name of the sensor."""
+    performance = {}
+    pairs = zip(survey.carried, survey.noise_each, survey.returns_each, strict=True)
+    for carried, noise, returns in pairs:
+        sensor = carried.sensor
+        words = "ideal" if sensor.noise is None else "datasheet"
+        unchanged_noise = replace(sensor.noise or Noise(), seed=noise.seed)
+        changed = ["noise"] * (noise != unchanged_noise)
+        changed += ["returns"] * (returns != (sensor.returns or Returns()))
+        performance[carried.name] = words + f" except for {joined(changed)}" * bool(changed)
+    return performance
 
 
 def _unseen(job: Job) -> dict[str, list[str]]:

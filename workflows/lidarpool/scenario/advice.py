@@ -55,15 +55,18 @@ def advice(built: Built) -> list[str]:
         axes = [f"{axes[0]}. The same applies to {plural(others, 'other file')}"]
     side = float(np.ptp(built.scene.bounds, axis=0).max())
     step = built.survey.precision_m
-    every = built.survey.keep_every
-    placed = "" if built.placing is None else built.placing.note
-    scene = built.scene.georeferenced(built.scenario.world.origin)
-    system = missing_system(scene, built.survey.epsg)
-    likely = filter(None, (_size_note(built, side), system, placed, _color_note(built)))
+    placed = () if built.placing is None else built.placing.notes
+    origin = built.scenario.world.origin
+    system = missing_system(built.scene.georeferenced(origin), built.survey.epsg)
+    likely = filter(None, (_size_note(built, side), system, *placed, _color_note(built)))
     scanners = [
         "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
         "`cloud.keep_every: 1`"
-    ] * (_writes_bags(built.scenario) and every > 1 and has_planar_sensors(built.survey))
+    ] * (
+        _writes_bags(built.scenario)
+        and built.survey.keep_every > 1
+        and has_planar_sensors(built.survey)
+    )
     coarse = [
         f"points are rounded to {step:g} m, but the scene is only {side:.3g} m long. Set a smaller "
         "`cloud.precision_m` in a scenario"

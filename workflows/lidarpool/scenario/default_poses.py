@@ -58,6 +58,29 @@ class Placing:
     surrounds_object: bool = False  # whether the poses are around an object
     grid: Mapping[str, Any] = field(default_factory=dict)  # arguments of `Sensor.grid`, if narrowed
 
+    @property
+    def entries(self) -> list[list[float] | dict[str, object]]:
+        """Poses in the form of a scenario, rounded to millimeters unless they surround an object.
+
+        Positions around an object are already rounded, with more digits if the object is small.
+        """
+        digits = 12 if self.surrounds_object else 3
+        rounded = [
+            replace(pose, position=tuple(round(x, digits) for x in pose.position))
+            for pose in self.poses
+        ]
+        return [as_entry(pose) for pose in rounded]
+
+    @property
+    def notes(self) -> list[str]:
+        """The note, and a note that lists the poses, if there are any."""
+        if not self.poses:
+            return [self.note]
+        return [
+            self.note,
+            f"no poses are set, so the default poses are {on_one_line(self.entries)}",
+        ]
+
 
 def place_sensor(
     scene: Scene,
