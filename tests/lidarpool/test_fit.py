@@ -222,8 +222,8 @@ def test_a_drive_along_walls_is_found_by_parked_cars_and_posts():
     told = str(raised.value)
     assert float(told.partition("(")[2].partition(" m/s")[0]) == pytest.approx(26, rel=0.05), told
     assert (
-        "Pass its scene with `--scene` and one `--pose` for each sweep, use sweeps from a "
-        "stationary sensor" in told
+        "Pass a mesh of its scene with `--scene` and one `--pose` for each sweep, or use sweeps "
+        "from a stationary sensor. `lidarpool twin` reconstructs such a scene" in told
     )
 
 
@@ -244,7 +244,8 @@ def test_poses_of_a_result_are_used(cluster_client):
     scene = parked_street()
     cloud = simulate(scene, survey_along(26, Noise(range_m=0.01)), client=cluster_client).cloud
     with pytest.raises(
-        LidarError, match=r"by 1.3 m \(26 m/s\) .* Pass the scene to which its poses refer"
+        LidarError,
+        match=r"by 1.3 m \(26 m/s\) .* Pass a mesh of the scene to which its poses refer",
     ):
         fit(cloud)
     fitted = fit(cloud, scene=scene)
@@ -277,11 +278,11 @@ def test_poses_that_are_given_are_one_or_one_for_each_sweep_of_a_scene():
     assert fit(made, scene=scene, pose=poses).figures["figures"]["dropout"]["high"] < 0.001
     for pose, where, says in (
         (poses[:2], scene, r"`pose` contains 2 poses, but drive.pcap has 6 sweeps. Pass one pose"),
-        (poses, None, "by 1.3 m .* Pass the scene to which its poses refer"),
+        (poses, None, "by 1.3 m .* Pass a mesh of the scene to which its poses refer"),
         (poses[0], None, "`pose` requires `scene`"),
         ([(x, y + 1, z + 1) for x, y, z in poses], scene, "Less than half of .* are within 0.3 m"),
         (np.full((6, 4, 4), np.nan), scene, "Matrix 0 of a pose deforms"),
-        (poses[0], scene, "by 1.3 m .* Pass its scene with `--scene` and one `--pose`"),
+        (poses[0], scene, "by 1.3 m .* Pass a mesh of its scene with `--scene` and one `--pose`"),
     ):
         with pytest.raises(LidarError, match=says) as raised:
             fit(made, scene=where, pose=pose)
@@ -353,7 +354,7 @@ def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
     assert lost["value"] < 1e-4
     assert 0 <= lost["low"] <= lost["value"] < lost["high"] < 1e-3  # also of no lost pulse
     assert figures["range_m"]["low"] < NOISE.range_m < figures["range_m"]["high"]
-    assert "% of the cells in the sweeps are gaps, caused by lost packets" in repr(fitted)
+    assert "% of the cells in the sweeps are gaps, which are runs of cells" in repr(fitted)
     lossy = recorded(replace(NOISE, dropout=0.1))
     figures = fit(replace(lossy, read=lossy.read)).figures["figures"]
     assert figures["dropout"]["low"] < 0.1 < figures["dropout"]["high"]

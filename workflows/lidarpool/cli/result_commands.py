@@ -452,7 +452,7 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **settings: Any) -> None
     shell_complete=completion.sensors,
     help="Sensor model for the properties that cannot be estimated from the recording.",
 )
-@options.path("--scene", help="Mesh file of the scene.")
+@options.path("--scene", help="Mesh file of the scene, such as place.glb of lidarpool twin.")
 @options.poses
 @click.option(
     "--sensor", metavar="NAME", help="Sensor or topic of the recording, if it contains several."
@@ -478,6 +478,7 @@ def fit(
       lidarpool fit recording.pcap --model velodyne/vlp16 --out my-vlp16.yaml
       lidarpool fit sweeps --white-intensity 255 --out mine.yaml
       lidarpool fit recording.mcap --scene hall.glb --pose 2,0,1.5 --out mine.yaml
+      lidarpool fit drive.mcap --scene twin/place.glb --out mine.yaml
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..comparing.fit import fit as fitted

@@ -145,7 +145,9 @@ def fit(
     elif loaded is None:
         raise LidarError(
             moving_message(
-                recording.name, speed, "Pass the scene to which its poses refer with `--scene`"
+                recording.name,
+                speed,
+                "Pass a mesh of the scene to which its poses refer with `--scene`",
             )
         )
     else:

@@ -81,8 +81,10 @@ class SweepStack:
         has_return = np.isfinite(values[0]).any(axis=0)
         if (gaps := 1 - covered[:, has_return].mean()) > 0.5 / covered.size:
             notes.append(
-                f"{rounded(100 * gaps, 2)} % of the cells in the sweeps are gaps, caused by lost "
-                "packets or truncated sweeps. Gaps are not counted as lost pulses"
+                f"{rounded(100 * gaps, 2)} % of the cells in the sweeps are gaps, which are runs "
+                "of cells without a return that are too long for individually lost pulses. "
+                "Possible causes are lost packets, truncated sweeps, and motion of the sensor or "
+                "of objects. Gaps are not counted as lost pulses"
             )
         directions, azimuth_offsets = _mean_directions(values, elevation_deg, cells.step_deg)
         return cls(

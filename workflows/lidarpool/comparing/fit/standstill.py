@@ -48,7 +48,9 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
     if speed is not None:
         raise LidarError(
             moving_message(
-                name, speed, "Pass its scene with `--scene` and one `--pose` for each sweep"
+                name,
+                speed,
+                "Pass a mesh of its scene with `--scene` and one `--pose` for each sweep",
             )
         )
     _check_drift(stack, name)
@@ -73,7 +75,7 @@ def sweep_period_ns(recording: Recording, numbers: Ints) -> float | None:
 def moving_message(name: str, speed: Speed, advice: str) -> str:
     """Return the message that the sensor of a recording moves.
 
-    `advice` is the first of three pieces of advice.
+    `advice` is the first piece of advice.
     """
     amounts = []
     if speed.shift_m > 0:
@@ -85,8 +87,8 @@ def moving_message(name: str, speed: Speed, advice: str) -> str:
         amounts.append(f"{rounded(speed.turn_deg, 2)}°")
     return (
         f"{name} was recorded by a sensor that moves by {' and '.join(amounts)} between sweeps. "
-        f"{advice}, use sweeps from a stationary sensor, or use a single sweep to fit only the "
-        "ring biases."
+        f"{advice}, or use sweeps from a stationary sensor. `lidarpool twin` reconstructs such a "
+        "scene from the recording, and also fits the sensor to it."
     )
 
 
