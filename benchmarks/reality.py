@@ -314,10 +314,11 @@ def _row(
     plane_m = [sweeps.alignment.plane_distance_m[number] for number in compared.tolist()]
     return {
         "twin": rays.figures(),
-        "static": masked.figures()["standing"],
+        "static": masked.figures()["stationary"],
         "static_share": float(returned.mean()),
         "interval_m": interval(
-            rays.select(rays.standing), lambda part: part.figures()["all"]["median_size_m"]
+            rays.select(rays.standing),
+            lambda part: part.figures()["all"]["median_abs_difference_m"],
         ),
         "next": to_next(recorded, compared, answering),
         "motion": sweeps.alignment.motion.value,
@@ -337,19 +338,20 @@ def _compared(task: BuildTask) -> HeldOut | None:
 def _line(row: dict[str, Any]) -> str:
     """Return the figures of a row as text."""
     twin = row["twin"]
-    standing = twin["standing"]
+    standing = twin["stationary"]
     no_return = twin["no_return"] or {"f1": float("nan")}
     correlation = standing["rank_correlation"]
     return (
         f"{row['recording']} ({row['rule']}, {row['sweeps']} sweeps, {row['length_m']:.0f} m, "
         f"{row['motion']}): "
-        f"half {1000 * standing['median_size_m']:.0f} mm "
+        f"half {1000 * standing['median_abs_difference_m']:.0f} mm "
         f"{[round(1000 * edge) for edge in row['interval_m'] or []]}, "
-        f"90 % {1000 * standing['p90_size_m']:.0f}, median {1000 * standing['median_m']:+.0f}, "
-        f"static mask {1000 * row['static']['median_size_m']:.0f} "
+        f"90 % {1000 * standing['p90_abs_difference_m']:.0f}, "
+        f"median {1000 * standing['median_difference_m']:+.0f}, "
+        f"static mask {1000 * row['static']['median_abs_difference_m']:.0f} "
         f"({100 * row['static_share']:.1f} %), next {1000 * row['next']['median_size_m']:.0f} "
         f"(F1 {row['next']['f1']:.2f}), "
-        f"planes {1000 * row['plane_m']:.1f}; missed {100 * standing['missed']:.2f} %, F1 "
+        f"planes {1000 * row['plane_m']:.1f}; missed {100 * standing['no_surface']:.2f} %, F1 "
         f"{no_return['f1']:.3f}, points {twin['points']:.3f}, by ring "
         f"{twin['points_by_ring']:.3f}; rank "
         f"{'–' if correlation is None else format(correlation, '.2f')}; {row['seconds']:.0f} s, "

@@ -262,8 +262,8 @@ def _rows(half: HalfPlace, base: SensorModel, only: str = "") -> list[dict[str, 
     sizes = {number: len(half.standing[number]) for number in half.mapped}
     lit, dark = meshes(place, reflectances)
     bare = Scene.from_meshes([lit])
-    white = None if reflectances is None else reflectances.response.white
-    model, notes = fit_sensor(half.sweeps, sizes, bare, white, base)
+    response = None if reflectances is None else reflectances.response
+    model, notes = fit_sensor(half.sweeps, sizes, bare, response, base)
     rays = Rays.of_sweeps(half.sweeps, half.standing, half.compared)
     print(f"{len(rays.recorded_m):,} rays, {model.performance}, {notes}", flush=True)
     scene = Scene.from_meshes([lit, *dark])
@@ -286,7 +286,7 @@ def _rank(half: HalfPlace, reflectances: Reflectances, textured: bool) -> float 
     """
     if not textured:
         reflectances = replace(reflectances, surfels=np.full_like(reflectances.surfels, 0.5))
-    standing = half.rays(half.compared, reflectances).figures()["standing"]
+    standing = half.rays(half.compared, reflectances).figures()["stationary"]
     rank: float | None = standing["rank_correlation"]
     return rank
 

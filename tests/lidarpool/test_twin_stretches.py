@@ -168,8 +168,8 @@ def test_the_same_place_by_any_number_of_workers_and_after_a_kill(bag, tmp_path)
     assert written(folder) == written(tmp_path / "one")
     assert resumed_s < whole_s
     figures = json.loads((folder / "twin.json").read_text())
-    assert figures["stretches"] == 2
-    assert figures["held_out"]["standing"]["median_size_m"] < 0.005
+    assert figures["submaps"] == 2
+    assert figures["held_out"]["stationary"]["median_abs_difference_m"] < 0.005
     assert all(name == "drive.mcap" or name.startswith("object ") for name in found.scene.names)
     assert sorted(path.name for path in folder.iterdir()) == [
         "place.glb", "report.html", "scenario.yaml", "sensor.yaml", "trajectory.csv", "twin.json",

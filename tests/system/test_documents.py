@@ -537,7 +537,7 @@ def test_a_twin_is_made_and_scanned_as_shown(tmp_path, lidarpool):
             assert outcome.code == 0, outcome.err
     figures = json.loads((tmp_path / "twin/twin.json").read_text())
     assert figures["motion"] == "as fired, with point times"
-    assert figures["held_out"]["standing"]["median_size_m"] < 0.003
+    assert figures["held_out"]["stationary"]["median_abs_difference_m"] < 0.003
     assert (tmp_path / "again/cloud.ply").stat().st_size > 1000
 
 

@@ -11,7 +11,7 @@ Arrays have s sweeps, r rings and n points.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
@@ -21,6 +21,7 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
+from lidarsim.sweeps.sweep_motion import FiringPoses
 
 from .lost_pulses import Answering, lost_pulses
 from .motion import Motion, Step
@@ -137,13 +138,37 @@ class Alignment:
         if times_s is None:
             return points, origins
         compensated = np.empty_like(points)
+        for rows, step, shares in self._moved(number, times_s):
+            compensated[rows] = step.compensated(points[rows], shares)
+            origins[rows] = shares[:, None] * step.translation
+        return compensated, origins
+
+    def fired(self, sweep: RecordedSweep, number: int) -> tuple[Floats, FiringPoses] | None:
+        """Return the points (n, 3) of a sweep as fired, calibrated, and the poses of their firings.
+
+        Returns None if the points are compensated.
+        """
+        from scipy.spatial.transform import Rotation
+
+        times_s = self.motion.times_s(sweep, self.sweep_s)
+        if times_s is None:
+            return None
+        pose = self.poses[number]
+        offsets = np.zeros((len(sweep), 3))
+        turns = np.zeros((len(sweep), 3))
+        for rows, step, shares in self._moved(number, times_s):
+            offsets[rows] = shares[:, None] * (pose[:3, :3] @ step.translation)
+            turns[rows] = shares[:, None] * step.rotation
+        quaternions = Rotation.from_rotvec(turns).as_quat().T
+        poses = FiringPoses(pose[:3, 3], pose[:3, :3], offsets.T, quaternions)
+        return self._calibrated(sweep), poses
+
+    def _moved(self, number: int, times_s: Floats) -> Iterator[tuple[Bools, Step, Floats]]:
+        """Yield masks of the points fired at times (n,), their step, and their shares of it."""
         for backward, rows in ((False, times_s >= 0), (True, times_s < 0)):
             if rows.any():
                 step, step_s = self.step(number, backward=backward)
-                shares = times_s[rows] / step_s
-                compensated[rows] = step.compensated(points[rows], shares)
-                origins[rows] = shares[:, None] * step.translation
-        return compensated, origins
+                yield rows, step, times_s[rows] / step_s
 
     def _calibrated(self, sweep: RecordedSweep) -> Floats:
         """Return the points (n, 3) of a sweep with the offsets of their rings."""

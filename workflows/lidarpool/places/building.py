@@ -19,7 +19,7 @@ from pydantic import Field
 
 from lidarscenes.writers.scene_file import write_scene
 from lidarsim._version import __version__
-from lidarsim.base.arrays import Floats
+from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import need
@@ -35,9 +35,9 @@ from lidarsim.sensor.models import SensorModel, read_model
 
 from ..clouds.folder import result_folder, staging
 from ..clouds.kitti import CALIBRATION_FILE
-from ..clouds.recording import Read, Recording
+from ..clouds.recording import FiredPoints, Read, Recording
 from ..columns.parts import StoredCloud
-from ..comparing.fit import fit
+from ..comparing.fit import Fit, fit
 from ..recordings.opening import open_recording
 from ..report.page.rendering import rendered
 from ..scenario.point_scene import CLASS_MATERIAL
@@ -47,11 +47,12 @@ from .finished_steps import FinishedSteps, Map, Step
 from .held_out import HeldOut
 from .labels import divided
 from .lost_pulses import Answering, firings_per_turn
+from .motion import Motion
 from .odometry import RecordedPoses, find_poses
 from .place import Observations
 from .processes import mapping
-from .recorded_sweeps import RecordedSweeps, RecordingChoice
-from .reflectances import Reflectances, Response, fit_response
+from .recorded_sweeps import RecordedSweep, RecordedSweeps, RecordingChoice, Rotation
+from .reflectances import IntensityModel, Reflectances, Response, fit_response
 from .stretch_tasks import (
     BuildTask,
     StretchSurfels,
@@ -69,6 +70,7 @@ SENSOR_FILE = "sensor.yaml"
 SCENARIO_FILE = "scenario.yaml"
 FIGURES_FILE = "twin.json"
 PAGE_FILE = "report.html"
+_COLUMNS = ["time", "intensity", "reflectivity", "class"]  # that the export to KITTI requires, too
 DEFAULT_VOXEL_M = 0.1
 _FIT_SWEEPS = 13  # whose pulses tell the noise of the sensor
 _COMPARED_SWEEPS = 12  # of the held-out sweeps
@@ -78,7 +80,18 @@ _POSES = Step("poses", (RecordedPoses,))
 _ALIGN = Step("align", (AlignedStretch,))
 _BUILD = Step("build", (StretchSurfels, Observations, HeldOut, SweepImages, Above))
 NO_RETURN = "no return"  # name of the object of dark surfels
+_ROTATION_FIELDS = {"clockwise", "zero_deg", "rate_hz"}  # which are written even by default
+_RATE_DECIMALS = 4
+_MIN_STEP_S = 1e-5  # between poses of the trajectory
+_MIN_LEAD = 0.01  # of a revolution, by which a stamp is after the first point
 _MIN_DRIVE_M = 0.3  # a shorter drive shows things from one side
+
+
+class TimedPose(NamedTuple):
+    """Pose at a time."""
+
+    pose: Floats  # (4, 4)
+    time_s: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,6 +107,9 @@ class Twin:
         array of shape (s, 4, 4).
     times_s
         Stamps of the sweeps in seconds since the first. float64 array of shape (s,).
+    start, stop
+        Poses as in `poses`, and times as in `times_s`, of the first point of the first sweep and
+        of the end of the last sweep.
     origin
         Origin of the scene frame in the world frame of the recorded poses, in meters. float64 array
         of shape (3,).
@@ -108,6 +124,8 @@ class Twin:
     scene: Scene
     poses: Floats
     times_s: Floats
+    start: TimedPose
+    stop: TimedPose
     origin: Floats
     model: SensorModel
     figures: dict[str, Any]
@@ -136,7 +154,9 @@ class Twin:
             write_scene(staged / SCENE_FILE, self.scene)
             pictures = {name: page.svg() for name, page in self.pictures.items()}
             page = rendered("twin.html", report=self.figures, pictures=pictures)
-            model = self.model.model_dump(mode="json", exclude_defaults=True)
+            stated = self.model.model_dump(mode="json", exclude_defaults=True)
+            stated |= self.model.model_dump(mode="json", include=_ROTATION_FIELDS)
+            model = {name: stated[name] for name in SensorModel.model_fields if name in stated}
             texts = {
                 TRAJECTORY_FILE: self._trajectory(),
                 SENSOR_FILE: yaml.safe_dump(model, sort_keys=False, default_flow_style=None),
@@ -156,9 +176,16 @@ class Twin:
         return {number: numbers[number] for number in sorted(numbers) if number >= 0}
 
     def _trajectory(self) -> str:
-        """Return the table of the poses."""
-        quaternions = quaternions_of(self.poses[:, :3, :3])
-        rows = np.column_stack([self.times_s, self.poses[:, :3, 3], quaternions])
+        """Return the table of the poses, from the start of the first sweep to the end of the last.
+
+        Otherwise a simulation would lack the last sweep.
+        """
+        before = [self.start] if self.start.time_s < self.times_s[0] else []
+        after = [self.stop] if self.stop.time_s > self.times_s[-1] + _MIN_STEP_S else []
+        poses = np.stack([*(one.pose for one in before), *self.poses, *(one.pose for one in after)])
+        times_s = [*(one.time_s for one in before), *self.times_s, *(one.time_s for one in after)]
+        quaternions = quaternions_of(poses[:, :3, :3])
+        rows = np.column_stack([times_s, poses[:, :3, 3], quaternions])
         lines = ["time_s,x,y,z,qx,qy,qz,qw"]
         lines += [",".join(f"{value:.{_POSE_DECIMALS}f}" for value in row) for row in rows]
         return "\n".join(lines) + "\n"
@@ -183,8 +210,7 @@ class Twin:
             materials.append({"objects": "*"} | light)
         if materials:
             scenario["materials"] = materials
-        columns = ["time", "intensity", *(["class"] if classes else [])]
-        scenario["cloud"] = {"columns": columns}
+        scenario["cloud"] = {"columns": _COLUMNS}
         head = (
             f"# Reconstruction of {self.figures['name']}, created by lidarpool "
             f"{__version__}.\n# To simulate another sensor on the same drive: lidarpool run "
@@ -217,7 +243,7 @@ def twin(
     ----------
     recording
         Sweeps in any format that `compare` supports, or a cloud in memory that has sweeps. The
-        points must be compensated for the motion during their sweep, unless the sensor is slow.
+        points may be as fired or compensated for the motion during their sweep, which is detected.
     model
         Sensor model, by name or file, from which the optics and the data sheet are taken. It is
         required for a sensor without rings. By default, the model is a sensor with the recorded
@@ -228,9 +254,11 @@ def twin(
         it has none, the sweeps are registered to each other.
     voxel_m
         Edge length in meters of the voxels in which points are averaged.
-    sensor, intensity
-        Name of the sensor, or topic of a bag, if the recording has several; and the column with the
-        intensities, which is ``intensity`` by default.
+    sensor
+        Name of the sensor, or topic of a bag, if the recording has several.
+    intensity
+        Name of the column that contains the intensities, by default ``intensity``. They may be
+        energies or compensated for range, which is detected.
     client
         Client of a cluster whose OTHER workers can read the recording at the same path. By default,
         processes on this machine reconstruct the submaps. A recording in memory is always processed
@@ -413,7 +441,8 @@ class _Building:
             for index, part in enumerate(built.parts)
             if len(part.surfels.corners)
         }
-        model, notes = self._sensor(built, sweeps, meshes, response)
+        timing = SweepTiming.of_sweeps(sweeps)
+        model, notes = self._sensor(built, sweeps, meshes, response, timing)
         held_out = built.held_out()
         figures = self._figures(built, alignment) | {
             "poses": poses.source,
@@ -442,6 +471,8 @@ class _Building:
             scene=Scene.from_meshes([*divided(joined_surfels([*meshes.values()])), *built.dark()]),
             poses=alignment.poses,
             times_s=poses.times_s,
+            start=timing.start(alignment),
+            stop=timing.stop(alignment),
             origin=poses.origin,
             model=model,
             figures=figures,
@@ -454,20 +485,27 @@ class _Building:
         sweeps: AlignedSweeps,
         meshes: Mapping[int, SceneMesh],
         response: Response | None,
+        timing: SweepTiming,
     ) -> tuple[SensorModel, list[str]]:
         """Return the sensor with the noise of its pulses on a part of the place, and notes."""
         middle = len(built.parts) // 2
         numbers = built.stretches[middle].own_numbers
         sizes = built.parts[middle].surfels.points
         near = [mesh for index, mesh in meshes.items() if abs(index - middle) <= 1]
-        white = None if response is None else response.white
-        return fit_sensor(
+        sensor = self.base or timing.sensor(sweeps, int(numbers[sizes.argmax()]))
+        model, notes = fit_sensor(
             sweeps,
             dict(zip(numbers.tolist(), sizes.tolist(), strict=True)),
             Scene.from_meshes([joined_surfels(near)]),
-            white,
-            self.base,
+            response,
+            sensor,
         )
+        if self.base is None and timing.rotation is None:
+            notes.append(
+                "the direction of rotation of the sensor is unknown, so sensor.yaml assumes a "
+                "counterclockwise rotation. Set clockwise and zero_deg in this file"
+            )
+        return model, notes
 
     def _figures(self, built: _Built, alignment: Alignment) -> dict[str, Any]:
         """Return the figures of the place and of the drive."""
@@ -477,8 +515,8 @@ class _Building:
             "versions": {"lidarpool": __version__},
             "name": Path(self.recorded.recording.name).name,
             "sweeps": self.recorded.count,
-            "counting_sweeps": sum(len(one.points) for one in surfels),
-            "stretches": len(surfels),
+            "used_sweeps": sum(len(one.points) for one in surfels),
+            "submaps": len(surfels),
             "rings": len(self.recorded.elevation_rad),
             "points": sum(int(one.points.sum()) for one in surfels),
             "moved": sum(int(one.moved.sum()) for one in surfels),
@@ -529,12 +567,75 @@ class _Built:
         return images[len(images) // 2]
 
 
+class SweepTiming(NamedTuple):
+    """When sweeps start, relative to their stamps, and how the sensor rotates."""
+
+    rate_hz: float  # revolutions in a second
+    revolutions: int  # with those whose sweeps were dropped
+    first_s: float  # from the stamp of a sweep to its start, at most 0
+    rotation: Rotation | None  # None if unknown
+
+    @classmethod
+    def of_sweeps(cls, sweeps: AlignedSweeps) -> SweepTiming:
+        """Find the timing of sweeps."""
+        recorded = sweeps.recorded
+        alignment = sweeps.alignment
+        span_s = float(alignment.times_s[-1] - alignment.times_s[0])
+        # Stamps jitter, and their mean step does not, if steps with dropped sweeps count as many.
+        steps = max(round(span_s / alignment.sweep_s), 1)
+        rate_hz = round(steps / span_s, _RATE_DECIMALS)
+        period_s = 1 / rate_hz
+        first_s = 0.0 if recorded.times is None else recorded.times.first_s
+        first_s = first_s if first_s < -_MIN_LEAD * period_s else 0.0
+        rotation = recorded.rotation(period_s, first_s)
+        if rotation is None and alignment.motion.is_turning:
+            rotation = recorded.starts(is_clockwise=alignment.motion is Motion.CLOCKWISE)
+        return cls(rate_hz, steps + 1, first_s, rotation)
+
+    def start(self, alignment: Alignment) -> TimedPose:
+        """Return the start of the first sweep."""
+        step, step_s = alignment.step(0)
+        pose = alignment.poses[0] @ step.part(self.first_s / step_s)
+        return TimedPose(pose, float(alignment.times_s[0]) + self.first_s)
+
+    def stop(self, alignment: Alignment) -> TimedPose:
+        """Return the end of the last sweep, to which its motion goes on."""
+        span_s = float(alignment.times_s[-1] - alignment.times_s[0])
+        rest_s = self.first_s + self.revolutions / self.rate_hz - span_s
+        step, step_s = alignment.step(len(alignment.poses) - 1)
+        pose = alignment.poses[-1] @ step.part(rest_s / step_s)
+        return TimedPose(pose, float(alignment.times_s[-1]) + rest_s)
+
+    def sensor(self, sweeps: AlignedSweeps, number: int) -> SensorModel | None:
+        """Return a sensor with the recorded rings and rotation, or None without rings.
+
+        The steps of azimuth are those of a sweep.
+        """
+        recorded = sweeps.recorded
+        if not len(recorded.elevation_rad):
+            return None
+        elevation_deg = np.degrees(np.sort(recorded.elevation_rad)).round(3)
+        known: dict[str, Any] = {}
+        if self.rotation is not None:
+            zero_deg = round(self.rotation.start_deg, 2) % 360
+            known = {"clockwise": self.rotation.is_clockwise, "zero_deg": zero_deg}
+        return SensorModel(
+            name="Recorded sensor",
+            sources={"angles": "median angles of the recorded points"},
+            **known,
+            firings_per_turn=firings_per_turn(recorded.read(number)),
+            rate_hz=self.rate_hz,
+            range_m=(0.0, float(np.ceil(1.1 * sweeps.answering.max_range_m))),
+            beams={"elevation_deg": elevation_deg.tolist()},
+        )
+
+
 def fit_sensor(
     sweeps: AlignedSweeps,
     sizes: Mapping[int, int],
     scene: Scene,
-    white: float | None,
-    base: SensorModel | None,
+    response: Response | None,
+    sensor: SensorModel | None,
 ) -> tuple[SensorModel, list[str]]:
     """Fit the noise of a sensor to its pulses on a place.
 
@@ -546,61 +647,88 @@ def fit_sensor(
         Numbers of points of the sweeps that may be read: {number of the sweep: points}.
     scene
         The place.
-    white
-        Intensity of a white surface; None if unknown.
-    base
-        The sensor, by default one with the recorded rings. Without rings it is returned.
+    response
+        How intensities follow from reflectances; None without intensities.
+    sensor
+        The sensor without noise, which may only be None for a recording with rings.
 
     Returns
     -------
     tuple
         The sensor, and notes.
     """
+    assert sensor is not None
     if not len(sweeps.recorded.elevation_rad):
-        assert base is not None
-        return base, ["without rings, the sensor noise is that of the sensor model"]
+        return sensor, ["without rings, the sensor noise is that of the sensor model"]
     # A sweep with few points, as with lost packets, looks like one of another sensor.
     counts = np.array([*sizes.values()])
     whole = np.array([*sizes])[counts >= np.median(counts) / 2]
     some = whole[even_indices(len(whole), 2 * _FIT_SWEEPS)]
     # Compensated sweeps may be tilted against the sensor, so that their rings are no cones.
     spread_rad = [sweeps.recorded.cone_spread_rad(number) for number in some.tolist()]
-    chosen = np.sort(some[np.argsort(spread_rad, kind="stable")[:_FIT_SWEEPS]]).tolist()
+    chosen = np.sort(some[np.argsort(spread_rad, kind="stable")[:_FIT_SWEEPS]])
+    try:
+        fitted = _fitted(sweeps, chosen, scene, response)
+    except LidarError as error:  # the place is there, and a scan of it needs no noise
+        return sensor, [f"the sensor noise is unknown: {error}"]
+    performance = fitted.model.performance
+    if performance is None:
+        return sensor, []
+    stated = performance.model_dump(exclude_defaults=True)
+    dropout = fitted.figures["figures"].get("dropout")
+    if dropout is not None and not dropout["low"] > 0:
+        stated.pop("dropout", None)
+    count = plural(len(chosen), "sweep")
+    source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}, {count}"
+    changes = {"performance": stated, "sources": {**sensor.sources, "performance": source}}
+    return SensorModel.model_validate(sensor.model_dump() | changes), []
+
+
+def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Response | None) -> Fit:
+    """Fit a sensor to chosen sweeps on a place, or raise LidarError.
+
+    Points as fired have a pose for each pulse. Compensated ones have none: their rings are blurred,
+    and steps of azimuth beside near things look like lost pulses.
+    """
+    recorded = sweeps.recorded
+    poses = sweeps.alignment.poses[chosen]
+    are_energies = response is not None and response.model is IntensityModel.ENERGIES
+    white = None if response is None else response.white
+
+    def columns(sweep: RecordedSweep) -> dict[str, Any]:
+        found: dict[str, Any] = {"ring": recorded.ring_count - 1 - sweep.ring}
+        if sweep.intensities is not None:
+            # As an energy, white at 10 m is 1.
+            found["intensity"] = sweep.intensities / (white if are_energies and white else 1)
+        return found
+
+    def fired(index: int) -> FiredPoints:
+        number = int(chosen[index])
+        sweep = recorded.read(number)
+        as_fired = sweeps.alignment.fired(sweep, number)
+        assert as_fired is not None
+        points, firing_poses = as_fired
+        return FiredPoints(points, columns(sweep), firing_poses)
 
     def read(index: int) -> Read:
-        sweep = sweeps.read(chosen[index])
-        columns: dict[str, Any] = {"ring": sweeps.recorded.ring_count - 1 - sweep.ring}
-        if sweep.intensities is not None:
-            columns["intensity"] = sweep.intensities
-        return sweep.points, columns, None
+        number = int(chosen[index])
+        sweep = recorded.read(number)
+        if is_compensated:
+            return sweeps.aligned(sweep, number).points, columns(sweep), None
+        points, found, _ = fired(index)
+        return points, found, None
 
-    aligned = Recording(sweeps.name, len(chosen), read)
-    poses = sweeps.alignment.poses[chosen]
-    try:
-        fitted = fit(aligned, scene=scene, pose=poses, white=white).model
-    except LidarError as error:  # the place is there, and a scan of it needs no noise
-        sensor = base or _without_noise(sweeps, chosen[0])
-        return sensor, [f"the sensor noise is unknown: {error}"]
-    if base is None or fitted.performance is None:
-        return base or fitted, []
-    source = f"fitted by lidarpool {__version__} to {Path(sweeps.name).name}"
-    changes = {
-        "performance": fitted.performance.model_dump(exclude_defaults=True),
-        "sources": {**base.sources, "performance": source},
-    }
-    return SensorModel.model_validate(base.model_dump() | changes), []
-
-
-def _without_noise(sweeps: AlignedSweeps, number: int) -> SensorModel:
-    """Return a sensor with the rings of a recording, and the steps of azimuth of a sweep."""
-    elevation_deg = np.degrees(np.sort(sweeps.recorded.elevation_rad)).round(3)
-    return SensorModel(
-        name="Recorded sensor",
-        sources={"angles": "median angles of the recorded points"},
-        firings_per_turn=firings_per_turn(sweeps.recorded.read(number)),
-        range_m=(0.0, float(np.ceil(1.1 * sweeps.answering.max_range_m))),
-        beams={"elevation_deg": elevation_deg.tolist()},
+    is_compensated = sweeps.alignment.motion is Motion.COMPENSATED
+    recording = Recording(
+        sweeps.name,
+        len(chosen),
+        read,
+        energies=are_energies,
+        frame_poses=lambda: poses,
+        fired=None if is_compensated else fired,
     )
+    pose = poses if is_compensated else None
+    return fit(recording, scene=scene, pose=pose, white=None if are_energies else white)
 
 
 def _drive_notes(alignment: Alignment) -> list[str]:

@@ -187,17 +187,20 @@ def draw_above(parts: Sequence[Above], path: Floats) -> Page:
 def draw_errors(figures: Mapping[str, Any]) -> Page:
     """Draw the differences of ranges along the drive, and by range."""
     page = Page((_WIDTH, 560))
-    page.title("Range differences", "in held-out sweeps; dots: medians; bars: 90th percentiles")
+    page.title(
+        "Range differences",
+        "absolute values in held-out sweeps; dots: medians; bars: 90th percentiles",
+    )
     rows = (
         (figures["held_out"]["by_sweep"], "sweep", "sweep"),
         (figures["held_out"]["by_range"], "from_m", "range from, m"),
     )
     for index, (entries, key, label) in enumerate(rows):
         axes = page.chart((_LEFT + 0.46 * index, 0.17, 0.38, 0.56), xlabel=label, ylabel="mm")
-        known = [entry for entry in entries if entry["median_size_m"] is not None]
+        known = [entry for entry in entries if entry["median_abs_difference_m"] is not None]
         x = [entry[key] for entry in known]
-        half = [1000 * entry["median_size_m"] for entry in known]
-        most = [1000 * entry["p90_size_m"] for entry in known]
+        half = [1000 * entry["median_abs_difference_m"] for entry in known]
+        most = [1000 * entry["p90_abs_difference_m"] for entry in known]
         axes.vlines(x, half, most, color=theme.UNSEEN, lw=1.8 * page.unit)
         axes.plot(x, half, "o", color=theme.OBJECT_COLORS[0], ms=4 * page.unit, mew=0)
         axes.set_yscale("log")

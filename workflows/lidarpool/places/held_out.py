@@ -79,7 +79,7 @@ class HeldOut:
         ]
         return {
             "all": self._figures(self.returned),
-            "standing": self._figures(self.standing),
+            "stationary": self._figures(self.standing),
             "by_range": [row for row in classes if row["rays"]],
             "by_sweep": [
                 {"sweep": int(number)} | self._figures(self.returned & (self.sweep == number))
@@ -128,18 +128,20 @@ class HeldOut:
         both = np.isfinite(recorded) & np.isfinite(simulated)
         figures: dict[str, Any] = {
             "rays": int(rays.sum()),
-            "missed": 1 - float(met.mean()) if len(met) else None,
-            "median_m": float(np.median(difference_m[met])) if met.any() else None,
-            "median_size_m": float(np.median(size_m)) if met.any() else None,
-            "p90_size_m": float(np.quantile(size_m, 0.9)) if met.any() else None,
+            "no_surface": 1 - float(met.mean()) if len(met) else None,
+            "median_difference_m": float(np.median(difference_m[met])) if met.any() else None,
+            "median_abs_difference_m": float(np.median(size_m)) if met.any() else None,
+            "p90_abs_difference_m": float(np.quantile(size_m, 0.9)) if met.any() else None,
             "rank_correlation": None,
-            "intensity_error": None,
+            "mean_intensity_difference": None,
         }
         if both.sum() > 2 and np.ptp(recorded[both]) > 0 and np.ptp(simulated[both]) > 0:
             from scipy.stats import spearmanr
 
             figures["rank_correlation"] = float(spearmanr(recorded[both], simulated[both])[0])
-            figures["intensity_error"] = float(simulated[both].mean() / recorded[both].mean() - 1)
+            figures["mean_intensity_difference"] = float(
+                simulated[both].mean() / recorded[both].mean() - 1
+            )
         return figures
 
 

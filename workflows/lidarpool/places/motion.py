@@ -26,6 +26,11 @@ class Motion(StrEnum):
     COUNTERCLOCKWISE = "as fired, counterclockwise"
     CLOCKWISE = "as fired, clockwise"
 
+    @property
+    def is_turning(self) -> bool:
+        """Whether points are compensated by their azimuths."""
+        return self in (Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE)
+
     def times_s(self, sweep: RecordedSweep, sweep_s: float) -> Floats | None:
         """Return the times of points (n,) relative to the stamp of their sweep.
 

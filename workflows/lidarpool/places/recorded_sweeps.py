@@ -38,6 +38,7 @@ _MAX_OUTSIDE = 0.5  # sweeps by which a stamp may lie before the first point or 
 _MIN_SWEEP_S = 0.01
 _MAX_SWEEP_S = 2.0
 _MAX_START_RAD = np.radians(12)  # between the first pulses of rings
+_MIN_AGREEMENT = 0.9  # of azimuths with a steady rotation: length of their mean direction
 _MIN_TIMES = 8  # different times of a sweep; fewer are times of packets, or lack precision
 _MAX_CONE_SPREAD = 0.25  # of a ring, over all elevations: lines of a Livox are no cones
 _MIN_IN_ORDER = 0.95  # share of runs whose elevations go on in one direction
@@ -113,6 +114,13 @@ class RecordingChoice(NamedTuple):
 @lru_cache(maxsize=1)
 def _opened(choice: RecordingChoice) -> Recording:
     return open_recording(*choice, name="the recording")
+
+
+class Rotation(NamedTuple):
+    """Rotation of a sensor."""
+
+    is_clockwise: bool
+    start_deg: float  # azimuth at the start of a sweep, 0 to 360
 
 
 class Clock(StrEnum):
@@ -261,7 +269,8 @@ class RecordedSweeps:
                 f"{recording.name} contains no sweeps. Use a recording that consists of sweeps."
             )
         numbers = even_indices(recording.count, _REFERENCE_SWEEPS).tolist()
-        returns = {number: _returns(recording, number) for number in numbers}
+        # Compensation for motion changes elevations.
+        returns = {number: _returns(recording, number, as_fired=True) for number in numbers}
         references = {number: found for number, found in returns.items() if len(found[0])}
         if not references:
             raise LidarError(
@@ -368,6 +377,39 @@ class RecordedSweeps:
             return None
         stamp_s = None if self.stamps_s is None else float(self.stamps_s[number])
         return self.times.of_points(columns, stamp_s)
+
+    def rotation(self, period_s: float, first_s: float) -> Rotation | None:
+        """Find the rotation by the times and azimuths of points, or None if these do not show it.
+
+        A revolution takes `period_s`, and starts at `first_s` relative to the stamp. The azimuth of
+        the start is a mean over rings and sweeps. The motion of the sensor hardly changes it, since
+        compensation shifts azimuths to the left and right alike.
+        """
+        if self.times is None:
+            return None
+        sums = np.zeros(2, complex)
+        count = 0
+        for number in even_indices(self.count, _REFERENCE_SWEEPS).tolist():
+            points, columns = _returns(self.recording, number)
+            stamp_s = None if self.stamps_s is None else float(self.stamps_s[number])
+            times_s = self.times.of_points(columns, stamp_s)
+            if times_s is None or not len(points):
+                continue
+            azimuth = np.arctan2(points[:, 1], points[:, 0])
+            turned = 2 * np.pi * (times_s - first_s) / period_s
+            sums += [np.exp(1j * (azimuth - sign * turned)).sum() for sign in (1, -1)]
+            count += len(points)
+        best = int(np.abs(sums).argmax())
+        if np.abs(sums[best]) <= _MIN_AGREEMENT * count:
+            return None
+        return Rotation(best == 1, float(np.degrees(np.angle(sums[best])) % 360))
+
+    def starts(self, *, is_clockwise: bool) -> Rotation:
+        """Return the rotation of a known direction, by where the rings of sweeps start."""
+        numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
+        start_rad = np.stack([self.read(number).start_rad for number in numbers])
+        mean = float(np.angle(np.exp(1j * start_rad).sum()))
+        return Rotation(is_clockwise, float(np.degrees(mean) % 360))
 
     def cone_spread_rad(self, number: int) -> float:
         """Return how far the rings of a sweep are from cones (`_cones`), radians; inf if empty."""
@@ -509,11 +551,19 @@ def _clusters(points: Floats) -> Floats | None:
     return _medians(elevation, starts)[::-1]
 
 
-def _returns(recording: Recording, number: int) -> tuple[Floats, dict[str, AnyArray]]:
-    """Return the points (n, 3) of a sweep in the sensor frame, meters, and their columns."""
+def _returns(
+    recording: Recording, number: int, *, as_fired: bool = False
+) -> tuple[Floats, dict[str, AnyArray]]:
+    """Return the points (n, 3) of a sweep in the sensor frame, meters, and their columns.
+
+    With `as_fired`, points that were compensated are not, if the recording has both.
+    """
     with reading(recording.name):
         points, columns, _ = recording.read(number)
         recording.check_intensity(columns)
+        if as_fired and recording.fired is not None:
+            points, columns, _ = recording.fired(number)
+            points = np.asarray(points, np.float64) / recording.meters
     positions = np.asarray(points, np.float64)
     # Drivers write NaN or zeros for pulses without a return.
     returned = np.isfinite(positions).all(axis=1) & positions.any(axis=1)

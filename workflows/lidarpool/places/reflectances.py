@@ -1,15 +1,17 @@
 """Reflectances of surfels from intensities, freed from range, incidence and ring.
 
-A recorded intensity is taken as the product of the reflectance of the surface and three factors of
-the sensor: of the range, as of optics that see near surfaces in part and electronics that
-compensate for distance, of the incidence, and of the ring. Each factor is the one that explains the
-intensities of surfels that were seen from several places.
+A recorded intensity is modeled as the product of the reflectance of the surface, a law of range and
+incidence (`IntensityModel`), and three factors of the sensor: of the range, as of optics that see
+near surfaces in part, of the incidence, and of the ring. Each factor is the one that explains the
+intensities of surfels that were seen from several places. A simulation applies its own law of range
+and incidence to the reflectances, and none of the factors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +28,33 @@ _MIN_RAYS = 200  # of a factor; fewer do not change it
 _WHITE_QUANTILE = 0.999  # of the intensities: what is brighter is as bright as white
 _WHITE_SHARE = 0.99  # of the rays, which end on surfaces up to white
 _MIN_REFLECTANCE = 0.01  # surfaces that were recorded as black
+_MAX_DIFFERENCE = 0.9  # of energies, over that of intensities that are compensated for range
+_MIN_COSINE = 1e-3  # of the incidence of rays that the factors are fitted to
+_WHITE_RANGE_M = 10.0  # range at which a white surface has the simulated intensity 1
+
+
+class IntensityModel(StrEnum):
+    """How intensities depend on range and incidence, apart from the factors of the sensor."""
+
+    COMPENSATED = "compensated for range"
+    ENERGIES = "energies"
+
+    def law(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
+        """Return the intensities (k,) of equally bright surfaces."""
+        if self is IntensityModel.COMPENSATED:
+            return np.ones(len(range_m))
+        return self.simulated(range_m, cosine)
+
+    def simulated(self, range_m: AnyFloats, cosine: AnyFloats) -> Floats:
+        """Return what a simulation writes for white surfaces (k,).
+
+        Energies are compared with its column `intensity`, and intensities that are compensated for
+        range with its column `reflectance`, to which `reflectivity` is proportional.
+        """
+        level = np.asarray(cosine, np.float64)
+        if self is IntensityModel.COMPENSATED:
+            return level
+        return level * (_WHITE_RANGE_M / np.asarray(range_m, np.float64)) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,28 +63,36 @@ class Response:
 
     Attributes
     ----------
+    model
+        How intensities depend on range and incidence.
     by_range, by_incidence, by_ring
         float64: factors of intensities, of the ranges between `_RANGE_EDGES_M`, of evenly spaced
         cosines, and of each ring.
     white
-        Intensity of a white surface.
+        Intensity of a white surface; of energies at 10 m and normal incidence.
     brightest
-        Intensity as which all that is brighter counts, such as a reflector.
+        Intensity over the law of the model as which all that is brighter counts, such as a
+        reflector.
     typical
         Median reflectance.
+    scale
+        Recorded over simulated intensity, in the mean of the rays.
     """
 
+    model: IntensityModel
     by_range: Floats
     by_incidence: Floats
     by_ring: Floats
     white: float
     brightest: float
     typical: float
+    scale: float
 
     def factors(self, range_m: AnyFloats, cosine: AnyFloats, ring: Integers) -> Floats:
         """Return the intensities (k,) of white surfaces."""
         factors = self.by_range[_range_bin(range_m)] * self.by_incidence[_incidence_bin(cosine)]
-        return np.asarray(factors * self.by_ring[ring] * self.white)
+        law = self.model.law(range_m, cosine)
+        return np.asarray(factors * self.by_ring[ring] * self.white * law)
 
     def reflectances(self, seen: Observations, centers: Floats) -> Reflectances:
         """Return the reflectances of surfels with centers (m, 3).
@@ -67,7 +104,8 @@ class Response:
         seen = seen.part(np.isfinite(seen.intensity))
         count = len(centers)
         expected = self.factors(seen.range_m, seen.cosine, seen.ring)
-        intensity = np.minimum(seen.intensity, self.brightest)
+        law = self.model.law(seen.range_m, seen.cosine)
+        intensity = np.minimum(seen.intensity, self.brightest * law)
         surfels = _ratios(seen.surfel, intensity, expected, np.full(count, np.nan))
         known = np.isfinite(surfels)
         if known.any():
@@ -80,6 +118,7 @@ class Response:
     def figures(self) -> dict[str, Any]:
         """Return the response of the sensor for the report."""
         return {
+            "model": self.model.value,
             "white": self.white,
             "by_range": self.by_range.round(4).tolist(),
             "by_incidence": self.by_incidence.round(4).tolist(),
@@ -95,10 +134,13 @@ class Reflectances:
     response: Response
 
     def intensities(self, sweep: AlignedSweep, seen: Seen) -> Floats:
-        """Return the intensities (n,) of the rays of a sweep, NaN for a ray that meets nothing."""
-        factors = self.response.factors(seen.distance_m, seen.cosine, sweep.ring[seen.rays])
+        """Return the simulated intensities (n,) of the rays of a sweep, on the recorded scale.
+
+        They are NaN for rays that meet nothing.
+        """
+        law = self.response.model.simulated(seen.distance_m, seen.cosine)
         intensities = np.full(len(sweep.points), np.nan)
-        intensities[seen.rays] = self.surfels[seen.surfel] * factors
+        intensities[seen.rays] = self.surfels[seen.surfel] * law * self.response.scale
         return intensities
 
 
@@ -107,59 +149,62 @@ def fit_response(
 ) -> Response | None:
     """Fit the response of a sensor to rays that end on surfels, or return None without intensities.
 
-    Each of the `parts` has surfels of its own. Intensities that are compensated for the range do
-    not depend on it, at first, and energies fall with the square of the range and the cosine of the
-    incidence: unless it is known that they `are_energies`, what explains the intensities better is
-    kept. Sums, not logarithms, are compared: many sensors report dark surfaces as 0.
+    Each of the `parts` has surfels of its own. Unless it is known that the intensities
+    `are_energies`, they are taken as compensated for range, if the other model does not explain
+    them clearly better: surfaces that were seen from one distance fit both models. Differences are
+    relative, because energies span several decades, and near surfaces would decide alone. Sums, not
+    logarithms, are compared: many sensors report dark surfaces as 0.
     """
     seen = Observations.joined(parts)
-    seen = seen.part(np.isfinite(seen.intensity))
+    seen = seen.part(np.isfinite(seen.intensity) & (seen.cosine > _MIN_COSINE))
     if not (seen.intensity > 0).any():
         return None
-    brightest = float(np.quantile(seen.intensity, _WHITE_QUANTILE))
-    intensity = np.minimum(seen.intensity / brightest, 1.0)
-    fits = [
-        _Factors.of_rays(seen, intensity, _first_factors(ring_count, energies=energies))
-        for energies in ((True,) if are_energies else (False, True))
-    ]
-    best = min(fits, key=lambda fit: fit.difference)
+    models = (IntensityModel.ENERGIES,) if are_energies else tuple(IntensityModel)
+    fits = [_Factors.of_rays(seen, model, ring_count) for model in models]
+    best = fits[0]
+    if fits[-1].difference < _MAX_DIFFERENCE * best.difference:
+        best = fits[-1]
     # Reflectances of 1 are white: the factors take what is above. Surfels that few rays met
     # scatter, so rays count.
-    scale = max(float(np.quantile(best.reflectance[seen.surfel], _WHITE_SHARE)), 1e-6)
-    typical = float(np.nanmedian(best.reflectance)) / scale
+    reflectance = best.reflectance[seen.surfel]
+    white = max(float(np.quantile(reflectance, _WHITE_SHARE)), 1e-6 * best.brightest)
+    typical = float(np.nanmedian(best.reflectance)) / white
+    simulated = (reflectance / white).clip(_MIN_REFLECTANCE, 1.0)
+    simulated *= best.model.simulated(seen.range_m, seen.cosine)
+    scale = float(best.intensity.sum() / simulated.sum())
     by_range, by_incidence, by_ring = best.factors
-    return Response(by_range, by_incidence, by_ring, brightest * scale, brightest, typical)
-
-
-def _first_factors(ring_count: int, *, energies: bool) -> list[Floats]:
-    """Return the factors by range, incidence and ring from which fitting starts.
-
-    A surface is met by few ranges, incidences and rings: what these do not tell stays.
-    """
-    edges_m = np.array(_RANGE_EDGES_M[:-1], np.float64)
-    widths_m = np.diff(edges_m, append=1.5 * edges_m[-1])
-    cosines = (np.arange(_INCIDENCE_BINS) + 0.5) / _INCIDENCE_BINS
-    if not energies:
-        return [np.ones(len(edges_m)), np.ones(_INCIDENCE_BINS), np.ones(ring_count)]
-    return [1 / (edges_m + widths_m / 2) ** 2, cosines, np.ones(ring_count)]
+    return Response(
+        best.model, by_range, by_incidence, by_ring, white, best.brightest, typical, scale
+    )
 
 
 class _Factors(NamedTuple):
     """Factors by range, incidence and ring, and reflectances of surfels, NaN if not seen."""
 
+    model: IntensityModel
+    intensity: Floats  # (k,): those of reflectors as those of white surfaces
     factors: list[Floats]
-    reflectance: Floats
-    difference: float  # mean, of intensities
+    reflectance: Floats  # intensity over the law of the model and the factors
+    brightest: float
+    difference: float  # mean, of intensities, over their sum
 
     @classmethod
-    def of_rays(cls, seen: Observations, intensity: AnyFloats, factors: list[Floats]) -> _Factors:
-        """Fit factors and reflectances in turn to the intensities (k,) of rays."""
+    def of_rays(cls, seen: Observations, model: IntensityModel, ring_count: int) -> _Factors:
+        """Fit factors and reflectances in turn to the intensities of rays.
+
+        A surface is met by few ranges, incidences and rings: what these do not tell stays.
+        """
+        law = model.law(seen.range_m, seen.cosine)
+        brightest = float(np.quantile(seen.intensity / law, _WHITE_QUANTILE))
+        intensity = np.minimum(seen.intensity, brightest * law)
         unknown = np.full(int(seen.surfel.max()) + 1, np.nan)
         rows: list[Integers] = [_range_bin(seen.range_m), _incidence_bin(seen.cosine), seen.ring]
+        counts = (len(_RANGE_EDGES_M) - 1, _INCIDENCE_BINS, ring_count)
+        factors = [np.ones(count) for count in counts]
         reflectance = unknown
-        product = intensity
+        product = law
         for _ in range(_ROUNDS):
-            product = np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
+            product = law * np.prod([f[row] for f, row in zip(factors, rows, strict=True)], axis=0)
             reflectance = _ratios(seen.surfel, intensity, product, unknown)
             for index, row in enumerate(rows):
                 others = product / factors[index][row]
@@ -169,8 +214,9 @@ class _Factors(NamedTuple):
                     factors[index], weights=np.bincount(row, minlength=len(factors[index]))
                 )
                 product = others * factors[index][row]
-        difference = np.abs(reflectance[seen.surfel] * product - intensity).mean()
-        return cls(factors, reflectance, float(difference))
+        expected = reflectance[seen.surfel] * product
+        difference = np.abs(expected - intensity) / np.maximum(expected + intensity, 1e-300)
+        return cls(model, intensity, factors, reflectance, brightest, float(difference.mean()))
 
 
 def _ratios(row: Integers, values: AnyFloats, expected: AnyFloats, before: Floats) -> Floats:
