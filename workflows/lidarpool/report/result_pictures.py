@@ -322,14 +322,15 @@ def draw_stations(plan: StationPlan) -> Page:
     page = Page(SIZE)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLORS, 0.6))
     page.numbers(axes, shot)
-    names = ["covered", "not covered", "not reachable (range, field of view, angle, or hidden)"]
+    names = ["covered", "not covered", "not reachable"]
     names += ["not a target"] * (not plan.targets.all())
     page.legend([*zip(names, COLORS, strict=False)], "station")
     candidates = plural(len(plan.candidates), "candidate position")
     targets = "" if plan.targets.all() else f" of {plural(int(plan.targets.sum()), 'object')}"
     page.title(
         plural(len(plan.stations), "station").capitalize(),
-        f"{plan.coverage[-1]:.1%} of the reachable area{targets} covered; {candidates}",
+        f"{plan.coverage[-1]:.1%} of the area{targets} that is reachable (within range, field of "
+        f"view and angle) covered; {candidates}",
         plan.sight.sensor.model,
     )
     return page
