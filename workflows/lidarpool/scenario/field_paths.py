@@ -72,6 +72,8 @@ def _field(scenario: Scenario, node: BaseModel, name: str, path: str) -> tuple[s
     if name not in attributes:
         kind = f"a field of {path}" if path else "a section of a scenario"
         hint = did_you_mean(name, attributes) or _path_hint(scenario, name)
+        if name.isdecimal() and "position" in attributes:  # of the short form [x, y, z]
+            hint = f" Did you mean {f'{path}.position.{name}'!r}?"
         raise LidarError(f"{name!r} is not {kind}.{hint}")
     attribute = attributes[name]
     return name, getattr(node, attribute, None), fields[attribute].annotation
