@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import pickle
+import re
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from lidarpool import Campaign, Job, LidarError, Noise, Scene, Survey
+from lidarpool import Campaign, Job, LidarError, Noise, Scene, Survey, load_sensor
 from lidarpool.scenario.campaign_jobs import file_hashes
 from lidarpool.scenario.campaign_sections import JobRandom, is_campaign
 from lidarpool.scenario.scenario import Scenario
+from lidarsim.sensor.models import model_names
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -226,6 +229,30 @@ def test_columns_of_a_table_are_fields_or_ignored(campaign, folder):
         campaign({"scene.copies": {"sample": {**sample, "ignore": ["wood", "steel"]}}})
 
 
+def test_a_value_that_is_not_set_is_none(campaign):
+    found = campaign({KM: {"each": [None, 0.5]}, "steps": {"choice": [None, 3], "weights": [1, 0]}})
+    assert [found.values(number) for number in range(2)] == [
+        {KM: None, "steps": None}, {KM: 0.5, "steps": None},
+    ]  # fmt: skip
+    assert dict(found.choices) == {
+        KM: "each of none, 0.5, in turn",
+        "steps": "chosen from none (1), 3 (0), with these weights",
+    }
+
+
+def test_the_guide_names_the_sensors_whose_data_sheets_suffice_for_rain():
+    """No other model can be used in rain without further values."""
+    guide = Path(__file__).parents[2] / "docs" / "how-to" / "campaign.md"
+    rain = guide.read_text(encoding="utf-8").partition("### Rain\n")[2].partition("Set it in")[0]
+    found = set()
+    for name in model_names():
+        with suppress(LidarError):  # a value is missing
+            sensor = load_sensor(name, performance="datasheet")
+            Survey(sensor, poses=[(0, 0, 1)], rain_mm_h=10)
+            found.add(name)
+    assert set(re.findall(r"`([a-z]+/[\w-]+)`", rain)) == found
+
+
 def test_names_may_be_given_to_values(campaign):
     found = campaign(
         {
@@ -399,7 +426,7 @@ def test_a_function_makes_jobs():
     assert (found.names, dict(found.choices)) == (("number", "sigma", "fog"), {})
     jobs = [found.job(number) for number in (0, 7, 7)]
     assert [made.values["number"] for made in jobs] == [0, 7, 7]
-    assert type(jobs[1].values["number"]) is int and "fog" not in jobs[1].values
+    assert type(jobs[1].values["number"]) is int and jobs[1].values["fog"] is None
     assert jobs[1].values == jobs[2].values != jobs[0].values
     assert (jobs[1].number, jobs[1].name, jobs[1].split) == (7, "0007", "a")
     assert found.scenario(7) is None and found.values(7) == jobs[1].values
@@ -446,6 +473,10 @@ WRONG = {
     "no field": ({"weather.visibility": {"uniform": [1, 2]}}, "Did you mean 'visibility_km'?"),
     "other unit": ({"weather.visibility_m": {"choice": [60]}}, "Its unit is km, not m."),
     "no name": ({"sensors.rof.model": {"choice": ["a"]}}, "Did you mean 'roof'?"),
+    "short form": (
+        {"sensors.front.left.mount.0": {"uniform": [1, 2]}},
+        "Did you mean 'sensors.front.left.mount.position.0'?",
+    ),
     "no list": ({"poses.0.yaw_deg": {"uniform": [1, 2]}}, "the base has no poses"),
     "low": ({KM: {"uniform": [0, 2]}}, f"{KM} can be 0.0, but must be from 0.001 to"),
     "tail": (

@@ -45,8 +45,8 @@ def write(place, rows, picture=None, versions=None, **given):
     of = SimpleNamespace(**{
         "title": "Drives", "count": 31, "seed": 7, "names": NAMES, "license": "CC-BY-4.0",
         "command": "campaign.yaml", "description": "", "keep": {"format": "kitti"},
-        "sensors": {"roof": "velodyne/vlp16, 10 Hz"}, "seconds": 0.0, "resumed": 0, "notes": (),
-        "stages": (), "classes": {},
+        "sensors": {"roof": "velodyne/vlp16, 10 Hz"}, "seconds": 0.0, "resumed": 0, "replayed": 0,
+        "notes": (), "stages": (), "classes": {},
     } | given)  # fmt: skip
     versions = versions or {"lidarpool": "1.2 (sources 01234567)"}
     return write_card(place, vars(of), of, rows, versions, picture)
@@ -139,7 +139,7 @@ def test_same_jobs_make_the_same_files(card, tmp_path):
 @pytest.mark.extended
 def test_casting_times_are_in_the_report_alone(card, tmp_path):
     folder, _ = card
-    slower = [replace(row, seconds=2 * row.seconds + 1) for row in ROWS]
+    slower = [replace(row, seconds=2 * row.number + 1) if row.done else row for row in ROWS]
     place = Storage.at(tmp_path, durable=False)
     write(place, slower, Page((80, 40)))
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
@@ -147,10 +147,40 @@ def test_casting_times_are_in_the_report_alone(card, tmp_path):
         name for name in names if (tmp_path / name).read_bytes() != (folder / name).read_bytes()
     }
     assert changed == {"report.html", "report.csv", "report.json"}
-    assert read_seconds(place) == {row.number: row.seconds for row in slower}
+    assert read_seconds(place) == {row.number: row.seconds for row in slower if row.done}
 
 
 @pytest.mark.extended
+def test_unknown_casting_times_are_empty(tmp_path):
+    rows = [row(0, seconds=2.0), row(1, seconds=None), row(2, seconds=5.0), row(3, seconds=None)]
+    report = write(Storage.at(tmp_path), rows)
+    assert (tmp_path / "report.csv").read_text() == "number,seconds\n0,2.0\n1,\n2,5.0\n3,\n"
+    assert read_seconds(Storage.at(tmp_path)) == {0: 2.0, 2: 5.0}
+    assert report["seconds"]["casting"] == 7.0
+    assert report["of_a_job"]["seconds"]["lowest"] == 2.0
+    assert [one["seconds"] for one in report["slowest"]] == [5.0, 2.0]
+    report = write(Storage.at(tmp_path), rows[1::2])
+    assert report["of_a_job"]["seconds"] is None and report["slowest"] == []
+    page = (tmp_path / "report.html").read_text()
+    assert "The casting times of the jobs are unknown." in page
+
+
+def test_the_card_counts_jobs_in_which_a_quantity_is_not_set(tmp_path):
+    unset = {"visibility": None, "model": "vlp16", "night": None}
+    rows = [row(0), *(row(k, values=unset) for k in range(1, 20))]
+    rows += [JobRow(20, "20", "", {}, "the function raised KeyError")]  # its values are unknown
+    report = write(Storage.at(tmp_path), rows)
+    assert {one["name"]: one["unset"] for one in report["varied"]} == {
+        "visibility": 19, "model": 0, "night": 19,
+    }  # fmt: skip
+    card = (tmp_path / "README.md").read_text()
+    assert "| `visibility` | 0.1 to 0.1, median 0.1; not set in 19 jobs |" in card
+    assert "| `model` | vlp16 |" in card and "| `night` | false; not set in 19 jobs |" in card
+    assert "boxes of the actors" in card
+    write(Storage.at(tmp_path), rows[1:20])
+    assert "| `visibility` | not set |" in (tmp_path / "README.md").read_text()
+
+
 def test_letters_of_users_are_escaped(tmp_path):
     names = (EVIL, "a")
     rows = [

@@ -379,6 +379,7 @@ def test_undisturbed_each_batch_is_cast_once(run):
     assert run.job.cast == run.job.generated == SCANS
     assert run.driver.book.stages["intersect"].items == SCANS
     assert run.job.seconds == pytest.approx(0.1 * len(run.committed[0]))
+    assert (run.driver.dispatcher.replayed, run.driver.dispatcher.lost_workers) == (0, set())
 
 
 def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
@@ -403,6 +404,10 @@ def test_the_batches_of_a_worker_that_dies_are_offered_to_others(run):
     assert not {batch.worker for batch in lost} & {"tcp://a:1"}
     run.end()
     assert [n for n in run.workers.tried.values() if n > 1] == [2, 2]
+    assert (run.driver.dispatcher.replayed, run.driver.dispatcher.lost_workers) == (
+        2,
+        {"tcp://a:1"},
+    )
 
 
 def test_the_batches_of_a_collector_that_dies_are_collected_by_another_without_a_cast(run):
@@ -412,6 +417,8 @@ def test_the_batches_of_a_collector_that_dies_are_collected_by_another_without_a
     assert lost and lost <= {order.key for orders in run.stages.orders.values() for order in orders}
     run.end()
     assert set(run.workers.tried.values()) == {1}
+    assert run.driver.dispatcher.replayed >= len(lost)
+    assert len(run.driver.dispatcher.lost_workers) == 1
 
 
 def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(run, clock):

@@ -27,7 +27,8 @@ import lidarpool
 from lidarpool import LidarError, Scene, Sweep
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS
-from lidarpool.datasets.dataset import INDEX_FILE
+from lidarpool.datasets.dataset import INDEX_FILE, DataSet
+from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.recordings.opening import open_recording
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
@@ -152,8 +153,12 @@ def test_sweeps_are_chosen_by_split_job_and_sensor(written):
         ({"split": "trian"}, r"no split 'trian'\. Did you mean 'train'"),
         ({"split": "x"}, r"no split 'x'\. The splits are train, val and test"),
         ({"sensors": ["roof"]}, r"no sensor 'roof'\. The sensors are front and rear/left"),
-        ({"jobs": [3]}, r"no completed job 3. All jobs are listed in jobs.csv"),
-        ({"jobs": [4], "split": "train"}, "no completed job 4 in split 'train'"),
+        ({"jobs": [3]}, r"no completed job 3 \(5 jobs: 0 to 5\)\. All jobs are listed in jobs.csv"),
+        (
+            {"jobs": [4], "split": "train"},
+            r"no completed job 4 in split 'train' \(3 jobs: 0 to 2\)",
+        ),
+        ({"jobs": ["4"]}, r"no completed job '4' \(5 jobs: 00 to 05\)"),
         ({"jobs": "04"}, "jobs must be a list of whole numbers or None, but is '04'"),
         ({"shuffle": True}, "shuffle must be a whole number or None, but is True"),
         ({"shuffle": -1}, "shuffle must be at least 0 or None, but is -1"),
@@ -162,6 +167,16 @@ def test_sweeps_are_chosen_by_split_job_and_sensor(written):
         with pytest.raises(LidarError, match=words) as told:
             lidarpool.sweeps(place, **options)
         assert "\n" not in str(told.value)
+
+
+def test_data_that_a_job_lacks_is_none(tmp_path, scene, all_sweeps):
+    data = DataSet(Storage.at(tmp_path), "webdataset")
+    row = JobRow(0, "00", values={"fog": None, "rain": 2.0})
+    row = data.write_job(row, points_of(scene, 0), all_sweeps)
+    write_table(data.storage, ["fog", "rain"], lambda: [row])
+    data.finish([row])
+    sweep = lidarpool.sweeps(tmp_path)[0]
+    assert (sweep.split, sweep.values) == (None, {"fog": None, "rain": 2.0})
 
 
 def test_a_store_that_does_not_answer_is_not_taken_for_a_damaged_file(

@@ -1,5 +1,6 @@
 """Campaigns: many jobs into one data set, whatever happens to workers, drivers and single jobs."""
 
+import json
 import re
 import shutil
 import signal
@@ -467,6 +468,7 @@ def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
     (files / "report.json").write_text("{}")
     for place, says in (
         (files, "is not a lidarpool data set"),
+        (files, "the two lines `base: scenario.yaml` and `keep: kitti`"),
         (files / "none", "does not exist"),
     ):
         refused = lidarpool("run", "--verify", place)
@@ -820,6 +822,10 @@ def test_killed_drivers_leave_the_same_bytes_and_no_remains(
     assert bytes_of(files / "ds") == whole
     rows = (files / "ds" / "jobs.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows[1:]] == [str(number) for number in range(6)]
+    times = [row.split(",")[1] for row in (files / "ds" / "report.csv").read_text().split()[1:]]
+    assert len(times) == 6 and all(time == "" or float(time) > 0 for time in times)
+    notes = json.loads((files / "ds" / "report.json").read_text())["notes"]
+    assert ("" in times) == any(note.startswith("the casting times of these") for note in notes)
     names = {path.name for path in (files / "ds").iterdir()}
     assert not names & {"run"} and not any(name.endswith("-dataset") for name in names)
     assert [*parts.rglob("*")] == []
@@ -863,6 +869,8 @@ def test_killed_workers_change_no_byte(outside, files, whole):
     assert (run.done, run.failed, strikes) == (6, (), [])
     assert bytes_of(files / "ds") == whole
     assert not (files / "ds" / "run").exists()
+    report = json.loads((files / "ds" / "report.json").read_text())
+    assert (report["notes"], report["replayed"]) == ([*run.notes], run.replayed)
 
 
 # -- others on the same cluster -------------------------------------------------------------------

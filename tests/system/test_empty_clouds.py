@@ -172,7 +172,10 @@ def test_shards_of_a_campaign_and_what_is_merged_of_them(campaign, lidarpool, sl
     assert warning.startswith(
         "2 jobs have no points: 0001, 0003. To see the most likely reason, run"
     )
-    assert json.loads((tmp_path / "set" / "report.json").read_text())["notes"] == [warning]
+    report = json.loads((tmp_path / "set" / "report.json").read_text())
+    assert report["notes"] == [warning]
+    merged = f"4 jobs, {report['totals']['points']:,} points in {tmp_path / 'set'}"
+    assert outcome.out.splitlines()[-1] == merged
 
 
 @pytest.mark.slow

@@ -284,7 +284,7 @@ def test_casting_times_that_are_lost_are_noted(parts, campaigns, tmp_path, edit)
     del one["report.json"], made["report.json"]
     assert made == one
     seconds = read_seconds(Storage.at(out))
-    assert [seconds[number] > 0 for number in range(7)] == [number % 3 != 1 for number in range(7)]
+    assert seconds.keys() == {0, 2, 3, 5, 6} and min(seconds.values()) > 0  # without shard 2
 
 
 def test_notes_of_a_damaged_report_are_lost_with_a_note(parts, tmp_path):

@@ -399,7 +399,8 @@ def merge(
     screen = Terminal(quiet, False, as_json)
     report = merge_shards(shards, out, screen=screen, **settings)
     points = report["points"] if "points" in report else report["totals"]["points"]
-    lines = [*screen.notes(report["notes"]), f"{plural(points, 'point')} in {out}"]
+    jobs = f"{plural(report['jobs']['done'], 'job')}, " if "jobs" in report else ""
+    lines = [*screen.notes(report["notes"]), f"{jobs}{plural(points, 'point')} in {out}"]
     shared.show({"folder": str(out), **report}, lines, as_json)
     screen.end(strict=strict)
 

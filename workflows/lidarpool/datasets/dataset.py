@@ -221,7 +221,7 @@ class DataSet:
 
     def _write_manifest(self, storage: Listing, row: JobRow, manifest: dict[str, Any]) -> None:
         """Write the manifest of a job, with the part of its row that is the same in every run."""
-        row_of_all_runs = asdict(replace(row, seconds=0.0))
+        row_of_all_runs = asdict(replace(row, seconds=None))
         manifest |= {"made_with": dict(self.made_with), "row": row_of_all_runs}
         manifest["crc"] = _crc(manifest)
         storage.write(manifest_file(row.name), json.dumps(manifest).encode())

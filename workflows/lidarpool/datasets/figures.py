@@ -131,6 +131,7 @@ class Figures:
         self._values = {name: array("d") for name in names}
         self._labeled = {name: array("b") for name in names}
         self._labels: dict[str, dict[str, int]] = {name: {} for name in names}
+        self._unset: Counter[str] = Counter()  # {name: jobs in which the quantity is not set}
         self._digest = hashlib.sha256()
         for row in jobs:
             self.add(row)
@@ -142,9 +143,13 @@ class Figures:
         """Count a job."""
         self.jobs += 1
         for name, column in self._per_job.items():
-            column.append(not row.done if name == "failed" else getattr(row, name))
+            value = not row.done if name == "failed" else getattr(row, name)
+            column.append(np.nan if value is None else value)
         for name, labels in self._labels.items():
-            value = row.values.get(name, np.nan)
+            value = row.values.get(name)
+            if value is None:
+                self._unset[name] += row.done or name in row.values
+                value = np.nan
             if labeled := isinstance(value, str | bool | np.bool_):
                 text = value if isinstance(value, str) else str(value).lower()
                 value = labels.setdefault(text, len(labels))
@@ -159,8 +164,9 @@ class Figures:
         self.splits.setdefault(row.split, Counter()).update(counts, jobs=1)
         for number, points in row.classes.items():
             self.classes.setdefault(number, Counter()).update(points=points, jobs=1)
-        insort(self.slowest, row, key=lambda row: (-row.seconds, row.number))
-        del self.slowest[MAX_SLOWEST:]
+        if row.seconds is not None:
+            insort(self.slowest, row, key=lambda row: (-(row.seconds or 0.0), row.number))
+            del self.slowest[MAX_SLOWEST:]
 
     @property
     def done(self) -> int:
@@ -201,7 +207,7 @@ class Figures:
         return Varied(name, codes, tuple(order))
 
     def per_job(self, name: str) -> Floats:
-        """Return points, rays, hits or seconds of each job (n,)."""
+        """Return points, rays, hits or seconds of each job (n,); NaN if they are unknown."""
         return np.array(self._per_job[name])
 
     @property
@@ -212,6 +218,7 @@ class Figures:
     def spread(self, name: str) -> dict[str, float] | None:
         """Return minimum, 10th, 50th and 90th percentile and maximum of finished jobs, or None."""
         values = self.per_job(name)[~self.failures]
+        values = values[np.isfinite(values)]
         if not len(values):
             return None
         names = ("lowest", "tenth", "median", "ninetieth", "highest")
@@ -225,6 +232,7 @@ class Figures:
             has_value = is_done & np.isfinite(varied.values)
             values = varied.known_values
             figures: dict[str, Any] = {"name": varied.name, "jobs": len(values)}
+            figures["unset"] = self._unset[varied.name]
             if varied.labels:
                 figures["values"] = dict(zip(varied.labels, varied.counts().tolist(), strict=True))
             elif len(values):

@@ -27,12 +27,13 @@ def writing_seconds(storage: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow
     with storage.writing(SECONDS_FILE) as file:
         file.write(f"{','.join(_HEADER)}\n".encode())
         for row in jobs:
-            file.write(f"{row.number},{row.seconds!r}\n".encode())
+            seconds = "" if row.seconds is None else repr(row.seconds)
+            file.write(f"{row.number},{seconds}\n".encode())
             yield row
 
 
 def read_seconds(storage: Storage) -> Mapping[int, float]:
-    """Return the casting times of jobs, {number: seconds}.
+    """Return the known casting times of jobs, {number: seconds}.
 
     Raises
     ------
@@ -43,7 +44,7 @@ def read_seconds(storage: Storage) -> Mapping[int, float]:
         header, *rows = csv.reader(io.StringIO(storage.read(SECONDS_FILE).decode()), strict=True)
         if header != _HEADER:
             raise ValueError("its header is invalid")
-        return {int(number): float(seconds) for number, seconds in rows}
+        return {int(number): float(seconds) for number, seconds in rows if seconds}
     except (OSError, ValueError, csv.Error) as error:
         raise LidarError(
             f"The casting times of the jobs cannot be read from {storage.path(SECONDS_FILE)}: "

@@ -76,14 +76,14 @@ class JobRow:
     split
         Its split, such as "train"; "" without splits.
     values
-        {path: varied value}; for a sample of objects, their number.
+        {path: varied value}; for a sample of objects, their number. None if the job has no value.
     error
         Why it failed; "" for a job that is done.
     scans, sweeps, rays, hits, points
         Numbers of scans, sweeps, rays, hits and points.
     seconds
-        Casting time of all its tasks. The only entry that differs between runs: the table has no
-        such column (`job_seconds`).
+        Casting time of all its tasks; None if it is unknown, as for a failed job. The only entry
+        that differs between runs: the table has no such column (`job_seconds`).
     sha256
         Hash of its points (`Tally`): the same on any cluster.
     classes
@@ -94,14 +94,14 @@ class JobRow:
     number: int
     name: str
     split: str = ""
-    values: Mapping[str, Value] = field(default_factory=dict)
+    values: Mapping[str, Value | None] = field(default_factory=dict)
     error: str = ""
     scans: int = 0
     sweeps: int = 0
     rays: int = 0
     hits: int = 0
     points: int = 0
-    seconds: float = 0.0
+    seconds: float | None = None
     sha256: str = ""
     classes: Mapping[int, int] = field(default_factory=dict)
 
@@ -121,7 +121,7 @@ class JobRow:
             raise ValueError(
                 f"a job row has a missing or unknown entry, such as {min(differing)!r}"
             )
-        kinds = {**_HEAD, **_TAIL, "seconds": int | float, "values": dict, "classes": dict}
+        kinds = {**_HEAD, **_TAIL, "seconds": int | float | None, "values": dict, "classes": dict}
         for name, kind in kinds.items():
             if not isinstance(data[name], kind):
                 raise ValueError(f"the {name} of a job has the invalid value {data[name]!r}")
@@ -316,7 +316,8 @@ def _columns(
             )
         classes.update(row.classes)
         for name, value in row.values.items():
-            kinds[name].add(_kind(value))
+            if value is not None:
+                kinds[name].add(_kind(value))
     return sorted(classes), kinds
 
 
@@ -325,7 +326,7 @@ def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterato
     for name, kind in (_HEAD | _TAIL).items():
         if name == "error":
             for value in names:
-                yield _written(row.values[value]) if value in row.values else ""
+                yield _written(row.values.get(value))
         entry = getattr(row, name)
         # Before Python 3.13, csv.writer left a bare carriage return unquoted.
         if kind is str:
@@ -358,7 +359,7 @@ def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> J
         if (match := _CLASS.fullmatch(name)) and text != "0"
     }
     varied = zip(names, cells[first:stop], strict=True)
-    values = {name: _read(text) for name, text in varied if text}
+    values = {name: _read(text) if text else None for name, text in varied}
     return _with_plain_names(JobRow(values=values, classes=classes, **entries))
 
 
@@ -394,7 +395,9 @@ def _kind(value: Any) -> type:
 
 
 def _written(value: Any) -> str:
-    """Return a cell for a varied value, which is read back with its type."""
+    """Return a cell for a varied value, which is read back with its type; empty for None."""
+    if value is None:
+        return ""
     plain = _plain(value)
     if not isinstance(plain, str):
         return json.dumps(plain)

@@ -25,7 +25,7 @@ from lidarsim.base.errors import LidarError, as_sentence
 from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
-from lidarsim.base.words import did_you_mean, joined
+from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import unsealed
@@ -321,7 +321,8 @@ def read_index(storage: Storage) -> dict[str, Any]:
             ) from error
         raise LidarError(
             f"{storage} is not a lidarpool data set, because {INDEX_FILE} is missing. Specify "
-            "the output folder of a campaign."
+            "the output folder of a campaign. To create a data set from a single scenario, run a "
+            "campaign file with the two lines `base: scenario.yaml` and `keep: kitti`."
         ) from error
     except OSError as error:
         raise _unreadable(storage.path(INDEX_FILE), error) from error
@@ -349,10 +350,13 @@ def _chosen(
         requested = {operator.index(job) if not isinstance(job, str) else job for job in jobs}
         available = {row.number for row in rows} | {row.name for row in rows}
         if missing := [job for job in jobs if job not in available]:
+            by_name = isinstance(missing[0], str)
+            names = [row.name if by_name else row.number for row in rows]
+            has = plural(len(names), "job") + (f": {names[0]} to {names[-1]}" if names else "")
+            where = "" if split is None else f" in split {split!r}"
             raise LidarError(
-                f"{storage} contains no completed job {missing[0]!r}"
-                + ("" if split is None else f" in split {split!r}")
-                + ". All jobs are listed in jobs.csv, with their splits and errors."
+                f"{storage} has no completed job {missing[0]!r}{where} ({has}). All jobs are "
+                "listed in jobs.csv, with their splits and errors."
             )
         rows = [row for row in rows if row.number in requested or row.name in requested]
     return rows

@@ -33,8 +33,8 @@ class Sweep:
 
     job: str  # name
     job_number: int
-    split: str  # "" without splits
-    values: Mapping[str, Value]  # {path: varied value}
+    split: str | None  # None without splits
+    values: Mapping[str, Value | None]  # {path: varied value}; None if the job has no value
     sensor: str  # name; "" for a single sensor without a name
     number: int  # index among the sweeps of its sensor in the job, from 0
     time_ns: int  # start of the sweep, nanoseconds since the start of the survey
@@ -61,7 +61,7 @@ class Sweep:
         return cls(
             job=job.name,
             job_number=job.number,
-            split=job.split,
+            split=job.split or None,
             values=job.values,
             sensor=sweeps.sensors[sweeps.sensor[number]],
             number=int(sweeps.numbers[number]),

@@ -137,7 +137,7 @@ class DataSetOutput(Output[CampaignRun]):
             rows = (row for row, _ in self.dataset.rows())
             seconds = known_seconds(storage)
             self._rows += sorted(
-                (replace(row, seconds=seconds.get(row.number, 0.0)) for row in rows),
+                (replace(row, seconds=seconds.get(row.number)) for row in rows),
                 key=lambda row: row.number,
             )
         has_table = _is_tabled(storage, self._rows)
@@ -190,6 +190,7 @@ class DataSetOutput(Output[CampaignRun]):
         """Add finished jobs to the store whose database was lost."""
         names = {row.name for row in store.rows()}
         rows: list[JobRow] = []
+        seconds = known_seconds(self.dataset.storage)  # of a data set whose record was damaged
         with explained(f"{self.dataset.storage} cannot be read"):
             for row, made_with in self.dataset.rows(names):
                 if made_with.get("identity") != store.made_with["identity"]:
@@ -197,7 +198,7 @@ class DataSetOutput(Output[CampaignRun]):
                 if not store.backend:
                     store.cast_with(made_with["backend"], made_with["casting"])
                 if made_with == store.made_with:
-                    rows.append(row)
+                    rows.append(replace(row, seconds=seconds.get(row.number)))
         store.adopt(rows)
 
     # -- the end ------------------------------------------------------------------------------
@@ -209,11 +210,18 @@ class DataSetOutput(Output[CampaignRun]):
         seconds = time.monotonic() - run.started
         fields: dict[str, Any] = {
             "stages": loop.stages if loop else (),
+            "replayed": loop.replayed if loop else 0,
             "notes": run.notes(),
         }
         warnings = run.warn_of_empty_jobs(store.rows())
         if self.campaign.shard == ALL:  # else the merged data set has this note
             fields["notes"] = (*fields["notes"], *warnings)
+        if untimed := [row.name for row in store.rows() if row.done and row.seconds is None]:
+            note = (
+                "the casting times of these jobs are unknown, because a run was interrupted before "
+                f"their results were recorded: {listed(untimed)}"
+            )
+            fields["notes"] = (*fields["notes"], note)
         sums = CampaignRun.from_rows(
             store.rows(), seconds, store.resumed, sensors=store.sensors, **fields
         )
@@ -469,7 +477,9 @@ def failures(sums: CampaignRun, max_errors: int = 5) -> str:
     head = f"{plural(len(sums.failed), 'job')} failed and {sums.done:,} succeeded:"
     errors = []
     for row in sums.failed:
-        values = ", ".join(f"{name} {value}" for name, value in row.values.items())
+        values = ", ".join(
+            f"{name} {'none' if value is None else value}" for name, value in row.values.items()
+        )
         errors.append((f"{row.name}{f' ({values})' if values else ''}", row.error))
     lines = lines_of_errors(errors, max_jobs=3)
     if (hidden := len(lines) - max_errors) > 0:

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from typing import Any
 
+import numpy as np
+
 from lidarsim.base.errors import LidarError, explained
 from lidarsim.base.storage import Storage
 from lidarview.render.picture_page import Page
@@ -151,10 +153,11 @@ def campaign_report(
             "failed": figures.jobs - figures.done,
             "resumed": run.resumed,
         },
+        "replayed": run.replayed,
         "totals": figures.totals,
         "seconds": {
             "run": round(run.seconds, 3),
-            "casting": round(float(figures.per_job("seconds").sum()), 3),
+            "casting": round(float(np.nansum(figures.per_job("seconds"))), 3),
         },
         "of_a_job": {name: figures.spread(name) for name in ("points", "rays", "hits", "seconds")},
         "splits": {

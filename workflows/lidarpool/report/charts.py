@@ -193,8 +193,9 @@ def draw_results(figures: Figures) -> Page | None:
 
 
 def draw_times(figures: Figures) -> Page | None:
-    """Draw how casting times are distributed over jobs, or None if no job is done."""
+    """Draw how casting times are distributed over jobs, or None if none is known."""
     seconds = figures.per_job("seconds")[~figures.failures]
+    seconds = seconds[np.isfinite(seconds)]
     quantity = Varied("casting time per job (all tasks), s", seconds)
     return _draw_distributions((quantity,), "Casting time", "Number of jobs by casting time")
 
@@ -388,7 +389,9 @@ def draw_sweep(sweep: Sweep, names: Mapping[int, str]) -> Page:
     classes = None if sweep.classes is None else sweep.classes[rows]
     values = [
         f"{name} {rounded(value, 4) if isinstance(value, float) else shortened(str(value))}"
-        for name, value in list(sweep.values.items())[:MAX_VALUES]
+        for name, value in [item for item in sweep.values.items() if item[1] is not None][
+            :MAX_VALUES
+        ]
     ]
     page.title(
         f"A sweep of job {sweep.job}",

@@ -454,7 +454,7 @@ class _RowFile:
                         f"{path} belongs to job {number}, which has another manifest. Move "
                         "one of the manifests elsewhere, and merge again."
                     )
-                row = replace(row, seconds=seconds.get(number, 0.0))
+                row = replace(row, seconds=seconds.get(number))
                 self._offsets[number] = file.tell()
                 file.write(json.dumps(asdict(row)).encode() + b"\n")
 
@@ -524,7 +524,7 @@ def _merged(files: Sequence[_RowFile]) -> Iterator[JobRow]:
     number = attrgetter("number")
     tables = [file.rows() for file in files]
     for _, rows in groupby(heapq.merge(*tables, key=number), number):
-        yield max(rows, key=attrgetter("done", "seconds"))
+        yield max(rows, key=lambda row: (row.done, row.seconds or 0.0))
 
 
 def _merge_survey(

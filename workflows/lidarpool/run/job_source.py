@@ -132,7 +132,7 @@ class Jobs(Protocol):
         """Return the name of a job's split, or no text without splits."""
         ...
 
-    def values(self, number: int) -> Mapping[str, Value]:
+    def values(self, number: int) -> Mapping[str, Value | None]:
         """Return the values of a job that differ from job to job, by name."""
         ...
 
@@ -181,7 +181,7 @@ class OneJob:
         """Return the split of the only job."""
         return self.survey_job.split
 
-    def values(self, number: int) -> Mapping[str, Value]:
+    def values(self, number: int) -> Mapping[str, Value | None]:
         """Return the values of the only job."""
         return self.survey_job.values
 
@@ -192,7 +192,7 @@ class OneJob:
 
 def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
     """Return the row of a job that has failed, and perhaps cannot be made."""
-    values: Mapping[str, Value] = {}
+    values: Mapping[str, Value | None] = {}
     with suppress(Exception):  # the values themselves may be the cause
         values = jobs.values(number)
     message = jobs.without_folders(str(error))

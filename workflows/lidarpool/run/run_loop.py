@@ -18,7 +18,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 from lidarsim.base.errors import LidarError
-from lidarsim.base.words import rounded
+from lidarsim.base.words import listed, plural, rounded
 from lidarsim.simulator.memory import MB, scans_that_fit
 
 from ..base import timeline
@@ -117,6 +117,7 @@ class RunLoop:
         self._only_committed = False  # True once the only job is committed
         self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
         self.stages: tuple[StageTotals, ...] = ()
+        self.replayed = 0  # batches that were cast or sent more than once
 
     # -- jobs come and go --------------------------------------------------------------------
 
@@ -234,7 +235,8 @@ class RunLoop:
             sweeps=len(job.sweeps),
             rays=job.survey.ray_count,
             hits=under_way.parts.hit_count,
-            seconds=under_way.seconds,
+            # The casting times of an earlier run are not stored.
+            seconds=None if under_way.resumed else under_way.seconds,
         )
         return JobFiles(row, under_way.points(), job.sweeps, job.made_of)
 
@@ -316,6 +318,13 @@ class RunLoop:
         books = [pipeline.book, *(tasks.book for tasks in tasks_beside)]
         self.stages = tuple(totals for book in books for totals in book.stages.values())
         self._store.notes += pipeline.notes
+        self.replayed = pipeline.dispatcher.replayed
+        # The report of a survey has the number of repeated batches.
+        if self._writer is not None and (lost := sorted(pipeline.dispatcher.lost_workers)):
+            self._store.notes.append(
+                f"{plural(len(lost), 'worker')} died, left or stopped responding "
+                f"({listed(lost)}). Batches that were cast or sent again: {self.replayed:,}"
+            )
         if self._writer is not None and self._writer.hidden:
             storage = self._writer.dataset.storage
             note = (

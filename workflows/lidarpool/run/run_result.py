@@ -116,13 +116,15 @@ class CampaignRun:
     done, points, rays
         Number of jobs in the data set, number of their points, and number of rays cast for them.
     casting_seconds
-        Casting time of all tasks, in seconds.
+        Casting time of all tasks, in seconds, without jobs whose casting time is unknown.
     resumed
         Number of jobs from an earlier run.
     seconds
         Wall time of this run, in seconds.
     stages
         Totals of the tasks in each stage.
+    replayed
+        Number of batches that were cast or sent more than once.
     notes, sensors, classes
         Notes for the user, the sensors of the finished jobs as {name: models and rates}, and the
         names of semantic classes as {number: name}.
@@ -138,6 +140,7 @@ class CampaignRun:
     resumed: int
     seconds: float
     stages: tuple[StageTotals, ...] = ()
+    replayed: int = 0
     notes: tuple[str, ...] = ()
     sensors: Mapping[str, str] = field(default_factory=dict)
     classes: Mapping[int, str] = field(default_factory=dict)
@@ -160,7 +163,7 @@ class CampaignRun:
                 job_count += 1
                 points += row.points
                 rays += row.rays
-                casting_seconds += row.seconds
+                casting_seconds += row.seconds or 0.0
         return cls(
             failed=tuple(failed),
             done=job_count,

@@ -192,11 +192,11 @@ class CampaignSpec:
         """
         return self._jobs.names
 
-    def values(self, number: int) -> dict[str, Value]:
+    def values(self, number: int) -> dict[str, Value | None]:
         """Return the values of a job, as {name: value}.
 
-        The value of a sample is its number of rows. Values that are None are omitted. If a function
-        makes the jobs, the job is made.
+        The value of a sample is its number of rows, and a field that is not set has the value None.
+        If a function makes the jobs, the job is made.
         """
         return self._jobs.values(self._checked_number(number))
 

@@ -63,7 +63,7 @@ class JobSource:
         """Return the name of a job in files: four digits or more."""
         return f"{number:04}"
 
-    def values(self, number: int) -> dict[str, Value]:
+    def values(self, number: int) -> dict[str, Value | None]:
         """Return the values that differ from job to job."""
         return {}
 
@@ -112,7 +112,7 @@ class FunctionJobs(JobSource):
         """Hash of the function."""
         return {"make": fingerprint(self._make)}
 
-    def values(self, number: int) -> dict[str, Value]:
+    def values(self, number: int) -> dict[str, Value | None]:
         """Make a job and return its values."""
         return dict(self.job(number, None, (), {}).values)
 
@@ -129,7 +129,7 @@ class FunctionJobs(JobSource):
                 f"Job {number} has a value {extra[0]!r}, which the first job does not have. Use "
                 "the same names for all jobs, with None for missing values."
             )
-        values: dict[str, Value] = {}
+        values: dict[str, Value | None] = dict.fromkeys(self.names)
         for name, value in job.values.items():
             plain = value.item() if isinstance(value, np.generic) else value
             if not isinstance(name, str) or not isinstance(plain, Value | None):
@@ -137,8 +137,7 @@ class FunctionJobs(JobSource):
                     "The values of a job must be numbers, text, True or False, and their names "
                     f"must be text, but job {number} has {{{name!r}: {shown(plain)}}}."
                 )
-            if plain is not None:
-                values[name] = plain
+            values[name] = plain
         survey = job.survey
         seed = _noise_seed(self._seed, number)
         check_whole(columns, survey.keep_every)
@@ -302,7 +301,7 @@ class VariedJobs(JobSource):
         scenarios += [base.files[file] for base in self._bases if file in base.files]
         return next(filter(None, (scenario.named_in(file) for scenario in scenarios)), "")
 
-    def values(self, number: int) -> dict[str, Value]:
+    def values(self, number: int) -> dict[str, Value | None]:
         """Return the values that a job has for the table of jobs."""
         return self._draw(number)[0]
 
@@ -314,12 +313,14 @@ class VariedJobs(JobSource):
         try:
             return base.changed(changes, f"{self._source}: job {number}", noise_seed)
         except LidarError as error:
-            listed = ", ".join(f"{name}: {value}" for name, value in values.items())
+            listed = ", ".join(
+                f"{name}: {'none' if value is None else value}" for name, value in values.items()
+            )
             raise LidarError(
                 f"{error}\nThe values of the job are {listed or 'those of the base'}."
             ) from error
 
-    def _draw(self, number: int) -> tuple[dict[str, Value], dict[str, Any]]:
+    def _draw(self, number: int) -> tuple[dict[str, Value | None], dict[str, Any]]:
         """Draw the values of a job: for the table of jobs, and for the scenario."""
         base = self._bases[number % len(self._bases)]
         values: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
@@ -337,7 +338,7 @@ class VariedJobs(JobSource):
                 changes[text], values[text] = choice.options[option]
             else:
                 changes[text], values[text] = choice.draw(rng)
-        return {name: value for name, value in values.items() if value is not None}, changes
+        return values, changes
 
 
 class _Base:

@@ -369,7 +369,14 @@ class Choice(Section):
         if limits := self.uniform or self.log_uniform or self.integer:
             return f"{limits[0]:.12g} to {limits[1]:.12g}, {self.kind}"
         shown = ["none" if label is None else str(label) for _, label in self.options]
-        return f"{', '.join(shown[:8])}{', …' * (len(shown) > 8)}, {self.kind} of {len(shown):,}"
+        if self.weights is not None:
+            shown = [f"{text} ({w:g})" for text, w in zip(shown, self.weights, strict=True)]
+        listed = ", ".join(shown[:8])
+        if len(shown) > 8:
+            listed = f"{listed}, … ({len(shown):,} values)"
+        if self.each is not None:
+            return f"each of {listed}, in turn"
+        return f"chosen from {listed}{', with these weights' * (self.weights is not None)}"
 
 
 def _choice(value: Any) -> Any:

@@ -70,6 +70,8 @@ class Dispatcher:
         self._cast_seconds = 0.0  # casting time of all committed batches
         self._cast_scans = 0  # scans of all committed batches
         self.per_task = 1  # small batches that are cast in one task
+        self.replayed = 0  # batches that were offered again, of all jobs
+        self.lost_workers: set[str] = set()  # addresses of workers whose batches were lost
         # {job: batches that killed a worker, tried alone before any batch of the job was cast}
         self._first_deaths: dict[PipelineJob, list[Batch]] = {}
 
@@ -231,6 +233,9 @@ class Dispatcher:
             self._forget_task(batch)
         batch.move(state)
         batch.job.offered_again += 1
+        self.replayed += 1
+        if reason in (Outcome.DIED.value, Outcome.GONE.value):
+            self.lost_workers.add(batch.worker)
         batch.job.trace("replay", INTERSECT, batch.scans, reason=reason)
         if reason == Outcome.DIED.value:
             self._blame(batch, INTERSECT, batch.worker)
@@ -378,6 +383,7 @@ class Dispatcher:
         `died` are the collectors whose workers died, {name: address of the worker}; `started` are
         the names of stages that were started now, which do not know earlier orders.
         """
+        self.lost_workers.update(died.values())
         for batch in self.in_states(BatchState.COLLECTING):
             name = batch.collector
             if name in died or name in started:

@@ -100,7 +100,7 @@ class JobList:
             "error": row.error,
             "points": row.points,
             "seconds": self._seconds.get(row.number),
-            "values": [_in_words(row.values.get(name, "")) for name in self._names],
+            "values": [_in_words(row.values.get(name)) for name in self._names],
             "opens": row.done,
         }
 
@@ -148,8 +148,10 @@ def show_jobs(jobs: JobList, *, port: int, browser: bool = True) -> None:
             wait_for_interrupt(stopped)
 
 
-def _in_words(value: Value) -> str:
-    """Return a value of a job in words."""
+def _in_words(value: Value | None) -> str:
+    """Return a value of a job in words, "" for None."""
+    if value is None:
+        return ""
     if isinstance(value, bool):
         return str(value).lower()
     return rounded(value, 4) if isinstance(value, float) else str(value)

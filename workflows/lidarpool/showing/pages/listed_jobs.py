@@ -75,8 +75,8 @@ class ListedJobs:
             ],
         }
 
-    def _words(self, values: Mapping[str, Value]) -> list[str]:
+    def _words(self, values: Mapping[str, Value | None]) -> list[str]:
         """Return values in the order of the table's columns, "" for a missing value."""
-        shown = (values.get(name, "") for name in self._names)
+        shown = ("" if (value := values.get(name)) is None else value for name in self._names)
         words = (rounded(value, 4) if isinstance(value, float) else value for value in shown)
         return [str(value).lower() if isinstance(value, bool) else str(value) for value in words]
