@@ -32,11 +32,12 @@ def test_it_shows_what_varies_and_five_jobs(campaign, lidarpool):
     outcome = lidarpool("check", campaign, "--out", campaign.parent / "out")
     assert outcome.code == 0
     lines = outcome.out.splitlines()
-    assert lines[:4] == [
+    assert lines[:5] == [
         "campaign    9 jobs, seed 0, stored as mcap, ouster",
         "varied      sensor.layers: 4 to 8, integer",
-        "varied      weather.visibility_km: none, 0.5, choice of 2",
+        "varied      weather.visibility_km: chosen from none, 0.5",
         "splits      train 0.5, test 0.5",
+        "checked     5 of 9 jobs",
     ]
     jobs = [re.match(r"job +(\d+) \((train|test)\): sensor.layers (\d)", line) for line in lines]
     jobs = [(number, int(layers)) for number, _, layers in (m.groups() for m in jobs if m)]
@@ -47,7 +48,7 @@ def test_it_shows_what_varies_and_five_jobs(campaign, lidarpool):
     # Four steps of 28 azimuths, from three poses.
     assert rays[:5] == [layers * rays[0] // jobs[0][1] for _, layers in jobs]
     assert rays[5] == round(sum(rays[:5]) * 9 / 5)
-    assert lines[-1].startswith(f"The scenario can be run: lidarpool run {campaign}")
+    assert lines[-1].startswith(f"The campaign can be run: lidarpool run {campaign}")
     assert not (campaign.parent / "out").exists()
 
 
@@ -58,6 +59,7 @@ def test_one_job_is_shown_like_a_scenario(campaign, lidarpool):
     assert words[:4] == ["job", "scene", "size", "survey"] and "planning    none" in outcome.out
     assert re.match(r"job +0003 \((train|test)\): sensor.layers \d", outcome.out)
     assert outcome.out.rstrip().endswith("campaign.yaml --job 3")
+    assert "The job can be run: " in outcome.out
 
 
 @pytest.mark.parametrize(("options", "word"), [((), "--live"), (("--live",), "survey")])
@@ -69,7 +71,7 @@ def test_a_campaign_has_no_pace(campaign, lidarpool, options, word):
 
 def test_as_json(campaign, lidarpool):
     found = json.loads(lidarpool("check", campaign, "--json").out)
-    assert found["can_run"] and found["count"] == 9
+    assert found["can_run"] and (found["count"], found["checked"]) == (9, 5)
     keep = {"format": "mcap", "layout": "ouster", "compensated": False}
     keep |= {"compensated_actors": False, "pose_rate_hz": None}
     assert found["keep"] == keep
@@ -86,7 +88,13 @@ def test_jobs_that_cannot_run_are_reasons(campaign, lidarpool):
     campaign.write_text("base: base.yaml\nvary: {scene: {each: [seed, hall.stl]}}\n")
     outcome = lidarpool("check", campaign)
     assert outcome.code == 2
-    assert "0000: scene seed" in outcome.out and "hall.stl" in outcome.err
+    assert "checked     2 of 2 jobs" in outcome.out and "0000: scene seed" in outcome.out
+    assert "1 of 2 checked jobs cannot be run; the others can.\njob 0001: " in outcome.err
+    assert "hall.stl" in outcome.err
+    assert json.loads(lidarpool("check", campaign, "--json").out)["failed"] == ["0001"]
+    campaign.write_text("base: base.yaml\nvary: {scene: {each: [hall.stl, hall.stl]}}\n")
+    outcome = lidarpool("check", campaign)
+    assert outcome.code == 2 and "None of the 2 checked jobs can be run.\n" in outcome.err
 
 
 @pytest.mark.parametrize(

@@ -282,7 +282,7 @@ def test_an_error_of_several_jobs_is_a_line_with_its_jobs(tmp_path, lidarpool):
     outcome = lidarpool("check", tmp_path / "c.yaml", "--out", tmp_path / "out")
     assert outcome.code == 2
     start, streets, house = outcome.err.splitlines()[-3:]
-    assert start == "lidarpool: The scenario cannot be run:"
+    assert start == "lidarpool: None of the 3 checked jobs can be run."
     assert streets.startswith("jobs 0000, 0002: ") and streets.count("Street*") == 1
     assert streets.endswith("Similar names: tree* (9).")
     assert house.startswith("job 0001: ")
