@@ -64,7 +64,7 @@ def test_a_time_outside_is_refused_as_by_the_trajectory():
     ways = ActorTrajectories([*WAYS, track(3)])
     last = ways[-1].duration_ns
     ways.poses(np.array([len(WAYS)]), np.array([last]))
-    with pytest.raises(LidarError, match=r"The trajectory covers .* 1 s outside"):
+    with pytest.raises(LidarError, match=r"The trajectory covers .* the last 1 s are not covered"):
         ways.poses(np.array([0, len(WAYS)]), np.array([0.0, last + 1e9]))
 
 

@@ -52,7 +52,11 @@ BAD = [
     (CAR % "", "", r"Actor 'Car' has no trajectory\. Set its .* replace `poses`"),
     (CAR % ", trajectory: t.txt", LINE, "actor 'Car': .* start_s is 0 s, which is 1 s outside"),
     (CAR % ", trajectory: {file: t.txt, start_s: 1}", LINE, "set `offset_s`"),
-    (CAR % (", trajectory: {points: [" + POINTS + "]}") + "\nsteps: 150", "", "0.25 s outside"),
+    (
+        CAR % (", trajectory: {points: [" + POINTS + "]}") + "\nsteps: 150",
+        "",
+        "the last 0.25 s are not covered",
+    ),
     ("actors: [{name: Car, file: no.stl, trajectory: t.txt}]", "0 " + LINE[2:], "no.stl does not"),
 ]
 

@@ -277,7 +277,8 @@ class Built:
         """
         outputs = tuple(entry for entry in self.scenario.output.write if entry.format != "ply")
         scene = self.scene.georeferenced(self.scenario.world.origin)
-        return Job(scene, self.survey, self.planning, outputs=outputs, **fields)
+        with prefixed(self.scenario.source):
+            return Job(scene, self.survey, self.planning, outputs=outputs, **fields)
 
 
 class _SurveyParts(NamedTuple):

@@ -23,7 +23,7 @@ from ..base.vectors import (
     matmul,
     matmul_of_components,
 )
-from ..base.words import joined
+from ..base.words import joined, rounded
 from .headings import CurveHeadings, Heading, headed_poses
 from .rotations import (
     check_rotations,
@@ -615,10 +615,11 @@ class Track:
             within = (times[0] <= moments_s) & (moments_s <= times[-1])
             moments_s = moments_s.clip(times[0], times[-1])
         elif gap > self.slack_s:
+            gaps_s = {"first": times[0] - first_s, "last": last_s - times[-1]}
+            parts = [f"the {end} {rounded(s)} s" for end, s in gaps_s.items() if s > self.slack_s]
             raise LidarError(
                 f"The trajectory covers {times[0]:.9g} to {times[-1]:.9g} s, but poses from "
-                f"{first_s:.9g} to {last_s:.9g} s are required, which is up to {gap:.6g} s "
-                "outside the trajectory."
+                f"{first_s:.9g} to {last_s:.9g} s are required, so {joined(parts)} are not covered."
             )
         segment = np.clip(np.searchsorted(times, moments_s, "right") - 1, 0, len(times) - 2)
         return _SegmentTimes(segment, moments_s - times.take(segment), within)

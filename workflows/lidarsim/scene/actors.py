@@ -219,8 +219,9 @@ class Actor:
         except LidarError as error:
             reason = str(error).rstrip(".")
             raise LidarError(
-                f"Actor {self.name!r}: {reason}. Its trajectory must start before the first scan "
-                "and end after the last."
+                f"Actor {self.name!r}: {reason}. Extend its trajectory or shorten the survey. To "
+                "keep the first and last pose outside the trajectory, set `beyond: hold`; to "
+                "remove the actor there, set `beyond: absent`."
             ) from error
 
 
