@@ -46,7 +46,7 @@ def returned(name, distance, reflectance):
 def test_each_model_says_where_its_figures_are_from_or_that_none_were_found(name):
     model = read_model(name)
     if model.performance is None:
-        assert model.sources["performance"].startswith("none that could be read")
+        assert model.sources["performance"].startswith("no available source")
         with pytest.raises(LidarError, match="Set noise instead"):
             model.datasheet()
         return
