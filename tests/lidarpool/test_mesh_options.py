@@ -27,13 +27,13 @@ def test_stations_of_a_mesh_that_lies_on_its_side(tmp_path):
     command += ["--count", "1", "--spacing", "2"]
     aside = CliRunner().invoke(cli, [*command, "--out", str(tmp_path / "a")])
     lines = aside.stderr.splitlines()
-    (note,) = [number for number, line in enumerate(lines) if "up_axis" in line]
+    (note,) = [number for number, line in enumerate(lines) if "--up-axis" in line]
     (looking,) = [number for number, line in enumerate(lines) if "computing the visibility" in line]
-    assert note < looking and "--up-axis" in lines[note]
+    assert note < looking and "set `--up-axis z`" in lines[note]
     told = [*command, "--up-axis", "z", "--json", "--out", str(tmp_path / "b")]
     upright = json.loads(CliRunner().invoke(cli, told).stdout)
     (station,) = upright["stations"]
-    assert station["position"][2] < 3 and not [n for n in upright["notes"] if "up_axis" in n]
+    assert station["position"][2] < 3 and not [n for n in upright["notes"] if "--up-axis" in n]
     assert "up_axis: z" in (tmp_path / "b" / "stations.yaml").read_text()
 
 
