@@ -34,6 +34,8 @@ _ELSEWHERE = {
 }
 # Sources that the reference shows in a better way. {file: page}
 _SHOWN = {"workflows/lidarsim/columns/table.py": "reference/columns.md"}
+# Input files of examples, which readers download. Sources of other kinds are shown as pages.
+_DOWNLOADS = {".csv", ".glb", ".gz", ".obj", ".png", ".tif", ".urdf", ".usdc"}
 _LINK = re.compile(r"(\]\()([^)#\s]+)([^)]*\))")
 # What a browser would fetch by itself, from elsewhere.
 _FETCHED = re.compile(
@@ -121,7 +123,7 @@ def _relinked(text: str, file: str, page: str, files: Files, config: Any) -> str
 
 
 def _page_of(path: str, files: Files, config: Any) -> str:
-    """Where the site has a file of the repository; a source gets a page, a mesh is copied."""
+    """Where the site has a file of the repository; sources get pages, input files are copied."""
     if shown := (_ELSEWHERE | _SHOWN).get(path):
         return shown
     if path.startswith("docs/"):
@@ -129,9 +131,9 @@ def _page_of(path: str, files: Files, config: Any) -> str:
     source = ROOT / path
     if not source.is_file():
         return path  # MkDocs warns of it
-    mesh = source.suffix == ".glb"
-    page = f"sources/{path}" if mesh else f"sources/{path}.md"
-    if files.get_file_from_path(page) is None and mesh:
+    is_download = source.suffix in _DOWNLOADS
+    page = f"sources/{path}" if is_download else f"sources/{path}.md"
+    if files.get_file_from_path(page) is None and is_download:
         files.append(File.generated(config, page, abs_src_path=str(source)))
     elif files.get_file_from_path(page) is None:
         kind = {".py": "python", ".yaml": "yaml", ".sh": "sh"}.get(source.suffix, "text")

@@ -100,9 +100,12 @@ def local_cluster(
                 workers=workers, scheduler=scheduler, security=security, silence_logs=logging.ERROR
             )
     except RuntimeError as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, AssertionError):  # it holds a status, such as Status.starting
+            cause = RuntimeError("a worker process ended or did not respond during its start")
         raise PoolError(
-            f"The workers did not start: {error.__cause__ or error}. Check their output above, "
-            "and whether the machine has enough memory."
+            f"The workers did not start: {cause}. Check their output above, and whether the "
+            "machine has enough memory."
         ) from error
 
 

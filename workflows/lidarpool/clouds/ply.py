@@ -261,7 +261,8 @@ def _move_bytes(file: int, start: int, stop: int, new_start: int) -> None:
 def read_cloud(path: str | Path) -> Cloud:
     """Read a .ply point cloud written by a run or by `save_cloud`, with all its columns.
 
-    A cloud that is read from a result folder includes its sweeps, and can be saved in all formats.
+    A cloud that is read from a result folder can be saved in all formats, because `cloud.sweeps()`
+    returns its sweeps. To read single sweeps with their poses and boxes, use `lidarpool.sweeps`.
 
     Returns
     -------
@@ -280,8 +281,12 @@ def read_cloud(path: str | Path) -> Cloud:
     columns = {names.get(name, name): rows[name] for name in rows.dtype.names or ()}
     columns = {name: values for name, values in columns.items() if name not in AXES}
     beside = path.with_name(SWEEPS_FILE)
-    sweeps = partial(Sweeps.load, beside) if beside.exists() else None
-    return Cloud(positions, columns, sweeps=sweeps)
+
+    def load_sweeps() -> Sweeps:
+        """Return the sweeps of the survey, which are stored beside the cloud."""
+        return Sweeps.load(beside)
+
+    return Cloud(positions, columns, sweeps=load_sweeps if beside.exists() else None)
 
 
 def _comment(name: str) -> str:

@@ -16,6 +16,7 @@ from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.base.storage import Storage, flush
 from lidarsim.base.vocabulary import PICTURES
 from lidarsim.base.writing_progress import WritingProgress
+from lidarsim.columns.table import optional_columns
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.instruments import INSTRUMENT_FILES, Instruments
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
@@ -79,7 +80,9 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     @property
     def _requested(self) -> Sequence[str]:
         """Columns that the user asked for, without those that only formats need."""
-        return self.survey.columns if self.scenario is None else self.scenario.cloud.columns
+        if self.scenario is not None:
+            return self.scenario.cloud.columns
+        return [column.name for column in optional_columns(self.survey.columns)]
 
     @contextmanager
     def held(self) -> Iterator[None]:

@@ -64,12 +64,10 @@ class Placing:
 
         Positions around an object are already rounded, with more digits if the object is small.
         """
-        digits = 12 if self.surrounds_object else 3
-        rounded = [
-            replace(pose, position=tuple(round(x, digits) for x in pose.position))
-            for pose in self.poses
-        ]
-        return [as_entry(pose) for pose in rounded]
+        if self.surrounds_object:
+            return [as_entry(pose) for pose in self.poses]
+        x_y_z = [np.round(pose.position, 3).tolist() for pose in self.poses]
+        return [as_entry(replace(p, position=at)) for p, at in zip(self.poses, x_y_z, strict=True)]
 
     @property
     def notes(self) -> list[str]:

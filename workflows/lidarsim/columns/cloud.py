@@ -87,8 +87,10 @@ class Cloud(CloudDisplay):
     custom_columns
         Descriptions of the columns that are not in `lidarsim.columns.table`.
     sweeps
-        Function that returns the sweeps of the survey. `save_cloud` requires it for some formats.
-        Clouds of a `Result` provide this function.
+        Function without arguments that returns the times, poses and sensors of the sweeps, which
+        `save_cloud` requires for some formats. Clouds of a `Result`, and clouds that `read_cloud`
+        read from a result folder, provide this function. To read the points of single sweeps, use
+        `lidarpool.sweeps`.
 
     Raises
     ------

@@ -324,7 +324,7 @@ def _pack_answers(view: View, show: WritingProgress) -> dict[str, str]:
     for number, (question, key, value) in enumerate(questions, 1):
         answer = view.answer(question, {key: value}, _never_abandoned)
         answers[f"{question}?{key}={value}"] = _packed(*answer)
-        show("page", number, len(questions), "answers")
+        show("page", number, len(questions), "parts")
     return answers
 
 
