@@ -80,9 +80,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     @property
     def _requested(self) -> Sequence[str]:
         """Columns that the user asked for, without those that only formats need."""
-        if self.scenario is not None:
-            return self.scenario.cloud.columns
-        return [column.name for column in optional_columns(self.survey.columns)]
+        columns = self.survey.columns if self.scenario is None else self.scenario.cloud.columns
+        return [column.name for column in optional_columns(columns)]
 
     @contextmanager
     def held(self) -> Iterator[None]:
