@@ -563,7 +563,8 @@ def test_a_raster_alone_is_a_survey(tmp_path):
         [pose.position for pose in built.placing.poses],
         [(x0 + 60, y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
-    assert built.survey.epsg == 2056 and advice(built)[1:] == []
+    assert built.survey.epsg == 2056
+    assert [note for note in advice(built)[1:] if "default poses" not in note] == []
     at = np.array([x0 + 60, y0 - 60, 110]) - built.scene.origin
     cloud = Scanner(built.scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
     x, _, z = cloud.positions.T
