@@ -119,6 +119,8 @@ def test_classes_of_points_without_classes_of_objects_are_noted(materials, note,
     told = [one for one in advice(build(Scenario.from_data(data | stored))) if "class" in one]
     assert len(told) == bool(note and stored)
     assert all(one.startswith(f"points are labeled by class, but {note}") for one in told)
+    named = build(Scenario.from_data(data | stored | {"classes": {0: "background", 4: "thing"}}))
+    assert not [one for one in advice(named) if "labeled by class" in one]
 
 
 def test_the_note_on_classes_without_names_says_what_to_give():

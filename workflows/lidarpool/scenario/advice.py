@@ -84,7 +84,12 @@ def advice(built: Built) -> list[str]:
 
 
 def unlabeled(scene: Scene, survey: Survey) -> list[str]:
-    """Return a note on static objects without a class, for a cloud with the classes of points."""
+    """Return a note on static objects without a class, for a cloud with the classes of points.
+
+    There is none if the survey names class 0, for example "background".
+    """
+    if 0 in survey.classes:
+        return []
     kinds = scene.surface_kinds
     table = MaterialTable.build(survey.materials, kinds, voxels=scene.has_voxels)
     has_class = np.zeros(len(scene.object_names), np.bool_)
@@ -104,7 +109,8 @@ def unlabeled(scene: Scene, survey: Survey) -> list[str]:
         (
             f"points are labeled by class, but {len(without):,} of "
             f"{plural(len(scene.names), 'static object')} have no class, so their points have "
-            f"class 0: {listed(without, 3)}. Set `class` in `materials`; see docs/how-to/labels.md"
+            f"class 0: {listed(without, 3)}. Set `class` in `materials`, or name class 0 in "
+            "`classes`; see docs/how-to/labels.md"
         )
     ]
 
