@@ -155,7 +155,7 @@ CENTER = Pose((0.0, 0.0, 0.0))  # mount of a sensor without carrier
 
 @dataclass(frozen=True)
 class InstrumentPose(Pose):
-    """Position and angles of an instrument in the carrier frame, as written in a file."""
+    """Position and angles of an instrument in the platform frame, as written in a file."""
 
     position: Annotated[Triple, about("x, y and z in meters")] = (0, 0, 0)
 
