@@ -363,7 +363,7 @@ class TestSurveys:
             Survey(Sensor.grid(rate_hz=10), steps=400, trajectory=self.track)
         with pytest.raises(LidarError, match="the first time step"):
             Survey(Sensor.grid(rate_hz=0.01), trajectory=self.track)
-        with pytest.raises(LidarError, match=r"0 to 1.05 s.* 0.95 s outside"):
+        with pytest.raises(LidarError, match=r"0 to 1.05 s.* the last 0.95 s are not covered"):
             self.track.poses(0, np.array([2e9]))
 
     def test_sensors_come_one_after_the_other_each_with_its_rate(self):
