@@ -213,7 +213,7 @@ def test_a_pool_that_is_divided_twice_does_not_give_one_worker_to_two(start):
     _, rest = pool.partition("Q", n_workers=1)
     assert sorted(map(list, declared(client).values())) == [["P"], ["P"], ["Q"]]
     assert rest.names == []
-    one, other = sorted(first.names)
+    one, other = sorted(worker.name for worker in first.workers)
     with pytest.raises(
         PoolError, match=f"Workers '{one}', '{other}' already belong to partition 'P'"
     ):
