@@ -52,6 +52,15 @@ def test_it_shows_what_varies_and_five_jobs(campaign, lidarpool):
     assert not (campaign.parent / "out").exists()
 
 
+def test_a_result_in_the_output_folder_is_not_compared_with_each_job(campaign, lidarpool):
+    out = campaign.parent / "out"
+    (out / "jobs").mkdir(parents=True)
+    (out / "report.json").write_text("{}")
+    outcome = lidarpool("check", campaign, "--out", out)
+    assert outcome.code == 0 and "different survey" not in outcome.out
+    assert f"--out {out}-2" in outcome.out
+
+
 def test_one_job_is_shown_like_a_scenario(campaign, lidarpool):
     outcome = lidarpool("check", campaign, "--job", 3)
     assert outcome.code == 0
@@ -122,4 +131,5 @@ def test_the_example_can_run(lidarpool, tmp_path):
             shutil.copy(file, tmp_path)
     outcome = lidarpool("check", tmp_path / "campaign.yaml")
     assert (outcome.code, outcome.out.count("\njob ")) == (0, 5)
-    assert "note:" not in outcome.out
+    notes = [line for line in outcome.out.splitlines() if line.startswith("note:")]
+    assert all("have no angles" in note for note in notes), notes

@@ -430,7 +430,7 @@ def test_the_command_that_is_named_runs_where_another_result_is(
     assert lidarpool("run", tmp_path / "s.yaml", *given).code == 0
     for k, number in enumerate((2, 3), 4):  # a result of another survey is in the way each time
         outcome = check("--scheduler", cluster, text=json.dumps(SHORT | {"steps": k}))
-        assert "holds the result of another survey" in outcome.out
+        assert "contains the result of a different survey" in outcome.out
         words = shlex.split(outcome.out.splitlines()[-1].partition("The scenario can be run: ")[2])
         assert str(tmp_path / f"out-{number}") in words
         assert lidarpool(*words[1:], "--cloud-only").code == 0

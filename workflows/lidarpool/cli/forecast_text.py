@@ -62,6 +62,7 @@ def forecast_scenario(
         )
 
     terminal = Terminal(quiet)
+    has_jobs = campaign is not None and number is None  # each with a folder of its own
 
     def forecast_job(job_number: int = 0) -> tuple[Job, dict[str, Any]]:
         """Return a job and the figures of its forecast."""
@@ -77,7 +78,7 @@ def forecast_scenario(
                 job,
                 options.with_pool(scenario.pool, {"backend": backend}),
                 client,
-                refuse=lambda: _refuse_other_result(job, options),
+                refuse=None if has_jobs else lambda: _refuse_other_result(job, options),
             )
         figures["notes"] += advice(built)
         figures["warnings"] += implausibilities(built)
@@ -91,7 +92,7 @@ def forecast_scenario(
             figures["job"] = _job_figures(campaign, job_number, figures)
         return job, figures
 
-    if campaign is None or number is not None:
+    if campaign is None or not has_jobs:
         job, figures = forecast_job(number or 0)
         return figures, _job_lines(job, figures)
     figures = _campaign_figures(campaign, options, lambda number: forecast_job(number)[1])
