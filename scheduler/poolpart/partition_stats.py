@@ -51,7 +51,8 @@ class StageStats:
         Total time in seconds that these tasks waited for a worker or a slot after their inputs were
         available.
     lost
-        Number of runs that were lost because their worker died. Dask runs these tasks again. A task
+        Number of times that a task was assigned to a worker that died, whether or not the task had
+        started. Dask runs these tasks again. Finished results that are lost are not counted. A task
         that Dask stops retrying after too many workers have died is counted as failed instead.
     """
 
@@ -113,7 +114,7 @@ class PartitionStats(StageStats):
         size = size_in_words(self.workers, self.target, self.slots)
         since = f", counted since {self.since:%H:%M:%S} UTC" if self.since else ""
         stages = [[stage, *stats._figures] for stage, stats in self.stages.items()]
-        lost = f", {self.lost} lost {'run' if self.lost == 1 else 'runs'}" if self.lost else ""
+        lost = f", {self.lost} lost {'task' if self.lost == 1 else 'tasks'}" if self.lost else ""
         title = f"<PartitionStats {self.name!r}: {size}, {self.busy} busy{lost}{since}>"
         return f"{title}\n{text_table(_HEAD_OF_STAGES, [*stages, ['all', *self._figures]])}"
 

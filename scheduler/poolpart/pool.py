@@ -230,7 +230,10 @@ class Pool:
         names, with_rule = on_scheduler(self.client, _all_and_divided)
         return {
             name: Partition(
-                name, self.client, "" if name in with_rule else note_on_slots(name, workers)
+                name,
+                self.client,
+                "" if name in with_rule else note_on_slots(name, workers),
+                by_rule=name in with_rule,
             )
             for name in names
         }

@@ -103,7 +103,7 @@ def test_runs_that_are_lost_with_their_worker_are_counted(nannies, tmp_path):
     stats = part.stats()
     assert (stats.lost, stats.done, stats.failed) == (1, 1, 0)
     assert stats.stages["die_once"].lost == 1
-    assert "1 lost run" in repr(stats)
+    assert "1 lost task" in repr(stats)
 
 
 def metrics_of(client):
