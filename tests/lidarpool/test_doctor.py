@@ -69,7 +69,7 @@ def test_a_port_that_is_in_use(monkeypatch):
         assert doctor._port_state(port) == "in use"
         figures = doctor.examine()
         lines = doctor.in_words(figures)
-        assert any(f"{port} " in line and "in use, for a test" in line for line in lines)
+        assert any(f"{port} " in line and "in use (a test)" in line for line in lines)
 
 
 def test_extras_are_added_in_the_checkout(monkeypatch):

@@ -452,7 +452,7 @@ def test_instances_prims_and_points_that_move_are_in_animations(tmp_path):
     ("stage", "text", "name", "message"),
     [
         ("", None, "Wlak", r"m.usda has no animation 'Wlak' \(Did you mean 'Walk'\?\)\.$"),
-        ("", None, "Fly", r"has no animation 'Fly' \(there are Walk, Run\)\.$"),
+        ("", None, "Fly", r"has no animation 'Fly' \(the animations are Walk, Run\)\.$"),
         ("startTimeCode = 3\nendTimeCode = 3", None, "", "an animation without a duration"),
         ("startTimeCode = 3\nendTimeCode = 3e9", None, "", "Unable to allocate|would unpack to"),
         ("timeCodesPerSecond = 0", None, "", "contains no animations. Export it with"),

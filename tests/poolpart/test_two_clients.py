@@ -61,7 +61,8 @@ def both(monkeypatch):
         ),
         (
             named("a", "b", "d"),
-            "The partition does not have all workers that its rule names. Missing: 'a', 'b'.",
+            "The partition does not have all workers that its rule names. Workers 'a', 'b' already "
+            "belong to partition 'P'.",
         ),
     ],
 )

@@ -131,7 +131,9 @@ def test_open_ground_that_decides_is_noted(tmp_path, lidarpool):
     (tmp_path / "site.glb").write_bytes(scene.export(file_type="glb"))
     arguments = ("site.glb", "--up-axis", "z", "--sensor", "riegl-vz400", "--spacing", "5")
     outcome = lidarpool("stations", *arguments, "--count", "1")
-    assert "note: Ground has " in outcome.out and "select them with `--target`" in outcome.out
+    assert (
+        "note: Ground accounts for " in outcome.out and "select them with `--target`" in outcome.out
+    )
     outcome = lidarpool(
         "stations", *arguments, "--count", "1", "--target", "Hut", "--overwrite", "--json"
     )

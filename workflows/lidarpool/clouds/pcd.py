@@ -98,8 +98,12 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
 
 def _stated_compensation(path: Path) -> bool | None:
     """Return what the comment of a file of `Pieces` states, or None for other files."""
-    with open_input(path) as file:
-        return states_compensation(file.readline(_COMMENT_BYTES).decode(errors="replace"))
+    try:
+        with open_input(path) as file:
+            comment = file.readline(_COMMENT_BYTES).decode(errors="replace")
+    except OSError:  # which is raised again, with the name of the file, when points are read
+        return None
+    return states_compensation(comment)
 
 
 def read_points(path: Path) -> FilePoints:
