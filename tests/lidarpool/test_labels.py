@@ -102,11 +102,11 @@ def test_the_scenario_of_the_page_labels_its_points():
         ([{"objects": "*", "class": 4}], ""),
         (
             [{"objects": ["Vase", "Cart"], "class": 4}, {"objects": "*"}],
-            "5 of 6 static objects have no class, so their points have class 0: ",
+            "5 of 6 static objects have no class (",
         ),
         (
             [{"objects": "Cart", "class": 4}, {"objects": "*"}],
-            "6 of 6 static objects have no class, so their points have class 0: ",
+            "6 of 6 static objects have no class (",
         ),
     ],
 )

@@ -210,6 +210,9 @@ class Twin:
             materials.append({"objects": "*"} | light)
         if materials:
             scenario["materials"] = materials
+        scenario["classes"] = {0: "unlabeled"} | {
+            number: name for number, name in classes.items() if number
+        }
         scenario["cloud"] = {"columns": _COLUMNS}
         head = (
             f"# Reconstruction of {self.figures['name']}, created by lidarpool "

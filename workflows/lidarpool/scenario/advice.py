@@ -108,9 +108,10 @@ def unlabeled(scene: Scene, survey: Survey) -> list[str]:
     return [
         (
             f"points are labeled by class, but {len(without):,} of "
-            f"{plural(len(scene.names), 'static object')} have no class, so their points have "
-            f"class 0: {listed(without, 3)}. Set `class` in `materials`, or name class 0 in "
-            "`classes`; see docs/how-to/labels.md"
+            f"{plural(len(scene.names), 'static object')} "
+            f"{'have' if without[1:] else 'has'} no class ({listed(without, 3)}). Their points "
+            "have class 0. Set `class` in `materials`, or name class 0 in `classes`; see "
+            "docs/how-to/labels.md"
         )
     ]
 
