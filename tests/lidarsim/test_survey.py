@@ -256,6 +256,18 @@ def test_a_platform_turns_during_the_whole_of_a_short_stop():
     times_s = np.array([0.99, 1.0, 1.3, 1.6, 2.5, 2.6, 2.8, 3.0, 3.5])
     yaws = yaws_of(track.poses(0, times_s * 1e9)[1])
     assert yaws == pytest.approx([0, 0, 45, 90, 90, 90, 45, 0, 0], abs=1e-6)
+    # A smooth curve reaches a stop with a slope, and leaves it along the axis of the next leg.
+    smooth = replace(track, smooth=True)
+    arrival, middle, departure, north = yaws_of(
+        smooth.poses(0, np.array([1.0, 1.3, 1.6, 2.1]) * 1e9)[1]
+    )
+    assert departure == north == pytest.approx(90, abs=1e-6), "from one stop to the next"
+    assert middle == pytest.approx((arrival + departure) / 2, abs=1e-6)
+    arrival, early, middle, departure = yaws_of(
+        smooth.poses(0, np.array([2.6, 2.65, 2.8, 3.0]) * 1e9)[1]
+    )
+    assert arrival == pytest.approx(90, abs=1e-6) and arrival > early > 80
+    assert middle == pytest.approx((arrival + departure) / 2, abs=1e-6)
 
 
 def test_a_carrier_that_rises_keeps_its_heading():

@@ -65,7 +65,7 @@ def check_chunks(path: Path) -> None:
 def read_metadata(path: Path) -> dict[str, dict[str, str]]:
     """Read the metadata records of an MCAP file, {name of a record: its content}.
 
-    Records that are cut short are left out. OSError if the file cannot be read.
+    Truncated records are skipped. Raises OSError if the file cannot be read.
     """
     records: dict[str, dict[str, str]] = {}
     if input_size(path) < _MAGIC_BYTES:

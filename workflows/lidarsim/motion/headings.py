@@ -15,7 +15,7 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Indices
 from ..base.elementary import arctan2, interp, sin_cos
 from ..base.vectors import hypot
-from .spline import on_curve
+from .spline import on_curve, rests
 
 # A carrier turns within this distance before and after a corner, or from the middle of one leg to
 # the middle of the next if a leg is shorter than twice the distance.
@@ -204,7 +204,8 @@ class CurveHeadings:
         slopes = on_curve(knots, steps, np.arange(count).repeat(3), since, 1)[1]
         velocities = slopes[:2].T.reshape(count, 3, 2)
         moves = hypot(velocities[..., 0], velocities[..., 1]) > _SAME
-        moves[still[:-1] & still[1:]] = False
+        # Both ends are still: of a pause, but also of a leg from one stop to the next.
+        moves[rests(steps, np.diff(knots[0]) / steps)] = False
         travels = moves.any(axis=1)
         rows = np.arange(count)
         first = velocities[rows, moves.argmax(axis=1)]

@@ -23,7 +23,8 @@ def knots_of(times: Floats, values: Floats) -> Floats:
     """
     steps = np.diff(times)
     slopes = np.diff(values) / steps
-    still = _stops(steps, slopes)
+    resting = rests(steps, slopes)
+    still = np.append(resting, False) | np.append(False, resting)
     # Equal second derivatives on both sides of a knot, of its slope v[i]:
     # v[i] + lower[i] v[i - 1] + upper[i] v[i + 1] = first[i]
     rows = np.zeros((2 + len(values), _PAD + len(times) + _PAD))
@@ -45,19 +46,19 @@ def knots_of(times: Floats, values: Floats) -> Floats:
     return np.array([values, first, second])
 
 
-def _stops(steps: Floats, slopes: Floats) -> Bools:
-    """Return whether values stand still at times (n,), by the steps (n - 1,) between the times.
+def rests(steps: Floats, slopes: Floats) -> Bools:
+    """Return whether values rest (n - 1,) during the steps (n - 1,) between times.
 
     `slopes` (d, n - 1) are the mean slopes in each step.
     """
     speeds = np.sqrt((slopes * slopes).sum(axis=0))
-    rests = speeds * steps <= 1e-9  # meters, or halves of radians
+    resting = speeds * steps <= 1e-9  # meters, or halves of radians
     # Steps ten times as long as their neighbor, and as slow, are pauses without values. A curve
     # with the neighbor's speed would swing far out in a pause.
     for step, neighbor in ((np.s_[1:], np.s_[:-1]), (np.s_[:-1], np.s_[1:])):
         longer = steps[step] > 10 * steps[neighbor]
-        rests[step] |= longer & (10 * speeds[step] < speeds[neighbor])
-    return np.append(rests, False) | np.append(False, rests)
+        resting[step] |= longer & (10 * speeds[step] < speeds[neighbor])
+    return np.asarray(resting)
 
 
 def _end_slopes(times: Floats, values: Floats) -> Floats:
