@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import sys
 import zipfile
 from unittest.mock import patch
 
@@ -26,6 +27,12 @@ def zipfile_bytes(arrays):
     return memory.getvalue()
 
 
+def assert_bytes_of_zipfile(data, arrays):
+    # Before Python 3.11.4, zipfile wrote sizes of 64 bits only for large files.
+    if sys.version_info >= (3, 11, 4):
+        assert data == zipfile_bytes(arrays)
+
+
 ARRAYS = {
     ".scans": np.array([3, 5]),
     ".samples": np.arange(24, dtype=np.float32).reshape(2, 4, 3),
@@ -38,7 +45,7 @@ ARRAYS = {
 
 def test_bytes_are_those_of_zipfile_and_numpy_reads_them():
     data = b"".join(stored_pieces(ARRAYS))
-    assert data == zipfile_bytes(ARRAYS)
+    assert_bytes_of_zipfile(data, ARRAYS)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert archive.testzip() is None
     with np.load(io.BytesIO(data)) as loaded:
@@ -52,7 +59,7 @@ def test_numbers_of_64_bits_are_where_zipfile_has_them(limit):
     """As of a part of more than 2 GiB, with a smaller limit."""
     with patch.object(zipfile, "ZIP64_LIMIT", limit), patch.object(archives, "_MAX_SIZE", limit):
         data = b"".join(stored_pieces(ARRAYS))
-        assert data == zipfile_bytes(ARRAYS)
+        assert_bytes_of_zipfile(data, ARRAYS)
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         assert archive.testzip() is None
 
@@ -62,7 +69,7 @@ def test_numbers_of_64_bits_are_where_zipfile_has_them(limit):
 def test_arrays_of_any_length(lengths, kind):
     arrays = {f"column{i}": np.arange(length).astype(kind) for i, length in enumerate(lengths)}
     data = b"".join(stored_pieces(arrays))
-    assert data == zipfile_bytes(arrays)
+    assert_bytes_of_zipfile(data, arrays)
     assert all(np.array_equal(a, arrays[name]) for name, a in read_arrays(data).items())
 
 
