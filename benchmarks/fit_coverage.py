@@ -20,6 +20,7 @@ from lidarpool.clouds.recording import Recording
 from lidarpool.comparing.fit import fit
 from lidarscenes.procedural.city import city
 from lidarscenes.procedural.plants import all_trees, place_instances
+from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.scene_mesh import SceneMesh
 
 SWEEPS = 12
@@ -134,13 +135,13 @@ def recorded(
     else:
         arrays = dict(np.load(cache))
 
-    def read(number: int) -> Any:
+    def read(number: int) -> Sweep:
         points = arrays[f"points{number}"]
         channel = arrays[f"channel{number}"]
         ranges = np.linalg.norm(points, axis=1)
         errors = np.broadcast_to(bias, LAYERS)[channel]
         columns = {"channel": channel, "intensity": arrays[f"intensity{number}"]}
-        return points * (1 + errors / np.maximum(ranges, 1e-6))[:, None], columns, None
+        return Sweep(points * (1 + errors / np.maximum(ranges, 1e-6))[:, None], columns)
 
     return Recording("simulated", sweeps, read, energies=True)
 

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from lidarpool.clouds.recording import Read, Recording
+from lidarpool.clouds.recording import Recording
 from lidarpool.places.alignment import AlignedSweeps, align, first_alignment
 from lidarpool.places.building import DEFAULT_VOXEL_M
 from lidarpool.places.free_space import standing_points
@@ -47,6 +47,7 @@ from lidarpool.places.stretches import divide, joined
 from lidarpool.recordings.opening import open_recording
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.even_samples import even_indices
+from lidarsim.columns.sweep import Sweep
 
 _COMPARED_SWEEPS = 24
 _BLOCK_SWEEPS = 20
@@ -90,9 +91,9 @@ def _tram(root: Path) -> Recording:
     )
     ring = np.arange(len(elevation)).repeat(len(azimuth))
 
-    def read(number: int) -> Read:
+    def read(number: int) -> Sweep:
         range_m = np.asarray(Image.open(files[number]), np.float64) / steps_per_m
-        return (range_m[..., None] * directions).reshape(-1, 3), {"ring": ring}, None
+        return Sweep((range_m[..., None] * directions).reshape(-1, 3), {"ring": ring})
 
     return Recording("tram", len(files), read)
 
@@ -148,7 +149,7 @@ class HalfPlace(NamedTuple):
         cls, recording: Recording, compared_sweeps: int, answering: Answering | None = None
     ) -> HalfPlace:
         """Build the place of the last sweeps of a recording."""
-        recorded = RecordedSweeps.of_recording(part_of(recording, slice(-_HALF_SWEEPS, None)))
+        recorded = RecordedSweeps.from_recording(part_of(recording, slice(-_HALF_SWEEPS, None)))
         mapped = mapped_sweeps(recorded.count, "easy").tolist()
         first = first_alignment(recorded, find_poses(recorded, None))
         alignment = align(recorded, first, np.arange(recorded.count), mapped)
@@ -236,7 +237,7 @@ def _range_image(sweeps: RecordedSweeps, number: int) -> Floats:
     image = np.full((sweeps.ring_count, _IMAGE_COLUMNS), np.nan)
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
     column = (turns * _IMAGE_COLUMNS).astype(np.int64) % _IMAGE_COLUMNS
-    image[sweep.ring, column] = np.linalg.norm(sweep.points, axis=1)
+    image[sweep.columns["row"], column] = np.linalg.norm(sweep.points, axis=1)
     return image
 
 
@@ -258,10 +259,10 @@ def measure(name: str, root: Path, rules: tuple[str, ...]) -> list[dict[str, Any
     source = SOURCES[name]
     rows = []
     whole = source.open(root / source.repository)
-    answering = Answering.of_sweeps(RecordedSweeps.of_recording(whole))
+    answering = Answering.of_sweeps(RecordedSweeps.from_recording(whole))
     for part, chosen in source.parts.items():
         recording = part_of(whole, chosen)
-        recorded = RecordedSweeps.of_recording(recording)
+        recorded = RecordedSweeps.from_recording(recording)
         poses = find_poses(recorded, None)
         for rule in rules:
             mapped = mapped_sweeps(recorded.count, rule)

@@ -237,7 +237,7 @@ def measure(name: str, root: Path) -> list[dict[str, Any]]:
     source = SOURCES[name]
     base = read_model(MODELS.get(name, _DEFAULT_MODEL))
     whole = source.open(root / source.repository)
-    answering = Answering.of_sweeps(RecordedSweeps.of_recording(whole))
+    answering = Answering.of_sweeps(RecordedSweeps.from_recording(whole))
     rows = []
     for part, chosen in source.parts.items():
         recording = part_of(whole, chosen)

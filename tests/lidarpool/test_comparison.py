@@ -15,7 +15,7 @@ from tests.drives import points_of, the_scene, the_sweeps, write_set
 import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
 from lidarpool.clouds.writing import Format
-from lidarpool.comparing import comparison, two_clouds
+from lidarpool.comparing import comparison, range_image, two_clouds
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.recordings.opening import open_recording
 from lidarsim.sweeps.sweeps import Sweeps
@@ -223,11 +223,12 @@ def test_rings_are_matched_whatever_their_numbers(numbers, note):
 def test_what_has_no_range_image_says_why():
     made = cloud()
     ringless = {name: made[name] for name in ("scan", "object")}
+    scattered = np.random.default_rng(8).normal(0, 10, (CELLS, 3))
     whole = Cloud(made.positions, made.columns)  # without sweeps, although zero is the sensor
     far = np.array([500_000, 5_400_000, 300])  # of UTM
     for a, b, says in (
         (
-            replace(made, columns=ringless),
+            replace(made, positions=scattered, columns=ringless),
             made,
             "cloud A has no ring column, such as `ring` or `channel`",
         ),
@@ -471,6 +472,48 @@ def test_names_and_places_of_other_programs(tmp_path):
     assert found.figures["intensity"]["rank_correlation"] == pytest.approx(1)
     with pytest.raises(LidarError, match=r"no column 'signl'.* Did you mean 'signal'\?"):
         compare(tmp_path, tmp_path, intensity_a="signl")
+
+
+@pytest.mark.parametrize(
+    ("is_ring_by_ring", "source"),
+    [(True, "the order of the points"), (False, "the elevation angles of the points")],
+)
+def test_rings_of_kitti_are_found_in_its_points(monkeypatch, tmp_path, is_ring_by_ring, source):
+    """KITTI has no ring column; five points after the last ring belong to no ring."""
+    pytest.importorskip("scipy", reason="the extra fit is not installed")
+    rng = np.random.default_rng(4)
+    there = rng.uniform(size=RANGES.shape) > 0.1
+    for name, sweep in (("a", cloud(RANGES + 0.05)), ("b", cloud(there=there))):
+        labels = np.zeros(len(sweep), np.uint8)
+        columns = {**sweep.columns, "reflectivity": labels, "class": labels}
+        made = Cloud(sweep.positions, columns, sweeps=lambda: ONE_SWEEP)
+        if is_ring_by_ring:
+            made = made[np.append(np.arange(len(made)), np.arange(5))]
+        else:
+            azimuth = np.arctan2(made.positions[:, 1], made.positions[:, 0]) % (2 * np.pi)
+            made = made[np.lexsort((made["channel"], azimuth))]
+        save_cloud(made, tmp_path / name, format="kitti")
+    found = compare(tmp_path / "a", tmp_path / "b").figures
+    image = found["ranges"]
+    assert [ring["ring"] for ring in image["rings"]] == list(range(RINGS))[::-1]
+    assert [r["elevation_deg"] for r in image["rings"]] == pytest.approx(ELEVATION[::-1], abs=1e-4)
+    for ring in image["rings"]:
+        assert ring["bias_m"] == pytest.approx(0.05, abs=1e-4)
+    lost = image["no_return"]
+    assert (lost["returns_in_both"], lost["in_b_only"]) == (there.sum(), (~there).sum())
+    assert lost["in_both"] == lost["in_a_only"] == 0
+    assert found["a"]["points"] == CELLS + 5 * is_ring_by_ring
+    assert image["hidden_points"] == {"a": 0.0, "b": 0.0}
+    assert found["notes"] == [
+        f"{tmp_path / name} has no ring column. Its 16 rings were determined from {source}"
+        for name in ("a", "b")
+    ]
+    stated = compare(tmp_path / "a", cloud()).figures
+    assert sum("no ring column" in note for note in stated["notes"]) == 1
+    monkeypatch.setattr(range_image, "find_spec", lambda name: None)
+    found = compare(tmp_path / "a", tmp_path / "b").figures
+    assert found["ranges"] is None
+    assert "a has no ring column, and finding its rings requires scipy" in found["notes"][0]
 
 
 def test_a_thinned_result_has_no_lost_returns(written, tmp_path):

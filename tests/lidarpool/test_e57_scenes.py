@@ -7,6 +7,7 @@ from lidarpool import LidarError
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.showing.pages.opened import open_view
+from lidarsim.columns.sweep import Sweep
 
 pytest.importorskip("pye57", reason="pye57 is an extra")
 
@@ -102,7 +103,7 @@ def test_invalid_intensities_do_not_darken(path):
     red, _ = reds(scene)
     assert (red == 255).all(), "all others are equal, and the 99th percentile is white"
     assert notes[0].startswith(f"{COUNT // 2} of {COUNT} points have no intensity.")
-    read = open_recording(path).read_points(0).intensities
+    read = open_recording(path)[0].intensity
     np.testing.assert_array_equal(np.isnan(read), ODD == 1)
 
 
@@ -147,7 +148,7 @@ def test_rows_beyond_16_bits_and_below_zero_are_read(path):
     grid = {"rowIndex": (rows, (0, 1 << 20)), "columnIndex": (-rows, (-(1 << 20), 0))}
     scene, _ = scene_and_notes(path, [{"fields": wall() | grid}])
     np.testing.assert_allclose(scene.bounds[:, 0], 5, atol=1e-6)
-    _, columns, _ = open_recording(path).read(0)
+    columns = open_recording(path)[0].columns
     np.testing.assert_array_equal(columns["row"], rows)
     np.testing.assert_array_equal(columns["column"], -rows)
 
@@ -193,9 +194,8 @@ def test_what_one_of_two_scans_lacks_is_gray(path, quantity, are_zero):
 def test_intensities_stay_with_their_scan_in_comparisons(path):
     write_scans(path, [{"fields": wall()}, {"fields": wall() | intensities(np.full(COUNT, 7.0))}])
     recording = open_recording(path)
-    parts = [recording.read_points(number) for number in range(2)]
-    joined = type(parts[0]).joined(parts)
-    np.testing.assert_array_equal(joined.intensities, np.repeat([np.nan, 7.0], COUNT))
+    joined = Sweep.joined([*recording])
+    np.testing.assert_array_equal(joined.intensity, np.repeat([np.nan, 7.0], COUNT))
 
 
 @pytest.mark.parametrize(
@@ -222,7 +222,7 @@ def test_scans_with_other_limits_have_the_same_scale(path, first, second):
     assert notes == [
         "specifies intensityLimits, so its intensities were scaled to the range 0 to 1"
     ]
-    read = [open_recording(path).read_points(number).intensities for number in range(2)]
+    read = [sweep.intensity for sweep in open_recording(path)]
     np.testing.assert_allclose(*read, atol=1e-6)
 
 

@@ -22,6 +22,7 @@ from lidarpool import (
     Track,
     fit,
     load_sensor,
+    save_cloud,
     simulate,
 )
 from lidarpool.clouds.recording import Recording
@@ -30,6 +31,7 @@ from lidarpool.comparing.fit.estimates import Estimate
 from lidarpool.comparing.fit.fitting import _with_performance
 from lidarpool.recordings.opening import open_recording
 from lidarscenes.procedural.city import city
+from lidarsim.columns.sweep import Sweep
 from lidarsim.sensor.models import read_model
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -146,7 +148,7 @@ def test_beams_that_begin_beside_zero_bias_no_ring():
     quiet = {"noise": Noise(range_m=0.003), "precision_m": 1e-4, "coordinates": "sensor"}
     scanner = Scanner(street(), sensor, **quiet)
     made = [scanner.sweep((0, 0, 0), number=k) for k in range(4)]
-    found = fit(Recording("os1", 4, lambda k: (made[k].positions, made[k].columns, None)))
+    found = fit(Recording("os1", 4, lambda k: Sweep(made[k].positions, made[k].columns)))
     bias = [row["bias_m"]["value"] for row in found.figures["channels"] if row["bias_m"]]
     assert len(bias) > 15 and np.abs(bias).max() < 0.001
 
@@ -171,7 +173,7 @@ def drive(scene, height_m, step_m, yaw_deg=0.0, sweeps=6):
     ]
 
     def read(number):
-        return clouds[number].positions, clouds[number].columns, None
+        return Sweep(clouds[number].positions, clouds[number].columns)
 
     return Recording("drive.pcap", sweeps, read, times=lambda: 5e7 * np.arange(sweeps))
 
@@ -263,7 +265,7 @@ def test_poses_of_sweeps_are_used(cluster_client, dropout):
     survey = survey_along(26, Noise(range_m=0.01, dropout=dropout, seed=2))
     result = open_recording(simulate(scene, survey, client=cluster_client).cloud)
     located = replace(result, fired=None)
-    unlocated = replace(located, frame_poses=None, read=lambda k: (*result.read(k)[:2], None))
+    unlocated = replace(located, frame_poses=None, read=lambda k: result.read(k).replace(pose=None))
     for recording, pose in ((located, None), (unlocated, result.frame_poses())):
         figures = fit(recording, scene=scene, pose=pose).figures["figures"]
         assert figures["dropout"]["value"] == pytest.approx(dropout, rel=0.15, abs=0.001)
@@ -313,14 +315,15 @@ def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
 
     def passed(number):
         """Points of a van of 5 by 2 m that comes along the street; what is behind it is hidden."""
-        points, columns, pose = stands.read(number)
+        sweep = stands.read(number)
+        points = sweep.points
         ahead = np.array([8.0 - 1.3 * number, 3.0])
         azimuth = np.arctan2(points[:, 1], points[:, 0])
         middle = np.arctan2(ahead[1], ahead[0])
         hit = (np.abs(azimuth - middle) < 0.12) & (np.abs(points[:, 2]) < 2)
         flat = np.hypot(points[:, 0], points[:, 1])
         near = np.where(hit, np.minimum(1, np.hypot(*ahead) / np.maximum(flat, 0.1)), 1)
-        return points * near[:, None], columns, pose
+        return sweep.replace(points=points * near[:, None])
 
     assert fit(replace(stands, read=passed)).figures["sweeps"] == 6
 
@@ -328,8 +331,8 @@ def test_a_sensor_that_stands_is_fitted_beside_cars_that_move(block):
 @pytest.mark.extended
 def test_points_that_are_not_in_meters_are_refused(recording):
     def scaled(number):
-        points, columns, pose = recording.read(number)
-        return points * 1000, columns, pose
+        sweep = recording.read(number)
+        return sweep.replace(points=sweep.points * 1000)
 
     with pytest.raises(LidarError, match=r"The ranges in .* change by .* Use points in meters"):
         fit(replace(recording, read=scaled))
@@ -341,12 +344,13 @@ def test_gaps_and_sweeps_cut_short_are_no_lost_pulses():
     whole = recorded(replace(NOISE, dropout=0.0))
 
     def holed(number):
-        points, columns, pose = whole.read(number)
+        sweep = whole.read(number)
+        points = sweep.points
         azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
         kept = (azimuth > 110) | (number % 3 > 0)
         for begin in np.random.default_rng(number).uniform(0, 360, 8):
             kept &= (azimuth < begin) | (azimuth > begin + 6)
-        return points[kept], {name: values[kept] for name, values in columns.items()}, pose
+        return sweep.select(kept)
 
     fitted = fit(replace(whole, read=holed))
     figures = fitted.figures["figures"]
@@ -372,16 +376,13 @@ def with_points(recording, chosen, points_of):
     """Keep the chosen points of each sweep, and add others: points (n, 3) of rings (n,)."""
 
     def read(number):
-        points, columns, pose = recording.read(number)
-        kept = chosen(number, points, columns["channel"])
+        sweep = recording.read(number)
         added, rings, light = points_of(number)
-        return (
-            np.concatenate([points[kept], added]),
-            {
-                "channel": np.append(columns["channel"][kept], rings),
-                "intensity": np.append(columns["intensity"][kept], light),
-            },
-            pose,
+        return Sweep.joined(
+            [
+                sweep.select(chosen(number, sweep.points, sweep.columns["channel"])),
+                Sweep(added, {"channel": rings, "intensity": light}),
+            ]
         )
 
     return replace(recording, read=read)
@@ -408,7 +409,7 @@ def test_rings_of_false_alarms_alone_are_of_the_same_sensor(recording):
         return away * rng.uniform(1, 120, (len(rings), 1)), rings, np.full(len(rings), 0.001)
 
     lower = with_points(recording, lambda number, points, rings: rings < 8, alarms)
-    of_sweeps = [len(np.unique(lower.read(k)[1]["channel"])) for k in range(lower.count)]
+    of_sweeps = [len(np.unique(lower.read(k).columns["channel"])) for k in range(lower.count)]
     assert max(of_sweeps[:3]) < 14
     fitted = fit(lower)
     assert len(fitted.figures["channels"]) == 16
@@ -455,9 +456,9 @@ def test_ranges_that_drift_are_refused():
     assert fit(steady).figures["figures"]["range_m"]["value"] == pytest.approx(0.006, rel=0.1)
 
     def longer(number):
-        points, columns, pose = steady.read(number)
-        ranges = np.linalg.norm(points, axis=1, keepdims=True)
-        return points * (1 + 0.003 * number / ranges), columns, pose
+        sweep = steady.read(number)
+        ranges = np.linalg.norm(sweep.points, axis=1, keepdims=True)
+        return sweep.replace(points=sweep.points * (1 + 0.003 * number / ranges))
 
     with pytest.raises(LidarError, match=r"The ranges in .* drift: .* over 6 sweeps"):
         fit(replace(steady, read=longer))
@@ -521,9 +522,10 @@ def test_intensities_of_unknown_scale_need_the_white_one():
     assert "--white-intensity" in repr(found)
 
     def calibrated(number):
-        points, columns, pose = made.read(number)
-        square = (points**2).sum(axis=1)
-        return points, {**columns, "intensity": columns["intensity"] * square / 100 * 255}, pose
+        sweep = made.read(number)
+        square = (sweep.points**2).sum(axis=1)
+        intensity = sweep.columns["intensity"] * square / 100 * 255
+        return sweep.replace(columns={**sweep.columns, "intensity": intensity})
 
     found = fit(replace(made, read=calibrated), white=255)
     assert found.figures["figures"]["detection_range_m"]["value"] == pytest.approx(10, rel=0.03)
@@ -531,18 +533,19 @@ def test_intensities_of_unknown_scale_need_the_white_one():
 
 def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
     def cut(number):
-        points, columns, pose = recording.read(number)
-        some = len(points) // 3 if number == 5 else len(points)
-        return points[:some], {name: one[:some] for name, one in columns.items()}, pose
+        sweep = recording.read(number)
+        return sweep.select(slice(len(sweep) // 3)) if number == 5 else sweep
 
     assert "5.6 % of the cells in the sweeps are gaps" in repr(fit(replace(recording, read=cut)))
     other = Scanner(street(), Sensor.grid(360, 40, vertical_fov_deg=80), coordinates="sensor")
-    sweep = other.sweep((0, 0, 0))
+    cloud = other.sweep((0, 0, 0))
+    foreign = Sweep(cloud.positions, cloud.columns)
 
     def mixed(number):
-        return (sweep.positions, sweep.columns, None) if number == 5 else recording.read(number)
+        return foreign if number == 5 else recording.read(number)
 
-    nothing = np.zeros((0, 3)), {"channel": np.zeros(0, int)}, None
+    nothing = Sweep(np.zeros((0, 3)), {"channel": np.zeros(0, int)})
+    scattered = Sweep(np.random.default_rng(0).normal(0, 10, (5000, 3)))
     for made, says in (
         (
             replace(recording, read=mixed),
@@ -555,7 +558,7 @@ def test_cut_and_mixed_recordings_are_told_in_a_line(recording, tmp_path):
         (replace(recording, count=0), "contains no sweeps"),
         (replace(recording, thinned=True, notes=("one of 5 hits",)), "one of 5 hits"),
         (
-            replace(recording, read=lambda k: (*recording.read(k)[:1], {}, None)),
+            replace(recording, read=lambda number: scattered),
             "has no ring column",
         ),
     ):
@@ -595,16 +598,16 @@ def test_packets_of_a_velodyne_are_sweeps(tmp_path):
     frames = [(time_ns, MACS + IPV4 + ip_packet(data)) for time_ns, data in round_room()]
     path.write_bytes(pcap(frames))
     opened = open_recording(path)
-    sweep = opened.read_points(1)
-    assert opened.count >= 3 and opened.white == 100 and set(sweep.intensities) == {50.0}
+    sweep = opened[1]
+    assert opened.count >= 3 and opened.white == 100 and set(sweep.intensity) == {50.0}
     assert len(np.unique(sweep.rings)) == 16
     assert np.linalg.norm(sweep.points, axis=1) == pytest.approx(5, abs=0.05)
     # A sweep has the time of its first packet, and its points have times since then.
-    times_s = opened.read(1)[1]["time"]
+    times_s = sweep.columns["time"]
     assert 0 <= times_s.min() < 0.002 and times_s.max() == pytest.approx(0.1, abs=0.002)
-    assert [*opened.times()][1] == pytest.approx(1e8, abs=4e6)  # three packets
+    assert opened.stamps_ns[1] == pytest.approx(1e8, abs=4e6)  # three packets
     # Each packet has 12 blocks of 32 points, those of the unfinished last sweep included.
-    sizes = [len(opened.read_points(number).points) for number in range(opened.count)]
+    sizes = [len(sweep) for sweep in opened]
     assert sum(sizes) == 76 * 4 * 12 * 32 and sizes[-1] > 0
     other = [
         (time_ns, MACS + IPV4 + ip_packet(data, source=(10, 0, 0, 7)))
@@ -660,19 +663,22 @@ def test_an_hdl64e_is_read_by_the_calibration_in_its_packets(model, tmp_path):
             (time_ns, MACS + IPV4 + ip_packet(data)) for time_ns, data in hdl64e(model, *lasers)
         ]
         path.write_bytes(pcap(frames))
-        return open_recording(path).read(1)
+        return open_recording(path)[1]
 
-    points, columns = read()[:2]
+    sweep = read()
+    points = sweep.points
+    columns = sweep.columns
     distances = np.linalg.norm(points, axis=1)
     elevations = np.degrees(np.arcsin(points[:, 2] / distances))
-    rings = columns["ring"].astype(int)
+    rings = columns["channel"].astype(int)
     assert np.array_equal(np.unique(rings), np.arange(64))
     np.testing.assert_allclose(distances, 5 + 0.001 * rings, atol=1e-5)
     np.testing.assert_allclose(elevations, (rings - 40) / 2, atol=1e-4)
     config = decoder.Config(timestamp_first_packet=True)
     _, rows = [*decoder.read_pcap(str(path), config)][1]  # which finds the model by itself
-    for row, name in enumerate(["x", "y", "z", "intensity", "time"]):
-        assert np.array_equal(columns[name], rows[:, row])
+    assert np.array_equal(points, rows[:, :3])
+    assert np.array_equal(columns["intensity"], rows[:, 3])
+    assert np.array_equal(columns["time"], rows[:, 4])
     with pytest.raises(LidarError, match="the calibration in its packets is incomplete"):
         read([0] * 64)
 
@@ -688,8 +694,33 @@ def test_a_velodyne_is_read_from_any_capture(name, tmp_path):
     (tmp_path / "plain.pcap").write_bytes(ROOM_CAPTURES["plain"])
     plain = open_recording(tmp_path / "plain.pcap")
     assert opened.count == plain.count
-    assert np.array_equal(opened.read_points(1).points, plain.read_points(1).points)
-    assert list(opened.times()) == pytest.approx(list(plain.times()), rel=0, abs=2000)
+    assert np.array_equal(opened[1].points, plain[1].points)
+    assert opened.stamps_ns == pytest.approx(plain.stamps_ns, rel=0, abs=2000)
+
+
+def test_a_kitti_sequence_is_fitted_by_the_rings_in_its_points(cluster_client, tmp_path):
+    survey = Survey(
+        Sensor.grid(360, 16, vertical_fov_deg=40, max_range_m=120), poses=[(0, 0, 0)] * 4,
+        steps=36, columns=["intensity", "reflectivity", "class"], noise=NOISE, precision_m=1e-4,
+    )  # fmt: skip
+    cloud = simulate(street(), survey, client=cluster_client).cloud
+    save_cloud(cloud, tmp_path / "kitti", format="kitti")
+    found = fit(tmp_path / "kitti", white=1.0).figures
+    assert found["notes"] == [
+        f"{tmp_path / 'kitti'} has no ring column. Its 16 rings were determined from the "
+        "elevation angles of the points"
+    ]
+    stated = fit(cloud).figures
+    assert stated["notes"] == []
+    for name in ("range_m", "range_per_m", "angle_deg", "dropout"):
+        for key in ("value", "low", "high"):
+            expected = stated["figures"][name][key]
+            assert found["figures"][name][key] == pytest.approx(expected, rel=0.05), name
+    assert found["figures"]["range_m"]["value"] == pytest.approx(NOISE.range_m, rel=0.1)
+    assert found["figures"]["dropout"]["value"] == pytest.approx(NOISE.dropout, rel=0.1)
+    for row, other in zip(found["channels"], stated["channels"], strict=True):
+        assert row["ring"] == other["ring"] and row["rays"] == other["rays"]
+        assert row["elevation_deg"] == pytest.approx(other["elevation_deg"], abs=1e-3)
 
 
 @pytest.mark.extended

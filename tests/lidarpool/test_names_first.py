@@ -22,7 +22,7 @@ def unread(monkeypatch):
     for place in (
         "lidarpool.scenario.build.read_static_scene",
         "lidarpool.comparing.fit.fitting.open_recording",
-        "lidarpool.places.building.RecordedSweeps.of_choice",
+        "lidarpool.places.building.RecordedSweeps.open",
     ):
         monkeypatch.setattr(place, read)
     return build_module

@@ -99,10 +99,10 @@ def test_views_leave_them_out(tmp_path):
     assert len(everything.points) == 900 and "skipped" not in everything.note
     for keep_noise, count in ((False, 600), (True, 900)):
         recording = open_recording(path, keep_noise=keep_noise)
-        positions, columns, _ = recording.sample(100_000)
-        share = len(positions) / 880  # of runs of 22 points
+        sample = recording.read_sample(100_000)
+        share = len(sample) / 880  # of runs of 22 points
         assert share == pytest.approx(count / 900, abs=0.05)
-        assert all(len(values) == len(positions) for values in columns.values())
+        assert all(len(values) == len(sample) for values in sample.columns.values())
 
 
 def test_a_file_of_nothing_else_is_refused(tmp_path):
@@ -159,7 +159,7 @@ def test_columns_of_converted_las_count_alike(tmp_path, name, value, is_left_out
     assert any("skipped" in note for note in notes) == is_left_out
     assert top_of(path, keep_noise=True)[0] == 500
     recording = open_recording(path)
-    assert len(recording.read_points(0)) == (600 if is_left_out else 900)
+    assert len(recording[0]) == (600 if is_left_out else 900)
     assert bool(recording.left_out_notes) == is_left_out
 
 

@@ -334,7 +334,7 @@ def test_one_of_several_versions_of_nuscenes_is_asked_for(nuscenes):
         )
     assert open_recording(table.parent, "LIDAR_TOP").count == sweeps
     one = open_recording(mini.parent)
-    assert one.count == 1 and len(one.read_points(0)) > 100
+    assert len(one) == 1 and len(one[0].returns()) > 100
 
 
 @pytest.mark.parametrize("name", ["../secret.bin", "{root}/../secret.bin", "samples/link.bin"])
@@ -354,7 +354,7 @@ def test_tables_of_nuscenes_name_files_of_the_data_set_only(nuscenes, name, tabl
         row = {"token": "1", "sample_data_token": first["token"], "filename": name}
         (sample_data.parent / "lidarseg.json").write_text(json.dumps([row]))
     with pytest.raises(LidarError) as told:
-        open_recording(root, "LIDAR_TOP").read_points(0)
+        open_recording(root, "LIDAR_TOP")[0]
     key = "token" if table == "sample_data" else "sample_data_token"
     assert str(told.value) == (
         f"{root}: v1.0-lidarpool/{table}.json, {key} {first['token']}, refers to {name!r}, which "
@@ -373,9 +373,9 @@ def test_single_sweeps_of_kitti_and_nuscenes_have_their_columns(tmp_path):
     (tmp_path / "sweeps" / "a.pcd.bin").write_bytes(rows.tobytes())
     for path in (tmp_path / "a.bin", tmp_path / "sweeps" / "a.pcd.bin", tmp_path / "sweeps"):
         recording = open_recording(path)
-        points = recording.read_points(0)
-        assert recording.count == 1 and points.points.tolist() == [[1, 2, 3], [5, 6, 7]]
-        assert points.intensities.tolist() == [0.5, 0.25]
+        points = recording[0].returns()
+        assert len(recording) == 1 and points.points.tolist() == [[1, 2, 3], [5, 6, 7]]
+        assert points.intensity.tolist() == [0.5, 0.25]
         assert points.rings is None if path.name == "a.bin" else points.rings.tolist() == [4, 31]
 
 

@@ -295,20 +295,20 @@ def test_a_plugin_reads_a_cloud_as_sweeps_and_as_points(tmp_path, distribution):
         {"lidarpool.clouds": {"lines": "line_cloud:ROW"}},
         {
             "line_cloud.py": "import numpy as np\n"
-            "from lidarpool.plugins import FilePoints, FormatRow\n"
+            "from lidarpool.plugins import FormatRow, Sweep\n"
             "ROW = FormatRow('', 'line_cloud', suffixes=('.lines',), reads=('sweeps', 'points'))\n"
             "def open_file(source):\n"
             "    points = np.loadtxt(source.path)\n"
-            "    return source.recording(1, lambda number: (points, {}, np.eye(4)))\n"
-            "def read_points(path): return FilePoints(np.loadtxt(path), {})\n"
+            "    return source.recording(1, lambda number: Sweep(points))\n"
         },
     )
     points = np.arange(60.0).reshape(20, 3)
     np.savetxt(tmp_path / "a.lines", points)
     recording = open_recording(tmp_path / "a.lines")
-    np.testing.assert_array_equal(recording.read_points(0).points, points)
-    scanned = read_points(tmp_path / "a.lines", None, tell=print)
-    np.testing.assert_array_equal(scanned.positions, points)
+    np.testing.assert_array_equal(recording[0].points, points)
+    scanned, epsg = read_points(tmp_path / "a.lines", None, tell=print)
+    np.testing.assert_array_equal(scanned.points, points)
+    assert epsg is None
     told = refused(save_cloud, Cloud(points, {}), tmp_path / "b.lines", format="lines")
     assert (
         told

@@ -317,7 +317,8 @@ def test_scenes_comparisons_and_views_have_the_same_points(tmp_path, name):
     scene = scene_of_points(path, voxel_m=1e-3)
     np.testing.assert_allclose(scene.bounds, bounds, atol=0.2)
     recording = open_recording(path)
-    compared = recording.read_points(0, in_world=True).points
+    compared = recording[0].returns()
+    compared = compared.points if compared.pose is None else compared.in_world()
     np.testing.assert_allclose([compared.min(axis=0), compared.max(axis=0)], bounds, atol=1e-4)
     viewed = open_view(path).points
     for axis, coordinate in enumerate("xyz"):
@@ -374,6 +375,114 @@ def test_what_one_of_two_scans_lacks_is_gray(tmp_path, first, second, quantity):
     assert any(f"1,200 of 2,400 points have no {quantity}. Surfels" in note for note in notes)
 
 
+def pts_cloud(x, cells):
+    """Return the text of a cloud of a wall at x whose points end with `cells`."""
+    return f"{len(GRID)}\n" + "".join(f"{x} {y:.6f} {z:.6f} {cells}\n" for y, z in GRID + 1)
+
+
+@pytest.mark.parametrize("second", ["100", "100 0 0 0"])
+def test_clouds_of_a_pts_without_colors_are_gray(tmp_path, second):
+    path = tmp_path / "a.pts"
+    path.write_text(pts_cloud(1, "100 200 200 200") + pts_cloud(50, second))
+    notes = []
+    red, x = reds(scene_of_points(path, voxel_m=1e-3, tell=notes.append))
+    assert (red[x < 10] == 200).all() and (red[x > 10] == 188).all()
+    assert any("1,200 of 2,400 points have no color. Surfels" in note for note in notes)
+
+
+def ply_with(path, **columns):
+    """Write a plane with further columns of real numbers."""
+    columns = {**dict(zip("xyz", plane().T, strict=True)), **columns}
+    kinds = [(name, "f4") for name in columns]
+    rows = np.rec.fromarrays([*columns.values()], np.dtype(kinds))
+    path.write_bytes(header_of(".ply", rows) + rows.tobytes())
+    return path
+
+
+def test_the_first_column_with_values_is_used_and_others_are_named_as_in_the_file(tmp_path):
+    values = np.where(GRID[:, 0] < 2, 50.0, 100.0)
+    path = ply_with(
+        tmp_path / "a.ply",
+        intensity=np.zeros(len(GRID)),
+        reflectivity=values,
+        Label=np.full(len(GRID), 3.0),
+        scalar_Classification=np.full(len(GRID), 2.0),
+        Ring=values,
+        Empty=np.zeros(len(GRID)),
+    )
+    notes = []
+    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    red, x = reds(scene)
+    assert (red[x < 1.9] == 188).all() and (red[x > 2.1] == 255).all()
+    assert scene.material_names == ("class 3",)
+    skipped = f"{path} has data that surfels cannot store, which were skipped: "
+    assert notes == [f"{skipped}scalar_Classification, Ring"]
+
+
+def test_packed_colors_are_read_in_all_formats(tmp_path):
+    rows = np.zeros(len(GRID), [("x", "f8"), ("y", "f8"), ("z", "f8"), ("rgb", "u4")])
+    for axis, values in zip("xyz", plane().T, strict=True):
+        rows[axis] = values
+    rows["rgb"] = 200 << 16 | 100 << 8 | 50
+    np.save(tmp_path / "a.npy", rows)
+    scene = scene_of_points(tmp_path / "a.npy", voxel_m=1e-3)
+    assert np.unique(scene.meshes()[0].colors.means(), axis=0).tolist() == [[200, 100, 50]]
+
+
+def test_parts_of_a_las_are_one_cloud(tmp_path, monkeypatch):
+    """Zeros in one of the parts are values, and points at zero are points."""
+    points = np.concatenate([plane((1, 0, 0)), np.zeros((20, 3))])
+    count = len(points)
+    intensities = np.where(np.arange(count) < 600, 0, 100)
+    classes = np.where(np.arange(count) % 2, 2, 7)
+    colors = np.zeros((count, 3), np.uint8)
+    path = written_with_columns(tmp_path / "a.las", points, classes, intensities, colors)
+
+    def made():
+        notes = []
+        scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+        return scene.vertices.tolist(), reds(scene)[0].tolist(), scene.material_names, notes
+
+    whole = made()
+    monkeypatch.setattr("lidarpool.clouds.las.CHUNK_POINTS", 500)
+    assert made() == whole
+    vertices, red, names, notes = whole
+    assert len(vertices) == 4 * (600 + 1), "the points at zero share a voxel"
+    assert set(red) == {0, 255} and names == ("class 2",)
+    assert notes[0].startswith(f"{path}: 610 noise points") and len(notes) == 2
+    assert notes[1].endswith("which were skipped: gps_time")
+
+
+def test_too_many_points_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    path = written(tmp_path / "a.las", plane())
+    monkeypatch.setattr("lidarpool.scenario.point_files.memory", lambda: 100_000)
+    monkeypatch.setattr("laspy.LasReader.read_points", None)
+    with pytest.raises(LidarError, match=r"a\.las: it has 1,200 points, which require 820\.31 kiB"):
+        scene_of_points(path)
+
+
+def test_a_parquet_file_is_a_scene(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is an extra")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = {**dict(zip("xyz", plane().T, strict=True)), "classification": np.full(len(GRID), 5)}
+    columns["t"] = np.arange(len(GRID))
+    path = tmp_path / "a.parquet"
+    parquet.write_table(pyarrow.table(columns), path, row_group_size=500)
+    notes = []
+    scene = scene_of_points(path, voxel_m=1e-3, tell=notes.append)
+    assert scene.triangles == 2 * len(GRID) and off_plane(scene) < 1e-5
+    assert scene.material_names == ("class 5",)
+    assert len(notes) == 1 and notes[0].endswith("which were skipped: t")
+
+
+def test_classes_of_semantic_kitti_become_materials(tmp_path):
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "labels").mkdir()
+    path = written(tmp_path / "velodyne/000000.bin", plane())
+    np.full(len(GRID), 40, "<u4").tofile(tmp_path / "labels/000000.label")
+    assert scene_of_points(path, voxel_m=1e-3).material_names == ("class 40",)
+
+
 def leica_file(path, intensities):
     """Write points with intensities."""
     rows = np.column_stack([plane(), intensities])
@@ -421,7 +530,7 @@ def test_all_clouds_of_a_pts_have_the_same_scale(tmp_path):
             file.writelines(f"{x:.6f} {y:.6f} {z:.6f} {intensity}\n" for x, y, z in points)
     red, x = reds(scene_of_points(path, voxel_m=1e-3))
     assert (red[x < 0] == 188).all() and (red[x > 0] == 255).all()
-    intensities = open_recording(path).read_points(0).intensities
+    intensities = open_recording(path)[0].intensity
     np.testing.assert_array_equal(np.unique(intensities), [1024, 2048])
 
 
@@ -447,7 +556,7 @@ def test_empty_cells_are_missing_intensities_and_classes(tmp_path):
 def test_a_cloud_without_points_takes_no_columns_away(tmp_path):
     path = written(tmp_path / "a.pts", plane())
     path.write_text("0\n" + path.read_text())
-    assert (open_recording(path).read_points(0).intensities == 0.5).all()
+    assert (open_recording(path)[0].intensity == 0.5).all()
 
 
 def test_pulses_without_a_return_are_left_out_with_a_note(tmp_path):
@@ -471,8 +580,8 @@ def test_units_of_a_header_are_converted_with_a_note(tmp_path):
     )
     meters = scene_of_points(path, unit="cm", tell=notes.append)
     np.testing.assert_allclose(meters.bounds, [[0, 0, 0], [40, 30, 20]], atol=2)
-    np.testing.assert_allclose(open_recording(path).read_points(0).points.max(axis=0), [4, 3, 2])
-    points = open_recording(path, unit="m").read_points(0).points
+    np.testing.assert_allclose(open_recording(path)[0].points.max(axis=0), [4, 3, 2])
+    points = open_recording(path, unit="m")[0].points
     np.testing.assert_allclose(points.max(axis=0), [4000, 3000, 2000])
 
 

@@ -15,7 +15,7 @@ from lidarpool.places.alignment import AlignedSweeps, Alignment, first_alignment
 from lidarpool.places.lost_pulses import Answering
 from lidarpool.places.motion import Motion
 from lidarpool.places.odometry import RecordedPoses, find_poses
-from lidarpool.places.recorded_sweeps import RecordedSweeps, RecordingChoice
+from lidarpool.places.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarsim.base.archives import packed
 from lidarsim.columns.bags import POINT_CLOUD
@@ -44,7 +44,7 @@ def write_image(path, x):
 
 def first_x(recording):
     """Return the x of the first point of each sweep."""
-    return [float(recording.read(number)[0][0, 0]) for number in range(recording.count)]
+    return [float(sweep.points[0, 0]) for sweep in recording]
 
 
 def kitti(folder, frames, pose_count, time_count=None, calibrated=True):
@@ -87,9 +87,9 @@ def test_rows_of_kitti_belong_to_the_frames_with_their_numbers(tmp_path):
     recording = open_recording(kitti(tmp_path / "some", [10, 11, 13], 20, 20))
     np.testing.assert_allclose(recording.poses(range(3))[:, 0, 3], [10, 11, 13], atol=1e-9)
     np.testing.assert_allclose(recording.poses(range(3))[:, :3, :3], [np.eye(3)] * 3, atol=1e-9)
-    np.testing.assert_allclose([*recording.times()], [1.0e9, 1.1e9, 1.3e9])
+    np.testing.assert_allclose(recording.stamps_ns, [1.0e9, 1.1e9, 1.3e9])
     for number in range(3):
-        assert recording.read_points(number, in_world=True).points[0, 0] == pytest.approx(50)
+        assert recording[number].in_world()[0, 0] == pytest.approx(50)
     assert recording.notes[0].endswith(
         "some has no point file for frames 0 to 9, 12, 14 to 19 in poses.txt"
     )
@@ -246,7 +246,7 @@ def test_points_are_where_they_were_fired_whatever_their_times_count_from(
     tmp_path, times, stamp_s, kind, name
 ):
     path = write_bag(tmp_path / "drive", drive(times, stamp_s, kind, name), late_ns=10**8)
-    sweeps = RecordedSweeps.of_choice(RecordingChoice(path))
+    sweeps = RecordedSweeps.open(path)
     poses = find_poses(sweeps, write_poses(tmp_path / "poses.txt", START_NS * 1e-9))
     alignment = first_alignment(sweeps, poses)
     assert alignment.motion is Motion.TIMED
@@ -291,7 +291,7 @@ def test_sweeps_of_bags_have_the_times_of_their_headers(tmp_path):
     live = write_bag(tmp_path / "live", sweeps, late_ns=10**8)
     offline = write_bag(tmp_path / "offline", sweeps)
     expected_ns = START_NS + 1e8 * np.arange(SWEEPS)
-    np.testing.assert_allclose([*open_recording(live).times()], expected_ns, rtol=0, atol=512)
+    np.testing.assert_allclose(open_recording(live).stamps_ns, expected_ns, rtol=0, atol=512)
     found = compare(live, offline, match="time").figures
     assert found["pairs"] == SWEEPS
     assert found["ranges"]["residual"]["rmse_m"] < 1e-6
@@ -301,14 +301,14 @@ def test_bags_without_stamps_have_the_times_of_their_records(tmp_path):
     unstamped = [(0, columns) for _, columns in drive(relative)]
     recording = open_recording(write_bag(tmp_path / "bag", unstamped, late_ns=10**8))
     expected_ns = START_NS + 1e8 * np.arange(1, SWEEPS + 1)
-    np.testing.assert_allclose([*recording.times()], expected_ns, rtol=0, atol=512)
+    np.testing.assert_allclose(recording.stamps_ns, expected_ns, rtol=0, atol=512)
     assert recording.notes[0].endswith(
         "bag has no timestamps, so the recording times are used instead"
     )
     # A simulation may begin at zero.
     simulated = [(stamp_ns - START_NS, columns) for stamp_ns, columns in drive(relative)]
     recording = open_recording(write_bag(tmp_path / "simulated", simulated))
-    assert [*recording.times()] == [1e8 * number for number in range(SWEEPS)]
+    assert [*recording.stamps_ns] == [1e8 * number for number in range(SWEEPS)]
     assert recording.notes == ()
 
 
@@ -336,7 +336,7 @@ def test_samples_of_tar_files_have_times_if_all_of_them_state_one(tmp_path):
     write_tar("shard-9.tar", {"b": (1, '{"time_ns": 100}'), "c": (2, '{"time_ns": 200}')})
     recording = open_recording(tmp_path)
     assert first_x(recording) == [1, 2, 3]
-    assert [*recording.times()] == [100, 200, 300]
+    assert [*recording.stamps_ns] == [100, 200, 300]
     write_tar("shard-11.tar", {"e": (4, "{}")})
     assert open_recording(tmp_path).times is None
 
@@ -345,9 +345,7 @@ def test_samples_of_tar_files_have_times_if_all_of_them_state_one(tmp_path):
 
 
 def test_poses_with_times_are_looked_up_though_there_is_one_for_each_sweep(tmp_path):
-    sweeps = RecordedSweeps.of_choice(
-        RecordingChoice(write_bag(tmp_path / "drive", drive(relative)))
-    )
+    sweeps = RecordedSweeps.open(write_bag(tmp_path / "drive", drive(relative)))
     seconds = START_NS * 1e-9 + np.linspace(-0.5, 1.5, SWEEPS)
     poses = tmp_path / "poses.txt"
     poses.write_text("".join(f"{s:.6f} {s - 1.7e9:.6f} 0 0 0 0 0 1\n" for s in seconds))
@@ -363,14 +361,14 @@ def test_rows_of_kitti_are_poses_of_the_sweeps(tmp_path):
     (folder / "poses.txt").unlink()
     poses = tmp_path / "poses.txt"
     np.savetxt(poses, rows)
-    sweeps = RecordedSweeps.of_choice(RecordingChoice(folder))
+    sweeps = RecordedSweeps.open(folder)
     # The poses are of a camera: its place is in the sequence.
     np.testing.assert_allclose(find_poses(sweeps, poses).matrices[:, 0, 3], range(4), atol=1e-9)
     np.testing.assert_allclose(find_poses(sweeps, poses).times_s, 0.1 * np.arange(4))
     # Or beside the poses of a recording in another format.
     for number in range(4):
         write_pcd(tmp_path / f"{number}.pcd", 50 - number)
-    files = RecordedSweeps.of_choice(RecordingChoice(tmp_path))
+    files = RecordedSweeps.open(tmp_path)
     with pytest.raises(LidarError, match=r"its z axis, .*Put KITTI's calib\.txt next to the file"):
         find_poses(files, poses)
     (folder / "calib.txt").rename(tmp_path / "calib.txt")

@@ -394,23 +394,23 @@ def test_recordings_of_each_layout_are_read_back(layout, organized, tmp_path):
     assert recording.count == 2
     points = sweep_of(cloud, 1)
     positions = cloud.sweeps().as_fired(1, points)
-    read = recording.read_points(1)
+    read = recording[1].returns()
     order, read_order = (np.lexsort(np.round(p, 4).T) for p in (positions, read.points))
     np.testing.assert_allclose(read.points[read_order], positions[order], atol=2e-4)
     highest = {"ouster": 15, "hesai": 31}.get(layout)
     rings = read.rings if highest is None else highest - read.rings
     np.testing.assert_array_equal(rings[read_order], points.channel[order])
-    assert read.intensities is not None
+    assert read.intensity is not None
 
 
 def test_a_recording_of_livox_may_have_its_own_messages_only(tmp_path):
     cloud = cast("livox/mid360")
     save_cloud(cloud, tmp_path / "c.mcap", layout="livox")
-    plain = open_recording(tmp_path / "c.mcap").read_points(1)
-    custom = open_recording(tmp_path / "c.mcap", sensor="/roof/livox").read_points(1)
+    plain = open_recording(tmp_path / "c.mcap")[1]
+    custom = open_recording(tmp_path / "c.mcap", sensor="/roof/livox")[1]
     np.testing.assert_array_equal(custom.points, plain.points)
     np.testing.assert_array_equal(custom.rings, plain.rings)
-    np.testing.assert_array_equal(custom.intensities, plain.intensities)
+    np.testing.assert_array_equal(custom.intensity, plain.intensity)
 
 
 def test_a_bag_of_an_older_driver_of_livox_has_no_point_cloud(tmp_path):
@@ -429,9 +429,9 @@ def test_a_bag_of_an_older_driver_of_livox_has_no_point_cloud(tmp_path):
             if connection.topic == "/roof/livox":
                 writer.write(topic, time_ns, data)
     old = open_recording(tmp_path / "old")
-    points = old.read_points(1).points
+    points = old[1].points
     assert old.count == 2
-    expected = open_recording(tmp_path / "c.mcap").read_points(1).points
+    expected = open_recording(tmp_path / "c.mcap")[1].points
     np.testing.assert_array_equal(points, expected)
 
 

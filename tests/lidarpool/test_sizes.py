@@ -37,7 +37,7 @@ def refused(read, path) -> str:
 def points_in(path):
     """Read all points of a recording."""
     recording = open_recording(path)
-    return [recording.read_points(number).points for number in range(recording.count)]
+    return [sweep.returns().points for sweep in recording]
 
 
 # -- tables --------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ def test_columns_of_parquet_that_are_no_numbers_are_not_read(tmp_path):
     parquet(path, {"x": ones, "y": ones, "z": ones, "words": ["a" * 99] * 3, "list": [[1]] * 3})
     recording = open_recording(path)
     assert recording.notes == (f"{path} has non-numeric columns, which were skipped: list, words",)
-    assert set(recording.read(0)[1]) == set()
+    assert set(recording[0].columns) == set()
     parquet(path, {"x": ones, "y": ["1"] * 3, "z": ones})
     assert "its coordinate columns are not numeric: y" in refused(open_recording, path)
 

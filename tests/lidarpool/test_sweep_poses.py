@@ -14,8 +14,8 @@ from lidarpool.places.free_space import RangeImage
 from lidarpool.places.labels import divided, labels_of
 from lidarpool.places.motion import Motion
 from lidarpool.places.odometry import RecordedPoses
-from lidarpool.places.recorded_sweeps import RecordedSweep
 from lidarpool.scenario.point_scene import CLASS_MATERIAL, surfel_faces
+from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials
 
 STAMPS_S = np.array([0.0, 0.1, 0.26, 0.33, 0.5])
@@ -54,8 +54,9 @@ def poses():
 
 
 def sweep(points, time_s=None, start_rad=0.0):
-    ring = np.arange(len(points)) % RINGS
-    return RecordedSweep(points, ring, None, None, time_s, np.full(RINGS, start_rad))
+    row = np.arange(len(points)) % RINGS
+    starts_rad = np.full(len(points), start_rad)
+    return Sweep(points).with_columns(row=row, time_s=time_s, start_rad=starts_rad)
 
 
 @pytest.fixture
@@ -165,10 +166,10 @@ def test_slopes_and_edges_of_a_room_are_those_of_its_planes():
 
 def test_surfels_are_divided_by_the_objects_and_classes_of_their_labels():
     columns = {
-        "label": np.array([7, 0, 9, 7, 70_000]),
-        "instance": np.array([2, 0, -1, 2, 0]),
+        "class": np.array([7, 0, 9, 7, 70_000]),
+        "object": np.array([2, 0, -1, 2, 0]),
     }
-    labels = labels_of(columns)
+    labels = labels_of(Sweep(np.zeros((5, 3)), columns))
     corners = np.arange(5 * 4 * 3, dtype=float).reshape(-1, 3)
     rows = np.unique(labels)
     names = tuple(f"{CLASS_MATERIAL}{label}" for label in rows.tolist())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -29,16 +30,19 @@ from lidarpool import (
     twin,
 )
 from lidarpool.cli.commands import cli
+from lidarpool.clouds.point_times import PointTimes
 from lidarpool.clouds.recording import Recording
+from lidarpool.clouds.rings import Rings, elevations
 from lidarpool.places.alignment import Alignment
 from lidarpool.places.lost_pulses import Answering, lost_pulses
 from lidarpool.places.motion import Motion
 from lidarpool.places.odometry import find_poses
-from lidarpool.places.recorded_sweeps import PointTimes, RecordedSweep, RecordedSweeps
+from lidarpool.places.recorded_sweeps import RecordedSweeps
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.colors import LINEAR
 from lidarsim.simulator.points.batch_columns import columns_of
@@ -144,12 +148,13 @@ def without_poses(drive, rows=None):
     opened = open_recording(drive, name="drive")
 
     def read(number):
-        points, columns, _ = opened.read(number)
-        order = slice(None) if rows is None else rows(points, columns)
-        ring = {} if rows is not None else {"ring": columns["channel"]}
-        return points[order], {"intensity": columns["intensity"][order]} | ring, None
+        sweep = opened[number]
+        columns = {"intensity": sweep.intensity}
+        if rows is None:
+            return Sweep(sweep.points, columns | {"ring": sweep.columns["channel"]})
+        return Sweep(sweep.points, columns).select(rows(sweep.points, sweep.columns))
 
-    return Recording("drive", opened.count, read)
+    return Recording("drive", len(opened), read)
 
 
 def test_a_twin_has_the_ranges_of_held_out_sweeps(place):
@@ -188,29 +193,23 @@ def test_lost_pulses_are_steps_of_a_ring_without_a_return():
     received = (column < 200) | (column >= 300)  # packets of 40 degrees did not come
     rows = returned & received
     points = (random.uniform(2, 50, len(ring))[:, None] * directions)[rows]
-    sweep = RecordedSweep(points, ring[rows], None, None, None, np.full(16, -np.pi))
+    sweep = Sweep(points, {"row": ring[rows]})
     answering = Answering(np.ones((16, 720), bool), 50.0)
     lost, _ = lost_pulses(sweep, elevation, answering, 0.0)
     expected = ~returned & received
-    assert len(lost.ring) == pytest.approx(expected.sum(), rel=0.01)
+    assert len(lost) == pytest.approx(expected.sum(), rel=0.01)
     for number in (0, 5, 9):
         truth = directions[expected & (ring == number)]
-        found = lost.points[lost.ring == number]
+        found = lost.points[lost.columns["row"] == number]
         cosines = found @ truth.T
         assert np.mean(cosines.max(axis=1) > np.cos(np.radians(0.25))) > 0.98
     # Second returns of the pulses, whose azimuths are rounded.
-    seconds = replace(sweep, points=sweep.points * 1.01 + (1e-6, -1e-6, 0))
-    both = RecordedSweep(
-        np.concatenate([sweep.points, seconds.points]),
-        np.tile(sweep.ring, 2),
-        *3 * [None],
-        sweep.start_rad,
-    )
+    both = Sweep.joined([sweep, sweep.replace(points=sweep.points * 1.01 + (1e-6, -1e-6, 0))])
     assert len(lost_pulses(both, elevation, answering, 0.0)[0]) == pytest.approx(
         len(lost), rel=0.01
     )
     unknown, _ = lost_pulses(sweep, np.empty(0), answering, 0.0)
-    assert not len(unknown.points)
+    assert not len(unknown)
 
 
 def test_rings_start_where_their_first_pulses_are():
@@ -227,9 +226,9 @@ def test_rings_start_where_their_first_pulses_are():
     )
     returned = (ring >= 5) | (column >= 80)
     order = np.flatnonzero(returned)
-    columns = {"ring": ring[order]}
-    recording = Recording("drive", 4, lambda _: (points[order], columns, None))
-    turn = RecordedSweeps.of_recording(recording).read(1).turn
+    recording = Recording("drive", 4, lambda _: Sweep(points[order], {"ring": ring[order]}))
+    sweep = RecordedSweeps.from_recording(recording).read(1)
+    turn = Motion.COUNTERCLOCKWISE.times_s(sweep, 1.0)
     known = ring[order] >= 5
     np.testing.assert_allclose(turn[known], share[column[order]][known], atol=1e-6)
     # Where the first pulses are lost, the start is that of the other rings, to their stagger.
@@ -294,9 +293,9 @@ def test_the_sensor_of_a_twin_rotates_like_the_recorded_sensor(bag):
     assert stated["rate_hz"] == pytest.approx(10, abs=1e-4)
     assert stated["firings_per_turn"] == 512
     recording = open_recording(folder / "drive.mcap", name="drive")
-    points, columns, _ = recording.read(5)
-    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
-    medians = sorted(np.median(elevation[columns["ring"] == ring]) for ring in range(32))
+    sweep = recording[5]
+    elevation = np.degrees(elevations(sweep.points))
+    medians = sorted(np.median(elevation[sweep.rings == ring]) for ring in range(32))
     np.testing.assert_allclose(stated["beams"]["elevation_deg"], medians, atol=0.03)
     assert "dropout" not in (stated.get("performance") or {})
     assert not any("direction of rotation" in note for note in found.figures["notes"])
@@ -317,9 +316,10 @@ def test_a_twin_simulates_all_sweeps_with_energies_as_recorded(bag):
     step = found.poses[-1, :3, 3] - found.poses[-2, :3, 3]
     np.testing.assert_allclose(last.position, found.poses[-1, :3, 3] + step, atol=0.01)
     simulated, _ = scanned(folder / "twin")
-    recorded = [open_recording(folder / "drive.mcap", name="drive").read(k) for k in range(SWEEPS)]
-    range_m = np.concatenate([np.linalg.norm(points, axis=1) for points, _, _ in recorded])
-    light = np.concatenate([columns["intensity"] for _, columns, _ in recorded])
+    recording = open_recording(folder / "drive.mcap", name="drive")
+    recorded = Sweep.joined([recording[number] for number in range(SWEEPS)])
+    range_m = np.linalg.norm(recorded.points, axis=1)
+    light = recorded.intensity
     poses = job.survey.path.poses(0, simulated["time"].astype(np.float64))[0]
     simulated_m = np.linalg.norm(simulated.positions - poses, axis=1)
     ratios = []
@@ -336,9 +336,9 @@ def test_intensities_that_are_compensated_for_range_are_found(drive, survey):
     opened = open_recording(drive, name="drive")
 
     def read(number):
-        points, columns, pose = opened.read(number)
-        intensity = columns["intensity"] * np.square(points).sum(axis=1)
-        return points, columns | {"intensity": intensity}, pose
+        sweep = opened[number]
+        intensity = sweep.intensity * np.square(sweep.points).sum(axis=1)
+        return sweep.replace(columns={**sweep.columns, "intensity": intensity})
 
     found = twin(replace(opened, read=read, energies=False))
     assert found.figures["response"]["model"] == "compensated for range"
@@ -354,27 +354,30 @@ def test_rings_are_found_in_the_order_of_points(drive):
         azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
         return np.lexsort((azimuth, -columns["channel"].astype(int)))
 
-    sweeps = RecordedSweeps.of_recording(without_poses(drive, ring_by_ring))
-    channels = len(np.unique(open_recording(drive, name="drive").read(0)[1]["channel"]))
-    assert sweeps.ring_count == channels
-    assert f"{channels} rings were determined" in sweeps.notes[0]
-    rings = sweeps.read(3).ring
-    assert (np.diff(rings) >= 0).all()
+    recording = without_poses(drive, ring_by_ring)
+    sweep = open_recording(drive, name="drive")[3]
+    channels = len(np.unique(sweep.rings))
+    assert len(recording.rings) == channels
+    assert f"{channels} rings were determined" in recording.rings.note
+    ordered = np.sort(sweep.rings.astype(int))[::-1]
+    np.testing.assert_array_equal(recording[3].rings, ordered - ordered[-1])
+    rows = RecordedSweeps.from_recording(recording).read(3).columns["row"]
+    np.testing.assert_array_equal(rows, ordered[0] - ordered)
 
 
 def test_times_of_points_have_one_unit_and_tell_the_period(drive):
     opened = open_recording(drive, name="drive")
 
-    def recording(times, stamps_ns=None):
+    def recording(times):
         def read(number):
-            points, columns, pose = opened.read(number)
-            kept = slice({3: 0, 4: 6}.get(number))
-            found = {"ring": columns["channel"], "time": times(columns["time"] % 100_000_000)}
-            return points[kept], {key: values[kept] for key, values in found.items()}, pose
+            sweep = opened[number]
+            time = times(sweep.columns["time"] % 100_000_000)
+            found = Sweep(sweep.points, {"ring": sweep.columns["channel"], "time": time})
+            return found.select(slice({3: 0, 4: 6}.get(number)))
 
-        return Recording("drive", opened.count, read, times=stamps_ns)
+        return Recording("drive", len(opened), read)
 
-    fired_s = (opened.read(4)[1]["time"][:6] % 100_000_000) * 1e-9
+    fired_s = (opened[4].columns["time"][:6] % 100_000_000) * 1e-9
     absolute_s = 1.7e9
     for times, half_s, stamp_s in (
         (lambda ns: ns * 1e-6, 1e-9, 0.0),
@@ -385,21 +388,74 @@ def test_times_of_points_have_one_unit_and_tell_the_period(drive):
         (lambda ns: ns.astype(np.uint64) + np.uint64(1_700_000_000_000_000_000), 1e-9,
          fired_s.min()),
     ):  # fmt: skip
-        sweeps = RecordedSweeps.of_recording(recording(times))
-        found_s = sweeps.read(4).time_s
-        np.testing.assert_allclose(found_s, fired_s - stamp_s, atol=half_s)
-        assert not len(sweeps.read(3).time_s)
-    quick = RecordedSweeps.of_recording(recording(lambda ns: ns // 2))
+        timed = recording(times)
+        np.testing.assert_allclose(timed[4].times_s, fired_s - stamp_s, atol=half_s)
+        assert not len(timed[3].times_s)
+        sweeps = RecordedSweeps.from_recording(timed)
+        for number in (3, 4):
+            found_s = sweeps.read(number).columns["time_s"]
+            np.testing.assert_array_equal(found_s, timed[number].times_s)
+    quick = RecordedSweeps.from_recording(recording(lambda ns: ns // 2))
     np.testing.assert_allclose(np.diff(find_poses(quick, None).times_s), 0.05, rtol=0.01)
     coarse = recording(lambda ns: np.where(ns < 50_000_000, 0, 128).astype(np.float32))
-    assert RecordedSweeps.of_recording(coarse).times is None
-    short = PointTimes.of_sweeps([{"t": np.arange(-100, 101, dtype=np.int8)}])  # milliseconds
+    assert coarse.point_times is None
+    short = PointTimes.from_sweeps([{"t": np.arange(-100, 101, dtype=np.int8)}])  # milliseconds
     assert short.sweep_s == pytest.approx(0.2)
+
+
+def test_kept_sweeps_are_as_they_were_read(drive):
+    opened = open_recording(drive, name="drive")
+
+    def read(number):
+        sweep = opened[number]
+        points = sweep.points.astype(np.float32)
+        columns = {"ring": sweep.rings, "intensity": sweep.intensity.astype(np.float32)}
+        return Sweep(points, columns | {"label": np.full(len(points), 50)})
+
+    sweeps = RecordedSweeps.from_recording(Recording("drive", len(opened), read))
+    kept = sweeps.keeping([2, 5])
+    for number in (2, 5, 7):
+        one, other = sweeps.read(number), kept.read(number)
+        assert set(one.columns) == {"row", "intensity", "label", "start_rad"}
+        np.testing.assert_array_equal(one.points, other.points)
+        assert one.points.dtype == other.points.dtype == np.float64
+        for name, values in one.columns.items():
+            np.testing.assert_array_equal(values, other.columns[name])
+            assert values.dtype == other.columns[name].dtype
+
+
+def test_kept_sweeps_need_half_the_memory(drive, tmp_path):
+    save_cloud(drive, tmp_path / "drive.mcap")
+    sweeps = RecordedSweeps.open(tmp_path / "drive.mcap")
+    sweep = sweeps.read(3)
+    arrays = [sweep.points, *sweep.columns.values()]
+    kept_bytes = len(pickle.dumps(sweeps.keeping([3]))) - len(pickle.dumps(sweeps))
+    assert kept_bytes < 0.5 * sum(values.nbytes for values in arrays)
+
+
+def test_other_processes_read_sweeps_without_another_analysis(drive, tmp_path, monkeypatch):
+    for name in ("drive.mcap", "another.mcap"):
+        save_cloud(drive, tmp_path / name)
+    sweeps = RecordedSweeps.open(tmp_path / "drive.mcap")
+    expected = sweeps.read(3)
+    handle = pickle.dumps(sweeps)
+    RecordedSweeps.open(tmp_path / "another.mcap")  # a process keeps one recording open
+
+    def analyze(*_):
+        raise AssertionError("analyzed again")
+
+    monkeypatch.setattr(Rings, "from_sweeps", analyze)
+    monkeypatch.setattr(PointTimes, "from_sweeps", analyze)
+    found = pickle.loads(handle).read(3)
+    np.testing.assert_array_equal(found.points, expected.points)
+    assert {"row", "time_s"} <= {*found.columns}
+    for name, values in expected.columns.items():
+        np.testing.assert_array_equal(found.columns[name], values)
 
 
 def test_a_sweep_has_its_share_of_a_step_with_dropped_sweeps():
     points = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
-    sweep = RecordedSweep(points, np.zeros(4, int), None, None, None, np.zeros(1))
+    sweep = Sweep(points, {"row": np.zeros(4, int), "start_rad": np.zeros(4)})
     for motion, expected in (
         (Motion.COUNTERCLOCKWISE, [0, 0.25, 0.5, 0.75]),
         (Motion.CLOCKWISE, [0, 0.75, 0.5, 0.25]),
@@ -420,17 +476,15 @@ def test_few_points_and_unknown_intensities_change_no_others(drive):
     opened = open_recording(drive, name="drive")
 
     def read(number):
-        points, columns, pose = opened.read(number)
+        sweep = opened[number]
         if number == 3:
-            return points[:0], {}, pose
-        intensity = columns["intensity"].copy()
+            return Sweep(sweep.points[:0])
+        intensity = sweep.intensity.copy()
         intensity[::500] = np.nan
-        found = {"ring": columns["channel"], "intensity": intensity}
-        found["class"] = np.full(len(points), 50)
+        columns = {"ring": sweep.rings, "intensity": intensity, "class": np.full(len(sweep), 50)}
+        found = Sweep(sweep.points, columns)
         # Of a ring alone: the beginning of a sweep, or the rest of one with lost packets.
-        kept = columns["channel"] == 12 if number == 5 else np.ones(len(points), bool)
-        kept = np.flatnonzero(kept)[:60] if number == 5 else kept
-        return points[kept], {key: values[kept] for key, values in found.items()}, pose
+        return found.select(np.flatnonzero(sweep.rings == 12)[:60]) if number == 5 else found
 
     found = twin(replace(opened, read=read))
     truth = opened.poses(range(SWEEPS))
@@ -455,7 +509,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
         twin(shuffled)
     with pytest.raises(LidarError, match="has no column 'nope' that could be used as intensity"):
         twin(replace(recording, intensity_column="nope"))
-    empty = Recording("drive", 9, lambda _: (np.zeros((0, 3)), {}, None))
+    empty = Recording("drive", 9, lambda _: Sweep(np.zeros((0, 3))))
     with pytest.raises(LidarError, match="drive contains no points"):
         twin(empty)
     unknown = np.tile(np.eye(4), (SWEEPS, 1, 1))
@@ -473,9 +527,9 @@ def test_classes_of_the_recording_are_labels_of_the_place(drive, tmp_path):
     opened = open_recording(drive, name="drive")
 
     def read(number):
-        points, columns, pose = opened.read(number)
-        level = points[:, 2] < -1.75  # of the floor, 1.8 m below the sensor
-        return points, {"ring": columns["channel"], "class": np.where(level, 11, 50)}, pose
+        sweep = opened[number]
+        level = sweep.points[:, 2] < -1.75  # of the floor, 1.8 m below the sensor
+        return Sweep(sweep.points, {"ring": sweep.rings, "class": np.where(level, 11, 50)})
 
     found = twin(replace(opened, read=read))
     found.save(tmp_path / "twin")
@@ -548,15 +602,13 @@ def test_rings_are_found_by_elevations_in_any_order(street, survey):
     order = np.random.default_rng(3).permutation(len(part.columns["channel"]))
     points = part.cloud((SCAN,), 1e-4, street.origin).positions[order] - (0, 0, 1.8)
     channel = part.columns["channel"][order]
-    recording = Recording("drive", 4, lambda number: (points[number::4], {}, None))
-    sweeps = RecordedSweeps.of_recording(recording)
-    assert "the elevation angles of the points" in sweeps.notes[0]
-    highest = channel.max()
-    np.testing.assert_array_equal(sweeps.read(2).ring, highest - channel[2::4])
+    recording = Recording("drive", 4, lambda number: Sweep(points[number::4]))
+    assert "the elevation angles of the points" in recording.rings.note
+    np.testing.assert_array_equal(recording[2].rings, channel[2::4] - channel.min())
     moved = points + np.outer(np.linspace(0, 0.5, len(points)), [1, 0, 0])
-    compensated = Recording("drive", 4, lambda number: (moved[number::4], {}, None))
-    notes = RecordedSweeps.of_recording(compensated).notes
-    assert "its rings cannot be determined" in notes[0]
+    compensated = Recording("drive", 4, lambda number: Sweep(moved[number::4]))
+    assert "its rings cannot be determined" in compensated.rings.note
+    assert compensated[2].rings is None
 
 
 @pytest.mark.extended
@@ -620,8 +672,8 @@ def test_poses_are_found_in_a_city(tmp_path):
     fired = open_recording(path, name="drive")
 
     def read(number):
-        points, columns, _ = fired.read(number)
-        return points, columns, None
+        sweep = fired[number]
+        return Sweep(sweep.points, sweep.columns)
 
     truth = opened.poses(range(24))
     found = twin(Recording("drive", 24, read))
@@ -640,12 +692,12 @@ def test_a_mirrored_recording_is_refused_and_a_sensor_that_stood_is_noted(drive)
     recording = open_recording(turned, name="drive")
 
     def mirrored(number):
-        points, columns, pose = recording.read(number)
-        return points * (1, -1, 1), columns, pose
+        sweep = recording[number]
+        return sweep.replace(points=sweep.points * (1, -1, 1))
 
     with pytest.raises(LidarError, match="fit its poses better with y inverted"):
         twin(replace(recording, read=mirrored, fired=None))
-    first = opened.read(0)
+    first = opened[0]
     stood = twin(replace(opened, read=lambda _: first, count=6, times=None, frame_poses=None))
     assert any("the sensor was stationary" in note for note in stood.figures["notes"])
 
@@ -659,8 +711,8 @@ def test_sweeps_that_are_tilted_against_the_sensor_tell_no_noise(drive, tmp_path
     poses = opened.poses(range(SWEEPS)) @ np.linalg.inv(tilt)
 
     def read(number):
-        points, columns, _ = opened.read(number)
-        return points @ tilt[:3, :3].T, {"ring": columns["channel"]}, None
+        sweep = opened[number]
+        return Sweep(sweep.points @ tilt[:3, :3].T, {"ring": sweep.rings})
 
     found = twin(Recording("drive", SWEEPS, read, frame_poses=lambda: poses))
     assert found.model.performance is None
@@ -684,11 +736,11 @@ def test_a_drive_far_from_zero_with_an_empty_sweep_and_a_trajectory(drive, place
     trajectory.write_text("\n".join(rows) + "\n")
 
     def read(number):
-        points, columns, _ = opened.read(number)
-        kept = slice(0) if number == 3 else slice(None)
-        return points[kept], {"ring": columns["channel"][kept]}, None
+        sweep = opened[number]
+        found = Sweep(sweep.points, {"ring": sweep.rings})
+        return found.select(slice(0)) if number == 3 else found
 
-    found = twin(Recording("drive", opened.count, read), trajectory=trajectory)
+    found = twin(Recording("drive", len(opened), read), trajectory=trajectory)
     np.testing.assert_allclose(found.times_s, 0.2 * np.arange(SWEEPS), atol=1e-9)
     steps = np.diff(found.poses[:, :3, 3], axis=0)
     np.testing.assert_allclose(steps[:, 1], SPEED_M_S * PERIOD_S, atol=0.01)
@@ -716,10 +768,10 @@ def test_the_benchmark_of_recordings_has_a_row_for_each_rule(drive, tmp_path, ca
     folder.mkdir(parents=True)
     opened = open_recording(drive, name="drive")
     for number in range(SWEEPS):
-        points, columns, _ = opened.read(number)
-        azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
-        order = np.lexsort((azimuth, -columns["channel"].astype(int)))
-        rows = np.column_stack([points, columns["intensity"]])[order]
+        sweep = opened[number]
+        azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) % (2 * np.pi)
+        order = np.lexsort((azimuth, -sweep.rings.astype(int)))
+        rows = np.column_stack([sweep.points, sweep.intensity])[order]
         rows.astype(np.float32).tofile(folder / f"{number:06}.bin")
     (row,) = reality.main([str(tmp_path), "kitti360", "udacity"])  # too short for blocks of 20
     assert row["rule"] == "easy"

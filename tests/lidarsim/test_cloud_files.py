@@ -7,8 +7,8 @@ import pytest
 
 from lidarsim import LidarError
 from lidarsim.base.errors import CutShortError
+from lidarsim.columns.column_names import standard_names
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
-from lidarsim.scene.files.cloud_scan import usual_names
 
 TEXT_ENDINGS = (".xyz", ".txt", ".asc", ".csv")
 
@@ -60,7 +60,7 @@ TWO = [[1.5, 2, 3], [4, 5.25, 6]]
 )
 def test_headers_and_separators(tmp_path, ending, text):
     scan = read(tmp_path, f"a{ending}", text)
-    assert scan.positions.tolist() == TWO
+    assert scan.points.tolist() == TWO
     assert not scan.columns and scan.pose is None and scan.units_m is None
 
 
@@ -71,14 +71,18 @@ def test_columns_are_named_by_the_header(tmp_path):
         "//X Y Z R G B Intensity Classification Nx Ny Nz Scalar_field\n"
         "1.5 2 3 255 0 10 0.5 2 0 0 1 7.5\n4 5.25 6 0 255 20 0.25 6 0 1 0 8\n",
     )
-    assert scan.positions.tolist() == TWO
+    assert scan.points.tolist() == TWO
     assert columns_of(scan) == {
-        "red": [255, 0], "green": [0, 255], "blue": [10, 20], "intensity": [0.5, 0.25],
-        "classification": [2, 6], "nx": [0, 0], "ny": [0, 1], "nz": [1, 0],
+        "R": [255, 0], "G": [0, 255], "B": [10, 20], "Intensity": [0.5, 0.25],
+        "Classification": [2, 6], "Nx": [0, 0], "Ny": [0, 1], "Nz": [1, 0],
         "Scalar_field": [7.5, 8],
     }  # fmt: skip
+    assert standard_names(scan.columns) == [
+        "red", "green", "blue", "intensity", "class", "normal_x", "normal_y", "normal_z",
+        "Scalar_field",
+    ]  # fmt: skip
     kinds = {name: values.dtype.kind for name, values in scan.columns.items()}
-    assert kinds["classification"] == "i" and kinds["intensity"] == "f"
+    assert kinds["Classification"] == "i" and kinds["Intensity"] == "f"
 
 
 @pytest.mark.parametrize("name", ["Points:{}", "Points_m_XYZ:{}"])
@@ -87,14 +91,14 @@ def test_veloview_names_points_in_two_ways(tmp_path, name, quote):
     axes = [f"{quote}{name.format(index)}{quote}" for index in range(3)]
     header = ",".join([f"{quote}intensity{quote}", *axes, f"{quote}laser_id{quote}"])
     scan = read(tmp_path, "a.csv", f"{header}\n9,1.5,2,-3,7\n8,4,5,6,6\n")
-    assert scan.positions.tolist() == [[1.5, 2, -3], [4, 5, 6]]
+    assert scan.points.tolist() == [[1.5, 2, -3], [4, 5, 6]]
     assert columns_of(scan) == {"intensity": [9, 8], "laser_id": [7, 6]}
 
 
 def test_columns_of_words_are_left_out_and_empty_cells_are_nan(tmp_path):
     text = 'name,x,y,z,i,label\n"a, b",1.5,2,3,,Ground\nc,4,5.25,6,7,\n'
     scan = read(tmp_path, "a.csv", text)
-    assert scan.positions.tolist() == TWO and scan.unread == ("name", "label")
+    assert scan.points.tolist() == TWO and scan.skipped == ("name", "label")
     np.testing.assert_array_equal(scan.columns["i"], [np.nan, 7])
     without_header = read(tmp_path, "b.xyz", "1.5 2 3 9 8\n4 5.25 6 9 7\n")
     assert columns_of(without_header) == {"column_4": [9, 9], "column_5": [8, 7]}
@@ -102,13 +106,13 @@ def test_columns_of_words_are_left_out_and_empty_cells_are_nan(tmp_path):
 
 def test_a_cloud_may_have_angles_beside_its_coordinates(tmp_path):
     scan = read(tmp_path, "a.csv", "lat,lon,x,y,z,roll,pitch,yaw\n1,2,3,4,5,6,7,8\n")
-    assert scan.positions.tolist() == [[3, 4, 5]]
+    assert scan.points.tolist() == [[3, 4, 5]]
     assert [*scan.columns] == ["lat", "lon", "roll", "pitch", "yaw"]
 
 
 def test_units_in_names_are_units_of_the_axes(tmp_path):
     scan = read(tmp_path, "a.csv", "x [mm],y [mm],z [m]\n1500,2000,3\n")
-    assert scan.positions.tolist() == [[1500, 2000, 3]] and scan.units_m == (1e-3, 1e-3, 1.0)
+    assert scan.points.tolist() == [[1500, 2000, 3]] and scan.units_m == (1e-3, 1e-3, 1.0)
     assert read(tmp_path, "a.txt", "# X [ft] Y [ft] Z\n1 2 3\n").units_m == (0.3048, 0.3048, 1.0)
 
 
@@ -120,7 +124,7 @@ def test_many_lines_are_read_in_blocks_and_the_line_is_exact(tmp_path):
     np.savetxt(memory, values, "%.3f", header="x y z i")
     lines = memory.getvalue().splitlines()
     scan = read(tmp_path, "a.xyz", "\n".join(lines))
-    np.testing.assert_array_equal(np.column_stack([scan.positions, scan.columns["i"]]), values)
+    np.testing.assert_array_equal(np.column_stack([scan.points, scan.columns["i"]]), values)
     lines[69_000] = "1 2 3"
     with pytest.raises(ValueError, match=r"line 69001 has 3 cells, but 4 were expected \(x, y, z"):
         read(tmp_path, "a.xyz", "\n".join(lines))
@@ -173,14 +177,14 @@ def test_fewer_lines_than_announced_are_cut_short(tmp_path):
 
 
 def test_whole_numbers_between_commas_are_understood_where_they_are_certain(tmp_path):
-    assert read(tmp_path, "a.csv", "1,2,3\n4,5,6\n").positions.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert read(tmp_path, "a.csv", "1,2,3\n4,5,6\n").points.tolist() == [[1, 2, 3], [4, 5, 6]]
     scan = read(tmp_path, "b.csv", "x,y,z,r,g,b\n1,2,3,4,5,6\n")
-    assert columns_of(scan) == {"red": [4], "green": [5], "blue": [6]}
+    assert columns_of(scan) == {"r": [4], "g": [5], "b": [6]}
 
 
 def test_names_stay_distinct():
     names = ["X", "y", "z", "R", "intensity", "Intensity", "intensity"]
-    assert usual_names(names) == ["x", "y", "z", "red", "intensity", "Intensity", "intensity_2"]
+    assert standard_names(names) == ["x", "y", "z", "red", "intensity", "Intensity", "intensity_2"]
 
 
 # -- Leica's .pts and .ptx -----------------------------------------------------------------------
@@ -200,9 +204,9 @@ def test_pts(tmp_path, line, columns):
     rows = [" ".join(map(str, row)) + line for row in TWO]
     for content in ("2\n" + "\n".join(rows), "\n".join(rows) + "\n"):
         scan = read(tmp_path, "a.pts", content)
-        assert scan.positions.tolist() == TWO and columns_of(scan) == columns
+        assert scan.points.tolist() == TWO and columns_of(scan) == columns
     both = read_all(tmp_path, "a.pts", f"1\n{rows[0]}\n1\n{rows[1]}\n")
-    assert [scan.positions.tolist() for scan in both] == [[TWO[0]], [TWO[1]]]
+    assert [scan.points.tolist() for scan in both] == [[TWO[0]], [TWO[1]]]
 
 
 @pytest.mark.parametrize(
@@ -247,8 +251,8 @@ PTX = """2
 
 def test_ptx_has_poses_and_intensities(tmp_path):
     first, second = read_all(tmp_path, "a.ptx", PTX + PTX.replace("10 20 5", "0 0 1"))
-    assert first.positions.tolist() == [[1, 0, 0], [2, 0, 0], [0, 3, 1]], "zeros are no returns"
-    world = first.positions @ first.pose[:3, :3].T + first.pose[:3, 3]
+    assert first.points.tolist() == [[1, 0, 0], [2, 0, 0], [0, 3, 1]], "zeros are no returns"
+    world = first.points @ first.pose[:3, :3].T + first.pose[:3, 3]
     assert world.tolist() == [[10, 21, 5], [10, 22, 5], [7, 20, 6]]
     assert columns_of(first) == {"intensity": [0.5, 0.25, 1]}
     assert first.scanner.tolist() == [10, 20, 5] and second.scanner.tolist() == [0, 0, 1]
@@ -316,10 +320,10 @@ def npy(array, **options):
 def test_npy(tmp_path, kind, order):
     array = np.arange(20).reshape(5, 4).astype(kind, order=order)
     scan = read(tmp_path, "a.npy", npy(array))
-    np.testing.assert_array_equal(scan.positions, array[:, :3])
+    np.testing.assert_array_equal(scan.points, array[:, :3])
     np.testing.assert_array_equal(scan.columns["column_4"], array[:, 3])
     image = read(tmp_path, "b.npy", npy(array.reshape(1, 5, 4)))
-    np.testing.assert_array_equal(image.positions, array[:, :3])
+    np.testing.assert_array_equal(image.points, array[:, :3])
 
 
 def test_npy_with_fields(tmp_path):
@@ -327,7 +331,7 @@ def test_npy_with_fields(tmp_path):
     records["Z"] = [1, 2, 3]
     records["n"][:, 1] = 7
     scan = read(tmp_path, "a.npy", npy(records))
-    assert scan.positions[:, 2].tolist() == [1, 2, 3]
+    assert scan.points[:, 2].tolist() == [1, 2, 3]
     assert columns_of(scan) == {"ring": [0, 0, 0], "n_0": [0, 0, 0], "n_1": [7, 7, 7]}
 
 
@@ -369,7 +373,7 @@ def test_npy_that_ends_too_early_is_cut_short(tmp_path):
 def test_bin_has_four_floats_and_of_nuscenes_five(tmp_path):
     rows = np.array([[1, 2, 3, 0.5, 4], [5, 6, 7, 0.25, 31]], "f4")
     scan = read(tmp_path, "000000.bin", rows[:, :4].tobytes())
-    assert scan.positions.tolist() == [[1, 2, 3], [5, 6, 7]]
+    assert scan.points.tolist() == [[1, 2, 3], [5, 6, 7]]
     assert columns_of(scan) == {"intensity": [0.5, 0.25]}
     scan = read(tmp_path, "a.pcd.bin", rows.tobytes())
     assert columns_of(scan) == {"intensity": [0.5, 0.25], "channel": [4, 31]}

@@ -231,7 +231,7 @@ def test_a_damaged_cloud_of_parquet_is_refused_in_a_line(tmp_path):
     with pytest.raises(
         LidarError, match=r"cloud\.parquet cannot be read: .* page header"
     ) as raised:
-        open_recording(path).read_points(0)
+        open_recording(path)[0]
     assert len(str(raised.value).splitlines()) == 1
 
 

@@ -87,7 +87,7 @@ def test_padding_and_fields_of_several_numbers(tmp_path, encoding):
     for without_padding in (False, True):
         content = encoded(encoding, names, kinds, columns, counts, without_padding)
         scan = read(tmp_path, content)
-        np.testing.assert_array_equal(scan.positions, np.stack([X, Y, Z], axis=1))
+        np.testing.assert_array_equal(scan.points, np.stack([X, Y, Z], axis=1))
         assert [*scan.columns] == ["intensity", "ring", "normal_0", "normal_1", "normal_2", "stamp"]
         np.testing.assert_array_equal(scan.columns["intensity"].astype("f4"), X / 2)
         np.testing.assert_array_equal(scan.columns["ring"], ring)
@@ -112,22 +112,22 @@ def test_names_in_upper_case_and_twice(tmp_path, encoding):
     names = ["X", "Y", "Z", "Intensity", "ring", "ring"]
     content = encoded(encoding, names, ["f4"] * 6, [X, Y, Z, X, Y, Z])
     scan = read(tmp_path, content)
-    np.testing.assert_array_equal(scan.positions.astype("f4"), np.stack([X, Y, Z], axis=1))
-    assert [*scan.columns] == ["intensity", "ring", "ring_2"]
+    np.testing.assert_array_equal(scan.points.astype("f4"), np.stack([X, Y, Z], axis=1))
+    assert [*scan.columns] == ["Intensity", "ring", "ring_2"]
     np.testing.assert_array_equal(scan.columns["ring_2"].astype("f4"), Z)
 
 
 def test_files_before_version_5_have_columns_alone(tmp_path):
     text = "# .PCD v.5\nCOLUMNS x y z\nPOINTS 2\nDATA ascii\n1 2 3\n4 5.5 6\n"
-    assert read(tmp_path, text.encode()).positions.tolist() == [[1, 2, 3], [4, 5.5, 6]]
+    assert read(tmp_path, text.encode()).points.tolist() == [[1, 2, 3], [4, 5.5, 6]]
     text = "FIELDS x y z\r\nWIDTH 1\r\nHEIGHT 2\r\nDATA ascii\r\n1 2 3\r\nnan nan nan\r\n"
-    positions = read(tmp_path, text.encode()).positions
+    positions = read(tmp_path, text.encode()).points
     assert positions[0].tolist() == [1, 2, 3] and np.isnan(positions[1]).all()
 
 
 def test_coordinates_of_text_keep_their_digits(tmp_path):
     text = header(["x", "y", "z"], ["f4"] * 3, 1, "ascii") + b"500000.123 5400000.456 100\n"
-    assert read(tmp_path, text).positions.tolist() == [[500000.123, 5400000.456, 100]]
+    assert read(tmp_path, text).points.tolist() == [[500000.123, 5400000.456, 100]]
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
@@ -183,7 +183,7 @@ def test_files_of_another_program(tmp_path, encoding):
     memory = io.BytesIO()
     cloud.save(memory, pypcd4.Encoding[encoding])
     scan = read(tmp_path, memory.getvalue())
-    np.testing.assert_allclose(scan.positions, np.stack(arrays[:3], axis=1), rtol=1e-6)
+    np.testing.assert_allclose(scan.points, np.stack(arrays[:3], axis=1), rtol=1e-6)
     np.testing.assert_array_equal(scan.columns["ring"], ring)
     np.testing.assert_array_equal(scan.columns["label"], arrays[4])
 
@@ -200,7 +200,7 @@ def test_what_is_written_is_what_another_program_writes(tmp_path):
     content = pcd_bytes(fields, (1.0, 2.5, 3.0), (1.0, 0.0, 0.0, 0.0), "a comment")
     assert content == b"# a comment\n" + memory.getvalue()
     scan = read(tmp_path, content)
-    np.testing.assert_array_equal(scan.positions.astype("f4"), np.stack([X, Y, Z], axis=1))
+    np.testing.assert_array_equal(scan.points.astype("f4"), np.stack([X, Y, Z], axis=1))
     assert scan.scanner.tolist() == [1, 2.5, 3]
 
 
@@ -241,7 +241,7 @@ def test_what_is_wrong_is_named(tmp_path, old, new, message):
     assert old in GOOD
     content = GOOD.replace(old, new)
     if message is None:  # another type that fits
-        assert read(tmp_path, content).positions.tolist()[0] == [1, 2, 3]
+        assert read(tmp_path, content).points.tolist()[0] == [1, 2, 3]
         return
     with pytest.raises(ValueError, match=message) as caught:
         read(tmp_path, content)
@@ -265,7 +265,7 @@ def test_what_ends_too_early_is_cut_short(tmp_path, encoding):
 
 def test_bytes_after_the_points_are_refused_and_zeros_are_padding(tmp_path):
     content = encoded("binary", [*"xyz"], ["f4"] * 3, [X, Y, Z])
-    assert len(read(tmp_path, content + bytes(4000)).positions) == COUNT
+    assert len(read(tmp_path, content + bytes(4000)).points) == COUNT
     with pytest.raises(ValueError, match="50 points are declared, but 12 bytes follow them"):
         read(tmp_path, content + 12 * b"\x01")
 
@@ -288,4 +288,4 @@ def test_no_packed_bytes_leave_the_array(tmp_path_factory, packed, count):
         (scan,) = read_pcd(path)
     except ValueError:
         return
-    assert scan.positions.shape == (count, 3)
+    assert scan.points.shape == (count, 3)

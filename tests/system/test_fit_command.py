@@ -22,8 +22,8 @@ def sweeps(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweeps")
     recording = recorded(Noise(range_m=0.02, dropout=0.05, seed=1), sweeps=SWEEPS)
     for number in range(SWEEPS):
-        points, columns, _ = recording.read(number)
-        arrays = [*points.T.astype("f4"), columns["channel"].astype("u2")]
+        sweep = recording[number]
+        arrays = [*sweep.points.T.astype("f4"), sweep.columns["channel"].astype("u2")]
         made = PointCloud.from_points(arrays, ("x", "y", "z", "ring"), [a.dtype for a in arrays])
         made.save(folder / f"{number}.pcd")
     return folder

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from lidarscenes.robots.urdf import load_robot
     from lidarsim.base.errors import LidarError
     from lidarsim.columns.cloud import Cloud
+    from lidarsim.columns.sweep import Sweep
     from lidarsim.columns.table import Column
     from lidarsim.media.materials import Material
     from lidarsim.motion.navigation import Gnss, Imu, Navigation
@@ -34,14 +35,15 @@ if TYPE_CHECKING:
     from .api.simulation import Campaign, simulate
     from .clouds.open3d_cloud import to_open3d
     from .clouds.ply import read_cloud
+    from .clouds.recording import Recording
     from .clouds.writing import save_cloud
     from .comparing.comparison import Comparison
     from .comparing.fit import Fit, fit
     from .comparing.two_clouds import compare
     from .datasets.loader import sweeps
-    from .datasets.sweep_data import Sweep
     from .places.building import Twin, twin
     from .plan import Plan, Planning
+    from .recordings.opening import open_recording
     from .report.merging import merge
     from .run.pipeline.stage_messages import ScanFrame
     from .run.run_result import CampaignRun
@@ -77,6 +79,7 @@ __all__ = [
     "Plan",
     "Planning",
     "Pose",
+    "Recording",
     "Rerun",
     "Result",
     "Returns",
@@ -101,6 +104,7 @@ __all__ = [
     "load_sensor",
     "load_trajectory",
     "merge",
+    "open_recording",
     "play",
     "read_cloud",
     "remove_run",
@@ -121,7 +125,6 @@ _MODULES = {
     ".api.result": ("Result",),
     ".api.simulation": ("Campaign", "simulate"),
     ".datasets.loader": ("sweeps",),
-    ".datasets.sweep_data": ("Sweep",),
     ".clouds.writing": ("save_cloud",),
     ".clouds.open3d_cloud": ("to_open3d",),
     ".clouds.ply": ("read_cloud",),
@@ -138,8 +141,11 @@ _MODULES = {
     ".run.store.run_store": ("remove_run",),
     ".scenario.build": ("Job",),
     ".showing.viewers.scanner_view": ("Foxglove", "Rerun"),
+    ".clouds.recording": ("Recording",),
+    ".recordings.opening": ("open_recording",),
     "lidarscenes.robots.robot": ("Robot",),
     "lidarscenes.robots.urdf": ("load_robot",),
+    "lidarsim.columns.sweep": ("Sweep",),
 }
 
 

@@ -398,8 +398,8 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
 def points(cloud: Path, out: Path, overwrite: bool, **settings: Any) -> None:
     """Convert a point cloud to a scene that can be scanned again.
 
-    The z axis of CLOUD must point up. Supported formats are .ply, .pcd, .las, .laz, .e57, text
-    (.xyz, .txt, .asc, .csv), Leica .pts and .ptx, .npy, and .bin from KITTI or nuScenes.
+    The z axis of CLOUD must point up. Supported formats are .ply, .pcd, .las, .laz, .e57, .parquet,
+    text (.xyz, .txt, .asc, .csv), Leica .pts and .ptx, .npy, and .bin from KITTI or nuScenes.
 
     \b
     Examples:

@@ -260,6 +260,7 @@ def _show_coverage(
     targets: Sequence[str],
 ) -> None:
     """Print what the stations of a scenario see, and what a cloud covers of it."""
+    from ..comparing.compared_sweep import compared_sweep
     from ..plan.stations import survey_coverage
     from ..recordings.opening import open_recording
     from .terminal import Terminal
@@ -279,7 +280,7 @@ def _show_coverage(
         )
     positions = _station_positions(built)
     clouds = (
-        recording.read_points(number, in_world=True).points for number in range(recording.count)
+        compared_sweep(recording, number, in_world=True).points for number in range(recording.count)
     )
     with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(

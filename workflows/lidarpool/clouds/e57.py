@@ -5,7 +5,6 @@ from __future__ import annotations
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,23 +20,21 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
 from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.motion.rotations import matrices
-from lidarsim.scene.files.cloud_scan import CloudScan
 from lidarsim.scene.files.intensity_scales import Limits, scales_of
 from lidarsim.scene.files.stated_system import StatedSystem, check_metric_format
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
-from .file_points import FilePoints, check_count, of_scans
 from .gps_time import gps_start_s
-from .recording import Read, Recording, RecordingSource, SweepFiles
+from .recording import Recording, RecordingSource
 from .well_known_text import wkt
 
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _THIN = "downsample it first"
-_POINT_BYTES = 24  # least bytes of the coordinates of a point
 _COORDINATES = {
     "cartesian": ("cartesianX", "cartesianY", "cartesianZ"),
     "spherical": ("sphericalRange", "sphericalAzimuth", "sphericalElevation"),
@@ -52,7 +49,6 @@ _COLUMNS = {
 }
 # Columns whose values the flags mark as invalid.
 _FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
-_GRAY = 188  # byte of a color that is unknown: half of the light
 _MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
 _MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
 _FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
@@ -240,14 +236,9 @@ def open_file(source: RecordingSource) -> Recording:
             total.take(_bytes_of_scan(header))
         scale = _scale(headers)
 
-        def read(number: int) -> Read:
+        def read(number: int) -> Sweep:
             Allowance(size, _THIN).take(_bytes_of_scan(headers[number]))
-            scan = _read_scan(file, headers, number, scale)
-            columns = dict(scan.columns)
-            if {*COLORS} <= columns.keys():
-                for name in COLORS:
-                    columns[name] = np.nan_to_num(columns[name], nan=_GRAY).astype(np.uint8)
-            return scan.positions, columns, np.eye(4) if scan.pose is None else scan.pose
+            return _read_scan(file, headers, number, scale)
 
         notes = list(scale.notes)
         for number, header in enumerate(headers):
@@ -255,43 +246,25 @@ def open_file(source: RecordingSource) -> Recording:
             notes += pose_notes
         epsg = None
         system = _system(file)
-        if system is not None and headers:
-            points, _, pose = read(0)
-            assert pose is not None  # every scan has a pose
-            notes += check_metric_format(system, points @ pose[:3, :3].T + pose[:3, 3])
+        if system is not None and headers and not source.as_stored:
+            notes += check_metric_format(system, read(0).in_world())
             # Else the points are in no such system.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
         names = [_stated_name(header) for header in headers]
         stations = [] if any(name.endswith(_MOVING) for name in names) else names
-        sweeps = SweepFiles(
-            len(headers), read, notes=tuple(notes), epsg=epsg, stations=tuple(stations)
-        )
-    return source.of_sensors({"": sweeps})
-
-
-def read_points(path: Path) -> FilePoints:
-    """Read all scans, joined in the frame of the file, with their scanners' positions."""
-    file = pye57.E57(str(path))
-    try:
-        headers = [file.get_header(number) for number in range(file.scan_count)]
-        if not headers:
-            raise ValueError("it contains no scans")
-        point_count = sum(header.point_count for header in headers)
-        check_count(point_count)
-        Allowance(input_size(path), _THIN).take(_POINT_BYTES * point_count)
-        scale = _scale(headers)
-        points = of_scans(
-            [_read_scan(file, headers, number, scale) for number in range(len(headers))]
-        )
-        system = _system(file)
-    finally:
-        file.close()
-    return replace(
-        points, system=system, in_meters=True, notes=[*scale.notes, *points.notes], units_m=None
+    return source.recording(
+        len(headers),
+        read,
+        point_count=sum(h.point_count for h in headers) if source.as_stored else None,
+        notes=source.named(notes),
+        system=system,
+        epsg=epsg,
+        is_metric=True,
+        stations=tuple(stations),
     )
 
 
-def _read_scan(file: Any, headers: Sequence[Any], number: int, scale: _Scale) -> CloudScan:
+def _read_scan(file: Any, headers: Sequence[Any], number: int, scale: _Scale) -> Sweep:
     """Read a scan of an open `pye57.E57` in the axes of its scanner, without invalid points.
 
     Colors and intensities that are marked as invalid are NaN, and columns of these alone are left
@@ -299,7 +272,7 @@ def _read_scan(file: Any, headers: Sequence[Any], number: int, scale: _Scale) ->
     """
     header = headers[number]
     scan_name = _name(header, number)
-    pose, notes = _pose(header, scan_name)
+    pose, _ = _pose(header, scan_name)
     fields = header.point_fields
     kind = next((kind for kind, axes in _COORDINATES.items() if {*axes} <= {*fields}), None)
     if kind is None:
@@ -324,7 +297,8 @@ def _read_scan(file: Any, headers: Sequence[Any], number: int, scale: _Scale) ->
         columns = {column: values[rows] for column, values in columns.items()}
     unread = tuple(field for field in fields if field not in read)
     scanner = None if pose is None else pose[:3, 3]
-    return CloudScan(positions, columns, pose, scanner, unread=unread, notes=notes)
+    pose = np.eye(4) if pose is None else pose
+    return Sweep(positions, columns, pose=pose, scanner=scanner, skipped=unread)
 
 
 def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:

@@ -45,8 +45,8 @@ class FormatRow:
         Endings of the files that are read, in lower case with their dots.
     reads
         What the module reads of such files: "sweeps" by `open_file(source)`, which returns a
-        `Recording` of a `RecordingSource` (`recording.py`); "points" by `read_points(path)`, for
-        scenes (`FilePoints` of `file_points.py`), which raises ValueError for a broken file.
+        `Recording` of a `RecordingSource` (`recording.py`); "points" if scenes can be made of
+        them.
     folders
         Patterns of names in the folders that are read, by `open_folder(source)` as by `open_file`.
     in_pieces
@@ -285,7 +285,7 @@ FORMATS = {
         data_set="parquet",
         of_job="points/job={number}",
         suffixes=(".parquet",),
-        reads=("sweeps",),
+        reads=("sweeps", "points"),
         folders=("**/*.parquet",),
     ),
     "pcd": FormatRow(
@@ -510,8 +510,8 @@ def _contains(folder: Path, pattern: str) -> bool:
     return next(folder.glob(pattern), None) is not None
 
 
-def points_reader(path: Path) -> Callable[[Path], Any] | None:
-    """Return the function that reads the points of a file, or None for an unknown suffix.
+def points_reader(path: Path) -> Callable[[Any], Any] | None:
+    """Return the function that opens a file for a scene, or None for an unknown suffix.
 
     Raises
     ------
@@ -519,7 +519,7 @@ def points_reader(path: Path) -> Callable[[Path], Any] | None:
         If a package that reads it is not installed.
     """
     row = _row_that_reads("points", path)
-    return None if row is None else row.reader("read_points", str(path))
+    return None if row is None else row.reader("open_file", str(path))
 
 
 def point_suffixes() -> tuple[str, ...]:

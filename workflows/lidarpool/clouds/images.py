@@ -17,13 +17,14 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
 from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.ray_image import Image, fired_of
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from . import pieces, sweep_reader
 from .boxes import Boxes
 from .pieces import Entry
-from .recording import Read, Recording, RecordingSource, SweepFiles
+from .recording import Recording, RecordingSource
 
 _NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are not images
 
@@ -119,25 +120,25 @@ def _file(sweeps: Sweeps, folders: Sequence[str], sweep: int) -> str:
 def open_folder(source: RecordingSource) -> Recording:
     """Open the range images of a folder, whose folders are sensors."""
     with reading(source.name):
-        sensors = _sensors(source.path)
+        sensors = _sensors(source)
     return source.of_sensors(sensors)
 
 
-def _sensors(folder: Path) -> dict[str, SweepFiles]:
-    """Open range images, {sensor: sweeps} of folders of .npz files."""
+def _sensors(source: RecordingSource) -> dict[str, Recording]:
+    """Open range images in folders of .npz files, {sensor: recording}."""
     files_of_sensor = {
         inner.name: sort_by_number(inner.glob("*.npz"))
-        for inner in sorted(folder.iterdir())
+        for inner in sorted(source.path.iterdir())
         if inner.is_dir()
     }
 
-    def sweeps_of(files: list[Path]) -> SweepFiles:
-        def read(number: int) -> Read:
+    def recording(files: list[Path]) -> Recording:
+        def read(number: int) -> Sweep:
             with open_archive(files[number], partial(read_input, files[number])) as images:
                 pose = images["pose"]
                 points, columns = points_of_images(images)
-            return points, columns, pose
+            return Sweep(points, columns, pose=pose)
 
-        return SweepFiles(len(files), read)
+        return source.recording(len(files), read)
 
-    return {sensor: sweeps_of(files) for sensor, files in files_of_sensor.items() if files}
+    return {sensor: recording(files) for sensor, files in files_of_sensor.items() if files}

@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -22,16 +23,16 @@ from lidarsim.base.numbered_files import (
 )
 from lidarsim.base.time_units import seconds_of
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import matrices
-from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns, read_float_rows
+from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from . import pieces, sweep_reader
 from .boxes import Boxes
-from .file_points import FilePoints, of_scans
 from .pieces import Data, Entry, as_data
-from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
+from .recording import Recording, RecordingSource, sweep_from_columns
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
@@ -231,36 +232,32 @@ def _labels(
 def open_file(source: RecordingSource) -> Recording:
     """Open a .bin of KITTI or nuScenes, a sweep, with its labels."""
     labels = source.path.parent.parent / "labels" / f"{source.path.stem}.label"
-    return source.of_sensors({"": SweepFiles(1, lambda _: _read_sweep(source.path, labels, None))})
+    return source.recording(1, lambda _: _read_sweep(source.path, labels))
 
 
 def open_folder(source: RecordingSource) -> Recording:
     """Open a sequence of KITTI odometry or SemanticKITTI."""
     with reading(source.name):
-        sequences = _sequences(source.path)
+        sequences = _sequences(source)
     return source.of_sensors(sequences)
 
 
-def read_points(path: Path) -> FilePoints:
-    """Read the points of a .bin, seen from zero."""
-    return of_scans(read_float_rows(path))
-
-
-def _sequences(folder: Path) -> dict[str, SweepFiles]:
+def _sequences(source: RecordingSource) -> dict[str, Recording]:
     """Open the sequences of KITTI odometry or SemanticKITTI, a sequence, or its .bin files."""
+    folder = source.path
     sequences = sort_by_number(p for p in folder.glob("sequences/*") if (p / "velodyne").is_dir())
     if sequences:
         return {
-            sequence.name: _sequence(sequence, "velodyne")._replace(sequence=sequence.name)
+            sequence.name: _sequence(source, sequence, "velodyne", sequence.name)
             for sequence in sequences
         }
     for inner in ("velodyne", "velodyne_points/data", "."):
         if any((folder / inner).glob("*.bin")):
-            return {"": _sequence(folder, inner)}
+            return {"": _sequence(source, folder, inner)}
     return {}
 
 
-def _sequence(folder: Path, inner: str) -> SweepFiles:
+def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "") -> Recording:
     """Open the sweeps of a folder, with its labels, poses and times if it has these."""
     files = sort_by_number((folder / inner).glob("*.bin"))
     calibration = folder / CALIBRATION_FILE
@@ -287,12 +284,21 @@ def _sequence(folder: Path, inner: str) -> SweepFiles:
         )
         times_ns = of_frames(times_ns, "times.txt")
 
-    def read(number: int) -> Read:
+    def read(number: int) -> Sweep:
         file = files[number]
         pose = None if poses is None else poses[number]
-        return _read_sweep(file, folder / "labels" / f"{file.stem}.label", pose)
+        time_ns = None if times_ns is None else times_ns[number]
+        labels = folder / "labels" / f"{file.stem}.label"
+        return _read_sweep(file, labels, pose=pose, time_ns=time_ns)
 
-    return SweepFiles(len(files), read, times_ns, notes=tuple(notes), calibration=calibration)
+    return source.recording(
+        len(files),
+        read,
+        times=None if times_ns is None else times_ns.tolist,
+        notes=source.named(notes),
+        sequence=name,
+        calibration=calibration,
+    )
 
 
 def lidar_poses(rows: Floats, calibration: Path) -> Floats:
@@ -340,14 +346,14 @@ def _square(matrix_rows: Floats) -> Floats:
     return np.vstack([matrix_rows, [0, 0, 0, 1]])
 
 
-def _read_sweep(path: Path, labels: Path, pose: Floats | None) -> Read:
+def _read_sweep(path: Path, labels: Path, **fields: Any) -> Sweep:
     """Read a sweep, with its classes and objects if there is a file of labels."""
-    columns = read_float_columns(path, columns_by_name(path))
-    positions = take_positions(columns)
+    sweep = sweep_from_columns(read_float_columns(path, columns_by_name(path)), **fields)
+    columns = dict(sweep.columns)
     if labels.exists():
         numbers = np.frombuffer(read_input(labels), "<u4")
-        if len(numbers) != len(positions):
-            raise ValueError(f"{labels.name} has {len(numbers)} labels for {len(positions)} points")
+        if len(numbers) != len(sweep):
+            raise ValueError(f"{labels.name} has {len(numbers)} labels for {len(sweep)} points")
         columns["class"] = (numbers & 0xFFFF).astype(np.uint16)
         columns["object"] = (numbers >> 16).astype(np.int32) - 1
-    return positions, columns, pose
+    return sweep.replace(columns=columns)

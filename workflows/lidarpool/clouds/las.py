@@ -24,16 +24,15 @@ from lidarsim.base.errors import CutShortError, LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.interrupts import deferred_interrupts
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
-from lidarsim.scene.files.stated_system import stated_meters
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
-from .file_points import FilePoints, check_count
 from .flight_lines import FlightLines
 from .gps_time import gps_start_s
 from .las_header import las_system, noise_classes, open_las
-from .recording import NoiseFilter, Read, Recording, RecordingSource
+from .recording import Recording, RecordingSource
 from .well_known_text import wkt
 
 # A sample consists of this many runs of points, which begin where chunks of a .laz begin: 50,000
@@ -60,6 +59,7 @@ _MAX_VLR_BYTES = 65_535  # limit for a variable length record
 _TEXT_AREA = 3  # number of the record with a description in words
 _FRAMES = {"world": IN_WORLD, "sensor": AS_FIRED}
 _ON_GRID = 0.1  # share of the precision that single precision may lie beside the grid
+_STEPS = ("X", "Y", "Z")  # dimensions with the integers of the coordinates
 _MAX_STEPS = 2**31 - 1  # steps of precision from the offset to the farthest point
 
 
@@ -309,28 +309,27 @@ def open_file(source: RecordingSource) -> Recording:
             count = reader.header.point_count
             classes = noise_classes(reader.header)
             places = np.zeros((0, 3)) if system is None else _some_positions(reader, count)
-        meters, notes = stated_meters(system, places, source.unit)
+        meters, notes = source.stated_meters(system, places)
 
-    def read_run(reader: laspy.LasReader, start: int, length: int) -> Read:
+    def read_run(reader: laspy.LasReader, start: int, length: int) -> Sweep:
         reader.seek(start)
         points = reader.read_points(length)
         if len(points) != length:
             raise CutShortError(f"its header declares {count:,} points, but it contains fewer")
-        columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
-        return np.stack([points.x, points.y, points.z], axis=1), columns, None
+        names = [name for name in points.point_format.dimension_names if name not in _STEPS]
+        columns = {name: np.asarray(points[name]) for name in names}
+        return Sweep(np.stack([points.x, points.y, points.z], axis=1), columns)
 
-    def read(number: int) -> Read:
+    def read(number: int) -> Sweep:
         start = number * CHUNK_POINTS
         with open_las(path) as reader:
             return read_run(reader, start, min(CHUNK_POINTS, count - start))
 
-    def sample(max_points: int) -> Read:
+    def sample(max_points: int) -> Sweep:
         length = min(max_points // _SAMPLE_RUNS, count // _SAMPLE_RUNS)
         starts = np.linspace(0, count - length, _SAMPLE_RUNS) // _LAZ_CHUNK * _LAZ_CHUNK
         with open_las(path) as reader:
-            runs = [read_run(reader, int(start), length) for start in starts]
-        columns = {name: np.concatenate([run[1][name] for run in runs]) for name in runs[0][1]}
-        return np.concatenate([run[0] for run in runs]), columns, None
+            return Sweep.joined([read_run(reader, int(start), length) for start in starts])
 
     parts = -(-count // CHUNK_POINTS)
     return source.recording(
@@ -338,11 +337,12 @@ def open_file(source: RecordingSource) -> Recording:
         read,
         is_cloud=True,
         point_count=count,
-        notes=source.named(notes),
+        notes=notes,
         meters=meters,
+        system=system,
         epsg=source.epsg_in_meters(system, meters),
         sample=sample,
-        noise_filter=NoiseFilter(classes),
+        noise_classes=classes,
     )
 
 
@@ -356,19 +356,3 @@ def _some_positions(reader: laspy.LasReader, count: int) -> Floats:
             positions.append([point.x[0], point.y[0], point.z[0]])
     return np.reshape(np.array(positions, np.float64), (-1, 3))
 
-
-def read_points(path: Path) -> FilePoints:
-    """Read the points of a .las or .laz.
-
-    Raises LidarError if they exceed the memory.
-    """
-    system = las_system(path)
-    with open_las(path) as reader:
-        check_count(reader.header.point_count)
-        points = reader.read_points(-1)
-        classes = noise_classes(reader.header)
-    names = [name for name in points.point_format.dimension_names if name not in ("X", "Y", "Z")]
-    positions = np.stack([points.x, points.y, points.z], axis=1)
-    columns = {name: np.asarray(points[name]) for name in names}
-    columns = {name: values for name, values in columns.items() if values.ndim == 1}
-    return FilePoints(positions, columns, system=system, noise_classes=classes)

@@ -22,6 +22,7 @@ from lidarsim.base.input_files import read_input
 from lidarsim.base.named_files import check_name, file_below
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.float_rows import NUSCENES, read_float_columns
 from lidarsim.scene.transform import affine
@@ -32,7 +33,7 @@ from . import pieces, sweep_reader
 from .boxes import Boxes
 from .format_table import FORMATS
 from .pieces import Data, Entry, as_data
-from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
+from .recording import Recording, RecordingSource, sweep_from_columns
 
 VERSION = "v1.0-lidarpool"
 FIRST_SENSOR = FORMATS["nuscenes"].first_sensor
@@ -461,14 +462,15 @@ def open_folder(source: RecordingSource) -> Recording:
             )
         (tables,) = versions
     with reading(source.name):
-        lidars = _DataSet(tables.absolute()).lidars()
+        lidars = _DataSet(source, tables.absolute()).lidars()
     return source.of_sensors(lidars)
 
 
 class _DataSet:
     """The lidars in the tables of a data set, whose files are below the folder above the tables."""
 
-    def __init__(self, tables: Path) -> None:
+    def __init__(self, source: RecordingSource, tables: Path) -> None:
+        self._source = source
         self._tables = tables
         self._poses = self._table("ego_pose")
         self._calibrated = self._table("calibrated_sensor")
@@ -486,7 +488,7 @@ class _DataSet:
         rows = json.loads(read_input(self._tables / f"{name}.json"))
         return {row["token"]: row for row in rows}
 
-    def lidars(self) -> dict[str, SweepFiles]:
+    def lidars(self) -> dict[str, Recording]:
         """Return the lidars, {channel: sweeps in order of time}.
 
         The names of channels begin with the name of their scene if there are several scenes.
@@ -508,7 +510,7 @@ class _DataSet:
                 for (_, channel), rows in sorted(rows_of_channel.items())
             }
         return {
-            f"{scene} {channel}": self._sweeps(rows)._replace(sequence=scene)
+            f"{scene} {channel}": self._sweeps(rows, scene)
             for (scene, channel), rows in sorted(rows_of_channel.items())
         }
 
@@ -522,20 +524,25 @@ class _DataSet:
             names.append((self._labels[token], entry))
         return names
 
-    def _sweeps(self, rows: list[_Row]) -> SweepFiles:
+    def _sweeps(self, rows: list[_Row], sequence: str = "") -> Recording:
         rows.sort(key=lambda row: row["timestamp"])
         times_ns = 1e3 * np.array([row["timestamp"] for row in rows])
-        return SweepFiles(len(rows), lambda number: self._read(rows[number]), times_ns)
+        return self._source.recording(
+            len(rows),
+            lambda number: self._read(rows[number]),
+            times=times_ns.tolist,
+            sequence=sequence,
+        )
 
-    def _read(self, row: _Row) -> Read:
+    def _read(self, row: _Row) -> Sweep:
         names = self._named_files(row)
         file, *label_files = [file_below(self._tables.parent, *named) for named in names]
         columns = read_float_columns(file, NUSCENES)
-        positions = take_positions(columns)
         for label_file in label_files:
             columns["class"] = self._classes[np.frombuffer(read_input(label_file), "u1")]
         calibration = _pose_of(self._calibrated[row["calibrated_sensor_token"]])
-        return positions, columns, _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
+        pose = _pose_of(self._poses[row["ego_pose_token"]]) @ calibration
+        return sweep_from_columns(columns, pose=pose, time_ns=1e3 * row["timestamp"])
 
 
 def _pose_of(row: _Row) -> Floats:

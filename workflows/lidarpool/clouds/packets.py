@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from lidarsim.columns.cloud import CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots, check_columns
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
-from .recording import Read, Recording, RecordingSource, positions_of
+from .recording import Recording, RecordingSource, sweep_from_columns
 
 _FORMAT = "pcap"
 
@@ -72,17 +73,18 @@ def write_pcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 def open_file(source: RecordingSource) -> Recording:
     """Open the packets of a sensor by the decoder of its maker."""
     decoder = decoder_of(source.path, source.name)
-    sensor = [*decoder.sensors].index(source.choose("sensors", decoder.sensors))
+    name = source.choose("sensors", decoder.sensors)
+    sensor = [*decoder.sensors].index(name)
 
-    def points(sweep: Any) -> Read:
-        columns = decoder.columns(sensor, sweep)
-        return positions_of(columns), columns, None
+    def convert(sweep: Any) -> Sweep:
+        columns = dict(decoder.columns(sensor, sweep))
+        return sweep_from_columns(columns, time_ns=decoder.time_ns(sweep), sensor=name)
 
     sweeps = partial(decoder.sweeps, sensor)
     white = WHITE if source.intensity in (None, decoder.intensity) else None
     return source.stream(
         sweeps,
-        points,
+        convert,
         white=white,
         times=lambda: map(decoder.time_ns, sweeps()),
         notes=source.named(decoder.notes),

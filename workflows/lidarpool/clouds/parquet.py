@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import islice
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -19,13 +18,14 @@ from lidarsim.base.allowance import Allowance
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES, TABLE
 from lidarsim.sweeps.sweeps import Sweeps
 
 from . import pieces, sweep_reader
 from .parquet_groups import check_groups, group_allowance, number_columns, read_group
 from .pieces import Entry
-from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
+from .recording import Recording, RecordingSource, sweep_from_columns
 
 _GROUP_ROWS = 65_536
 
@@ -138,8 +138,7 @@ class Reader(sweep_reader.Reader):
 def open_file(source: RecordingSource) -> Recording:
     """Open a .parquet file in its groups of rows."""
     with reading(source.name):
-        points = _points(source.path)
-    return source.of_sensors({"": points})
+        return _parts(source)
 
 
 def open_folder(source: RecordingSource) -> Recording:
@@ -147,11 +146,12 @@ def open_folder(source: RecordingSource) -> Recording:
     return open_file(source)
 
 
-def _points(path: Path) -> SweepFiles:
-    """Return the parts of a file or folder.
+def _parts(source: RecordingSource) -> Recording:
+    """Open the parts of a file or folder.
 
     Only columns of numbers are read: the memory of others is not known before.
     """
+    path = source.path
     if path.is_file():
         input_size(path)
     dataset = pa.dataset.dataset(str(path), format="parquet")
@@ -168,17 +168,19 @@ def _points(path: Path) -> SweepFiles:
         files += len(of_file) * [(columns, size)]
     if axes := sorted(unread.intersection("xyz")):
         raise ValueError(f"its coordinate columns are not numeric: {', '.join(axes)}")
-    names = {column.in_files: column.name for column in TABLE.values()}
 
-    def read(number: int) -> Read:
+    def read(number: int) -> Sweep:
         number_names, size = files[number]
         rows = read_group(groups[number], number_names, group_allowance(size))
-        columns = {
-            names.get(column, column): rows[column].to_numpy() for column in rows.column_names
-        }
-        return take_positions(columns), columns, None
+        return sweep_from_columns({name: rows[name].to_numpy() for name in rows.column_names})
 
     notes = []
     if unread:
         notes.append(f"has non-numeric columns, which were skipped: {', '.join(sorted(unread))}")
-    return SweepFiles(len(groups), read, point_count=dataset.count_rows(), notes=tuple(notes))
+    return source.recording(
+        len(groups),
+        read,
+        is_cloud=True,
+        point_count=dataset.count_rows(),
+        notes=source.named(notes),
+    )

@@ -12,14 +12,14 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import open_input
 from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.scene.colors import as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation
 
 from . import pieces
-from .file_points import FilePoints, of_scans
-from .recording import NoiseFilter, Read, Recording, RecordingSource
+from .recording import Recording, RecordingSource
 
 _COMMENT_BYTES = 1000  # of the first line that is searched
 
@@ -81,17 +81,16 @@ def open_folder(source: RecordingSource) -> Recording:
 
 
 def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
-    def read(number: int) -> Read:
+    def read(number: int) -> Sweep:
         path = files[number]
         with reading(path.name) if len(files) > 1 else nullcontext():
-            (scan,) = read_pcd(path)
-        return scan.positions, scan.columns, scan.pose
+            (sweep,) = read_pcd(path)
+        return sweep
 
     return source.recording(
         len(files),
         read,
         meters=source.chosen_meters(),
-        noise_filter=NoiseFilter(),
         compensated=_stated_compensation(files[0]),
     )
 
@@ -105,7 +104,3 @@ def _stated_compensation(path: Path) -> bool | None:
         return None
     return states_compensation(comment)
 
-
-def read_points(path: Path) -> FilePoints:
-    """Read the points of a file, seen from its VIEWPOINT."""
-    return of_scans(read_pcd(path))

@@ -21,17 +21,16 @@ from lidarsim.base.words import printable
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES as POSITION
 from lidarsim.columns.table import NORMAL, TABLE, Column, check_names
-from lidarsim.scene.files.cloud_scan import with_usual_names
 from lidarsim.scene.files.polygon_files import ply_comments, read_ply_columns
-from lidarsim.scene.files.stated_system import StatedSystem, stated_meters
+from lidarsim.scene.files.stated_system import StatedSystem
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
 from . import sweep_reader
-from .file_points import FilePoints, from_columns
-from .recording import NoiseFilter, Read, Recording, RecordingSource, open_cloud, positions_of
+from .recording import Recording, RecordingSource, open_cloud, sweep_from_columns
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
@@ -377,6 +376,8 @@ def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]
 
 def open_file(source: RecordingSource) -> Recording:
     """Open a .ply, with the file of sweeps beside the .ply of a result."""
+    if source.as_stored:
+        return _open_foreign(source)
     try:
         cloud = CloudFile(source.path)
     except LidarError:  # text, or of another program
@@ -393,28 +394,22 @@ def open_folder(source: RecordingSource) -> Recording:
 def _open_foreign(source: RecordingSource) -> Recording:
     """Open a .ply of another program, or of text, in the units of the system that it states."""
 
-    def read(_: int) -> Read:
-        columns = with_usual_names(read_ply_columns(read_input(source.path)))
-        return positions_of(columns), columns, None
+    def read(_: int) -> Sweep:
+        return sweep_from_columns(read_ply_columns(read_input(source.path)))
 
-    system = None
     with reading(source.name):
-        data = read_input(source.path)
-        system = StatedSystem.of_comments(ply_comments(data))
-        positions = (
-            np.zeros((0, 3))
-            if system is None
-            else positions_of(with_usual_names(read_ply_columns(data)))
-        )
-        meters, notes = stated_meters(system, positions, source.unit)
+        system = StatedSystem.of_comments(ply_comments(read_input(source.path)))
+        is_checked = system is not None and not source.as_stored
+        positions = read(0).points if is_checked else np.zeros((0, 3))
+        meters, notes = source.stated_meters(system, positions)
     return source.recording(
         1,
         read,
         is_cloud=True,
-        notes=source.named(notes),
+        notes=notes,
         meters=meters,
+        system=system,
         epsg=source.epsg_in_meters(system, meters),
-        noise_filter=NoiseFilter(),
     )
 
 
@@ -435,9 +430,3 @@ def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
     load = partial(Sweeps.load, sweeps_path)
     return open_cloud(source.name, cloud, load, source.sensor, source.intensity, **fields)
 
-
-def read_points(path: Path) -> FilePoints:
-    """Read the vertices of a .ply."""
-    data = read_input(path)
-    content = from_columns(with_usual_names(read_ply_columns(data)))
-    return replace(content, system=StatedSystem.of_comments(ply_comments(data)))

@@ -1,56 +1,46 @@
-"""Recordings: sweeps of a sensor, or parts of a cloud, which formats open and read one by one."""
+"""Recordings: sequences of sweeps, or of parts of a large cloud, whatever their file format.
+
+Names and units are resolved here, when an item is read: standard column names, meters, the column
+chosen as intensity, and points that the file withholds. Rings and point times that a file does not
+state are determined from a few sweeps when they are first requested.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Indices, Ints
+from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
+from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import reading
 from lidarsim.base.words import did_you_mean, joined
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
+from lidarsim.columns.column_names import STRENGTHS, with_standard_names
+from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
+from lidarsim.scene.files.pcd import unpacked_colors
 from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
-from lidarsim.sweeps.sweep_motion import FiringPoses
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
+from .point_times import PointTimes
+from .rings import Rings
 
-Columns = Mapping[str, AnyArray]
-# Positions (n, 3), columns (n,), and the sensor's pose in the world (4, 4); None if unknown.
-Read = tuple[AnyArray, Columns, Floats | None]
-
-# Names of the columns of rings and of intensities in other programs; the first column present is
-# read.
-_RING_COLUMNS = ("ring", "channel", "laser_id", "laser_number", "line", "beam")
-_INTENSITY_COLUMNS = ("intensity", "reflectivity", "i")
 METERS: Meters = (1.0, 1.0, 1.0)
-
-
-class SweepFiles(NamedTuple):
-    """Sweeps of a sensor, or parts of a cloud."""
-
-    sweeps: int  # or parts
-    read: Callable[[int], Read]
-    times_ns: Floats | None = None  # (sweeps,): stamp of each sweep; None if unknown
-    point_count: int | None = None  # number of points of a cloud in parts; None for sweeps
-    sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
-    notes: tuple[str, ...] = ()  # clauses that follow the name of the recording
-    calibration: Path | None = None  # KITTI's calib.txt, which may not exist
-    epsg: int | None = None  # EPSG code of the file's system, if that is in meters
-    stations: Sequence[str] = ()  # name of each sweep if each is from a station; "" for unnamed
+_REFERENCE_SWEEPS = 5  # sweeps that determine rings and point times
 
 
 class SeveralSensorsError(LidarError):
     """The recording has several sensors or topics, and none is chosen.
 
-    `contents` is a sentence that names them, and `option` the option that chooses one.
+    `contents` is a sentence that names them, and `option` is the option that chooses one.
     """
 
     def __init__(self, contents: str, names: Sequence[str], option: str = "--sensor") -> None:
@@ -60,251 +50,307 @@ class SeveralSensorsError(LidarError):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedPoints:
-    """Points of a sweep, or of a part of a cloud."""
-
-    points: Floats  # (n, 3): meters
-    rings: Ints | None = None  # (n,)
-    intensities: Floats | None = None  # (n,): of any scale
-    rays: Ints | None = None  # (n,): keys of ray and return; None for parts of a cloud
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def part(self, row_indices: Indices) -> RecordedPoints:
-        """Select points by rows (k,), without the keys of their rays."""
-        return RecordedPoints(
-            self.points[row_indices],
-            None if self.rings is None else self.rings[row_indices],
-            None if self.intensities is None else self.intensities[row_indices],
-        )
-
-    @classmethod
-    def joined(cls, recorded: list[RecordedPoints]) -> RecordedPoints:
-        """Concatenate parts of the same recording, without the keys of their rays.
-
-        Intensities that only some parts have are NaN in the others. Rings that only some parts have
-        are left out.
-        """
-        parts = [part for part in recorded if len(part)]
-        if not parts:
-            return cls(np.empty((0, 3)))
-        rings = [part.rings for part in parts if part.rings is not None]
-        intensities = None
-        if any(part.intensities is not None for part in parts):
-            unknown = [np.full(len(part), np.nan) for part in parts]
-            intensities = np.concatenate(
-                [
-                    nothing if part.intensities is None else part.intensities
-                    for part, nothing in zip(parts, unknown, strict=True)
-                ]
-            )
-        return cls(
-            np.concatenate([part.points for part in parts]),
-            np.concatenate(rings) if len(rings) == len(parts) else None,
-            intensities,
-        )
-
-
-@dataclass(eq=False)
-class NoiseFilter:
-    """Leaves out points that a file withholds or classifies as noise, and counts them."""
-
-    noise_classes: tuple[int, ...] = NOISE_CLASSES
-    counts: dict[int, LeftOut] = field(default_factory=dict)  # {number of a sweep or part: counts}
-
-    def usable(self, number: int, read: Read) -> Read:
-        """Return a sweep or part without withheld points and points of noise, and count these."""
-        points, columns, pose = read
-        usable, self.counts[number] = usable_points(columns, self.noise_classes)
-        if usable is None:
-            return read
-        usable_columns = {name: np.asarray(values)[usable] for name, values in columns.items()}
-        return points[usable], usable_columns, pose
-
-    def note(self) -> str:
-        """Return a sentence on the points that were left out, or an empty string for none."""
-        totals = np.sum([(0, 0), *self.counts.values()], axis=0).tolist()
-        return LeftOut(*totals).note()
-
-
-class FiredPoints(NamedTuple):
-    """Points of a sweep as they were fired."""
-
-    points: Floats  # (n, 3): in the sensor frame at the firing of each, meters
-    columns: Columns  # (n,) each
-    poses: FiringPoses  # poses of the sensor in the world
-
-
-@dataclass(frozen=True, eq=False)
 class Recording:
-    """A recording of sweeps, or a cloud without sweeps (`is_cloud`) that is read in parts."""
+    """A sequence of sweeps of one sensor, or of parts of a cloud without sweeps.
+
+    ``len(recording)`` is the number of items, and ``recording[number]`` reads an item as a `Sweep`.
+
+    Parameters
+    ----------
+    name
+        Name in messages.
+    count
+        Number of sweeps or parts.
+    read
+        Function that returns the sweep of a number as the file stores it: in units of the file, and
+        with its column names.
+    is_cloud
+        Whether the items are parts of a cloud without sweeps.
+    point_count
+        Number of points of a cloud, or None if it is not known before the points are read.
+    intensity_column
+        Column that the user chose as intensity, or None.
+    times
+        Function that returns the timestamps of all sweeps in nanoseconds, or None.
+    frame_poses
+        Function that returns the poses of all sweeps in the world, of shape (count, 4, 4), or None
+        if some are unknown. It is faster than reading every sweep.
+    fired
+        Function that reads a sweep as fired, with `firing_poses`, or None if this is unknown.
+    sample
+        Function that reads about a number of points that are evenly distributed in the file.
+    compensated
+        Whether the file states that the points are compensated for the motion of the sensor. None
+        if it states nothing, or if the sensor does not move.
+    meters
+        Lengths of the units of x, y and z in meters.
+    system
+        Coordinate system that the file states.
+    epsg
+        EPSG code of the coordinates, or None if they are in no known system in meters.
+    is_metric
+        Whether coordinates are true meters by definition of the format, whatever the system.
+    sequence
+        Name of a drive with its own frame, or an empty string for the only drive.
+    calibration
+        KITTI's calib.txt, which may not exist.
+    stations
+        Name of each sweep if each sweep is from a scan station; an empty string if unnamed.
+    thinned
+        Whether some returns were omitted, so that gaps are not lost returns.
+    white
+        Intensity of a white surface, if it does not depend on the range.
+    energies
+        Whether intensities are energies, as in results.
+    firing_key
+        Recordings with the same key have the same rays. An empty string if this is unknown.
+    noise_classes
+        Classes of noise, which are omitted together with withheld points; None to keep all points.
+    notes
+        Sentences for the user.
+    """
 
     name: str
-    count: int  # number of sweeps or parts
-    read: Callable[[int], Read]
-    intensity_column: str | None = None  # a name that is not in `_INTENSITY_COLUMNS`
+    count: int
+    read: Callable[[int], Sweep]
     is_cloud: bool = False
-    point_count: int | None = None  # None if unknown before the points are read
-    times: Callable[[], Iterable[float]] | None = None  # stamp of each sweep, ns
-    notes: tuple[str, ...] = ()
-    thinned: bool = False  # whether hits were left out: gaps are not lost returns
-    white: float | None = None  # intensity of a white surface, if it is the same at all ranges
-    energies: bool = False  # whether intensities are energies, as in results
-    firing_key: str = ""  # recordings with the same key have the same rays; "" for unknown
-    meters: Meters = METERS  # lengths of the units of x, y and z
-    epsg: int | None = None  # EPSG code of the file's system, if that is in meters
-    sample: Callable[[int], Read] | None = None  # reads about so many points, evenly in the file
-    # Returns the poses (count, 4, 4) in the world of sweeps that are read in the sensor frame, or
-    # None if they are unknown; None if the recording has no frames.
+    point_count: int | None = None
+    intensity_column: str | None = None
+    times: Callable[[], Iterable[float]] | None = None
     frame_poses: Callable[[], Floats | None] | None = None
-    sequence: str = ""  # name of a drive that has a separate frame; "" for the only drive
-    calibration: Path | None = None  # KITTI's calib.txt, which may not exist
-    stations: Sequence[str] = ()  # name of each sweep if each is from a station; "" for unnamed
-    noise_filter: NoiseFilter | None = None  # applied by `read`; None if nothing is left out
-    # Reads a sweep as fired, with the poses of its firings; None if these are unknown.
-    fired: Callable[[int], FiredPoints] | None = None
-    # Whether sweeps are stated to be compensated for the motion of the sensor; None if unknown, or
-    # if the sensor does not move.
+    fired: Callable[[int], Sweep] | None = None
+    sample: Callable[[int], Sweep] | None = None
     compensated: bool | None = None
+    meters: Meters = METERS
+    system: StatedSystem | None = None
+    epsg: int | None = None
+    is_metric: bool = False
+    sequence: str = ""
+    calibration: Path | None = None
+    stations: Sequence[str] = ()
+    thinned: bool = False
+    white: float | None = None
+    energies: bool = False
+    firing_key: str = ""
+    noise_classes: tuple[int, ...] | None = NOISE_CLASSES
+    notes: tuple[str, ...] = ()
+    _omitted: dict[int, LeftOut] = field(default_factory=dict)  # {number of an item: points}
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, number: int) -> Sweep:
+        """Read a sweep, or a part of a cloud.
+
+        Raises LidarError if the recording cannot be read, and IndexError for an unknown item.
+        """
+        if not -self.count <= number < self.count:
+            raise IndexError(f"{self.name} has no item {number}, but {self.count:,} items")
+        number %= self.count
+        with reading(self.name):
+            return self._resolved(number, self.read(number))
+
+    def read_fired(self, number: int) -> Sweep:
+        """Read the returns of a sweep as fired, if this is known, otherwise as they are stored."""
+        if self.fired is None:
+            return self[number].returns()
+        with reading(self.name):
+            return self._resolved(number, self.fired(number)).returns()
+
+    def read_sample(self, max_points: int) -> Sweep:
+        """Read a sample of a cloud that has the function `sample`."""
+        assert self.sample is not None
+        with reading(self.name):
+            return self._resolved(-1, self.sample(max_points))
+
+    def _resolved(self, number: int, sweep: Sweep) -> Sweep:
+        """Return a stored sweep with standard names and in meters, without withheld points."""
+        if self.noise_classes is not None:
+            usable, omitted = usable_points(sweep.columns, self.noise_classes)
+            if number >= 0:
+                self._omitted[number] = omitted
+            if usable is not None:
+                sweep = sweep.select(usable)
+        standard = unpacked_colors(with_standard_names(sweep.columns))
+        columns = self._chosen_intensity(sweep.columns, standard)
+        points = sweep.points
+        if self.meters != METERS:
+            points = np.asarray(points, np.float64) * self.meters
+        pose = sweep._pose
+        if self.meters != METERS and sweep.pose is not None:
+            pose = sweep.pose.copy()
+            pose[:3, 3] *= self.meters
+        changes: dict[str, Any] = {}
+        if not self.is_cloud:
+            changes = {"recording": self, "number": max(number, 0)}
+        if sweep.compensated is None:
+            changes["compensated"] = self.compensated
+        return sweep.replace(points=points, columns=columns, pose=pose, **changes)
+
+    def _chosen_intensity(self, stored: Columns, standard: Columns) -> Columns:
+        """Return columns with the chosen column as intensity; raise ValueError without it."""
+        name = self.intensity_column
+        if name is None or name == "intensity":
+            return standard
+        for columns in (stored, standard):
+            if name in columns:
+                return {**standard, "intensity": np.asarray(columns[name])}
+        raise ValueError(
+            f"it has no column {name!r} that could be used as intensity."
+            + (did_you_mean(name, stored) or f" Available columns: {', '.join(stored)}.")
+        )
 
     @property
     def intensity_name(self) -> str:
         """Name of the column that was chosen as intensity, by default «intensity»."""
-        return self.intensity_column or _INTENSITY_COLUMNS[0]
+        return self.intensity_column or STRENGTHS[0]
 
     @property
     def left_out_notes(self) -> list[str]:
-        """Notes on points that were left out of what has been read."""
-        note = "" if self.noise_filter is None else self.noise_filter.note()
+        """Notes on points that were omitted from the items that have been read."""
+        totals = np.sum([(0, 0), *self._omitted.values()], axis=0).tolist()
+        note = LeftOut(*totals).note()
         return [f"{self.name}: {note}"] if note else []
 
     def poses(self, numbers: Iterable[int]) -> Floats | None:
         """Return the poses (n, 4, 4) of sweeps in the world, or None if a pose is unknown.
 
-        LidarError if the recording cannot be read.
+        Raises LidarError if the recording cannot be read.
         """
-        with reading(self.name):
-            if self.frame_poses is not None and (frame_poses := self.frame_poses()) is not None:
-                return np.asarray(frame_poses[list(numbers)])
-            poses = []
-            for number in numbers:
-                _, _, pose = self.read(number)
-                if pose is None:
-                    return None
-                poses.append(pose)
-        matrices = np.array(poses, np.float64).reshape(-1, 4, 4)
-        matrices[:, :3, 3] *= self.meters
-        return matrices
-
-    def without_noise(self, noise_filter: NoiseFilter) -> Recording:
-        """Return the recording without points that it withholds or classifies as noise."""
-        read = self.read
-        sample = self.sample
-
-        def usable_sample(max_points: int) -> Read:
-            assert sample is not None
-            return NoiseFilter(noise_filter.noise_classes).usable(0, sample(max_points))
-
-        return replace(
-            self,
-            read=lambda number: noise_filter.usable(number, read(number)),
-            sample=None if sample is None else usable_sample,
-            noise_filter=noise_filter,
-        )
-
-    def read_points(self, number: int, *, in_world: bool = False) -> RecordedPoints:
-        """Read a sweep, or part of a cloud, in the sensor frame or in the world frame.
-
-        LidarError if the recording cannot be read.
-        """
-        with reading(self.name):
-            points, columns, pose = self.read(number)
-            self.check_intensity(columns)
-        positions = np.asarray(points, np.float64)
-        # Drivers write NaN or zeros for pulses without a return.
-        valid = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
-        positions = positions[valid] * self.meters
-        if in_world and not self.is_cloud:
+        if self.frame_poses is not None:
+            with reading(self.name):
+                frame_poses = self.frame_poses()
+            if frame_poses is not None:
+                matrices = np.array(frame_poses[list(numbers)], np.float64).reshape(-1, 4, 4)
+                matrices[:, :3, 3] *= self.meters
+                return matrices
+        poses = []
+        for number in numbers:
+            pose = self[number].pose
             if pose is None:
-                raise LidarError(
-                    f"{self.name} is in sensor coordinates and does not contain the pose of "
-                    "the sensor. Compare it with a recording that consists of sweeps."
-                )
-            positions = positions @ pose[:3, :3].T + pose[:3, 3] * self.meters
-        rings = rings_of(columns)
-        intensities = intensities_of(self, columns)
-        return RecordedPoints(
-            positions,
-            None if rings is None else rings[valid].astype(np.int64),
-            None if intensities is None else intensities[valid].astype(np.float64),
-            _ray_keys(columns)[valid] if self.firing_key and not in_world else None,
-        )
+                return None
+            poses.append(pose)
+        return np.array(poses, np.float64).reshape(-1, 4, 4)
 
-    def check_intensity(self, columns: Columns) -> None:
-        """Raise LidarError if the recording lacks the column that was chosen as intensity."""
-        name = self.intensity_column
-        if name is not None and name not in columns:
-            raise LidarError(
-                f"it has no column {name!r} that could be used as intensity."
-                + (did_you_mean(name, columns) or f" Available columns: {', '.join(columns)}.")
-            )
+    @cached_property
+    def stamps_ns(self) -> Floats | None:
+        """Timestamps of the sweeps in nanoseconds, float64 (s,), or None if there are none."""
+        if self.times is None:
+            return None
+        with reading(self.name):
+            return np.fromiter(self.times(), np.float64)
+
+    @property
+    def rings(self) -> Rings:
+        """The rings of the sensor."""
+        return self._rings_and_times[0]
+
+    @property
+    def point_times(self) -> PointTimes | None:
+        """Unit and zero of the point times, or None if the recording has none."""
+        return self._rings_and_times[1]
+
+    @cached_property
+    def _rings_and_times(self) -> tuple[Rings, PointTimes | None]:
+        numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
+        # Compensation for motion changes elevations.
+        sweeps = {number: self.read_fired(number) for number in numbers}
+        sweeps = {number: sweep for number, sweep in sweeps.items() if len(sweep)}
+        stamps_s = self.stamps_ns
+        if stamps_s is not None and len(stamps_s) == self.count:
+            stamps_s = 1e-9 * stamps_s[[*sweeps]]
+        else:
+            stamps_s = None
+        columns = [sweep.columns for sweep in sweeps.values()]
+        times = PointTimes.from_sweeps(columns, stamps_s) if columns else None
+        return Rings.from_sweeps(self.name, [*sweeps.values()]), times
+
+    def rings_of(self, sweep: Sweep) -> Ints | None:
+        """Return the rings (n,) of points without a ring column, counted from the lowest.
+
+        Points without a ring, or without a return, have the value -1. Returns None if the rings are
+        unknown.
+        """
+        if not len(self.rings) or self.rings.numbers is not None:
+            return None
+        returned = sweep.has_return
+        rows = self.rings.rows(sweep.returns())
+        rings = np.full(len(sweep), -1)
+        rings[returned] = np.where(rows >= 0, len(self.rings) - 1 - rows, -1)
+        return rings
+
+    def times_of(self, sweep: Sweep) -> Floats | None:
+        """Return the times (n,) of points relative to the timestamp of their sweep, in seconds.
+
+        Returns None if the times are unknown.
+        """
+        if self.fired is not None:  # a result, whose times are exact
+            if "time" not in sweep.columns or sweep.time_ns is None:
+                return None
+            return 1e-9 * (np.asarray(sweep.columns["time"]) - sweep.time_ns)
+        if self.point_times is None:
+            return None
+        stamps_ns = self.stamps_ns
+        stamp_s = None if stamps_ns is None else 1e-9 * float(stamps_ns[sweep.number])
+        return self.point_times.of_points(sweep.columns, stamp_s)
 
 
 @dataclass(frozen=True)
 class RecordingSource:
-    """A file or folder to open, and what the user chose of it."""
+    """A file or folder to open, and the user's choices."""
 
     path: Path
     name: str  # name in messages
     sensor: str | None = None  # or topic
-    intensity: str | None = None  # column, if not one of the usual names
+    intensity: str | None = None  # column, if it has another name than `intensity`
     unit: str | None = None  # replaces the unit that the file states
+    # Whether positions stay in the units and system of the file, unchecked, and all scans in the
+    # file are separate items.
+    as_stored: bool = False
 
-    def recording(self, count: int, read: Callable[[int], Read], **fields: Any) -> Recording:
+    def recording(self, count: int, read: Callable[[int], Sweep], **fields: Any) -> Recording:
         """Return a recording of `count` sweeps or parts, with further fields of `Recording`."""
-        return Recording(self.name, count, read, self.intensity, **fields)
+        fields.setdefault("intensity_column", self.intensity)
+        return Recording(self.name, count, read, **fields)
 
     def choose(self, kind: str, names: Iterable[str]) -> str:
         """Return the chosen sensor or topic, or the only one.
 
         `kind` is the plural, such as "sensors".
-        LidarError without a choice among several, or for a name that is not there.
+        Raises LidarError if several are present and none was chosen, or for an unknown name.
         """
         return choose(self.name, kind, names, self.sensor)
 
-    def of_sensors(self, sensors: Mapping[str, SweepFiles]) -> Recording:
-        """Return the sweeps of the chosen sensor of {name: sweeps}.
+    def of_sensors(self, sensors: Mapping[str, Recording]) -> Recording:
+        """Return the recording of the chosen sensor in {name: recording}.
 
         The only sensor of a recording may have the name "".
         """
-        files = sensors[self.choose("sensors", sensors)]
-        return self.recording(
-            files.sweeps,
-            files.read,
-            is_cloud=files.point_count is not None,
-            point_count=files.point_count,
-            times=None if files.times_ns is None else files.times_ns.tolist,
-            notes=self.named(files.notes),
-            sequence=files.sequence,
-            calibration=files.calibration,
-            epsg=files.epsg,
-            stations=files.stations,
-        )
+        return sensors[self.choose("sensors", sensors)]
 
     def named(self, clauses: Iterable[str]) -> tuple[str, ...]:
         """Return notes: the name of the recording before each clause."""
         return tuple(f"{self.name} {clause}" for clause in clauses)
 
     def chosen_meters(self) -> Meters:
-        """Return the meters of the chosen unit, of a format that states none."""
+        """Return the lengths of the chosen unit, for a format that states none."""
         return stated_meters(None, np.zeros((0, 3)), self.unit)[0]
 
-    def epsg_in_meters(self, system: StatedSystem | None, meters: Meters) -> int | None:
-        """Return the code of a stated system.
+    def stated_meters(
+        self, system: StatedSystem | None, positions: Floats
+    ) -> tuple[Meters, tuple[str, ...]]:
+        """Return the lengths of the units of x, y and z, and notes.
 
-        Returns None if a unit was chosen instead, or in feet.
+        `positions` (n, 3) are points of the file, or a sample, in its units. Raises LidarError as
+        `lidarsim.scene.files.stated_system.stated_meters`.
         """
+        if self.as_stored:
+            return METERS, ()
+        meters, clauses = stated_meters(system, positions, self.unit)
+        return meters, self.named(clauses)
+
+    def epsg_in_meters(self, system: StatedSystem | None, meters: Meters) -> int | None:
+        """Return the code of a stated system in meters, or None if a unit was chosen instead."""
         if system is None or self.unit is not None or meters != METERS:
             return None
         return system.epsg
@@ -312,14 +358,14 @@ class RecordingSource:
     def stream(
         self,
         sweeps: Callable[[], Iterable[Any]],
-        points: Callable[[Any], Read],
+        convert: Callable[[Any], Sweep],
         count: int | None = None,
         **fields: Any,
     ) -> Recording:
-        """Return a recording whose `sweeps()` can be iterated from the first sweep only.
+        """Return a recording whose `sweeps()` can only be iterated from the first sweep.
 
-        `points` converts a sweep; `count` is the number of sweeps, which are counted if it is None;
-        `fields` are fields of `Recording`.
+        `convert` returns the `Sweep` of an item. `count` is the number of sweeps, which are counted
+        if it is None. `fields` are fields of `Recording`.
         """
         if count is None:
             with reading(self.name):
@@ -327,32 +373,28 @@ class RecordingSource:
         next_number = 0
         remaining: Iterator[Any] = iter(())  # sweeps from `next_number`
 
-        def read(number: int) -> Read:
+        def read(number: int) -> Sweep:
             nonlocal next_number, remaining
             if not 0 < next_number <= number:
                 next_number = 0
                 remaining = iter(sweeps())
             sweep = next(islice(remaining, number - next_number, None))
             next_number = number + 1
-            return points(sweep)
+            return convert(sweep)
 
         return self.recording(count, read, **fields)
 
 
-def rings_of(columns: Columns) -> AnyArray | None:
-    """Return the rings (n,) of points, or None without a column of rings."""
-    return _first_column(columns, _RING_COLUMNS)
+def sweep_from_columns(columns: dict[str, Any], **fields: Any) -> Sweep:
+    """Return a sweep with the points in the columns x, y and z, which are removed.
 
-
-def intensities_of(recording: Recording, columns: Columns) -> AnyArray | None:
-    """Return the intensities (n,) of points, or None without a column of intensities."""
-    chosen = recording.intensity_column
-    return _first_column(columns, _INTENSITY_COLUMNS if chosen is None else (chosen,))
-
-
-def _first_column(columns: Columns, names: Iterable[str]) -> AnyArray | None:
-    """Return the first column (n,) that is present, or None."""
-    return next((np.asarray(columns[name]) for name in names if name in columns), None)
+    Raises ValueError if an axis is missing.
+    """
+    columns = with_standard_names(columns, "xyz")
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise ValueError(f"its point coordinates are incomplete ({', '.join(missing)} missing)")
+    points = np.stack([np.asarray(columns.pop(axis), np.float64) for axis in "xyz"], axis=1)
+    return Sweep(points, columns, **fields)
 
 
 def open_cloud(
@@ -369,32 +411,42 @@ def open_cloud(
     intensities if chosen. `load_sweeps` is None for a cloud without sweeps; `fields` are further
     fields of `Recording`.
 
-    LidarError without a choice among several sensors, or for a sensor that the cloud does not have.
+    Raises LidarError if several sensors are present and none was chosen, or for an unknown sensor.
     """
+    fields |= {"intensity_column": intensity, "noise_classes": None}
     if load_sweeps is None:
 
-        def read_part(number: int) -> Read:
+        def read_part(number: int) -> Sweep:
             chunk = next(cloud.chunks(CHUNK_POINTS, number * CHUNK_POINTS))
-            return chunk.positions, chunk.columns, None
+            return Sweep(chunk.positions, chunk.columns)
 
         parts = -(-len(cloud) // CHUNK_POINTS)
-        return Recording(
-            name, parts, read_part, intensity, is_cloud=True, point_count=len(cloud), **fields
-        )
+        return Recording(name, parts, read_part, is_cloud=True, point_count=len(cloud), **fields)
     saved = load_sweeps()
     sensor_index = saved.sensors.index(choose(name, "sensors", saved.sensors, sensor))
     indices = np.flatnonzero(saved.sensor == sensor_index).tolist()
 
-    def read_sweep(number: int) -> Read:
+    def read_sweep(number: int) -> Sweep:
         index = indices[number]
         points = next(saved.points(cloud, index, index + 1))
-        return saved.in_sensor(index, points.positions), points.columns, saved.pose.matrix(index)
+        return Sweep(
+            saved.in_sensor(index, points.positions),
+            points.columns,
+            pose=saved.pose.matrix(index),
+            time_ns=float(saved.begins_ns[index]),
+            sensor=saved.sensors[sensor_index],
+        )
 
-    def read_fired(number: int) -> FiredPoints:
+    def read_fired(number: int) -> Sweep:
         index = indices[number]
         points = next(saved.points(cloud, index, index + 1))
-        positions = saved.as_fired(index, points)
-        return FiredPoints(positions, points.columns, saved.firing_poses(index, points))
+        return Sweep(
+            saved.as_fired(index, points),
+            points.columns,
+            pose=saved.pose.matrix(index),
+            compensated=False,
+            firing_poses=saved.firing_poses(index, points),
+        )
 
     def frame_poses() -> Floats:
         return np.array([saved.pose.matrix(index) for index in indices])
@@ -405,42 +457,21 @@ def open_cloud(
     columns = {column.name for column in cloud.table}
     if ray_columns := columns & {"time", "ray"}:
         poses = saved.pose.positions[indices], saved.pose.quaternions[indices]
-        key = max(ray_columns), "return_number" in columns  # time rather than ray: `_ray_keys`
+        key = max(ray_columns), "return_number" in columns  # time rather than ray, as in ray keys
         fields["firing_key"] = fingerprint(
             key, saved.scans[indices], saved.begins_ns[indices], poses
         )
     if len(saved.knots):
         fields["compensated"] = saved.coordinates == "world"
     fields |= {"times": lambda: times, "frame_poses": frame_poses, "fired": read_fired}
-    return Recording(name, len(indices), read_sweep, intensity, **fields)
-
-
-def _ray_keys(columns: Columns) -> Ints:
-    """Return keys (n,) that differ for all rays of a sweep, and for all returns of a ray."""
-    if "time" in columns:
-        rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
-    else:
-        rays = columns["scan"].astype(np.int64) << 32 | columns["ray"]
-    _, first, ray = np.unique(rays, return_index=True, return_inverse=True)
-    order: Ints = np.arange(len(rays)) - first[ray]  # returns of a ray are together
-    return rays << 8 | columns.get("return_number", order)
-
-
-def positions_of(columns: Columns) -> Floats:
-    """Return the positions (n, 3) in columns x, y and z.
-
-    Raises ValueError without these.
-    """
-    if missing := [axis for axis in "xyz" if axis not in columns]:
-        raise ValueError(f"its point coordinates are incomplete ({', '.join(missing)} missing)")
-    return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
+    return Recording(name, len(indices), read_sweep, **fields)
 
 
 def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> str:
     """Return the chosen sensor or topic, or the only sensor or topic.
 
-    LidarError without a choice among several, or for a name that the recording does not have.
     `kind` is the plural, such as "sensors"; `name` is the recording's name.
+    Raises LidarError if several are present and none was chosen, or for an unknown name.
     """
     available = list(names)
     if chosen is None and len(available) == 1:
@@ -456,14 +487,3 @@ def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> st
         raise SeveralSensorsError(f"{name} contains the {kind} {joined(available)}.", available)
     hint = did_you_mean(chosen, available)
     raise LidarError(f"{name} does not contain {chosen!r}.{hint} {contents}")
-
-
-def take_positions(columns: dict[str, AnyArray]) -> Floats:
-    """Take columns x, y and z out, and return positions (n, 3).
-
-    Raises ValueError without these.
-    """
-    positions = positions_of(columns)
-    for axis in "xyz":
-        del columns[axis]
-    return positions

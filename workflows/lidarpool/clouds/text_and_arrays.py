@@ -2,57 +2,39 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
-
 from lidarsim.base.extras import reading
+from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.ptx import read_ptx
 
-from .file_points import FilePoints, of_scans
-from .recording import METERS, NoiseFilter, Read, Recording, RecordingSource
+from .recording import Recording, RecordingSource
 
 
 def open_file(source: RecordingSource) -> Recording:
     """Open the scans of a .ptx, each in the frame of its scanner, or a cloud that is read at once.
 
-    A chosen unit replaces the units that the header of a cloud names. Of several clouds in a file,
-    the columns that all have are read.
+    A chosen unit replaces the units that the header of a cloud states. If a file contains several
+    clouds, the columns that they share are read.
     """
-    if source.path.suffix.lower() == ".ptx":
-        return _open_ptx(source)
+    read_scans = SCAN_READERS[source.path.suffix.lower()]
+    if read_scans is read_ptx or source.as_stored:
+        with reading(source.name):
+            scans = read_scans(source.path)
+        return source.recording(
+            len(scans),
+            scans.__getitem__,
+            point_count=sum(map(len, scans)) if source.as_stored else None,
+            meters=source.chosen_meters(),
+            stations=[""] * len(scans),
+        )
 
-    def read(_: int) -> Read:
-        scans = SCAN_READERS[source.path.suffix.lower()](source.path)
+    def read(_: int) -> Sweep:
+        scans = read_scans(source.path)
         # Clouds without points have no columns.
-        scans = [scan for scan in scans if len(scan.positions)] or scans
-        units_m = METERS if source.unit is not None else scans[0].units_m or METERS
-        shared = set.intersection(*(set(scan.columns) for scan in scans))
-        columns = {
-            column: np.concatenate([scan.columns[column] for scan in scans])
-            for column in scans[0].columns
-            if column in shared
-        }
-        return np.concatenate([scan.positions for scan in scans]) * units_m, columns, None
+        scans = [scan for scan in scans if len(scan)] or scans
+        sweep = Sweep.joined(scans, only_shared=True)
+        if source.unit is None and scans[0].units_m is not None:
+            sweep = sweep.replace(points=sweep.points * scans[0].units_m)
+        return sweep
 
-    return source.recording(
-        1, read, is_cloud=True, meters=source.chosen_meters(), noise_filter=NoiseFilter()
-    )
-
-
-def _open_ptx(source: RecordingSource) -> Recording:
-    with reading(source.name):
-        scans = read_ptx(source.path)
-
-    def read(number: int) -> Read:
-        scan = scans[number]
-        return scan.positions, scan.columns, scan.pose
-
-    stations = [""] * len(scans)
-    return source.recording(len(scans), read, meters=source.chosen_meters(), stations=stations)
-
-
-def read_points(path: Path) -> FilePoints:
-    """Read the points of a file, with the scanners' positions if it has them."""
-    return of_scans(SCAN_READERS[path.suffix.lower()](path))
+    return source.recording(1, read, is_cloud=True, meters=source.chosen_meters())

@@ -20,12 +20,13 @@ from lidarsim.base.input_files import input_size
 from lidarsim.base.numbered_files import sort_by_number
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from . import pieces, sweep_reader
 from .boxes import Boxes, SweepBoxes
 from .pieces import Entry, PieceRange, WrittenRange
-from .recording import Read, Recording, RecordingSource, SweepFiles
+from .recording import Recording, RecordingSource
 
 MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
 _RESERVED = ("points", "pose", "boxes")  # arrays that are not columns
@@ -195,12 +196,12 @@ def open_folder(source: RecordingSource) -> Recording:
 
 def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
     with reading(source.name):
-        sensors = _sensors(files)
+        sensors = _sensors(source, files)
     return source.of_sensors(sensors)
 
 
-def _sensors(files: list[Path]) -> dict[str, SweepFiles]:
-    """Open the samples of tar files, {sensor: sweeps}: ``KEY.points.npy``, ``KEY.json``, ….
+def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]:
+    """Open the samples of tar files, {sensor: recording}: ``KEY.points.npy``, ``KEY.json``, ….
 
     LidarError if no sample has points.
     """
@@ -218,24 +219,26 @@ def _sensors(files: list[Path]) -> dict[str, SweepFiles]:
             "files named KEY.points.npy."
         )
 
-    def sweeps_of(
+    def recording(
         samples: list[tuple[float | None, Path, dict[str, tuple[int, int]]]],
-    ) -> SweepFiles:
-        def read(number: int) -> Read:
-            _, path, members = samples[number]
+    ) -> Recording:
+        def read(number: int) -> Sweep:
+            time_ns, path, members = samples[number]
             arrays = {
                 name.removesuffix(".npy"): read_npy(_slice(path, *span), name)
                 for name, span in members.items()
                 if name.endswith(".npy") and name != "boxes.npy"
             }
             pose = arrays.pop("pose", None)
-            return arrays.pop("points"), arrays, pose
+            return Sweep(arrays.pop("points"), arrays, pose=pose, time_ns=time_ns)
 
         times = [time for time, _, _ in samples]
         times_ns = None if None in times else np.array(times, np.float64)
-        return SweepFiles(len(samples), read, times_ns)
+        return source.recording(
+            len(samples), read, times=None if times_ns is None else times_ns.tolist
+        )
 
-    return {sensor: sweeps_of(samples) for sensor, samples in samples_of_sensor.items()}
+    return {sensor: recording(samples) for sensor, samples in samples_of_sensor.items()}
 
 
 def _samples(path: Path) -> dict[str, dict[str, tuple[int, int]]]:

@@ -49,13 +49,6 @@ RESIDUAL_SCALE = 6.0  # end of the scale, in median absolute deviations: about f
 MIN_DISTANCE_M = 0.001  # end of the scale of distances
 
 
-class MeasuredPoints(NamedTuple):
-    """Points of a cloud, and their distances to the compared cloud."""
-
-    points: Floats  # (n, 3), meters
-    distances: Floats  # (n,), meters
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison:
     """Result of `compare`, which is printed as a table."""
@@ -67,7 +60,9 @@ class Comparison:
     residuals: Floats  # (k,): of all cells with a return in both, or of a choice, meters
     distances: tuple[Floats, Floats]  # distances from A's points to B, and from B's to A, meters
     intensities: tuple[Floats, Floats]  # intensities in A and B that are compared
-    measured_points: Sequence[MeasuredPoints]  # points of A and of B: one pair of sweeps, or all
+    # Points of A and of B, of the first pair of sweeps that has any, or of whole clouds, meters.
+    # Their distances are the first in `distances`.
+    points: Sequence[Floats]
 
     def __repr__(self) -> str:
         return rendered("comparison.txt", report=self.figures).rstrip("\n")
@@ -342,23 +337,26 @@ def draw_above(comparison: Comparison) -> Page:
     page.title(
         "Top view", f"{which}colored by the distance to the nearest point of the other cloud"
     )
-    measured = comparison.measured_points
-    lower = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points, _ in measured], axis=0)
-    upper = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points, _ in measured], axis=0)
+    clouds = comparison.points
+    distances = [d[: len(points)] for d, points in zip(comparison.distances, clouds, strict=True)]
+    lower = np.min([np.quantile(points[:, :2], 0.01, axis=0) for points in clouds], axis=0)
+    upper = np.max([np.quantile(points[:, :2], 0.99, axis=0) for points in clouds], axis=0)
     half_side = 1.06 * max(float((upper - lower).max()), 1e-3) / 2
     limits = (lower + upper) / 2 + half_side * np.array([[-1.0], [1.0]])
     width = 0.36
     chart_height = 0.36 * WIDTH / height
-    scale = _distance_scale(np.concatenate([distances for _, distances in measured]))
-    for number, cloud in enumerate(measured):
+    scale = _distance_scale(np.concatenate(distances))
+    for number, points in enumerate(clouds):
         frame = (LEFT + number * (width + 0.045), 0.12, width, chart_height)
         axes = page.map_chart(frame, limits, tick_count=6)
         if number:
             axes.set_ylabel("")
-        _scatter_points(page, axes, cloud, scale)
+        _scatter_points(page, axes, points, distances[number], scale)
         page.heading(axes, ("A, distance to B", "B, distance to A")[number])
-    ramp = theme.mapped(DISTANCE_COLORS, np.linspace(0, 1, 256))
-    page.color_bar(ramp, scale, "distance, m", (0.875, 0.12, 0.014, chart_height))
+    frame = (0.875, 0.12, 0.014, chart_height)
+    page.color_bar(
+        theme.mapped(DISTANCE_COLORS, np.linspace(0, 1, 256)), scale, "distance, m", frame
+    )
     return page
 
 
@@ -369,14 +367,16 @@ def _distance_scale(distances: Floats) -> LogNorm:
     return LogNorm(min_m, max_m)
 
 
-def _scatter_points(page: Page, axes: Axes, cloud: MeasuredPoints, scale: LogNorm) -> None:
-    """Draw points of a cloud from above, colored by distance, the most distant on top."""
-    rows = even_indices(len(cloud.points), MAX_DOTS)
-    rows = rows[np.argsort(cloud.distances[rows])]
+def _scatter_points(
+    page: Page, axes: Axes, points: Floats, distances: Floats, scale: LogNorm
+) -> None:
+    """Draw points (n, 3) from above, colored by distances (n,), the most distant on top."""
+    rows = even_indices(len(points), MAX_DOTS)
+    rows = rows[np.argsort(distances[rows])]
     axes.scatter(
-        cloud.points[rows, 0],
-        cloud.points[rows, 1],
-        c=np.maximum(cloud.distances[rows], scale.vmin or 0.0),
+        points[rows, 0],
+        points[rows, 1],
+        c=np.maximum(distances[rows], scale.vmin or 0.0),
         cmap=DISTANCE_COLORS,
         norm=scale,
         s=(1.6 if len(rows) > 40_000 else 3) * page.unit**2,

@@ -9,15 +9,18 @@ points.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import NamedTuple
 
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Indices, Ints
 from lidarsim.base.errors import LidarError
+from lidarsim.base.extras import install_command
 from lidarsim.base.words import plural
+from lidarsim.columns.sweep import Sweep
 
-from ..clouds.recording import RecordedPoints
+from .compared_sweep import RAY_KEY
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings close to each other
 _STEP_TOLERANCE = 0.15  # relative difference of single steps from their mean, at most
@@ -79,14 +82,23 @@ class _PolarSweep:
     ring_elevation: Floats  # (r,): medians, degrees
 
     @classmethod
-    def from_points(cls, sweep: RecordedPoints, name: str) -> _PolarSweep:
+    def from_points(cls, sweep: Sweep, name: str) -> _PolarSweep:
         """Convert a sweep into a range image.
 
         LidarError if the sweep has no rings, or zero is not the sensor: the rings are not cones
         around zero, or the points are too far away.
         """
-        if sweep.rings is None:
+        has_column = "channel" in sweep.columns
+        if not has_column and find_spec("scipy") is None:
+            raise LidarError(
+                f"{name} has no ring column, and finding its rings requires scipy. Run "
+                f"`{install_command('lidarpool[fit]')}`"
+            )
+        rings = sweep.rings
+        if rings is None:
             raise LidarError(f"{name} has no ring column, such as `ring` or `channel`")
+        if not has_column and (rings < 0).any():  # some points belong to no ring
+            return cls.from_points(sweep.select(rings >= 0), name)
         ranges = np.linalg.norm(sweep.points, axis=1)
         if np.median(ranges) > _MAX_RANGE_M:
             raise LidarError(
@@ -95,7 +107,7 @@ class _PolarSweep:
             )
         x, y, z = sweep.points.T
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
-        rings, index = np.unique(sweep.rings, return_inverse=True)
+        rings, index = np.unique(rings, return_inverse=True)
         order = np.lexsort((elevation, index))
         offsets = np.searchsorted(index[order], np.arange(len(rings) + 1))
         counts = np.diff(offsets)
@@ -115,7 +127,7 @@ class _PolarSweep:
             elevation=elevation,
             ranges=ranges,
             ring_index=index,
-            intensities=sweep.intensities,
+            intensities=sweep.intensity,
             rings=rings,
             ring_elevation=middle,
         )
@@ -184,7 +196,7 @@ class _PolarSweep:
 
 
 def range_images(
-    a: RecordedPoints, b: RecordedPoints, names: tuple[str, str], azimuth_deg: float | None = None
+    a: Sweep, b: Sweep, names: tuple[str, str], azimuth_deg: float | None = None
 ) -> RangeImages:
     """Put two sweeps of a sensor into the same cells.
 
@@ -274,16 +286,16 @@ class RayPairs(NamedTuple):
     rings: Ints  # (k,)
 
 
-def pair_rays(a: RecordedPoints, b: RecordedPoints) -> RayPairs:
+def pair_rays(a: Sweep, b: Sweep) -> RayPairs:
     """Pair the returns of two sweeps with the same rays."""
-    assert a.rays is not None and b.rays is not None and a.rings is not None and b.rings is not None
-    _, first, ray = np.unique(np.append(a.rays, b.rays), return_index=True, return_inverse=True)
+    keys, channels = (np.append(a.columns[name], b.columns[name]) for name in (RAY_KEY, "channel"))
+    _, first, ray = np.unique(keys, return_index=True, return_inverse=True)
     values = np.full((2, 2, len(first)), np.nan)
     for index, sweep, columns in ((0, a, ray[: len(a)]), (1, b, ray[len(a) :])):
         values[index, 0, columns] = np.linalg.norm(sweep.points, axis=1)
-        values[index, 1, columns] = np.nan if sweep.intensities is None else sweep.intensities
+        values[index, 1, columns] = np.nan if sweep.intensity is None else sweep.intensity
     points = np.concatenate([a.points, b.points])[first]
-    return RayPairs(values, points, np.append(a.rings, b.rings)[first])
+    return RayPairs(values, points, channels[first])
 
 
 def images_of_rays(
@@ -294,7 +306,7 @@ def images_of_rays(
     Each cell shows one of its rays. Raises the same errors as `range_images`.
     """
     ray_index = np.arange(len(pairs.rings), dtype=np.float64)
-    all_rays = RecordedPoints(pairs.points, pairs.rings, intensities=ray_index)
+    all_rays = Sweep(pairs.points, {"channel": pairs.rings, "intensity": ray_index})
     images = range_images(all_rays, all_rays, names, azimuth_deg)
     ray_of_cell = np.nan_to_num(images.images[0, 1], nan=-1).astype(int)
     values = np.pad(pairs.values, ((0, 0), (0, 0), (0, 1)), constant_values=np.nan)  # -1: no ray

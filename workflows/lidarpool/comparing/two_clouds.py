@@ -20,13 +20,15 @@ from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.sweep import Sweep
 
 from ..base.neighbors import nearest
-from ..clouds.recording import RecordedPoints, Recording, SeveralSensorsError
+from ..clouds.recording import Recording, SeveralSensorsError
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..recordings.opening import open_recording
-from .comparison import CELLS, RESIDUALS, Comparison, MeasuredPoints
+from .compared_sweep import compared_sweep, rings_note
+from .comparison import CELLS, RESIDUALS, Comparison
 from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range_images
 
 MAX_POINTS = 10_000_000  # points of each cloud in memory
@@ -129,8 +131,11 @@ def compare(
             comparing.note(_motion_note(*sorted((first, second), key=lambda r: not r.compensated)))
         budget = MAX_VALUES // len(pairs)
         for number_a, number_b in pairs:
-            pair = first.read_points(number_a), second.read_points(number_b)
-            comparing.add_sweeps((number_a, number_b), *pair, budget)
+            sweep_a, sweep_b = (
+                compared_sweep(recording, number, with_rays=comparing.has_same_rays)
+                for recording, number in ((first, number_a), (second, number_b))
+            )
+            comparing.add_sweeps((number_a, number_b), sweep_a, sweep_b, budget)
         return comparing.result()
     cloud = first if first.is_cloud else second
     if sweeps or match == "time":
@@ -210,9 +215,9 @@ def _sweep_times(recording: Recording) -> Floats:
 
     LidarError if the recording has no times.
     """
-    if recording.times is None:
+    if recording.stamps_ns is None:
         raise LidarError(f"{recording.name} has no sweep times. Omit `--match time`.")
-    return np.fromiter(recording.times(), np.float64)
+    return recording.stamps_ns
 
 
 class _CellPairs(NamedTuple):
@@ -245,11 +250,11 @@ class _Comparing:
         self.pairs: list[tuple[int, int]] = []  # numbers of sweeps; empty for whole clouds
         self.point_counts = np.zeros(2, np.int64)
         self.images: RangeImages | None = None  # of the first pair that has any
-        self.pictured: tuple[int, int] | None = None  # pair of sweeps of `measured_points`
+        self.pictured: tuple[int, int] | None = None  # pair of sweeps of `points`
         self.empty_pairs = 0  # number of pairs of which a sweep has no points
         # {why pairs of sweeps have no range images: number of these pairs}
         self.without_images: Counter[str] = Counter()
-        self.measured_points: list[MeasuredPoints] = []
+        self.points: list[Floats] = []  # of A and of B, of the first pair that has any
         self.cells: list[_CellPairs] = []
         # pairs from A, and from B
         self.nearest: tuple[list[_NearestPairs], list[_NearestPairs]] = ([], [])
@@ -263,25 +268,25 @@ class _Comparing:
         if text not in self.notes:
             self.notes.append(text)
 
-    def read_cloud(self, recording: Recording, max_points: int) -> RecordedPoints:
+    def read_cloud(self, recording: Recording, max_points: int) -> Sweep:
         """Read points in the world frame: all, or about `max_points`, chosen evenly."""
         count = recording.point_count
         share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
         for number in range(recording.count):
-            part = recording.read_points(number, in_world=True)
-            parts.append(part.part(even_indices(len(part), round(share * len(part)))))
+            part = compared_sweep(recording, number, in_world=True)
+            if share < 1:
+                part = part.select(even_indices(len(part), round(share * len(part))))
+            parts.append(part)
         if share == 1 or not parts:
-            return RecordedPoints.joined(parts)
+            return Sweep.joined(parts)
         self.note(
             f"{100 * share:.3g} % of the {count:,} points in {recording.name} are compared, "
             "sampled evenly. Distances to this cloud are therefore overestimated"
         )
-        return RecordedPoints.joined(parts)
+        return Sweep.joined(parts)
 
-    def add_sweeps(
-        self, numbers: tuple[int, int], a: RecordedPoints, b: RecordedPoints, budget: int
-    ) -> None:
+    def add_sweeps(self, numbers: tuple[int, int], a: Sweep, b: Sweep, budget: int) -> None:
         """Compare two sweeps in the sensor frame, at most `budget` cells and points of each."""
         if max(len(a), len(b)) > budget:
             self.note(
@@ -294,21 +299,21 @@ class _Comparing:
             self.empty_pairs += 1
         self.add_points(a, b, budget)
 
-    def add_points(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+    def add_points(self, a: Sweep, b: Sweep, budget: int) -> None:
         """Compare distances and intensities of two sweeps or clouds, at most `budget` of each."""
         self.point_counts += len(a), len(b)
         if not len(a) or not len(b):
             return
         for pairs, cloud, reference in zip(self.nearest, (a, b), (b, a), strict=True):
-            chosen = cloud.part(even_indices(len(cloud), budget))
+            chosen = cloud.select(even_indices(len(cloud), budget))
             distance, index = nearest(chosen.points, reference.points)
-            if len(self.measured_points) < 2:
-                self.measured_points.append(MeasuredPoints(chosen.points, distance))
-            intensity = chosen.intensities
-            if intensity is None or reference.intensities is None:
+            if len(self.points) < 2:
+                self.points.append(chosen.points)
+            intensity = chosen.intensity
+            if intensity is None or reference.intensity is None:
                 pairs.append(_NearestPairs(distance, *np.full((2, len(distance)), np.nan)))
             else:
-                pairs.append(_NearestPairs(distance, intensity, reference.intensities[index]))
+                pairs.append(_NearestPairs(distance, intensity, reference.intensity[index]))
 
     @property
     def has_same_rays(self) -> bool:
@@ -316,7 +321,7 @@ class _Comparing:
         first, second = self.recordings
         return bool(first.firing_key) and first.firing_key == second.firing_key
 
-    def _add_ranges(self, a: RecordedPoints, b: RecordedPoints, budget: int) -> None:
+    def _add_ranges(self, a: Sweep, b: Sweep, budget: int) -> None:
         """Compare the ranges of two sweeps, ray by ray if they have the same rays, else by cell.
 
         Sweeps of the same rays need no range images. Without either, a note is added.
@@ -333,14 +338,14 @@ class _Comparing:
         except LidarError as error:
             self.without_images[str(error)] += 1
         if images is not None:
+            for note in (*rings_note(first, a), *rings_note(second, b), *images.notes):
+                self.note(note)
             self._add_image_cells(images, budget)
         elif rays is not None:
             self._add_rays(rays, budget)
 
     def _add_image_cells(self, images: RangeImages, budget: int) -> None:
         """Compare the cells, or the rays, of the range images of two sweeps."""
-        for note in images.notes:
-            self.note(note)
         self.images = self.images or images
         in_a, in_b = np.isfinite(images.compared[:, 0])
         self._count_cells(images, in_a, in_b)
@@ -392,7 +397,7 @@ class _Comparing:
                 raise LidarError(
                     f"{recording.name} contains no points, so there is nothing to compare.{listed}"
                 )
-        if not self.measured_points:
+        if not self.points:
             raise LidarError("None of the pairs has points in both sweeps. Choose other sweeps.")
         from_a, from_b = (
             _NearestPairs(*map(np.concatenate, zip(*pairs, strict=True))) for pairs in self.nearest
@@ -426,9 +431,7 @@ class _Comparing:
             "distances": self._distance_figures(from_a.distance, from_b.distance),
         }
         distances = from_a.distance, from_b.distance
-        return Comparison(
-            figures, self._images(), residuals, distances, intensities, self.measured_points
-        )
+        return Comparison(figures, self._images(), residuals, distances, intensities, self.points)
 
     def _source_figures(self) -> dict[str, Any]:
         """Return the name and the sizes of A and B, and the sweeps that were compared."""

@@ -26,6 +26,7 @@ from lidarsim.base.extras import install_command
 from lidarsim.base.storage import Storage
 from lidarsim.base.validation import checked
 from lidarsim.base.words import did_you_mean, joined, plural
+from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import unsealed
@@ -37,7 +38,7 @@ from ..clouds.sweep_reader import Reader
 from ..clouds.writing import Format
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
-from .sweep_data import Sweep
+from .sweep_data import sweep_of_job
 
 _REQUESTS = 8  # sweeps that are read at a time, from a URL or a disk
 _OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
@@ -229,7 +230,7 @@ class _OpenJob:
         except Exception as error:  # libraries of five formats raise many kinds of errors
             file = self.storage.path(self.reader.last or self.reader.files(sweep)[0])
             raise _unreadable(file, error) from error
-        return Sweep.from_points(self.job, self.sweeps, sweep, points, self.boxes, sweep)
+        return sweep_of_job(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
 
 @checked

@@ -15,8 +15,7 @@ import torch.distributed
 import torch.utils.data
 
 from lidarsim.base.errors import LidarError
-
-from .sweep_data import Sweep
+from lidarsim.columns.sweep import Sweep
 
 
 class ReadSweeps(Protocol):
@@ -106,7 +105,7 @@ def tensors(sweep: Sweep) -> dict[str, Any]:
         name: array.astype(np.int64) if array.dtype.kind in "iu" else array
         for name, array in sweep.columns.items()
     }
-    arrays |= {"points": sweep.points, "pose": sweep.pose, "boxes": boxes.rows}
+    arrays |= {"points": sweep.points, "pose": np.asarray(sweep.pose), "boxes": boxes.rows}
     arrays["box_objects"] = boxes.objects.astype(np.int64)
     return {
         **{name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()},

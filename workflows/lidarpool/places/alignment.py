@@ -21,12 +21,14 @@ import numpy as np
 from lidarsim.base.arrays import Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
+from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
+from ..clouds.rings import MIN_RINGS, elevations
 from .lost_pulses import Answering, lost_pulses
 from .motion import Motion, Step
 from .odometry import RecordedPoses
-from .recorded_sweeps import MIN_RINGS, RecordedSweep, RecordedSweeps, elevations
+from .recorded_sweeps import RecordedSweeps
 from .voxel_planes import VoxelPlanes
 
 _MAP_POINTS = 40_000  # points of a sweep in the map that is aligned to
@@ -127,7 +129,7 @@ class Alignment:
         step_s = float(self.times_s[second] - self.times_s[first])
         return Step.between(self.poses[first], self.poses[second]), step_s
 
-    def compensated(self, sweep: RecordedSweep, number: int) -> tuple[Floats, Floats]:
+    def compensated(self, sweep: Sweep, number: int) -> tuple[Floats, Floats]:
         """Return the points (n, 3) of a sweep in the sensor frame at its stamp, calibrated.
 
         The second array (n, 3) has the positions of the sensor when it fired, in the same frame.
@@ -143,7 +145,7 @@ class Alignment:
             origins[rows] = shares[:, None] * step.translation
         return compensated, origins
 
-    def fired(self, sweep: RecordedSweep, number: int) -> tuple[Floats, FiringPoses] | None:
+    def fired(self, sweep: Sweep, number: int) -> tuple[Floats, FiringPoses] | None:
         """Return the points (n, 3) of a sweep as fired, calibrated, and the poses of their firings.
 
         Returns None if the points are compensated.
@@ -170,12 +172,12 @@ class Alignment:
                 step, step_s = self.step(number, backward=backward)
                 yield rows, step, times_s[rows] / step_s
 
-    def _calibrated(self, sweep: RecordedSweep) -> Floats:
+    def _calibrated(self, sweep: Sweep) -> Floats:
         """Return the points (n, 3) of a sweep with the offsets of their rings."""
         points = sweep.points
         if not self.ring_offsets.any():
             return points
-        range_offset_m, elevation_offset, azimuth_offset = self.ring_offsets[sweep.ring].T
+        range_offset_m, elevation_offset, azimuth_offset = self.ring_offsets[sweep.columns["row"]].T
         range_m = np.linalg.norm(points, axis=1) + range_offset_m
         elevation = elevations(points) + elevation_offset
         azimuth = np.arctan2(points[:, 1], points[:, 0]) + azimuth_offset
@@ -232,7 +234,7 @@ class AlignedSweeps:
         aligned = self.aligned(lost, number)._replace(gap_range_m=gap_range_m)
         return self.aligned(sweep, number), aligned
 
-    def aligned(self, sweep: RecordedSweep, number: int) -> AlignedSweep:
+    def aligned(self, sweep: Sweep, number: int) -> AlignedSweep:
         """Return points of a sweep at their places."""
         points, origins = self.alignment.compensated(sweep, number)
         pose = self.alignment.poses[number]
@@ -240,9 +242,9 @@ class AlignedSweeps:
             points=points,
             world=placed(points, pose),
             origins=placed(origins, pose),
-            ring=sweep.ring,
-            intensities=sweep.intensities,
-            labels=sweep.labels,
+            ring=sweep.columns["row"],
+            intensities=sweep.intensity,
+            labels=sweep.columns.get("label"),
         )
 
 
@@ -299,7 +301,7 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
     window = _fastest(poses)
     numbers = range(sweeps.count)[window]
     samples = [_sample(sweeps.read(number), number) for number in numbers]
-    is_timed = all(sample.time_s is not None for sample in samples)
+    is_timed = all("time_s" in sample.columns for sample in samples)
     if sweeps.is_compensated:
         candidates = [Motion.COMPENSATED]
     elif is_timed:
@@ -326,7 +328,7 @@ def _motion(sweeps: RecordedSweeps, poses: RecordedPoses, voxel_m: float) -> Mot
 
 def _filled_voxels(
     name: str,
-    samples: Sequence[RecordedSweep],
+    samples: Sequence[Sweep],
     poses: RecordedPoses,
     ring_count: int,
     voxel_m: float,
@@ -338,7 +340,7 @@ def _filled_voxels(
     Poses by registration are aligned first. Poses that are given are not: alignment would bring
     even mirrored sweeps together. Far points, which are alone in their voxels, do not count.
     """
-    scaled = [replace(sample, points=sample.points * scale) for sample in samples]
+    scaled = [sample.replace(points=sample.points * scale) for sample in samples]
     alignment = Alignment.unaligned(poses, voxel_m, motion, ring_count)
     numbers = range(len(scaled))
     rounds = 0 if poses.are_given else _TRIAL_ROUNDS
@@ -368,7 +370,7 @@ def _fastest(poses: RecordedPoses) -> slice:
 
 def _rounds(
     name: str,
-    samples: Sequence[RecordedSweep],
+    samples: Sequence[Sweep],
     alignment: Alignment,
     mapped: Sequence[int],
     rounds: int,
@@ -380,13 +382,13 @@ def _rounds(
     return alignment
 
 
-def _sample(sweep: RecordedSweep, number: int) -> RecordedSweep:
+def _sample(sweep: Sweep, number: int) -> Sweep:
     """Return some points of a sweep, in an order without a pattern."""
     order = np.random.default_rng(number).permutation(len(sweep))[:_MAP_POINTS]
-    return sweep.part(order)
+    return sweep.select(order)
 
 
-def _voxel_m(samples: Sequence[RecordedSweep]) -> float:
+def _voxel_m(samples: Sequence[Sweep]) -> float:
     """Return the edge of the voxels of the map, meters."""
     ranges = np.concatenate([np.linalg.norm(sample.points, axis=1) for sample in samples])
     return float(np.clip(_VOXEL_SHARE * np.median(ranges), _MIN_VOXEL_M, _MAX_VOXEL_M))
@@ -394,7 +396,7 @@ def _voxel_m(samples: Sequence[RecordedSweep]) -> float:
 
 def _planes(
     name: str,
-    samples: Sequence[RecordedSweep],
+    samples: Sequence[Sweep],
     alignment: Alignment,
     mapped: Sequence[int],
 ) -> VoxelPlanes:
@@ -435,12 +437,12 @@ class _PlanePoints:
 
 
 def _registered(
-    alignment: Alignment, sample: RecordedSweep, planes: VoxelPlanes, number: int
+    alignment: Alignment, sample: Sweep, planes: VoxelPlanes, number: int
 ) -> tuple[Floats, _PlanePoints]:
     """Return the pose of a sweep that brings its points to planes, and these points."""
     from scipy.spatial.transform import Rotation
 
-    some = sample.part(np.arange(min(len(sample), _SWEEP_POINTS)))
+    some = sample.select(slice(_SWEEP_POINTS))
     points, _ = alignment.compensated(some, number)
     pose = alignment.poses[number].copy()
     voxel_m = alignment.voxel_m
@@ -462,7 +464,7 @@ def _registered(
 
 def _aligned(
     alignment: Alignment,
-    samples: Sequence[RecordedSweep],
+    samples: Sequence[Sweep],
     planes: VoxelPlanes,
     mapped: Sequence[int],
 ) -> Alignment:
@@ -478,7 +480,7 @@ def _aligned(
         if len(on_planes.distances):
             distance_m[number] = np.median(np.abs(on_planes.distances))
         if number in calibrating and ring_count >= MIN_RINGS:
-            ring = sample.ring[: len(on_planes.rows)][on_planes.rows]
+            ring = sample.columns["row"][: len(on_planes.rows)][on_planes.rows]
             design = _ring_design(on_planes, poses[number])
             weighted = design * on_planes.weights[:, None]
             for first in range(3):

@@ -27,6 +27,7 @@ from lidarsim.base.signatures import ReadableSignature
 from lidarsim.base.validation import checked
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.scene.colors import Colors, as_srgb
 from lidarsim.scene.scene import Scene
@@ -35,7 +36,7 @@ from lidarsim.sensor.models import SensorModel, read_model
 
 from ..clouds.folder import result_folder, staging
 from ..clouds.kitti import CALIBRATION_FILE
-from ..clouds.recording import FiredPoints, Read, Recording
+from ..clouds.recording import Recording
 from ..columns.parts import StoredCloud
 from ..comparing.fit import Fit, fit
 from ..recordings.opening import open_recording
@@ -51,7 +52,7 @@ from .motion import Motion
 from .odometry import RecordedPoses, find_poses
 from .place import Observations
 from .processes import mapping
-from .recorded_sweeps import RecordedSweep, RecordedSweeps, RecordingChoice, Rotation
+from .recorded_sweeps import RecordedSweeps, Rotation
 from .reflectances import IntensityModel, Reflectances, Response, fit_response
 from .stretch_tasks import (
     BuildTask,
@@ -289,7 +290,7 @@ def twin(
     need("scipy", "twin", "Reconstructing a recording")
     base = None if model is None else read_model(model)  # before the recording, which takes long
     if isinstance(recording, (str, Path)):
-        recorded = RecordedSweeps.of_choice(RecordingChoice(Path(recording), sensor, intensity))
+        recorded = RecordedSweeps.open(Path(recording), sensor, intensity)
     else:
         if client is not None:
             raise LidarError(
@@ -298,7 +299,7 @@ def twin(
             )
         if not isinstance(recording, Recording):
             recording = open_recording(recording, sensor, intensity, name="the recording")
-        recorded = RecordedSweeps.of_recording(recording)
+        recorded = RecordedSweeps.from_recording(recording)
     _check(recorded)
     if base is None and not len(recorded.elevation_rad):
         reason = " ".join(recorded.notes) or f"{recorded.recording.name} has no rings."
@@ -334,9 +335,9 @@ def _stated(recorded: RecordedSweeps, trajectory: Path | None) -> list[object]:
     Nothing is the same as a recording in memory.
     """
     source = recorded.source
-    if not isinstance(source, RecordingChoice):
+    if isinstance(source, Recording):
         return [secrets.token_hex()]
-    files = [source.path]
+    files = [source[0]]
     if trajectory is not None:
         files += [trajectory, trajectory.with_name(CALIBRATION_FILE)]
     inner = chain.from_iterable(sorted(file.rglob("*")) for file in files if file.is_dir())
@@ -380,7 +381,7 @@ class _Building:
             voxel_m=self.voxel_m,
             drawn_share=0.0,
         )
-        is_shared = isinstance(recorded.source, RecordingChoice)
+        is_shared = not isinstance(recorded.source, Recording)
         with mapping(self.client, len(stretches) if is_shared else 1) as run:
             task = replace(task, alignment=self._aligned(run, task, stretches))
             built = self._built(run, task, stretches)
@@ -698,37 +699,37 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
     are_energies = response is not None and response.model is IntensityModel.ENERGIES
     white = None if response is None else response.white
 
-    def columns(sweep: RecordedSweep) -> dict[str, Any]:
-        found: dict[str, Any] = {"ring": recorded.ring_count - 1 - sweep.ring}
-        if sweep.intensities is not None:
-            # As an energy, white at 10 m is 1.
-            found["intensity"] = sweep.intensities / (white if are_energies and white else 1)
-        return found
+    def with_points(sweep: Sweep, points: Floats, **fields: Any) -> Sweep:
+        intensity = sweep.intensity
+        if intensity is not None:  # as an energy, white at 10 m is 1
+            intensity = intensity / (white if are_energies and white else 1)
+        channel = recorded.ring_count - 1 - sweep.columns["row"]
+        return sweep.with_columns(channel=channel, intensity=intensity).replace(
+            points=points, **fields
+        )
 
-    def fired(index: int) -> FiredPoints:
+    def fired(index: int) -> Sweep:
         number = int(chosen[index])
         sweep = recorded.read(number)
         as_fired = sweeps.alignment.fired(sweep, number)
         assert as_fired is not None
         points, firing_poses = as_fired
-        return FiredPoints(points, columns(sweep), firing_poses)
+        return with_points(sweep, points, firing_poses=firing_poses)
 
-    def read(index: int) -> Read:
+    def compensated(index: int) -> Sweep:
         number = int(chosen[index])
         sweep = recorded.read(number)
-        if is_compensated:
-            return sweeps.aligned(sweep, number).points, columns(sweep), None
-        points, found, _ = fired(index)
-        return points, found, None
+        return with_points(sweep, sweeps.aligned(sweep, number).points)
 
     is_compensated = sweeps.alignment.motion is Motion.COMPENSATED
     recording = Recording(
         sweeps.name,
         len(chosen),
-        read,
+        compensated if is_compensated else fired,
         energies=are_energies,
         frame_poses=lambda: poses,
         fired=None if is_compensated else fired,
+        noise_classes=None,
     )
     pose = poses if is_compensated else None
     return fit(recording, scene=scene, pose=pose, white=None if are_energies else white)

@@ -12,9 +12,9 @@ from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 from lidarview.render import theme
 from lidarview.render.picture_page import Page, label_logarithms
 
+from ..clouds.rings import elevations
 from .alignment import AlignedSweep, AlignedSweeps
 from .place import Place
-from .recorded_sweeps import elevations
 from .reflectances import Reflectances
 
 _WIDTH = 1600

@@ -14,8 +14,8 @@ import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 
+from ..clouds.rings import elevations
 from .alignment import AlignedSweeps
-from .recorded_sweeps import elevations
 
 _COLUMNS = 1024  # of an image: wider than the step of azimuth of nearly all sensors
 _ROW_RAD = np.radians(0.5)  # of an image of a sensor without rings

@@ -11,23 +11,20 @@ from dataclasses import replace
 import numpy as np
 
 from lidarsim.base.arrays import Ints
+from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from ..clouds.recording import Columns
-from ..scenario.point_files import CLASSES
 from ..scenario.point_scene import CLASS_MATERIAL, surfel_faces
 
-OBJECTS = ("object", "instance")  # names of columns; the first that a recording has is read
 OBJECT_NAME = "object "  # and the number in the recording
 _CLASS_BITS = 16
 _MAX_CLASS = (1 << _CLASS_BITS) - 1
 
 
-def labels_of(columns: Columns) -> Ints | None:
+def labels_of(sweep: Sweep) -> Ints | None:
     """Return the labels (n,) of the points of a sweep, or None without classes and objects."""
-    classes = next((columns[name] for name in CLASSES if name in columns), None)
-    objects = next((columns[name] for name in OBJECTS if name in columns), None)
+    classes, objects = sweep.classes, sweep.objects
     known = objects if classes is None else classes
     if known is None:
         return None

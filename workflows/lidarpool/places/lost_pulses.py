@@ -12,10 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.arrays import AnyArray, Bools, Floats, Ints
 from lidarsim.base.even_samples import even_indices
+from lidarsim.columns.sweep import Sweep
 
-from .recorded_sweeps import RecordedSweep, RecordedSweeps, elevations
+from ..clouds.rings import elevations
+from .recorded_sweeps import RecordedSweeps, ring_starts
 
 _MIN_STEPS = 1.6  # of a gap that holds a lost pulse: motion within a sweep stretches steps
 _MAX_STEPS = 3.0  # of a ring's own step, over the typical step
@@ -34,8 +36,8 @@ _MIN_RINGS = 0.05  # share of the rings that return in a sector; with less, no p
 
 
 def lost_pulses(
-    sweep: RecordedSweep, elevation_rad: Floats, answering: Answering, moved_m: float
-) -> tuple[RecordedSweep, Floats]:
+    sweep: Sweep, elevation_rad: Floats, answering: Answering, moved_m: float
+) -> tuple[Sweep, Floats]:
     """Return the lost pulses of a sweep, as points a meter away, and the ranges around their gaps.
 
     Parameters
@@ -57,7 +59,7 @@ def lost_pulses(
         where the gap does, meters; NaN of a wide gap, or between different surfaces.
     """
     if not len(elevation_rad) or len(sweep) < _MIN_RETURNS:
-        return sweep.part(np.zeros(len(sweep), bool)), np.empty(0)
+        return sweep.select(slice(0)), np.empty(0)
     gaps = _Gaps.of_sweep(sweep)
     lost = gaps.between(moved_m)
     silent = np.setdiff1d(np.arange(len(elevation_rad)), gaps.ring)
@@ -70,24 +72,27 @@ def lost_pulses(
     directions = np.stack(
         [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1
     )
-    time_s = None if sweep.time_s is None else _times_s(sweep, azimuth)
-    pulses = RecordedSweep(directions, ring, None, None, time_s, sweep.start_rad)
+    columns: dict[str, AnyArray] = {"row": ring}
+    if "time_s" in sweep.columns:
+        columns["time_s"] = _times_s(sweep, azimuth)
+    if "start_rad" in sweep.columns:
+        columns["start_rad"] = ring_starts(sweep, len(elevation_rad))[ring]
+    pulses = Sweep(directions, columns)
     received = _received(gaps, len(elevation_rad))[_sectors(azimuth)]
     chosen = received & answering.cells[_cells(pulses)]
-    return pulses.part(chosen), range_m[chosen]
+    return pulses.select(chosen), range_m[chosen]
 
 
-def _times_s(sweep: RecordedSweep, azimuth: Floats) -> Floats:
+def _times_s(sweep: Sweep, azimuth: Floats) -> Floats:
     """Return the times (k,) of pulses of azimuths (k,): of the returns nearest in azimuth."""
-    assert sweep.time_s is not None
     azimuths = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
     order = np.argsort(azimuths)
     turned = (azimuth + np.pi) % (2 * np.pi) - np.pi
     index = np.searchsorted(azimuths[order], turned).clip(max=len(order) - 1)
-    return np.asarray(sweep.time_s[order[index]])
+    return np.asarray(sweep.columns["time_s"][order[index]])
 
 
-def firings_per_turn(sweep: RecordedSweep) -> int:
+def firings_per_turn(sweep: Sweep) -> int:
     """Return the number of steps of a revolution, by the typical step between returns of a ring."""
     return round(2 * np.pi / float(np.median(_Gaps.of_sweep(sweep).step_rad)))
 
@@ -113,12 +118,12 @@ class _Gaps(NamedTuple):
     step_rad: Floats  # (n,): between the azimuths of neighboring pulses of the ring
 
     @classmethod
-    def of_sweep(cls, sweep: RecordedSweep) -> _Gaps:
+    def of_sweep(cls, sweep: Sweep) -> _Gaps:
         """Sort the returns of a sweep."""
         azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
-        order = np.lexsort((azimuth, sweep.ring))
+        order = np.lexsort((azimuth, sweep.columns["row"]))
         azimuth = azimuth[order]
-        ring = sweep.ring[order]
+        ring = sweep.columns["row"][order]
         starts = np.flatnonzero(np.diff(ring, prepend=-1))
         counts = np.diff(np.append(starts, len(ring)))
         lasts = starts + counts - 1
@@ -207,7 +212,7 @@ class Answering(NamedTuple):
         return cls(returned > least[:, None], max_range_m)
 
 
-def _cells(sweep: RecordedSweep) -> tuple[Ints, Ints]:
+def _cells(sweep: Sweep) -> tuple[Ints, Ints]:
     """Return the rings and columns (n,) of the rays of a sweep."""
     turns = np.arctan2(sweep.points[:, 1], sweep.points[:, 0]) / (2 * np.pi) + 0.5
-    return sweep.ring, (turns * _COLUMNS).astype(np.int64) % _COLUMNS
+    return sweep.columns["row"], (turns * _COLUMNS).astype(np.int64) % _COLUMNS

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.arrays import Floats
-
-from .recorded_sweeps import RecordedSweep
+from lidarsim.columns.sweep import Sweep
 
 
 class Motion(StrEnum):
@@ -31,16 +30,17 @@ class Motion(StrEnum):
         """Whether points are compensated by their azimuths."""
         return self in (Motion.COUNTERCLOCKWISE, Motion.CLOCKWISE)
 
-    def times_s(self, sweep: RecordedSweep, sweep_s: float) -> Floats | None:
+    def times_s(self, sweep: Sweep, sweep_s: float) -> Floats | None:
         """Return the times of points (n,) relative to the stamp of their sweep.
 
         `sweep_s` is the duration of a sweep. Returns None if points are compensated.
         """
         if self is Motion.TIMED:
-            return sweep.time_s
+            return sweep.columns.get("time_s")
         if self is Motion.COMPENSATED:
             return None
-        turn = sweep.turn
+        azimuth = np.arctan2(sweep.points[:, 1], sweep.points[:, 0])
+        turn: Floats = ((azimuth - sweep.columns["start_rad"]) / (2 * np.pi)) % 1
         if self is Motion.CLOCKWISE:
             turn = -turn % 1  # the first points are at 0, and not at 1
         return turn * sweep_s

@@ -26,7 +26,6 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
 from raybeam import RayCaster
 
-from ..scenario.point_files import ScannedPoints
 from .alignment import AlignedSweep, AlignedSweeps
 from .surfels import Surfels
 
@@ -183,24 +182,28 @@ class Place:
 
 def build_place(sweeps: AlignedSweeps, standing: Mapping[int, Bools], voxel_m: float) -> Place:
     """Build the place of the points that stand, or raise LidarError if too few stand."""
-    points = _standing(sweeps, standing)
+    points, outward, labels = _standing(sweeps, standing)
     if not len(points):
         raise LidarError(
             f"{sweeps.name} contains no stationary points, so the reconstruction is empty."
         )
     name = Path(sweeps.name).name
     gap_rad = sweeps.recorded.gap_rad
-    surfels = Surfels.of_points(name, points, voxel_m, gap_rad)
-    dark = _dark(sweeps, standing)
-    if Surfels.are_enough(dark, voxel_m):
-        surfels = surfels.with_dark(Surfels.of_points(name, dark, voxel_m, gap_rad))
+    surfels = Surfels.of_points(name, points, outward, voxel_m, gap_rad, labels)
+    dark_points, dark_outward = _dark(sweeps, standing)
+    if Surfels.are_enough(dark_points, voxel_m):
+        dark = Surfels.of_points(name, dark_points, dark_outward, voxel_m, gap_rad)
+        surfels = surfels.with_dark(dark)
     for _ in range(_ROUNDS):  # of two trees, the second would take as much memory again
         surfels = Place.of_surfels(surfels).refined(sweeps, standing)
     return Place.of_surfels(surfels)
 
 
-def _dark(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPoints:
-    """Return where lost pulses were lost, if surfaces go on in their gaps."""
+def _dark(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Floats, Floats]:
+    """Return where lost pulses were lost (n, 3), if surfaces go on in their gaps.
+
+    The second array (n, 3) has the vectors to the sensor.
+    """
     positions = []
     outward = []
     for number in _some(standing):
@@ -211,7 +214,7 @@ def _dark(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPoints
         vectors *= (lost.gap_range_m[known] / np.linalg.norm(vectors, axis=1))[:, None]
         positions.append(lost.origins[known] + vectors)
         outward.append(-vectors)
-    return ScannedPoints(np.concatenate(positions), np.concatenate(outward))
+    return np.concatenate(positions), np.concatenate(outward)
 
 
 def _shifts(surfel: Ints, offset_m: Floats, count: int) -> Floats:
@@ -234,8 +237,12 @@ def _some(standing: Mapping[int, Bools]) -> list[int]:
     return chosen
 
 
-def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPoints:
-    """Return the points that stand in the world, with the directions to the sensor.
+def _standing(
+    sweeps: AlignedSweeps, standing: Mapping[int, Bools]
+) -> tuple[Floats, AnyFloats, Ints | None]:
+    """Return the points (n, 3) that stand in the world, with the vectors (n, 3) to the sensor.
+
+    The third array has the labels (n,) of the points, or is None without labels.
 
     Points that were seen from much closer elsewhere are left out: rays that come from far away are
     far apart, and their errors of direction are large.
@@ -258,9 +265,7 @@ def _standing(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> ScannedPo
     world = np.concatenate(positions)
     # A sweep without points may have no columns.
     labeled = sum(map(len, labels)) == len(world)
-    return ScannedPoints(
-        world, np.concatenate(outward), np.concatenate(labels) if labels and labeled else None
-    )
+    return world, np.concatenate(outward), np.concatenate(labels) if labels and labeled else None
 
 
 def _closest(sweeps: AlignedSweeps, standing: Mapping[int, Bools]) -> tuple[Ints, Floats]:

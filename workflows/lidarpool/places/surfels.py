@@ -16,14 +16,13 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarsim.base.allowance import bytes_of, memory
-from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.arrays import AnyFloats, Bools, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.scene.colors import join_colors
 from lidarsim.scene.face_materials import join_materials
 from lidarsim.scene.scene_mesh import SceneMesh
 
-from ..clouds.file_points import POINT_BYTES
-from ..scenario.point_files import ScannedPoints
+from ..scenario.point_files import POINT_BYTES
 from ..scenario.point_scene import Voxels, surfel_faces, surfel_materials
 
 _NEIGHBORS = (12, 32, 80)  # of which the first number that is no line counts
@@ -81,13 +80,21 @@ class Surfels:
         return Surfels(joined_surfels([self.mesh, others.mesh]), dark)
 
     @staticmethod
-    def are_enough(points: ScannedPoints, voxel_m: float) -> bool:
-        """Whether points make surfels: they are in enough voxels."""
-        cells = np.unique(np.floor(points.positions / voxel_m).astype(np.int64), axis=0)
+    def are_enough(points: Floats, voxel_m: float) -> bool:
+        """Whether points (n, 3) make surfels: they are in enough voxels."""
+        cells = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0)
         return len(cells) > 2 * _NEIGHBORS[-1]
 
     @classmethod
-    def of_points(cls, name: str, points: ScannedPoints, voxel_m: float, gap_rad: float) -> Surfels:
+    def of_points(
+        cls,
+        name: str,
+        points: Floats,
+        outward: AnyFloats,
+        voxel_m: float,
+        gap_rad: float,
+        labels: Ints | None = None,
+    ) -> Surfels:
         """Make surfels of the means of points in voxels.
 
         Parameters
@@ -95,11 +102,16 @@ class Surfels:
         name
             Of the mesh, and in messages.
         points
-            Points with the directions to the sensor, whose lengths are the ranges.
+            Positions of shape (n, 3), in meters.
+        outward
+            Vectors from the points to the sensor, of shape (n, 3), in meters.
         voxel_m
             Edge of the voxels.
         gap_rad
             Angle between the rays of neighboring rings.
+        labels
+            Labels of the points (`labels_of`), of shape (n,), or None. The most frequent label of
+            the points of a surfel is in the name of its material.
 
         Raises
         ------
@@ -108,8 +120,7 @@ class Surfels:
         """
         from scipy.spatial import cKDTree
 
-        assert points.outward is not None
-        voxels = Voxels.of_points(Path(name), points.positions, voxel_m)
+        voxels = Voxels.of_points(Path(name), points, voxel_m)
         count = len(voxels.counts)
         if count * POINT_BYTES > memory() // 2:
             raise LidarError(
@@ -123,19 +134,19 @@ class Surfels:
                 f"least {_NEIGHBORS[-1]} are required. Use a smaller `voxel_m`, or a longer "
                 "recording."
             )
-        means = voxels.means(points.positions)
-        outward = voxels.means(points.outward)
+        means = voxels.means(points)
+        mean_outward = voxels.means(outward)
         tree = cKDTree(means)
         corners = np.empty((count, 4, 3))
         for start in range(0, count, _BLOCK):
             block = slice(start, start + _BLOCK)
             planes = _Planes.around(means[block], tree, means)
-            corners[block] = planes.corners(means[block], outward[block], voxel_m, gap_rad)
+            corners[block] = planes.corners(means[block], mean_outward[block], voxel_m, gap_rad)
         mesh = SceneMesh(
             name,
             corners.reshape(-1, 3),
             surfel_faces(count),
-            materials=surfel_materials(points, voxels),
+            materials=surfel_materials(labels, voxels),
         )
         return cls(mesh, np.zeros(count, bool))
 

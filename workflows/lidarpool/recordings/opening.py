@@ -12,7 +12,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 
 from ..clouds.format_table import reader_of
-from ..clouds.recording import Read, Recording, RecordingSource, SeveralSensorsError, open_cloud
+from ..clouds.recording import Recording, RecordingSource, SeveralSensorsError, open_cloud
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
@@ -74,15 +74,42 @@ def open_recording(
     unit: str | None = None,
     keep_noise: bool = False,
 ) -> Recording:
-    """Open a cloud or recording of `KINDS`, or a cloud in memory.
+    """Open a recording or cloud, whatever its format, to read it sweep by sweep.
 
-    A cloud in memory has sweeps if it belongs to a result.
+    Parameters
+    ----------
+    source
+        File or folder of a recording, a result or a data set, or a cloud in memory, which has
+        sweeps if it belongs to a result.
+    sensor
+        Name of the sensor, or topic of a bag, in recordings that contain several.
+    intensity
+        Column that contains the intensities. The default is ``intensity``.
+    name
+        Name of a cloud in memory in messages.
+    unit
+        Length unit of a .las, .laz, .ply, .pcd, .ptx, .pts, .npy or text file, which replaces the
+        unit that the file states. The default is the unit of the file, otherwise meters.
+    keep_noise
+        Whether to include points that a file withholds or classifies as noise.
 
-    `sensor` chooses one of several sensors, or the topic of a bag; `intensity` is the column of the
-    intensity, if not one of the usual names; `name` is the name of a cloud in memory; `unit` is the
-    unit of a file of `_UNIT_SUFFIXES`, in place of meters or of the units that a .las states;
-    without `keep_noise`, points that a file withholds or classifies as noise are left out.
-    LidarError if the source is none of these, cannot be opened, or has lengths that are not true.
+    Returns
+    -------
+    Recording
+        A sequence of `Sweep` objects, which are read on access. Clouds without sweeps are divided
+        into parts.
+
+    Raises
+    ------
+    LidarError
+        If the source is missing or its format is not supported, if it contains several sensors and
+        none is chosen, or if its coordinate system distorts lengths.
+
+    Examples
+    --------
+    >>> recording = open_recording("drive.mcap")  # doctest: +SKIP
+    >>> recording[0].points.shape  # doctest: +SKIP
+    (28800, 3)
     """
     if isinstance(source, Cloud | StoredCloud):
         if unit is not None:
@@ -96,10 +123,7 @@ def open_recording(
             f"{joined(_UNIT_SUFFIXES)} files."
         )
     recording = _open_path(RecordingSource(path, name, sensor, intensity, unit))
-    noise_filter = recording.noise_filter
-    if keep_noise or noise_filter is None:
-        return replace(recording, noise_filter=None)
-    return recording.without_noise(noise_filter)
+    return replace(recording, noise_classes=None) if keep_noise else recording
 
 
 def _open_path(source: RecordingSource) -> Recording:
@@ -121,9 +145,6 @@ def _open_path(source: RecordingSource) -> Recording:
 def _open_data_set(source: RecordingSource) -> Recording:
     """Open the sweeps of a data set."""
     saved = sweeps(source.path, sensors=None if source.sensor is None else [source.sensor])
-
-    def read(number: int) -> Read:
-        sweep = saved[number]
-        return sweep.points, sweep.columns, sweep.pose
-
-    return source.recording(len(saved), read, compensated=True)
+    return source.recording(
+        len(saved), saved.__getitem__, compensated=True, noise_classes=None
+    )

@@ -13,13 +13,13 @@ from matplotlib.ticker import MaxNLocator
 from lidarsim.base.arrays import Bools, Floats, Indices
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import plural, rounded, shortened
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Z, value_names
 from lidarview.render import theme
 from lidarview.render.coloring import colors_of
 from lidarview.render.picture_page import FONT, Page, label_logarithms
 
 from ..datasets.figures import Figures, Varied
-from ..datasets.sweep_data import Sweep
 from .page.rendering import NARROW
 
 WIDTH = 1600

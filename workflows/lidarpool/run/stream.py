@@ -25,6 +25,7 @@ from lidarsim.base.errors import LidarError, message_of
 from lidarsim.base.extras import install_command
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.part_columns import PartColumns
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES, SCAN
 from lidarsim.columns.waveforms import WAVEFORM
 from lidarsim.simulator.casting.scene_caster import check_backend_here
@@ -35,7 +36,7 @@ from poolpart.fetch import fetch_available
 from ..clouds.boxes import Boxes
 from ..clouds.kitti import intensity_of
 from ..datasets.job_table import JobRow
-from ..datasets.sweep_data import Sweep
+from ..datasets.sweep_data import sweep_of_job
 from ..scenario.build import Job
 from ..scenario.campaign import CampaignSpec
 from ..scenario.campaign_sections import Keep
@@ -166,7 +167,7 @@ class StreamedJob(PipelineJob):
         boxes = Boxes.from_points(sweeps, number, cloud) if sweeps.actors else None
         boxes = boxes and boxes.inward(sweeps.pose, number)
         row = JobRow(job.number, job.name, job.split, job.values)
-        return Sweep.from_points(row, sweeps, number, (positions, columns), boxes)
+        return sweep_of_job(row, sweeps, number, (positions, columns), boxes)
 
 
 class _Casting:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Floats32, Indices, Ints
-from lidarsim.base.errors import LidarError, as_sentence, explained, prefixed, unreadable
+from lidarsim.base.allowance import bytes_of, memory
+from lidarsim.base.arrays import AnyArray, Bools, Floats, Floats32, Ints
+from lidarsim.base.errors import LidarError, as_sentence, explained, prefixed
+from lidarsim.base.extras import reading
 from lidarsim.base.input_files import check_input
 from lidarsim.base.words import plural, printable
+from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS, STRENGTHS, columns_for
+from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.files.intensity_scales import from_zero
 from lidarsim.scene.files.mesh_formats import advice_on
 from lidarsim.scene.files.noise_points import LeftOut, usable_points
+from lidarsim.scene.files.pcd import unpacked_colors
 from lidarsim.scene.files.stated_system import (
     Reprojection,
     check_metric_format,
@@ -23,73 +28,18 @@ from lidarsim.scene.files.stated_system import (
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
-from ..clouds.file_points import (
-    COLORS,
-    INTENSITIES,
-    MIN_POINTS,
-    NORMALS,
-    ORIGINS,
-    Columns,
-    FilePoints,
-    Vectors,
-)
 from ..clouds.format_table import point_suffixes, points_reader
+from ..clouds.recording import METERS, Recording, RecordingSource
 
-_SAMPLE = 1000  # points that tell whether another system has true meters there
+MIN_POINTS = 12  # least points of a scene: a surfel lies in the plane of as many
+POINT_BYTES = 700  # peak memory per point while surfels are computed and written
 NO_CLASS = np.iinfo(np.int64).min  # class of a point without a class
-# Names of columns in files of various programs; the first name that a file has is read.
-CLASSES = (
-    "class", "classification", "scalar_Classification", "scalar_classification", "label",
-    "scalar_Label", "scalar_label",
-)  # fmt: skip
+_SAMPLE = 1000  # points that tell whether another system has true meters there
+_CLASS = ("class",)
+_INTENSITIES = tuple((name,) for name in STRENGTHS)
+_QUANTITIES = (_CLASS, *_INTENSITIES, COLORS, NORMALS, ORIGINS)  # standard names of components
 
-
-@dataclass(frozen=True, eq=False)
-class ScannedPoints:
-    """Points of a file, in meters, and the quantities that surfels keep.
-
-    A quantity that the file does not have is None.
-
-    Attributes
-    ----------
-    positions
-        float64 (n, 3), finite, meters.
-    outward
-        float64 (n, 3): direction to the scanner, or the normal of the file; zero if unknown.
-    classes
-        int64 (n,); `NO_CLASS` for points without a class.
-    intensities
-        float64 (n,), from 0, in the scale of the file; NaN for points without an intensity.
-    colors
-        float32 (n, 3), sRGB from 0 to 255; NaN for points without a color.
-    scanners
-        float64 (n, 3): position of the scanner of each point, meters; NaN where unknown.
-    epsg
-        EPSG code of the coordinate system of the positions, or None if it is not known.
-    """
-
-    positions: Floats
-    outward: Floats | None = None
-    classes: Ints | None = None
-    intensities: Floats | None = None
-    colors: Floats32 | None = None
-    scanners: Floats | None = None
-    epsg: int | None = None
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def take(self, row_indices: Indices) -> ScannedPoints:
-        """Return selected points."""
-        return ScannedPoints(
-            self.positions[row_indices],
-            None if self.outward is None else self.outward[row_indices],
-            None if self.classes is None else self.classes[row_indices],
-            None if self.intensities is None else self.intensities[row_indices],
-            None if self.colors is None else self.colors[row_indices],
-            None if self.scanners is None else self.scanners[row_indices],
-            self.epsg,
-        )
+Columns = Mapping[str, AnyArray]  # {name: (n,)}
 
 
 def read_points(
@@ -99,8 +49,15 @@ def read_points(
     *,
     epsg: int | None = None,
     keep_noise: bool = False,
-) -> ScannedPoints:
-    """Return the finite points of a file, in true meters.
+) -> tuple[Sweep, int | None]:
+    """Return the finite points of a file, in true meters, and their EPSG code if it is known.
+
+    Scans are joined in the frame of the file. The columns are those of the following that the file
+    has: `class` (int64, `NO_CLASS` for points without a class), `intensity` (float64, from 0, in
+    the scale of the file), `red`, `green` and `blue` (float32, sRGB from 0 to 255), and `origin_x`,
+    `origin_y` and `origin_z` (float64, position of the scanner of each point, meters) or, if the
+    file has no positions of scanners, `normal_x`, `normal_y` and `normal_z` (float64). Unknown
+    values are NaN; unknown normals are zero.
 
     Parameters
     ----------
@@ -121,42 +78,46 @@ def read_points(
         If the file cannot be read, is too large, has fewer than `MIN_POINTS` points, or lengths
         that are not true; see `stated_meters` and `Reprojection`.
     """
-    reader = points_reader(path)
-    if reader is None:
+    open_file = points_reader(path)
+    if open_file is None:
         if advice := advice_on(path):
             raise LidarError(f"{path} cannot be read. {as_sentence(advice)}")
         raise LidarError(
             f"{path} has the extension {path.suffix or '(none)'}, but point clouds must have one "
             f"of these extensions: {' '.join(point_suffixes())}."
         )
-    try:
-        with explained(f"{path} cannot be read"), prefixed(path):
-            if not check_input(path):
-                raise LidarError("it is empty (0 bytes).")
-            content = reader(path)
-            if not keep_noise:
-                content = _without_noise(path, content, tell)
-            to_meters, placed_epsg = _to_meters(path, content, unit, epsg, tell)
-            points, notes = _scanned_points(content, to_meters)
-            points = replace(points, epsg=placed_epsg)
-    except LidarError:
-        raise
-    except Exception as error:  # readers raise whatever they stumble over
-        raise LidarError(unreadable(path, error)) from error
+    with explained(f"{path} cannot be read"), prefixed(path):
+        if not check_input(path):
+            raise LidarError("it is empty (0 bytes).")
+    recording: Recording = open_file(RecordingSource(path, str(path), as_stored=True))
+    with reading(str(path)):
+        content = _read(recording, keep_noise)
+        if note := content.left_out.note():
+            tell(f"{path}: {note}")
+        to_meters, placed_epsg = _to_meters(path, recording, content.points, unit, epsg, tell)
+        points = _converted(content.points, to_meters)
     _check_points(path, points, content.left_out)
-    for note in (*content.notes, *notes):
-        tell(f"{path} {note}")
+    for line in (*recording.notes, *(f"{path} {note}" for note in points.notes)):
+        tell(line)
     if content.no_returns:
         tell(
             f"{plural(content.no_returns, 'point')} of {path} at the origin "
             f"{'was' if content.no_returns == 1 else 'were'} skipped as pulses without a return"
         )
-    if names := _left_out(content):
-        tell(f"{path} has data that surfels cannot store, which were skipped: {', '.join(names)}")
-    return points
+    if points.skipped:
+        names = ", ".join(map(printable, points.skipped))
+        tell(f"{path} has data that surfels cannot store, which were skipped: {names}")
+    return points, placed_epsg
 
 
-def _check_points(path: Path, points: ScannedPoints, left_out: LeftOut) -> None:
+def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
+    """Return columns as the components of vectors (n, k), or None without the first column."""
+    if names[0] not in points.columns:
+        return None
+    return np.stack([points.columns[name] for name in names], axis=1)
+
+
+def _check_points(path: Path, points: Sweep, left_out: LeftOut) -> None:
     """Raise LidarError if there are too few points, or a point is farther than any on Earth."""
     if len(points) < MIN_POINTS and (note := left_out.note()):
         raise LidarError(
@@ -164,31 +125,124 @@ def _check_points(path: Path, points: ScannedPoints, left_out: LeftOut) -> None:
         )
     if len(points) < MIN_POINTS:
         raise LidarError(f"{path} must have at least {MIN_POINTS} points, but has {len(points)}.")
-    if (reach := np.abs(points.positions).max()) > MAX_COORDINATE_M:
+    if (reach := np.abs(points.points).max()) > MAX_COORDINATE_M:
         raise LidarError(
             f"{path} extends {reach:.3g} m from the origin, which is farther than anything on "
             "Earth. If the file is not damaged, set its unit with `--unit` (`unit` in Python)."
         )
 
 
-def _without_noise(path: Path, content: FilePoints, tell: Callable[[str], None]) -> FilePoints:
-    """Return content without withheld points and noise, and call `tell` with their number."""
-    usable, left_out = usable_points(content.columns, content.noise_classes)
-    if usable is None:
-        return content
-    tell(f"{path}: {left_out.note()}")
-    return replace(
-        content,
-        positions=content.positions[usable],
-        columns={name: values[usable] for name, values in content.columns.items()},
-        scanners=None if content.scanners is None else content.scanners[usable],
-        left_out=left_out,
+class _Content(NamedTuple):
+    """Content of a file."""
+
+    # Points in the units and the frame of the file. Columns that are used keep their names in the
+    # file. `skipped` has the names of all columns that are not zero throughout.
+    points: Sweep
+    left_out: LeftOut  # withheld points and noise
+    no_returns: int  # points at zero that are left out
+
+
+def _read(recording: Recording, keep_noise: bool) -> _Content:
+    """Read the scans or parts of a file, and join them in the frame of the file.
+
+    Raises LidarError if the points would exceed the memory.
+    """
+    if not len(recording) and not recording.is_cloud:
+        raise ValueError("it contains no scans")
+    _check_count(recording.point_count or 0)
+    missing_if_zero: list[Sequence[str]] = [ORIGINS]
+    if len(recording) > 1 and not recording.is_cloud:
+        # Some programs write zeros for quantities that a scan does not have.
+        missing_if_zero += [*_INTENSITIES, COLORS]
+    scans = []
+    left_out = LeftOut()
+    no_returns = 0
+    for number in range(len(recording)):
+        scan = recording.read(number)
+        if not recording.is_cloud:
+            _check_count(len(scan))
+            count = len(scan)
+            scan = _without_zeros(scan)
+            no_returns += count - len(scan)
+        if recording.noise_classes is not None and not keep_noise:
+            usable, omitted = usable_points(scan.columns, recording.noise_classes)
+            scan = scan if usable is None else scan.select(usable)
+            left_out = LeftOut(*np.add(left_out, omitted).tolist())
+        scans.append(_placed(_with_used_columns(scan, missing_if_zero)))
+    joined = scans[0] if len(scans) == 1 else Sweep.joined(scans)
+    joined = joined.replace(
+        units_m=scans[0].units_m if scans else None,
+        skipped=[*dict.fromkeys(name for scan in scans for name in scan.skipped)],
+        notes=[*dict.fromkeys(note for scan in scans for note in scan.notes)],
     )
+    return _Content(joined, left_out, no_returns)
+
+
+def _check_count(count: int) -> None:
+    """Raise LidarError if points would exceed the memory."""
+    if (size := count * POINT_BYTES) > memory():
+        raise LidarError(
+            f"it has {count:,} points, which require {bytes_of(size)} of memory. Downsample "
+            "it first."
+        )
+
+
+def _without_zeros(scan: Sweep) -> Sweep:
+    """Return a scan without the pulses that had no return.
+
+    Drivers write zeros for these pulses. Fewer than `MIN_POINTS` points at zero may be points.
+    """
+    is_return: Bools = np.asarray(scan.points.any(axis=1))
+    zero_count = len(scan) - int(is_return.sum())
+    return scan if zero_count < MIN_POINTS else scan.select(is_return)
+
+
+def _with_used_columns(scan: Sweep, missing_if_zero: Iterable[Sequence[str]]) -> Sweep:
+    """Return a scan with the columns of `_QUANTITIES` only, under their names in the file.
+
+    Columns of some quantities are removed if they are zero throughout.
+    """
+    stored = {name: values for name, values in scan.columns.items() if values.ndim == 1}
+    columns = unpacked_colors(stored)
+    used = {
+        name: values
+        for names in _QUANTITIES
+        for component in names
+        for name, values in columns_for(columns, component).items()
+    }
+    skipped = [name for name in columns if name in used or _has_values(columns[name])]
+    for names in missing_if_zero:
+        for group in _groups(used, names):
+            if not any(map(_has_values, group.values())):
+                used = {name: values for name, values in used.items() if name not in group}
+    return scan.replace(columns=used, skipped=[*skipped, *scan.skipped])
+
+
+def _placed(scan: Sweep) -> Sweep:
+    """Return a scan in the frame of the file, with the position of its scanner as origins."""
+    points = np.asarray(scan.points, np.float64)
+    columns = dict(scan.columns)
+    if scan.pose is not None:
+        rotation = scan.pose[:3, :3]
+        offset = scan.pose[:3, 3]
+        points = points @ rotation.T + offset
+        for names, shift in ((NORMALS, np.zeros(3)), (ORIGINS, offset)):
+            for group in _groups(columns, names):
+                placed = _stacked(group).astype(np.float64) @ rotation.T + shift
+                columns |= zip(group, placed.T, strict=True)
+    if scan.scanner is not None and not _groups(columns, ORIGINS):
+        # The origin of each ray would be more exact.
+        columns |= {
+            name: np.full(len(scan), position)
+            for name, position in zip(ORIGINS, scan.scanner, strict=True)
+        }
+    return scan.replace(points=points, columns=columns)
 
 
 def _to_meters(
     path: Path,
-    content: FilePoints,
+    recording: Recording,
+    points: Sweep,
     unit: str | None,
     epsg: int | None,
     tell: Callable[[str], None],
@@ -198,97 +252,106 @@ def _to_meters(
     The code is None if the coordinates are in no known system afterwards. `tell` gets a message
     that says how positions are converted.
     """
-    finite = content.positions[np.isfinite(content.positions).all(axis=1)]
+    finite = points.points[np.isfinite(points.points).all(axis=1)]
     if epsg is not None:
         if unit is not None:
             raise LidarError("`epsg` and `unit` cannot be combined.")
-        reprojection = Reprojection(content.system, epsg)
+        reprojection = Reprojection(recording.system, epsg)
         reprojection.check(finite[:: len(finite) // _SAMPLE + 1])
         notes = reprojection.notes
         convert = reprojection.apply
         placed_epsg = epsg
     else:
-        if content.in_meters and unit is None:
-            notes = check_metric_format(content.system, finite)
-            meters = (1.0, 1.0, 1.0)
-        elif content.units_m is not None and unit is None:
-            meters = content.units_m
+        if recording.is_metric and unit is None:
+            notes = check_metric_format(recording.system, finite)
+            meters = METERS
+        elif points.units_m is not None and unit is None:
+            meters = points.units_m
             lengths = ", ".join(f"{length:g}" for length in meters)
             notes = [f"was converted to meters, because its header states units of {lengths} m"]
+        elif recording.meters != METERS and unit is None:
+            meters = recording.meters
+            notes = []
         else:
-            meters, notes = stated_meters(content.system, finite, unit)
+            meters, notes = stated_meters(recording.system, finite, unit)
         convert = partial(np.multiply, meters)
         placed_epsg = None
-        if content.system is not None and unit is None and meters == (1.0, 1.0, 1.0):
-            placed_epsg = content.system.epsg_in_meters
+        if recording.system is not None and unit is None and meters == METERS:
+            placed_epsg = recording.system.epsg_in_meters
     for note in notes:
         tell(f"{path} {note}")
     return convert, placed_epsg
 
 
-def _scanned_points(
-    content: FilePoints, to_meters: Callable[[Floats], Floats]
-) -> tuple[ScannedPoints, list[str]]:
-    """Return the finite points of a file's content in meters, and notes on them.
+def _converted(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
+    """Return the finite points of a file in meters, with the columns of `read_points`.
 
-    Notes are clauses that follow the name of the file.
+    `notes` are clauses that follow the name of the file, and `skipped` has the names of columns.
     """
-    columns = content.columns
-    notes = []
-    positions = to_meters(content.positions)
-    colors = _first_vectors(columns, COLORS)
-    outward = _first_vectors(columns, NORMALS)
-    scanners = content.scanners
-    if scanners is None:
-        scanners = _first_vectors(columns, ORIGINS)
-    if scanners is not None:
-        try:
-            scanners = to_meters(scanners.astype(np.float64))
-            outward = scanners - positions
-        except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
-            scanners = outward = None
-            content.ignored.append("scanner positions that cannot be converted to that system")
-    classes = _first(columns, CLASSES)
-    intensities = _first(columns, INTENSITIES)
-    if intensities is not None:
-        values = intensities.astype(np.float64)
-        intensities, note = from_zero(np.where(np.isfinite(values), values, np.nan))
+    points = to_meters(stored.points)
+    classes = _first(stored.columns, _CLASS)
+    intensities = _first(stored.columns, *_INTENSITIES)
+    colors = _first(stored.columns, COLORS)
+    normals = _first(stored.columns, NORMALS)
+    origins = next(iter(_groups(stored.columns, ORIGINS)), {})
+    skipped = _unused(stored, {*classes, *intensities, *colors, *normals, *origins})
+    notes = [*stored.notes]
+    columns: dict[str, AnyArray] = {}
+    for values in classes.values():
+        columns["class"] = _as_integers(values)
+    for values in intensities.values():
+        numbers = values.astype(np.float64)
+        columns["intensity"], note = from_zero(np.where(np.isfinite(numbers), numbers, np.nan))
         notes += [note] if note else []
-    points = ScannedPoints(
-        positions,
-        None if outward is None else np.nan_to_num(outward.astype(np.float64)),
-        None if classes is None else _as_integers(classes),
-        intensities,
-        None if colors is None else _as_srgb(colors),
-        scanners,
-    )
+    if colors:
+        columns |= zip(COLORS, _as_srgb(_stacked(colors)).T, strict=True)
+    if origins:
+        try:
+            scanners = to_meters(_stacked(origins).astype(np.float64))
+            columns |= zip(ORIGINS, scanners.T, strict=True)
+        except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
+            skipped.append("scanner positions that cannot be converted to that system")
+    elif normals:
+        columns |= zip(NORMALS, np.nan_to_num(_stacked(normals).astype(np.float64)).T, strict=True)
+    converted = stored.replace(points=points, columns=columns, notes=notes, skipped=skipped)
     # Depth cameras write NaN for pixels without a return.
-    finite = np.isfinite(positions).all(axis=1)
-    return points if finite.all() else points.take(np.flatnonzero(finite)), notes
+    finite = np.isfinite(points).all(axis=1)
+    return converted if finite.all() else converted.select(np.flatnonzero(finite))
 
 
-def _first(columns: Columns, names: Iterable[str]) -> AnyArray | None:
-    """Return the first column that a file has and that is not zero throughout, or None.
+def _unused(stored: Sweep, used: Collection[str]) -> list[str]:
+    """Return the names in `skipped` that are not used, without columns that are zero throughout."""
+    names = [name for name in stored.skipped if name not in used]
+    columns = stored.columns
+    return [name for name in names if name not in columns or _has_values(columns[name])]
+
+
+def _groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
+    """Return the columns that contain the components of a quantity, {name in the file: (n,)}.
+
+    Several groups are possible; the group with the standard names is the first.
+    """
+    found = [columns_for(columns, name).items() for name in names]
+    return [dict(group) for group in zip(*found, strict=False)]
+
+
+def _first(columns: Columns, *quantities: Sequence[str]) -> Columns:
+    """Return the first columns of quantities that are not zero throughout, or no columns.
 
     LAS has a column for each quantity, zero where the quantity was not measured.
     """
-    present = (columns[name] for name in names if name in columns)
-    return next((values for values in present if _has_values(values)), None)
+    groups = (group for names in quantities for group in _groups(columns, names))
+    return next((group for group in groups if any(map(_has_values, group.values()))), {})
 
 
-def _first_vectors(columns: Columns, names: Iterable[Vectors]) -> AnyArray | None:
-    """Return the first three columns of vectors that a file has, (n, 3), or None."""
-    for axes in names:
-        if all(name in columns for name in axes):
-            vectors = np.stack([columns[name] for name in axes], axis=1)
-            if _has_values(vectors):
-                return vectors
-    return None
+def _stacked(group: Columns) -> AnyArray:
+    """Return columns as the components of vectors (n, k)."""
+    return np.stack([*group.values()], axis=1)
 
 
 def _has_values(values: AnyArray) -> bool:
     """Return True if a value is neither 0 nor NaN."""
-    return bool((values[values == values] != 0).any())
+    return bool(np.any((values != 0) & (values == values)))
 
 
 def _as_integers(classes: AnyArray) -> Ints:
@@ -316,17 +379,3 @@ def _as_srgb(colors: AnyArray) -> Floats32:
     elif highest > 255:
         values = values / 257  # 16 bits; several programs write 8 bits into the 16 of LAS
     return np.rint(np.clip(values, 0, 255)).astype(np.float32)
-
-
-def _left_out(content: FilePoints) -> list[str]:
-    """Return the names of the columns that surfels do not keep and that are not zero."""
-    columns = content.columns
-    used: set[str] = set()
-    for names in (CLASSES, INTENSITIES):
-        used.update([name for name in names if name in columns][:1])
-    for axes in (*COLORS, *NORMALS, *ORIGINS):
-        used.update(axes)
-    remaining = [
-        name for name, values in columns.items() if name not in used and _has_values(values)
-    ]
-    return [printable(name) for name in [*remaining, *content.ignored]]

@@ -16,11 +16,13 @@ import numpy as np
 from pydantic import Field
 
 from lidarsim.base.allowance import bytes_of, memory
-from lidarsim.base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
+from lidarsim.base.arrays import AnyArray, Bools, Bytes, Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.validation import checked
 from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import plural, rounded
+from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS
+from lidarsim.columns.sweep import Sweep
 from lidarsim.scene.colors import GRAY, LINEAR, Colors, as_srgb
 from lidarsim.scene.face_materials import FaceMaterials
 from lidarsim.scene.files.meshfile import warn
@@ -28,8 +30,7 @@ from lidarsim.scene.scene import Scene
 from lidarsim.scene.scene_mesh import SceneMesh
 
 from ..base.open3d_module import load_open3d
-from ..clouds.file_points import MIN_POINTS, POINT_BYTES
-from .point_files import NO_CLASS, ScannedPoints, read_points
+from .point_files import MIN_POINTS, NO_CLASS, POINT_BYTES, read_points, vectors
 from .surfel_gaps import expected_loss
 
 # Chosen on scans of a city, from 7 to 30 neighbors and 0.7 to 1.4: more of either closes more gaps
@@ -74,9 +75,9 @@ def scene_of_points(
     ----------
     path
         .ply, .pcd, text (.xyz, .txt, .asc, .csv), .pts, .ptx, .npy, .bin of KITTI or nuScenes, .las
-        or .laz, which need laspy, or .e57, which needs pye57. Scans are joined by their poses.
-        Z-up; .las and .laz in the units of their coordinate system, text in the units of its
-        header, others in meters.
+        or .laz, which need laspy, .e57, which needs pye57, or .parquet, which needs pyarrow. Scans
+        are joined by their poses. Z-up; .las and .laz in the units of their coordinate system, text
+        in the units of its header, others in meters.
     voxel_m
         Edge of cubes; the points of a cube become their mean. By default the median distance of
         points to the eighth of their neighbors.
@@ -173,20 +174,20 @@ def points_to_scene(
     for name, value in (("voxel_m", voxel_m), ("size", size)):
         if value is not None and not 0 < value < np.inf:
             raise LidarError(f"{name} must be a positive number, but is {value}.")
-    points = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
+    points, placed_epsg = read_points(path, unit, tell, epsg=epsg, keep_noise=keep_noise)
     points = _colored(path, points, color, tell)
     surfels = _surfels_of(path, points, voxel_m, size)
     loss = None
-    if points.scanners is not None:
+    if (scanners := vectors(points, ORIGINS)) is not None:
         corners = surfels.mesh.vertices.reshape(-1, 4, 3)
-        loss = expected_loss(points.positions, points.scanners, corners)
-    scene = replace(Scene.from_meshes([surfels.mesh]), epsg=points.epsg)
+        loss = expected_loss(points.points, scanners, corners)
+    scene = replace(Scene.from_meshes([surfels.mesh]), epsg=placed_epsg)
     return PointScene(scene, surfels.voxel_m, loss)
 
 
 def surfels(path: Path, points: Floats, voxel_m: float | None, size: float = 1.0) -> SceneMesh:
     """Return the surfels of the points (n, 3) of a file."""
-    return _surfels_of(path, ScannedPoints(points), voxel_m, size).mesh
+    return _surfels_of(path, Sweep(points), voxel_m, size).mesh
 
 
 class _Surfels(NamedTuple):
@@ -196,14 +197,13 @@ class _Surfels(NamedTuple):
     voxel_m: float  # edge of the cubes whose points became a surfel, meters
 
 
-def _colored(
-    path: Path, points: ScannedPoints, color: str | None, tell: Callable[[str], None]
-) -> ScannedPoints:
+def _colored(path: Path, points: Sweep, color: str | None, tell: Callable[[str], None]) -> Sweep:
     """Return points with either colors or intensities.
 
     LidarError if the chosen quantity is missing.
     """
-    present = {"rgb": points.colors is not None, "intensity": points.intensities is not None}
+    columns = dict(points.columns)
+    present = {"rgb": "red" in columns, "intensity": "intensity" in columns}
     if color is not None and not present[color]:
         quantity = "colors" if color == "rgb" else "intensities"
         raise LidarError(f"`color` cannot be {color!r}, because {path} has no {quantity}.")
@@ -218,12 +218,13 @@ def _colored(
             f"the {other} of {path} are not stored, because a surfel has a single color. To use "
             f"them, set `color` to {choice}"
         )
-    if points.colors is not None and color == "rgb":
-        _note_unknown(path, "color", np.isnan(points.colors[:, 0]), _GRAY, tell)
-        return replace(points, intensities=None)
-    if points.intensities is not None:
-        _note_unknown(path, "intensity", np.isnan(points.intensities), _GRAY, tell)
-    return replace(points, colors=None)
+    if color == "rgb":
+        _note_unknown(path, "color", np.isnan(columns["red"]), _GRAY, tell)
+        columns.pop("intensity", None)
+    else:
+        _note_unknown(path, "intensity", np.isnan(columns["intensity"]), _GRAY, tell)
+        columns = {name: values for name, values in columns.items() if name not in COLORS}
+    return points.replace(columns=columns)
 
 
 def _note_unknown(
@@ -237,10 +238,10 @@ def _note_unknown(
         )
 
 
-def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: float) -> _Surfels:
+def _surfels_of(path: Path, points: Sweep, voxel_m: float | None, size: float) -> _Surfels:
     """Return the surfels of the points of a file, with their colors and classes."""
     # Covariances of Open3D lose the digits of points far from zero.
-    positions = points.positions
+    positions = points.points
     origin = np.round((positions.min(axis=0) + positions.max(axis=0)) / 2)
     positions = positions - origin
     o3d = load_open3d()
@@ -262,7 +263,8 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
         )
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(voxels.means(positions)))
     cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(_NEIGHBORS))
-    outward = None if points.outward is None else voxels.means(_directions(points.outward))
+    outward = _outward(points)
+    outward = None if outward is None else voxels.means(_directions(outward))
     corners = _surfel_corners(
         np.asarray(cloud.points), np.asarray(cloud.covariances), voxel_m, size, outward
     )
@@ -271,7 +273,7 @@ def _surfels_of(path: Path, points: ScannedPoints, voxel_m: float | None, size: 
         corners.reshape(-1, 3) + origin,
         surfel_faces(count),
         colors=_surfel_colors(o3d, points, voxels, np.asarray(cloud.points)),
-        materials=surfel_materials(points, voxels),
+        materials=surfel_materials(points.classes, voxels),
     )
     return _Surfels(mesh, voxel_m)
 
@@ -342,26 +344,33 @@ class Voxels:
         return modes
 
 
-def _directions(vectors: Floats) -> Floats:
+def _outward(points: Sweep) -> Floats | None:
+    """Return vectors (n, 3) to the scanner, otherwise normals, or None if neither is known.
+
+    Points whose scanner has an unknown position have a zero vector.
+    """
+    scanners = vectors(points, ORIGINS)
+    return vectors(points, NORMALS) if scanners is None else np.nan_to_num(scanners - points.points)
+
+
+def _directions(outward: Floats) -> Floats:
     """Return the directions of vectors (n, 3), of length 1 or, of zero vectors, 0."""
-    lengths = np.sqrt((vectors * vectors).sum(axis=1, keepdims=True))
-    return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)
+    lengths = np.sqrt((outward * outward).sum(axis=1, keepdims=True))
+    return np.divide(outward, lengths, out=np.zeros_like(outward), where=lengths > 0)
 
 
-def _surfel_colors(
-    o3d: Any, points: ScannedPoints, voxels: Voxels, centers: Floats
-) -> Colors | None:
+def _surfel_colors(o3d: Any, points: Sweep, voxels: Voxels, centers: Floats) -> Colors | None:
     """Return the mean colors of surfels in linear light, or grays of their mean intensities.
 
     `centers` (v, 3) are the centers of the surfels. A surfel whose points have neither has the mean
     of its neighbors, or, if these have neither, the gray of a file without colors.
     """
     light: Floats
-    if points.colors is not None:
-        light = voxels.known_means(_light(points.colors))
-    elif points.intensities is not None:
-        white = np.nanquantile(points.intensities, _WHITE_QUANTILE)
-        intensities = voxels.known_means(points.intensities[:, None])
+    if (srgb := vectors(points, COLORS)) is not None:
+        light = voxels.known_means(_light(srgb))
+    elif (strengths := points.intensity) is not None:
+        white = np.nanquantile(strengths, _WHITE_QUANTILE)
+        intensities = voxels.known_means(strengths[:, None])
         light = np.clip(intensities / (white if white > 0 else 1.0), 0, 1).repeat(3, axis=1)
     else:
         return None
@@ -384,18 +393,22 @@ def _fill_from_neighbors(o3d: Any, light: Floats, centers: Floats) -> None:
         light[unknown] = np.where(known, around, 0.0).sum(axis=1) / known.sum(axis=1)
 
 
-def _light(colors: Floats32) -> Floats:
+def _light(colors: AnyArray) -> Floats:
     """Return the linear light (n, 3) of sRGB colors from 0 to 255, NaN of NaN."""
     known = np.isfinite(colors)
     light = LINEAR[np.where(known, colors, 0).astype(np.uint8)]
     return np.where(known, light, np.nan)
 
 
-def surfel_materials(points: ScannedPoints, voxels: Voxels) -> FaceMaterials | None:
-    """Return the most frequent classes of surfels as names of materials, such as «class 2»."""
-    if points.classes is None:
+def surfel_materials(point_classes: Ints | None, voxels: Voxels) -> FaceMaterials | None:
+    """Return the most frequent classes of surfels as names of materials, such as «class 2».
+
+    `point_classes` (n,) are the classes of the points, `NO_CLASS` for points without a class, or
+    None if they are unknown.
+    """
+    if point_classes is None:
         return None
-    classes, numbers = np.unique(points.classes, return_inverse=True)
+    classes, numbers = np.unique(point_classes, return_inverse=True)
     unknown = 0 if classes[0] == NO_CLASS else None  # the lowest of all classes
     modes = voxels.most_frequent(numbers, len(classes), unknown)
     present, rows = np.unique(modes, return_inverse=True)

@@ -13,15 +13,16 @@ import numpy as np
 from ..base.tables import DEGREES, METERS, NUMBERS, Quantity, read_table
 from ..base.textfile import read_text
 from ..base.time_units import SECONDS
+from ..columns.column_names import ALIASES, TIMES
 from .complete_files import write_text_of
 from .fired_rays import FiredRays
 from .ray_header import COLUMNS, DIRECTION, ORIGIN, TIME_COLUMN, columns_of, header_of, rays_of
 
 _DECIMALS = 9  # of angles; directions have all digits
-_TIMES = ("time", "t", "time offset", "offset", "timestamp", "stamp", "fire time")
+_TIMES = (*TIMES, "offset", "stamp", "fire_time")
 QUANTITIES = (
     Quantity("time_s", _TIMES, SECONDS, None),
-    Quantity("channel", ("channel", "ring", "laser", "beam"), NUMBERS, ""),
+    Quantity("channel", ("channel", *ALIASES["channel"]), NUMBERS, ""),
     Quantity("azimuth_deg", ("azimuth",), DEGREES, None),
     Quantity("elevation_deg", ("elevation",), DEGREES, None),
     *(Quantity(name, (name, name[-1], f"d{name[-1]}"), NUMBERS, "") for name in DIRECTION),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,15 @@ class FiringPoses:
     def positions(self) -> Floats:
         """Positions (k, 3), or (3,) of a static sensor, meters, world coordinates."""
         return self.position if self.offsets is None else self.position + self.offsets.T
+
+    def select(self, rows: Any) -> FiringPoses:
+        """Return the poses of selected points."""
+        if self.offsets is None:
+            return self
+        parts = (self.offsets, self.quaternions, self.steps)
+        return FiringPoses(
+            self.position, self.rotation, *(None if p is None else p[:, rows] for p in parts)
+        )
 
     def inward(self, points: Floats) -> Floats:
         """Convert points (k, 3) from the world to the sensor frame at the firing of each point."""

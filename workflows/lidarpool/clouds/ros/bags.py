@@ -37,13 +37,14 @@ from lidarsim.columns.bags import (
 from lidarsim.columns.closing_bag import ClosingBag
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.mcap_chunks import read_metadata
+from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.bag_trajectories import read_bag
 from lidarsim.motion.trajectory import Track
 from lidarsim.sweeps.sweeps import Sweeps, states_compensation
 
 from .. import sweep_reader
 from ..frame_names import survey_start_ns
-from ..recording import Read, Recording, RecordingSource, positions_of
+from ..recording import Recording, RecordingSource, sweep_from_columns
 from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
 from .messages import LATCHED_TOPICS, message_store, survey_messages, sweep_topic
 
@@ -232,9 +233,10 @@ def open_file(source: RecordingSource) -> Recording:
     messages = partial(bag.messages, [connection])
     columns_of = livox_columns if topics is livox_clouds else point_columns
 
-    def points(message: Any) -> Read:
-        columns = columns_of(message[2])
-        return positions_of(columns), columns, None
+    def convert(message: Any) -> Sweep:
+        _, recorded_ns, data = message
+        stamp_ns = _header_of(data).stamp_ns if is_stamped else recorded_ns
+        return sweep_from_columns(columns_of(data), time_ns=float(stamp_ns))
 
     with reading(source.name):
         # Programs that set no stamps leave zeros.
@@ -254,7 +256,7 @@ def open_file(source: RecordingSource) -> Recording:
     unstamped = () if is_stamped or not connection.msgcount else (_UNSTAMPED,)
     return source.stream(
         messages,
-        points,
+        convert,
         connection.msgcount,
         times=times,
         frame_poses=frame_poses,

@@ -13,13 +13,15 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import plural
+from lidarsim.columns.sweep import Sweep
 from lidarsim.motion.rotations import check_rotations
 from lidarsim.motion.trajectory import Pose, pose_of
 from lidarsim.scene.scene import Scene
 from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweep_motion import FiringPoses
 
-from ...clouds.recording import FiredPoints, Recording
+from ...clouds.recording import Recording
+from ..compared_sweep import compared_sweep, with_compared_columns
 from .standstill import Speed, sweep_period_ns
 
 _MAX_SWEEPS = 64  # whose poses are read
@@ -87,24 +89,24 @@ class KnownPoses:
         turn_deg = float(turns_deg.sum() / sweeps)
         return Speed(shift_m, turn_deg if turn_deg > _MIN_SPEED_DEG else 0.0, period_ns)
 
-    def fired(self, recording: Recording) -> Callable[[int], FiredPoints]:
-        """Return a function that reads a sweep as fired, with poses in the scene frame.
+    def fired(self, recording: Recording) -> Callable[[int], Sweep]:
+        """Return a function that reads a sweep as fired, with `firing_poses` in the scene frame.
 
         A result says where each pulse was fired; otherwise the pose of a sweep counts for all its
         pulses. LidarError if the recording has poses of some sweeps alone.
         """
-        read = recording.fired
-        if self.are_given or read is None:
+        if not self.are_of_firings(recording):
             return self._of_whole_sweeps(recording)
 
-        def read_in_scene(number: int) -> FiredPoints:
-            fired = read(number)
-            poses = replace(fired.poses, position=fired.poses.position - self.origin)
-            return fired._replace(poses=poses)
+        def read_in_scene(number: int) -> Sweep:
+            sweep = recording.read_fired(number)
+            poses = sweep.firing_poses
+            poses = replace(poses, position=poses.position - self.origin)
+            return with_compared_columns(sweep).replace(firing_poses=poses)
 
         return read_in_scene
 
-    def _of_whole_sweeps(self, recording: Recording) -> Callable[[int], FiredPoints]:
+    def _of_whole_sweeps(self, recording: Recording) -> Callable[[int], Sweep]:
         """Return a function that reads a sweep as fired from a single pose."""
         matrices = self.matrices
         if not self.are_given:
@@ -116,14 +118,9 @@ class KnownPoses:
             matrices = recorded
             matrices[:, :3, 3] -= self.origin
 
-        def read_from_pose(number: int) -> FiredPoints:
-            points, columns, _ = recording.read(number)
-            positions = np.asarray(points, np.float64) * recording.meters
-            # Drivers write NaN or zeros for pulses without a return.
-            valid = np.isfinite(positions).all(axis=1) & positions.any(axis=1)
+        def read_from_pose(number: int) -> Sweep:
             poses = FiringPoses(matrices[number, :3, 3], matrices[number, :3, :3])
-            returned = {name: np.asarray(values)[valid] for name, values in columns.items()}
-            return FiredPoints(positions[valid], returned, poses)
+            return compared_sweep(recording, number).replace(firing_poses=poses)
 
         return read_from_pose
 

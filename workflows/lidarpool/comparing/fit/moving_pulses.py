@@ -7,13 +7,14 @@ Arrays of a sweep have r rows and c columns, as of `stack`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from lidarsim.base.arrays import Bools, Floats, Indices, Ints
 from lidarsim.base.even_samples import even_indices
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import NORMAL
 from lidarsim.motion.rotations import matrices
 from lidarsim.motion.trajectory import Pose
@@ -22,7 +23,7 @@ from lidarsim.sensor import Spin
 from lidarsim.sensor.ray_sensors import ListedSensor
 from lidarsim.simulator import Scanner
 
-from ...clouds.recording import FiredPoints, Read, Recording, rings_of
+from ...clouds.recording import Recording
 from .smooth_surfaces import (
     ASSUMED_DIRECTION_NOISE_RAD,
     MAX_KINK_PER_M,
@@ -112,20 +113,14 @@ class SweepPulses(NamedTuple):
 
 
 def measure_pulses(
-    recording: Recording, scene: Scene, fired: Callable[[int], FiredPoints]
+    recording: Recording, scene: Scene, fired: Callable[[int], Sweep]
 ) -> tuple[SweepStack, SweepPulses]:
     """Read the sweeps of a sensor that moves, and compare their pulses with a scene.
 
-    `fired` returns the points of a sweep as they were fired, with poses in the scene frame.
+    `fired` reads the returns of a sweep as fired, with `firing_poses` in the scene frame.
     LidarError as of `SweepStack.read`.
     """
-
-    def read(number: int) -> Read:
-        points = fired(number)
-        return points.points, points.columns, None
-
-    as_fired = replace(recording, read=read, firing_key="", meters=(1.0, 1.0, 1.0))
-    stack = SweepStack.read(as_fired)
+    stack = SweepStack.read(recording, fired)
     caster = _CellCaster.of_stack(stack, scene)
     sweeps = enumerate(stack.numbers.tolist())
     return stack, SweepPulses.joined(
@@ -144,10 +139,11 @@ class _CellReturns(NamedTuple):
     rotations: Floats  # (r c, 3, 3): from the sensor frame to the scene frame
 
     @classmethod
-    def of_sweep(cls, stack: SweepStack, sweep: int, fired: FiredPoints) -> _CellReturns:
+    def of_sweep(cls, stack: SweepStack, sweep: int, fired: Sweep) -> _CellReturns:
         """Find the returns of the cells of a sweep."""
-        points = np.asarray(fired.points, np.float64)
-        rings = np.asarray(rings_of(fired.columns), np.int64)
+        points = fired.points
+        rings = fired.rings
+        assert rings is not None
         nearest = _NearestReturns.of_sweep(stack, sweep, points, rings)
         index = nearest.indices
         ranges = np.linalg.norm(points, axis=1)[index]
@@ -303,7 +299,7 @@ class _SceneSurfaces(NamedTuple):
 
 
 def _pulses_of_sweep(
-    stack: SweepStack, sweep: int, caster: _CellCaster, fired: FiredPoints
+    stack: SweepStack, sweep: int, caster: _CellCaster, fired: Sweep
 ) -> SweepPulses:
     """Compare the pulses of a sweep with the smooth surfaces of a scene."""
     returns = _CellReturns.of_sweep(stack, sweep, fired)
@@ -339,9 +335,9 @@ def _pulses_of_sweep(
     return SweepPulses(pulses, len(errors), int((errors < SCENE_TOLERANCE_M).sum()))
 
 
-def _firing_poses(fired: FiredPoints, index: Ints) -> tuple[Floats, Floats]:
+def _firing_poses(fired: Sweep, index: Ints) -> tuple[Floats, Floats]:
     """Return the positions (k, 3) and rotations (k, 3, 3) of the firings of points (k,)."""
-    poses = fired.poses
+    poses = fired.firing_poses
     if poses.quaternions is None or poses.offsets is None:
         count = len(index)
         rotations = np.broadcast_to(poses.rotation, (count, 3, 3))

@@ -8,8 +8,9 @@ and k rays; positions and directions are in the sensor frame.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,10 @@ from lidarsim.base.arrays import Bools, Floats, Floats32, Ints
 from lidarsim.base.errors import LidarError, prefixed
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.words import rounded
+from lidarsim.columns.sweep import Sweep
 
-from ...clouds.recording import RecordedPoints, Recording
+from ...clouds.recording import Recording
+from ..compared_sweep import compared_sweep, rings_note
 from ..range_image import RangeImages, range_images
 
 MAX_RETURNS = 1 << 24  # returns in memory; of a longer recording, sweeps are chosen evenly
@@ -62,20 +65,25 @@ class SweepStack:
         return steady_cells(np.isfinite(self.ranges), self.covered)
 
     @classmethod
-    def read(cls, recording: Recording) -> SweepStack:
+    def read(cls, recording: Recording, read: Callable[[int], Sweep] | None = None) -> SweepStack:
         """Read the sweeps of a recording into the same cells.
+
+        `read` reads the returns of a sweep by its number. The default is `compared_sweep`.
 
         LidarError if the recording has no sweeps with points and rings, or is of several sensors.
         """
         check_sweeps(recording)
-        notes = list(recording.notes)
-        cells = _CommonCells.read(recording)
+        read = read or partial(compared_sweep, recording)
+        cells = _CommonCells.read(recording, read)
+        notes = [*recording.notes, *rings_note(recording, cells.reference)]
         if len(cells.numbers) < recording.count:
             notes.append(
                 f"{len(cells.numbers):,} evenly spaced sweeps out of {recording.count:,} are used"
             )
-        for index in range(len(cells.numbers)):
-            cells.read_sweep(recording, index)
+        for index, number in enumerate(cells.numbers.tolist()):
+            sweep = read(number)
+            with prefixed(recording.name):
+                cells.add_sweep(index, sweep)
         elevation_deg, values = cells.sorted_by_elevation()
         covered = covered_cells(np.isfinite(values[0]))
         has_return = np.isfinite(values[0]).any(axis=0)
@@ -119,17 +127,16 @@ class _CommonCells:
     """
 
     numbers: Ints  # (s,): numbers of the sweeps of the recording that are read
-    reference: RecordedPoints  # the sweep whose rings and steps of azimuth define the cells
+    reference: Sweep  # the sweep whose rings and steps of azimuth define the cells
     images: RangeImages  # range images of the reference
     rings: Ints  # (r,)
     elevation_deg: Floats  # (r,)
     values: Floats32  # (4, s, r, c): range, meters; intensity; azimuth and elevation, degrees
 
     @classmethod
-    def read(cls, recording: Recording) -> _CommonCells:
+    def read(cls, recording: Recording, read: Callable[[int], Sweep]) -> _CommonCells:
         """Define empty cells by the largest of the first three sweeps."""
-        sweeps = (recording.read_points(k) for k in range(min(3, recording.count)))
-        reference = max(sweeps, key=len)
+        reference = max(map(read, range(min(3, recording.count))), key=len)
         if not len(reference):
             raise LidarError(f"{recording.name} contains no points, so there is nothing to fit.")
         with prefixed(recording.name):
@@ -145,28 +152,26 @@ class _CommonCells:
         """Width of a column, degrees."""
         return self.images.step_deg
 
-    def read_sweep(self, recording: Recording, index: int) -> None:
-        """Read the sweep `numbers[index]` into the cells.
+    def add_sweep(self, index: int, points: Sweep) -> None:
+        """Put the sweep `numbers[index]` into the cells.
 
         LidarError if the sweep is of another sensor.
         """
-        number = int(self.numbers[index])
-        points = recording.read_points(number)
         if not len(points):
             return
-        with prefixed(recording.name):
-            names = (f"sweep {number}", "another")
-            sweep = range_images(points, self.reference, names, self.step_deg)
-            returned = np.isfinite(sweep.images[0, 0])
-            # Rings of false alarms alone may have no return in the first sweeps.
-            foreign = returned[~np.isin(sweep.rings, self.images.rings)].sum()
-            is_foreign = foreign > _MAX_FOREIGN_SHARE * returned.sum()
-            # With other steps of azimuth, more points lie behind others of their cell.
-            if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
-                raise LidarError(
-                    f"sweep {number} comes from a different sensor, or was recorded in a "
-                    "different mode."
-                )
+        number = int(self.numbers[index])
+        names = (f"sweep {number}", "another")
+        sweep = range_images(points, self.reference, names, self.step_deg)
+        returned = np.isfinite(sweep.images[0, 0])
+        # Rings of false alarms alone may have no return in the first sweeps.
+        foreign = returned[~np.isin(sweep.rings, self.images.rings)].sum()
+        is_foreign = foreign > _MAX_FOREIGN_SHARE * returned.sum()
+        # With other steps of azimuth, more points lie behind others of their cell.
+        if is_foreign or sweep.hidden_shares[0] > self.images.hidden_shares[0] + 0.25:
+            raise LidarError(
+                f"sweep {number} comes from a different sensor, or was recorded in a different "
+                "mode."
+            )
         self._add_rings(sweep)
         _, sweep_rows, row_indices = np.intersect1d(sweep.rings, self.rings, return_indices=True)
         first_column = round(sweep.start_deg / sweep.step_deg)

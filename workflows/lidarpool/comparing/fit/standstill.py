@@ -66,10 +66,9 @@ def read_static(recording: Recording, *, stands: bool = False) -> SweepStack:
 
 def sweep_period_ns(recording: Recording, numbers: Ints) -> float | None:
     """Return the median time from a sweep of `numbers` to the next, or None if unknown."""
-    if recording.times is None or len(numbers) < 2:
+    if len(numbers) < 2 or recording.stamps_ns is None:
         return None
-    times = np.array([*recording.times()])[numbers]
-    return float(np.median(np.diff(times)))
+    return float(np.median(np.diff(recording.stamps_ns[numbers])))
 
 
 def moving_message(name: str, speed: Speed, advice: str) -> str:

@@ -15,7 +15,6 @@ import numpy as np
 
 from lidarsim.base.storage import Storage
 from lidarsim.base.words import plural, rounded
-from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 from lidarview.viewer.point_selection import OrderedPoints
 from lidarview.viewer.result_views import wait_for_interrupt
@@ -28,7 +27,7 @@ from ...datasets.job_seconds import known_seconds
 from ...datasets.job_table import JobRow, Value, read_table
 from ...datasets.loader import read_index, sweeps
 from .downloads import downloads
-from .recorded import Pieces
+from .recorded import joined_cloud, shown
 
 MAX_LISTED = 1000  # rows of the table of jobs, of those done and of those that failed
 _MAX_VIEWS = 4  # jobs whose points are in memory
@@ -125,16 +124,10 @@ class JobList:
         name = job_file(self._index["format"], row.name, SWEEPS_FILE)
         saved = Sweeps.load(self._storage.path(name), partial(self._storage.read, name))
         saved = replace(saved, coordinates="world")
-        pieces = Pieces()
-        scans: list[np.ndarray[Any, Any]] = []
         loaded = sweeps(self.location, jobs=[row.number])
-        for index, sweep in enumerate(loaded):
-            pose = sweep.pose
-            pieces.add(
-                sweep.points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3], sweep.columns
-            )
-            scans.append(np.full(len(pieces.positions[-1]), saved.scans[index], np.int32))
-        cloud = pieces.cloud(scan=np.concatenate(scans)) if scans else Cloud(np.zeros((0, 3)), {})
+        read = [shown(sweep.replace(points=sweep.in_world())) for sweep in loaded]
+        scans = saved.scans[: len(read)].astype(np.int32).repeat([len(sweep) for sweep in read])
+        cloud = joined_cloud(read, scan=scans)
         title = f"job {row.name} - {self.title}"
         return View(OrderedPoints(cloud), None, saved, title=title, downloads=downloads())
 

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.errors import LidarError
-from lidarsim.base.extras import reading
 from lidarsim.base.words import plural
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.column_names import COLORS
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import TABLE, Column, Kind, Scale
 from lidarsim.motion.rotations import quaternions_of
 from lidarsim.sweeps.sweeps import SweepPoses, Sweeps
@@ -25,12 +26,10 @@ MAX_POINTS = 20_000_000  # points of a recording, in memory
 LARGE_POINTS = 2_000_000  # a larger cloud is shown by a sample while it is read
 _SAMPLE_POINTS = 200_000
 _GROWING_POINTS = 1_000_000  # points that are shown before all are read, beside the sample
-# Receives positions (n, 3) and columns of a part of a cloud, and the share that has been read.
-OnPart = Callable[[Floats, Mapping[str, AnyArray], float], None]
+# Receives a part of a cloud, and the share of the cloud that has been read.
+OnPart = Callable[[Sweep, float], None]
 _SWEEP_NS = 1e8  # assumed from sweep to sweep if the recording has no times
-_RINGS = ("ring", "laser_id", "laser_number", "line", "beam")  # names of the column `channel`
-_NAMES = {"classification": "class", "label": "class", "NormalX": "normal_x", "NormalY": "normal_y"}
-_NAMES |= {"NormalZ": "normal_z", "energy": "intensity"}
+_GRAY = 188  # byte of a color that is unknown: half of the light
 # Classes of ASPRS LAS 1.4 by their numbers.
 ASPRS_CLASSES = (
     "never classified", "unassigned", "ground", "low vegetation", "medium vegetation",
@@ -40,79 +39,48 @@ ASPRS_CLASSES = (
 )  # fmt: skip
 
 
-@dataclass(eq=False)
-class Pieces:
-    """Points of sweeps, or of parts of a cloud, in memory."""
-
-    positions: list[Floats] = field(default_factory=list)
-    columns: list[Mapping[str, AnyArray]] = field(default_factory=list)
-    count: int = 0
-    _used: set[str] = field(default_factory=set)  # columns with other values than zeros
-
-    def add(self, positions: Floats, columns: Mapping[str, AnyArray]) -> None:
-        """Add points at finite positions (n, 3), with the columns of a number for each point."""
-        arrays = {name: np.asarray(values) for name, values in columns.items()}
-        arrays = {
-            name: values
-            for name, values in arrays.items()
-            if values.shape == (len(positions),) and values.dtype.kind in "biuf"
-        }
-        valid = np.asarray(np.isfinite(positions).all(axis=1))
-        if not valid.all():
-            positions = positions[valid]
-            arrays = {name: values[valid] for name, values in arrays.items()}
-        self.positions.append(positions)
-        self.columns.append(arrays)
-        self.count += len(positions)
-        self._used |= {
-            name for name in arrays.keys() - self._used if arrays[name].any()
-        }  # zeros take long to be looked at, and are not joined
-
-    def cloud(self, **columns: AnyArray) -> Cloud:
-        """Join the points with the columns that all pieces have, and further columns.
-
-        Pieces without points may lack columns.
-        """
-        if not self.positions:
-            return Cloud(np.zeros((0, 3)), columns)
-        pairs = zip(self.positions, self.columns, strict=True)
-        filled = [piece for positions, piece in pairs if len(positions)] or self.columns
-        shared = set.intersection(*({*piece} for piece in filled))
-        joined = {
-            name: np.concatenate([piece[name] for piece in filled])
-            for name in filled[0]
-            if name in shared & self._used
-        }
-        joined = _with_known_names(joined, shared) | columns
-        custom = tuple(_described(name, array) for name, array in joined.items())
-        return Cloud(np.concatenate(self.positions), joined, custom)
+def shown(sweep: Sweep) -> Sweep:
+    """Return the points at finite positions, with the columns of one number per point."""
+    arrays = {name: np.asarray(values) for name, values in sweep.columns.items()}
+    columns = {
+        name: values
+        for name, values in arrays.items()
+        if values.shape == (len(sweep),) and values.dtype.kind in "biuf"
+    }
+    numbers = sweep.with_columns(**columns)
+    finite = np.asarray(np.isfinite(sweep.points).all(axis=1))
+    return numbers if finite.all() else numbers.select(finite)
 
 
-def _with_known_names(
-    columns: Mapping[str, AnyArray], all_names: Collection[str]
-) -> dict[str, AnyArray]:
-    """Return columns by the names of lidarpool, without coordinates.
+def joined_cloud(sweeps: Sequence[Sweep], **further: AnyArray) -> Cloud:
+    """Join the points of `shown` sweeps with the columns that all of them have.
 
-    `all_names` are the names in the recording, with columns that are left out.
+    Columns that are zero throughout are omitted. Sweeps without points may lack columns. `further`
+    are additional columns of all points.
     """
-    named: dict[str, AnyArray] = {}
-    for name, values in columns.items():
-        if name == "rgb":  # a column of PCL: bytes in the bits of a float
-            bits = values.astype(np.float32).view(np.uint32) if values.dtype.kind == "f" else values
-            for color, shift in (("red", 16), ("green", 8), ("blue", 0)):
-                named[color] = ((bits >> shift) & 255).astype(np.uint8)
-            continue
-        known_name = "channel" if name in _RINGS else _NAMES.get(name, name)
-        known_name = re.sub(r"\W", "_", known_name)
-        known_name = known_name if known_name.isidentifier() else f"_{known_name}"
-        is_new = known_name not in all_names or known_name == name
-        if known_name.lower() not in "xyz" and is_new:
-            # Bytes in the order of this machine; True and False as numbers.
-            kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
-            named[known_name] = values.astype(kind.newbyteorder("="))
-    if "return_number" in named and "number_of_returns" in named:
-        named["returns"] = named.pop("number_of_returns")
-    return named
+    if not sweeps:
+        return Cloud(np.zeros((0, 3)), further)
+    filled = [sweep for sweep in sweeps if len(sweep)] or sweeps
+    shared = set.intersection(*({*sweep.columns} for sweep in filled))
+    columns: dict[str, AnyArray] = {}
+    for name in filled[0].columns:
+        parts = [sweep.columns[name] for sweep in filled if name in shared]
+        identifier = re.sub(r"\W", "_", name)
+        identifier = identifier if identifier.isidentifier() else f"_{identifier}"
+        is_new = identifier == name or identifier not in shared
+        if is_new and identifier.lower() not in "xyz" and any(part.any() for part in parts):
+            columns[identifier] = _plain(name, np.concatenate(parts))
+    columns |= further
+    custom = tuple(_described(name, array) for name, array in columns.items())
+    return Cloud(np.concatenate([sweep.points for sweep in sweeps]), columns, custom)
+
+
+def _plain(name: str, values: AnyArray) -> AnyArray:
+    """Return values in native byte order, with bytes for colors and truth values."""
+    if name in COLORS and values.dtype.kind == "f" and np.isnan(values).any():
+        return np.nan_to_num(values, nan=_GRAY).astype(np.uint8)
+    kind = np.dtype(np.uint8) if values.dtype == np.bool_ else values.dtype
+    return values.astype(kind.newbyteorder("="), copy=False)
 
 
 def _described(name: str, values: AnyArray) -> Column:
@@ -176,37 +144,33 @@ def _station_names(recording: Recording, sweeps: Sweeps) -> list[str]:
     return names
 
 
-def sampled_view(recording: Recording, title: str) -> tuple[View, Pieces]:
+def sampled_view(recording: Recording, title: str) -> tuple[View, Sweep]:
     """Return the view of a sample of a cloud that has `Recording.sample`, and its points.
 
     The sample consists of runs of points, which are read within a second.
     """
-    pieces = Pieces()
-    assert recording.sample is not None
-    with reading(recording.name):
-        positions, columns, _ = recording.sample(_SAMPLE_POINTS)
-        pieces.add(positions * recording.meters, columns)
-    names = {"class": ASPRS_CLASSES}
+    sample = shown(recording.read_sample(_SAMPLE_POINTS))
     view = View(
-        HeldPoints(pieces.cloud()),
+        HeldPoints(joined_cloud([sample])),
         note=" ".join(recording.notes),
         title=title,
-        names=names,
+        names={"class": ASPRS_CLASSES},
         stated_epsg=recording.epsg,
     )
-    return view, pieces
+    return view, sample
 
 
 def growing_view(recording: Recording, title: str, read: Callable[[OnPart], View]) -> GrowingView:
     """Return a view that shows a sample of a cloud, and more points while `read` reads all."""
     total = recording.point_count or 0
-    sampled, pieces = sampled_view(recording, title)
+    sampled, sample = sampled_view(recording, title)
+    parts = [sample]
     step = -(-total // _GROWING_POINTS)
 
     def grow(show: Callable[[Points, float], None]) -> View:
-        def on_part(positions: Floats, columns: Mapping[str, AnyArray], share: float) -> None:
-            pieces.add(positions[::step], {name: v[::step] for name, v in columns.items()})
-            show(HeldPoints(pieces.cloud()), share)
+        def on_part(part: Sweep, share: float) -> None:
+            parts.append(part.select(slice(None, None, step)))
+            show(HeldPoints(joined_cloud(parts)), share)
 
         return read(on_part)
 
@@ -214,23 +178,15 @@ def growing_view(recording: Recording, title: str, read: Callable[[OnPart], View
 
 
 def _cloud_of(recording: Recording, on_part: OnPart) -> Cloud:
-    """Read a cloud.
-
-    Of a large cloud, take one point in a few.
-    """
+    """Read a cloud, or evenly distributed points of a large cloud."""
     total = recording.point_count or 0
     step = max(1, -(-total // MAX_POINTS))
-    pieces = Pieces()
-    for number in range(recording.count):
-        with reading(recording.name):
-            positions, columns, _ = recording.read(number)
-            positions = np.asarray(positions, np.float64)[::step]
-            if recording.meters != (1.0, 1.0, 1.0):
-                positions = positions * recording.meters
-            columns = {name: np.asarray(values)[::step] for name, values in columns.items()}
-            pieces.add(positions, columns)
-        on_part(positions, columns, (number + 1) / recording.count)
-    return pieces.cloud()
+    parts: list[Sweep] = []
+    for number in range(len(recording)):
+        part = shown(recording[number].select(slice(None, None, step)))
+        parts.append(part.replace(points=np.asarray(part.points, np.float64)))
+        on_part(parts[-1], (number + 1) / len(recording))
+    return joined_cloud(parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,12 +203,14 @@ def _order(sensors: Sequence[Recording]) -> tuple[list[_TimedSweep], bool]:
     sweeps: list[_TimedSweep] = []
     is_timed = True
     for sensor, recording in enumerate(sensors):
-        times: Sequence[float] = [] if recording.times is None else [*recording.times()]
-        if len(times) < recording.count:
+        stamps_ns = recording.stamps_ns
+        times = _SWEEP_NS * np.arange(len(recording), dtype=np.float64)
+        if stamps_ns is None or len(stamps_ns) < len(recording):
             is_timed = False
-            times = [_SWEEP_NS * number for number in range(recording.count)]
+        else:
+            times = stamps_ns
         sweeps += [
-            _TimedSweep(float(times[number]), sensor, number) for number in range(recording.count)
+            _TimedSweep(float(times[number]), sensor, number) for number in range(len(recording))
         ]
     start_ns = min((sweep.begins_ns for sweep in sweeps), default=0.0)
     ordered = sorted(sweeps, key=lambda sweep: (sweep.begins_ns, sweep.sensor))
@@ -265,16 +223,21 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     """Read sweeps until memory is full, and return their points, the sweeps, and notes."""
     recordings = [*sensors.values()]
     ordered, is_timed = _order(recordings)
-    pieces = Pieces()
     frame_poses = [_frame_poses(recording) for recording in recordings]
     if any(sensor_poses is None for sensor_poses in frame_poses):
         frame_poses = [None] * len(recordings)  # sensors without a pose fit no others
+    read: list[Sweep] = []
     poses: list[Floats | None] = []
-    for sweep in ordered:
-        sensor_poses = frame_poses[sweep.sensor]
-        pose = None if sensor_poses is None else sensor_poses[sweep.number]
-        poses.append(_add_sweep(pieces, recordings[sweep.sensor], sweep.number, pose))
-        if pieces.count > MAX_POINTS:
+    count = 0
+    for timed in ordered:
+        sweep = recordings[timed.sensor][timed.number].returns()
+        sensor_poses = frame_poses[timed.sensor]
+        if sweep.pose is None and sensor_poses is not None:
+            sweep = sweep.replace(pose=sensor_poses[timed.number])
+        poses.append(sweep.pose)
+        read.append(shown(sweep if sweep.pose is None else sweep.replace(points=sweep.in_world())))
+        count += len(read[-1])
+        if count > MAX_POINTS:
             break
     notes = []
     if len(poses) < len(ordered):
@@ -282,37 +245,16 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
     are_stations = all(recording.stations for recording in recordings)
     if not is_timed and len(ordered) > 1 and not are_stations:
         notes.append("The recording contains no times. A rate of 10 sweeps per second is assumed.")
-    counts = [len(positions) for positions in pieces.positions]
-    cloud = pieces.cloud(scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
+    counts = [len(sweep) for sweep in read]
+    cloud = joined_cloud(read, scan=np.repeat(np.arange(len(counts), dtype=np.int32), counts))
     sweeps = recorded_sweeps(ordered[: len(poses)], poses, [*sensors])
     return cloud, replace(sweeps, stations=len(sweeps) if are_stations else 1), notes
 
 
 def _frame_poses(recording: Recording) -> Floats | None:
     """Return the poses (n, 4, 4) of sweeps by the frames of a bag, or None."""
-    if recording.frame_poses is None:
-        return None
-    with reading(recording.name):
-        return recording.frame_poses()
-
-
-def _add_sweep(
-    pieces: Pieces, recording: Recording, number: int, frame_pose: Floats | None
-) -> Floats | None:
-    """Read a sweep into the world frame, if its pose is known, and return the pose.
-
-    `frame_pose` is the pose of a sweep without a pose.
-    """
-    with reading(recording.name):
-        positions, columns, pose = recording.read(number)
-        pose = frame_pose if pose is None else pose
-        local = np.asarray(positions, np.float64) * recording.meters
-    is_return = local.any(axis=1)  # drivers write zeros for pulses without a return
-    local = local[is_return]
-    if pose is not None:
-        local = local @ pose[:3, :3].T + pose[:3, 3]
-    pieces.add(local, {name: np.asarray(values)[is_return] for name, values in columns.items()})
-    return pose
+    has_frames = recording.frame_poses is not None
+    return recording.poses(range(len(recording))) if has_frames else None
 
 
 def recorded_sweeps(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from .cloud_scan import CloudScan
+from ...columns.sweep import Sweep
 from .float_rows import read_float_rows
 from .npy_cloud import read_npy_cloud
 from .pcd import read_pcd
@@ -14,7 +14,7 @@ from .ptx import read_ptx
 from .text_cloud import read_text_cloud
 
 # {ending: reader, which raises ValueError for a broken file}
-SCAN_READERS: dict[str, Callable[[Path], list[CloudScan]]] = {
+SCAN_READERS: dict[str, Callable[[Path], list[Sweep]]] = {
     ".pcd": read_pcd,
     ".xyz": read_text_cloud,
     ".txt": read_text_cloud,

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...base.arrays import AnyArray
 from ...base.input_files import read_input
-from .cloud_scan import CloudScan
+from ...columns.sweep import Sweep
 
 # Columns of the formats.
 KITTI = ("x", "y", "z", "intensity")
@@ -48,7 +48,7 @@ def read_float_columns(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray
     return columns
 
 
-def read_float_rows(path: Path) -> list[CloudScan]:
+def read_float_rows(path: Path) -> list[Sweep]:
     """Read the points of a sweep, of the format that its ending tells.
 
     Errors as of `read_float_columns`.
@@ -56,4 +56,4 @@ def read_float_rows(path: Path) -> list[CloudScan]:
     columns = read_float_columns(path, columns_by_name(path))
     with np.errstate(invalid="ignore"):  # NaN of any kind may be invalid
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
-    return [CloudScan(positions, columns)]
+    return [Sweep(positions, columns)]

@@ -12,14 +12,15 @@ from ...base.arrays import AnyArray
 from ...base.errors import CutShortError
 from ...base.input_files import check_input, open_input
 from ...base.words import printable
-from .cloud_scan import CloudScan, with_usual_names
+from ...columns.column_names import with_standard_names
+from ...columns.sweep import Sweep
 
 _EXPECTED = (
     "Expected an array (n, k) with at least three columns, or records with the fields x, y and z"
 )
 
 
-def read_npy_cloud(path: Path) -> list[CloudScan]:
+def read_npy_cloud(path: Path) -> list[Sweep]:
     """Read the points of an array: x, y and z are its first three columns, or fields.
 
     Columns after z are `column_4`, …. The rows of a range image (rows, columns, 3 or more) are
@@ -48,11 +49,11 @@ def read_npy_cloud(path: Path) -> list[CloudScan]:
         raise ValueError(f"its array has the shape {array.shape}. {_EXPECTED}")
     with np.errstate(invalid="ignore", over="ignore"):  # NaN of any kind, and long doubles
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
-    return [CloudScan(positions, columns)]
+    return [Sweep(positions, columns)]
 
 
 def _fields(records: AnyArray) -> dict[str, AnyArray]:
-    """Return the fields of records (n,) by their usual names.
+    """Return the fields of records (n,).
 
     Raises ValueError without x, y and z.
     """
@@ -64,7 +65,7 @@ def _fields(records: AnyArray) -> dict[str, AnyArray]:
             continue
         numbers = values.reshape(len(values), -1)
         columns |= {f"{name}_{index}": column for index, column in enumerate(numbers.T)}
-    columns = with_usual_names(columns)
+    columns = with_standard_names(columns, "xyz")
     if not {*"xyz"} <= columns.keys():
         raise ValueError(f"its fields are {printable(', '.join(columns))}. {_EXPECTED}")
     return columns

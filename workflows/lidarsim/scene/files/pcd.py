@@ -23,9 +23,10 @@ from ...base.arrays import AnyArray, Bytes, Floats
 from ...base.errors import CutShortError
 from ...base.input_files import read_input
 from ...base.words import printable
+from ...columns.column_names import COLORS, standard_names
+from ...columns.sweep import Sweep
 from ...motion.rotations import matrices
 from ..transform import affine
-from .cloud_scan import CloudScan, usual_names
 from .text_rows import RowReader
 
 _KEYWORDS = (
@@ -44,7 +45,7 @@ _HEADER_MAX_BYTES = 1 << 20
 _MAX_NUMBERS = 10_000  # numbers of a point; descriptors of PCL have up to 1,980
 _MAX_QUATERNION_ERROR = 0.01  # error of the length of VIEWPOINT's quaternion
 _SMALLER = "write it uncompressed"
-_COLORS = ("red", "green", "blue")
+_RESOLVED = (*"xyz", "rgb", "rgba", *COLORS)  # names that are resolved here
 _NO_VIEWPOINT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
@@ -72,7 +73,7 @@ class _Header(NamedTuple):
     lines: int  # up to DATA
 
 
-def read_pcd(path: Path) -> list[CloudScan]:
+def read_pcd(path: Path) -> list[Sweep]:
     """Read the points of a .pcd file, with its VIEWPOINT as their pose.
 
     Fields of several numbers become the columns `name_0`, `name_1`, …; the bits of `rgb` and `rgba`
@@ -114,7 +115,7 @@ def read_pcd(path: Path) -> list[CloudScan]:
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1).astype(np.float64)
     pose = _pose(header.viewpoint)
     scanner = None if header.viewpoint == _NO_VIEWPOINT else pose[:3, 3]
-    return [CloudScan(positions, _with_colors(columns), pose, scanner)]
+    return [Sweep(positions, unpacked_colors(columns), pose=pose, scanner=scanner)]
 
 
 def pcd_bytes(
@@ -466,20 +467,20 @@ def _named_columns(fields: Sequence[_Field], arrays: Sequence[AnyArray]) -> dict
         if field.name != _PADDING
         for index, name in enumerate(_column_names(field))
     ]
-    names = usual_names(name for name, _ in columns)
+    names = standard_names([name for name, _ in columns], _RESOLVED)
     return {
         name: array.astype(array.dtype.newbyteorder("="))
         for name, (_, array) in zip(names, columns, strict=True)
     }
 
 
-def _with_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
-    """Return columns with red, green and blue in place of the bits of `rgb` or `rgba`."""
+def unpacked_colors(columns: dict[str, AnyArray]) -> dict[str, AnyArray]:
+    """Return columns with red, green and blue in place of the packed column `rgb` or `rgba`."""
     for name in ("rgb", "rgba"):
-        if name not in columns or not columns.keys().isdisjoint(_COLORS):
+        if name not in columns or not columns.keys().isdisjoint(COLORS):
             continue
         bits = _bits(columns.pop(name))
-        for shift, color in zip((16, 8, 0), _COLORS, strict=True):
+        for shift, color in zip((16, 8, 0), COLORS, strict=True):
             columns[color] = (bits >> shift & 255).astype(np.uint8)
         alpha = (bits >> 24).astype(np.uint8)
         if (alpha != alpha[:1]).any():

@@ -17,7 +17,7 @@ from ...base.arrays import AnyArray, Floats
 from ...base.errors import CutShortError
 from ...base.input_files import check_input, open_input
 from ...base.words import plural, printable
-from .cloud_scan import CloudScan
+from ...columns.sweep import Sweep
 from .intensity_scales import LEICA_LOWEST
 from .text_rows import RowReader
 
@@ -30,7 +30,7 @@ _NAMES = {  # {cells of a line: names}
 }
 
 
-def read_pts(path: Path) -> list[CloudScan]:
+def read_pts(path: Path) -> list[Sweep]:
     """Read the clouds of a .pts, all in one frame.
 
     If an intensity of any cloud is negative, the intensities of all clouds are shifted by 2048, the
@@ -73,10 +73,10 @@ def next_line(lines: Iterator[tuple[int, str]]) -> tuple[int, str] | None:
     return next(((number, line) for number, line in lines if not line.isspace()), None)
 
 
-def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None) -> CloudScan:
+def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None) -> Sweep:
     """Return the next `count` points, or all points without a count, after line `number`."""
     if count == 0:
-        return CloudScan(np.zeros((0, 3)), {})
+        return Sweep(np.zeros((0, 3)), {})
     first = next_line(lines)
     if first is None:
         raise CutShortError(f"line {number} declares {count:,} points, but none follow")
@@ -85,7 +85,7 @@ def _read_cloud(lines: Iterator[tuple[int, str]], number: int, count: int | None
     values = RowReader(names, range(len(names))).read(islice(texts, count), first[0])
     if count is not None and len(values) < count:
         raise CutShortError(f"line {number} declares {count:,} points, but {len(values):,} follow")
-    return CloudScan(values[:, :3], point_columns(values, names))
+    return Sweep(values[:, :3], point_columns(values, names))
 
 
 def names_of_cells(entry: tuple[int, str], names: dict[int, tuple[str, ...]]) -> tuple[str, ...]:

@@ -19,8 +19,8 @@ from ...base.errors import CutShortError
 from ...base.input_files import check_input, open_input
 from ...base.vectors import matmul
 from ...base.words import plural, printable
+from ...columns.sweep import Sweep
 from ..transform import affine
-from .cloud_scan import CloudScan
 from .pts import COLORS, names_of_cells, next_line, point_columns
 from .text_rows import RowReader
 
@@ -45,7 +45,7 @@ _MAX_ROTATION_ERROR = 1e-3  # error of the transformation's axes, which are roun
 _Lines = Iterator[tuple[int, str]]
 
 
-def read_ptx(path: Path) -> list[CloudScan]:
+def read_ptx(path: Path) -> list[Sweep]:
     """Read the scans of a .ptx, each in the frame of its scanner, with its pose.
 
     Raises
@@ -69,7 +69,7 @@ def read_ptx(path: Path) -> list[CloudScan]:
     return scans
 
 
-def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> CloudScan:
+def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> Sweep:
     """Return the scan whose header begins with a line, from a file of a size in bytes."""
     start = entry[0]
     header = [_header_numbers(entry, *_HEADER_LINES[0])]
@@ -93,7 +93,7 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> CloudScan:
     is_placed = np.array_equal(pose, np.eye(4))
     scanner = np.array(position) if is_placed else pose[:3, 3]
     if not count:
-        return CloudScan(np.zeros((0, 3)), {}, pose, scanner)
+        return Sweep(np.zeros((0, 3)), {}, pose=pose, scanner=scanner)
     first = next_line(lines)
     names = ("x", "y", "z", "intensity") if first is None else names_of_cells(first, _NAMES)
     values = np.zeros((0, len(names)))
@@ -109,7 +109,7 @@ def _read_scan(entry: tuple[int, str], lines: _Lines, size: int) -> CloudScan:
             f"{following_points}"
         )
     values = values[values[:, :3].any(axis=1)]
-    return CloudScan(values[:, :3], point_columns(values, names), pose, scanner)
+    return Sweep(values[:, :3], point_columns(values, names), pose=pose, scanner=scanner)
 
 
 def _begun(first: str, lines: Iterator[str]) -> Iterator[str]:

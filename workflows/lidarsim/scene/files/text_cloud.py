@@ -21,8 +21,8 @@ from ...base.errors import CutShortError
 from ...base.input_files import check_input, open_input, read_input
 from ...base.tables import column_name
 from ...base.vocabulary import UNITS_M
-from ...base.words import plural, printable
-from .cloud_scan import CloudScan, usual_names
+from ...base.words import distinct, plural, printable
+from ...columns.sweep import Sweep
 from .text_rows import REMARKS, RowReader, cells_of
 
 _SEPARATORS = (";", "\t", ",", None)
@@ -65,7 +65,7 @@ class _Head(NamedTuple):
     first_line: int
 
 
-def read_text_cloud(path: Path) -> list[CloudScan]:
+def read_text_cloud(path: Path) -> list[Sweep]:
     """Read a cloud of a point in each line.
 
     Columns are named by the header; without a header, those after z are `column_4`, …. Cells are
@@ -101,10 +101,10 @@ def read_text_cloud(path: Path) -> list[CloudScan]:
         for position, index in enumerate(numeric)
     }
     positions = np.stack([arrays.pop(index) for index in axes], axis=1).astype(np.float64)
-    usual = usual_names(["x", "y", "z", *(names[index] for index in arrays)])[3:]
-    columns = dict(zip(usual, arrays.values(), strict=True))
+    others = distinct(["x", "y", "z", *(names[index] for index in arrays)])[3:]
+    columns = dict(zip(others, arrays.values(), strict=True))
     unread = tuple(name for index, name in enumerate(names) if index not in numeric)
-    return [CloudScan(positions, columns, units_m=units_m, unread=unread)]
+    return [Sweep(positions, columns, units_m=units_m, skipped=unread)]
 
 
 def is_text_raster(path: Path) -> bool:

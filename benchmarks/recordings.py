@@ -1,0 +1,247 @@
+"""How fast recorded points are read, compared with another version of lidarpool.
+
+    python -m benchmarks.recordings [--against CHECKOUT] [--pairs N] [--folder FOLDER]
+
+The inputs are written once: an airborne survey (.las), the drive of a rotating sensor (.mcap), a
+sequence in KITTI format, and a data set of a campaign. Each measurement runs in a new process,
+which first performs the action on a small input, so that imports and compilation are not counted.
+Short actions are then repeated, and the fastest repetition counts. The processes of both checkouts
+alternate; the ratio is the median of the ratios of all pairs, less than 1 if this checkout is
+faster. Seconds are processor time.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import laspy
+import numpy as np
+
+import lidarpool as lp
+
+ROOT = Path(__file__).resolve().parent.parent
+SURVEY_POINTS, SCENE_POINTS = 16_000_000, 2_000_000
+FIRINGS, CHANNELS, SCANS = 640, 32, 32  # firings and scans per revolution
+DRIVE_SWEEPS, JOBS, JOB_SWEEPS = 500, 6, 50
+KITTI_SWEEPS, KITTI_POINTS = 100, 100_000  # points per sweep
+SMALL = 0.02  # share of the points, or sweeps, in the inputs that are read before the measurement
+LEAST_S = 2  # actions are repeated for so long in each process
+
+
+def write_survey(path, count):
+    """Write points with colors and classes, among them noise, in lines across the flight."""
+    rng = np.random.default_rng(1)
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.scales, header.offsets = np.full(3, 0.001), np.array([4e5, 5.6e6, 0])
+    with laspy.open(path, "w", header=header) as writer:
+        for rows in np.array_split(np.arange(count), max(1, count // 1_000_000)):
+            record = laspy.ScaleAwarePointRecord.zeros(len(rows), header=header)
+            line, place = np.divmod(rows, 1000)
+            record.X = place * 400 + rng.integers(-100, 100, len(rows))
+            record.Y = line * 400 + rng.integers(-100, 100, len(rows))
+            record.Z = 5000 * np.sin(line / 200) + rng.integers(0, 20_000, len(rows))
+            is_noise = rng.random(len(rows)) < 1e-4
+            record.classification = np.where(is_noise, 7, rng.integers(1, 7, len(rows)))
+            record.return_number = record.number_of_returns = np.ones(len(rows), np.uint8)
+            record.gps_time = rows / 500_000
+            for name in ("intensity", "red", "green", "blue"):
+                record[name] = rng.integers(0, 65_536, len(rows))
+            writer.write_points(record)
+
+
+def make_drive(sweep_count):
+    """Return the points of a moving sensor beside a car, and their sweeps."""
+    from lidarsim.sweeps.sweeps import Sweeps  # other versions may not have this module
+
+    rng = np.random.default_rng(1)
+    times_s, x_m = [0, sweep_count / 10], 0.8 * sweep_count
+    car = lp.Actor(lp.box("Car 1", (4, 2, 1.5)), lp.Track(times_s, [[5, 5, 0], [5 + x_m, 5, 0]]))
+    scene = lp.Scene.seed().with_actors((car,))
+    track = lp.Track(times_s, [[0, 0, 2], [x_m, 0, 2]])
+    sensor = lp.Sensor.grid(FIRINGS, CHANNELS, 40, 360 / SCANS)
+    survey = lp.Survey(sensor, trajectory=track, steps=SCANS * sweep_count)
+    rows = np.arange(sweep_count * FIRINGS * CHANNELS)
+    firing, channel = np.divmod(rows, CHANNELS)
+    azimuth, slope = 2 * np.pi / FIRINGS * firing, np.linspace(-0.36, 0.36, CHANNELS)[channel]
+    positions = np.stack([np.cos(azimuth), np.sin(azimuth), slope], axis=1)
+    positions = positions * rng.uniform(2, 80, (len(rows), 1)) + [0, 0, 2]
+    positions[:, 0] += 0.8 / FIRINGS * firing
+    columns = {
+        "scan": firing * SCANS // FIRINGS,
+        "ray": rows % (FIRINGS * CHANNELS // SCANS),
+        "channel": channel,
+        "object": rng.integers(0, len(scene.object_names), len(rows)),
+        "class": rng.integers(1, 20, len(rows)),
+        "time": firing * 100_000_000 // FIRINGS,
+        "intensity": rng.random(len(rows), np.float32),
+        "reflectivity": rng.integers(0, 256, len(rows)).astype(np.uint8),
+    }
+    return lp.Cloud(np.round(positions, 3), columns), Sweeps.from_survey(survey, scene)
+
+
+def write_kitti(folder, sweep_count):
+    """Write a sequence of SemanticKITTI."""
+    rng = np.random.default_rng(1)
+    (folder / "velodyne").mkdir(parents=True)
+    (folder / "labels").mkdir()
+    rows = rng.uniform(-60, 60, (KITTI_POINTS, 4)).astype("<f4")
+    labels = rng.integers(0, 50, KITTI_POINTS) << 16 | rng.integers(0, 20, KITTI_POINTS)
+    for number in range(sweep_count):
+        rows[:, 3] = rng.random(KITTI_POINTS)
+        rows.tofile(folder / "velodyne" / f"{number:06}.bin")
+        labels.astype("<u4").tofile(folder / "labels" / f"{number:06}.label")
+    poses = [[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, number] for number in range(sweep_count)]
+    np.savetxt(folder / "poses.txt", poses)
+    np.savetxt(folder / "times.txt", np.arange(sweep_count) / 10)
+    (folder / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n", encoding="ascii")
+
+
+def write_data_set(folder, sweep_count):
+    """Write the data set of a campaign with `keep: kitti`."""
+    from lidarpool.datasets.dataset import DataSet
+    from lidarpool.datasets.job_table import JobRow, write_table
+    from lidarsim.base.storage import Storage
+
+    cloud, sweeps = make_drive(sweep_count)
+    data = DataSet(Storage.at(folder), "kitti")
+    jobs = [data.write_job(JobRow(number, f"{number:04}"), cloud, sweeps) for number in range(JOBS)]
+    write_table(data.storage, [], lambda: jobs)
+    data.finish(jobs)
+
+
+def write_inputs(folder, share=1.0):
+    """Write all inputs with a share of the points or sweeps, unless they exist."""
+    from lidarpool.clouds.writing import Format
+
+    if folder.exists():
+        return
+    staged = folder.with_name(f"{folder.name}.incomplete")
+    shutil.rmtree(staged, ignore_errors=True)
+    staged.mkdir(parents=True)
+    write_survey(staged / "survey.las", int(share * SURVEY_POINTS))
+    write_survey(staged / "scene.las", int(share * SCENE_POINTS))
+    Format("mcap").write(staged / "drive.mcap", *make_drive(int(share * DRIVE_SWEEPS)))
+    write_kitti(staged / "kitti", int(share * KITTI_SWEEPS))
+    write_data_set(staged / "dataset", int(share * JOB_SWEEPS))
+    staged.rename(folder)
+
+
+def read_items(path):
+    """Open a recording and read all items: positions in meters, float64, and all columns."""
+    from lidarpool.recordings.opening import open_recording
+
+    recording = open_recording(path)
+    count = 0
+    for number in range(len(recording) if hasattr(recording, "__len__") else recording.count):
+        if hasattr(recording, "__getitem__"):
+            item = recording[number]
+            points, columns = item.points, item.columns
+        else:  # an earlier version
+            points, columns, _ = recording.read(number)
+            if recording.meters != (1, 1, 1):
+                points = points * recording.meters
+        _ = np.asarray(points, np.float64), *map(np.asarray, columns.values())
+        count += len(points)
+    return count
+
+
+def view(path):
+    """Open a recording in the viewer."""
+    from lidarpool.recordings.opening import open_sensors
+    from lidarpool.showing.pages.recorded import recorded_view
+
+    return len(recorded_view(open_sensors(path), "recording", None).points)
+
+
+def read_scene(path):
+    """Read points as `lidarpool scene points` does, before surfels are made of them."""
+    from lidarpool.scenario.point_files import read_points
+
+    points = read_points(path, None, lambda _: None)
+    return len(points[0] if isinstance(points, tuple) else points)
+
+
+def read_epoch(path):
+    """Iterate once over all sweeps of a data set."""
+    values = ((sweep.points, sweep.columns, sweep.pose, sweep.boxes) for sweep in lp.sweeps(path))
+    return sum(len(points) for points, *_ in values)
+
+
+def read_torch_epoch(path):
+    """Iterate once over all sweeps of a data set as tensors."""
+    return sum(len(item["points"]) for item in lp.sweeps(path).torch())
+
+
+ACTIONS = {  # {name: (function that returns the number of points it has read, input)}
+    "read LAS": (read_items, "survey.las"),
+    "read MCAP": (read_items, "drive.mcap"),
+    "read KITTI": (read_items, "kitti"),
+    "view LAS": (view, "survey.las"),
+    "view MCAP": (view, "drive.mcap"),
+    "scene from LAS": (read_scene, "scene.las"),
+    "epoch": (read_epoch, "dataset"),
+    "epoch with torch": (read_torch_epoch, "dataset"),
+}
+
+
+def measure(name, folder):
+    """Print the fewest seconds of an action in this process, and the number of points, as JSON."""
+    (action, file), seconds = ACTIONS[name], []
+    action(folder / "small" / file)
+    while sum(seconds) < LEAST_S:
+        begin = time.process_time()
+        count = action(folder / "full" / file)
+        seconds.append(time.process_time() - begin)
+    print(json.dumps([min(seconds), count]))
+
+
+def measure_in_process(checkout, name, folder):
+    """Return the seconds of an action in a new process, and the number of points."""
+    paths = os.pathsep.join(f"{checkout}/{part}" for part in ("kernels", "scheduler", "workflows"))
+    command = [sys.executable, "-m", __spec__.name, "--measure", name, "--folder", str(folder)]
+    environment = os.environ | {"PYTHONPATH": paths}
+    return json.loads(subprocess.check_output(command, cwd=ROOT, env=environment))
+
+
+def main(checkouts, pairs, folder):
+    """Print the table."""
+    write_inputs(folder / "full")
+    write_inputs(folder / "small", SMALL)
+    titles = "".join(f"{title:>9}" for title in ("s", "other s", "ratio")[: 2 * len(checkouts) - 1])
+    print(f"{'action':18}{'points':>12}{titles}")
+    for name in ACTIONS:
+        if "torch" in name and find_spec("torch") is None:
+            continue
+        seconds, counts = np.empty((pairs + 1, len(checkouts))), set()
+        for index in np.ndindex(seconds.shape):
+            column = index[1] if index[0] % 2 else -1 - index[1]  # each is first in turn
+            seconds[index[0], column], count = measure_in_process(checkouts[column], name, folder)
+            counts.add(count)
+        if len(counts) > 1:
+            raise SystemExit(f"{name}: the versions read different numbers of points: {counts}.")
+        seconds = seconds[1:]  # the first round has warmed the file cache
+        ratio = np.median(seconds[:, 0] / seconds[:, -1])
+        cells = [*np.median(seconds, axis=0), ratio][: 2 * len(checkouts) - 1]
+        print(f"{name:18}{count:12,}" + "".join(f"{cell:9.3f}" for cell in cells), flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="another checkout")
+    parser.add_argument("--pairs", type=int, default=5, help="measurements of each action")
+    parser.add_argument("--folder", type=Path, default=ROOT / "build" / "recordings")
+    parser.add_argument("--measure", choices=ACTIONS, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.against and not (options.against / "workflows" / "lidarpool").is_dir():
+        parser.error(f"{options.against} is not a checkout of lidarpool")
+    if options.measure:
+        measure(options.measure, options.folder)
+    else:
+        checkouts = [ROOT] if options.against is None else [ROOT, options.against.resolve()]
+        main(checkouts, options.pairs, options.folder.resolve())

@@ -1,0 +1,122 @@
+"""Unit and zero of the point times in a recording, found from the times of several sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from lidarsim.base.arrays import Floats
+from lidarsim.columns.column_names import TIMES
+from lidarsim.columns.sweep import Columns
+
+_TIME_UNITS_S = (1.0, 1e-3, 1e-6, 1e-9)
+_MAX_OUTSIDE = 0.5  # sweeps by which a timestamp may lie before the first or after the last point
+_MIN_SWEEP_S = 0.01
+_MAX_SWEEP_S = 2.0
+_MIN_TIMES = 8  # distinct times of a sweep; fewer are packet times, or lack precision
+
+
+class Clock(StrEnum):
+    """Zero of the point times."""
+
+    STAMP = "the stamp of the sweep"
+    SHARED = "the zero of the stamps"
+    OTHER = "another zero"
+
+
+class PointTimes(NamedTuple):
+    """Unit and zero of the column of point times, which are the same for all sweeps.
+
+    A sweep lasts 0.01 to 2 s, so the range of its times determines their unit: s, ms, µs or ns.
+
+    Drivers stamp a sweep with the time of its first or of its last point. The times are relative to
+    the stamp if zero lies within or close to the times of most sweeps, and absolute if their stamps
+    do. Otherwise they come from another clock, and the first point of a sweep is assumed to be
+    fired at the stamp.
+    """
+
+    unit_s: float
+    sweep_s: float  # median duration of a sweep
+    clock: Clock = Clock.OTHER
+    first_s: float = 0.0  # median time of the first point of a sweep, relative to the stamp
+
+    @classmethod
+    def from_sweeps(
+        cls, sweeps: Sequence[Columns], stamps_s: Sequence[float] | Floats | None = None
+    ) -> PointTimes | None:
+        """Find the unit and the zero of the times in the columns of several sweeps.
+
+        `stamps_s` are the timestamps of these sweeps in seconds, or None if they are unknown.
+        Returns None if the sweeps have no times.
+        """
+        parts = [_stored_times(columns) for columns in sweeps]
+        spans = [
+            float(part.since.max()) for part in parts if len(np.unique(part.since)) >= _MIN_TIMES
+        ]
+        if len(spans) <= len(sweeps) / 2:
+            return None
+        span = float(np.median(spans))
+        unit_s = next((u for u in _TIME_UNITS_S if _MIN_SWEEP_S <= span * u <= _MAX_SWEEP_S), None)
+        if unit_s is None:
+            return None
+        sweep_s = span * unit_s
+        known = [row for row, part in enumerate(parts) if len(part.since)]
+        firsts_s = np.array([parts[row].first for row in known]) * unit_s
+        lasts_s = firsts_s + [parts[row].since.max() * unit_s for row in known]
+        zeros_s = {Clock.STAMP: np.zeros(len(known))}
+        if stamps_s is not None:
+            zeros_s[Clock.SHARED] = np.asarray(stamps_s)[known]
+        for clock, zero_s in zeros_s.items():
+            outside_s = np.maximum(firsts_s - zero_s, zero_s - lasts_s)
+            if np.median(outside_s) <= _MAX_OUTSIDE * sweep_s:
+                return cls(unit_s, sweep_s, clock, float(np.median(firsts_s - zero_s)))
+        return cls(unit_s, sweep_s)
+
+    def of_points(self, columns: Columns, stamp_s: float | None = None) -> Floats | None:
+        """Return the times (n,) of the points of a sweep relative to its timestamp, in seconds.
+
+        Returns None if a time is missing, or if the times span no sweep or are far from the stamp.
+        """
+        times = _stored_times(columns)
+        since_s = times.since * self.unit_s
+        if len(since_s) != len(next(iter(columns.values()), ())):
+            return None
+        if not len(since_s):
+            return since_s
+        first_s = 0.0
+        if self.clock is not Clock.OTHER:
+            zero_s = stamp_s if self.clock is Clock.SHARED and stamp_s is not None else 0.0
+            first_s = times.first * self.unit_s - zero_s
+        if since_s.max() > _MAX_SWEEP_S or abs(first_s) > _MAX_SWEEP_S:
+            return None
+        return since_s + first_s
+
+    def note(self, name: str) -> str:
+        """Return a note for the user if the times come from another clock, or an empty string."""
+        if self.clock is not Clock.OTHER:
+            return ""
+        return (
+            f"The point times in {name} use a different clock than the sweep timestamps. The first "
+            "point of each sweep is assumed to be fired at the timestamp of the sweep."
+        )
+
+
+class _StoredTimes(NamedTuple):
+    """Point times of a sweep in the unit of their column; empty without times."""
+
+    since: Floats  # (n,): since the first, without loss of precision
+    first: float = 0.0
+
+
+def _stored_times(columns: Columns) -> _StoredTimes:
+    values = next((columns[name] for name in TIMES if name in columns), ())
+    times = np.asarray(values)
+    if not len(times) or times.dtype.kind not in "iuf" or not np.isfinite(times).all():
+        return _StoredTimes(np.empty(0))
+    if times.dtype.kind == "i":  # differences of short integers overflow
+        times = times.astype(np.int64)
+    first = times.min()
+    return _StoredTimes(np.asarray((times - first).astype(np.float64)), float(first))

@@ -1,0 +1,201 @@
+"""Rings of a recording: from a column, from the order of the points, or from their elevations.
+
+A KITTI `.bin` and many PCD files have no column of rings. Where points are stored ring by ring, a
+new ring begins where the azimuth falls back to 0°. In any order, the points of a sensor whose beams
+sweep cones have few distinct elevation angles, unless motion compensation has changed these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidarsim.base.arrays import Bools, Floats, Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.sweep import Sweep
+
+MIN_RINGS = 4  # a sensor with fewer rings is treated as a sensor without rings
+_MAX_RINGS = 512
+_BACKWARD_DEG = 15.0  # a step of the azimuth backward that begins a ring
+_SHORT_RING = 0.02  # a run of points that is shorter than this share of the median is not a ring
+_MAX_CONE_SPREAD = 0.25  # of a ring, over all elevations: lines of a Livox are not cones
+_MIN_IN_ORDER = 0.95  # share of runs whose elevations continue in one direction
+_MAX_CLUSTERS = 128  # of elevations
+_MIN_GAP_RATIO = 3.0  # of the smallest gap between clusters, over the largest gap within one
+_MIN_CLUSTER = 1e-3  # share of the points in a cluster; fewer are stray points
+
+
+@dataclass(frozen=True, eq=False)
+class Rings:
+    """The rings of a recording, the highest first."""
+
+    name: str  # of the recording
+    # (r,): median elevations; empty without rings
+    elevation_rad: Floats = field(default_factory=lambda: np.empty(0))
+    numbers: Ints | None = None  # (r,): in the column `channel`; None without this column
+    are_cones: bool = False  # whether elevations rather than the order of points show the rings
+    note: str = ""  # how the rings were found, or why they are unknown
+
+    @classmethod
+    def from_sweeps(cls, name: str, sweeps: Sequence[Sweep]) -> Rings:
+        """Find the rings in the returns of some sweeps, as fired if possible."""
+        if not sweeps:
+            return cls(name)
+        if all("channel" in sweep.columns for sweep in sweeps):
+            return cls._from_columns(name, sweeps)
+        found = [_runs_in_order(sweep.points) for sweep in sweeps]
+        runs = [run for run in found if run is not None]
+        if runs:
+            medians = max(runs, key=len)
+            note = (
+                f"{name} has no ring column. Its {len(medians)} rings were determined from the "
+                "order of the points."
+            )
+            return cls(name, np.sort(medians)[::-1], note=note)
+        clusters = _clusters(np.concatenate([sweep.points for sweep in sweeps]))
+        if clusters is not None:
+            note = (
+                f"{name} has no ring column. Its {len(clusters)} rings were determined from the "
+                "elevation angles of the points."
+            )
+            return cls(name, clusters, are_cones=True, note=note)
+        note = (
+            f"{name} has no ring column, and its rings cannot be determined from the order or the "
+            "elevation angles of its points. Either its points are motion-compensated, or its ray "
+            "directions are not calibrated."
+        )
+        return cls(name, note=note)
+
+    @classmethod
+    def _from_columns(cls, name: str, sweeps: Sequence[Sweep]) -> Rings:
+        rings = np.concatenate([np.asarray(sweep.columns["channel"]) for sweep in sweeps])
+        elevation = np.concatenate([elevations(sweep.points) for sweep in sweeps])
+        numbers, medians, spread_rad = cones(rings.astype(np.int64), elevation)
+        if len(numbers) < MIN_RINGS:
+            return cls(name)
+        if spread_rad > _MAX_CONE_SPREAD * np.ptp(medians):
+            note = (
+                f"The rings of {name} do not form cones, so its ray directions are not calibrated."
+            )
+            return cls(name, note=note)
+        return cls(name, medians, numbers)
+
+    def __len__(self) -> int:
+        return len(self.elevation_rad)
+
+    def rows(self, sweep: Sweep) -> Ints:
+        """Return the rows (n,) of the rings of points, the highest ring first, or -1 if unknown.
+
+        Raises LidarError if the sweep lacks the ring column that other sweeps have.
+        """
+        points = sweep.points
+        if not len(self) or not len(points):
+            return np.full(len(points), -1)
+        if self.numbers is not None:
+            return self._rows_of_column(sweep)
+        if self.are_cones:
+            boundaries = (self.elevation_rad[1:] + self.elevation_rad[:-1]) / 2
+            return np.searchsorted(-boundaries, -elevations(points))
+        starts, is_ring = _runs(points)
+        lengths = np.diff(np.append(starts, len(points)))
+        rows = self._rows_of_runs(_medians(elevations(points), starts), is_ring)
+        return rows.repeat(lengths)
+
+    def _rows_of_column(self, sweep: Sweep) -> Ints:
+        if "channel" not in sweep.columns:
+            raise LidarError(
+                f"Some sweeps of {self.name} have a ring column, and others do not. Use the sweeps "
+                "of a single sensor."
+            )
+        assert self.numbers is not None
+        numbers = np.asarray(sweep.columns["channel"]).astype(np.int64)
+        order = np.argsort(self.numbers)
+        place = np.searchsorted(self.numbers, numbers, sorter=order)
+        row = order[np.minimum(place, len(order) - 1)]
+        return np.where(self.numbers[row] == numbers, row, -1)
+
+    def _rows_of_runs(self, medians: Floats, is_ring: Bools) -> Ints:
+        """Return the rows (k,) of runs with median elevations (k,), -1 for a run without a ring.
+
+        Each ring is assigned to one run. The median elevation of a ring depends on what the ring
+        hits, and may change by more than the angle between neighboring rings.
+        """
+        from scipy.optimize import linear_sum_assignment
+
+        rows = np.full(len(medians), -1)
+        runs = np.flatnonzero(is_ring)
+        chosen, assigned = linear_sum_assignment(np.abs(medians[runs, None] - self.elevation_rad))
+        rows[runs[chosen]] = assigned
+        return rows
+
+
+def elevations(points: Floats) -> Floats:
+    """Return the elevation angles (n,) of points (n, 3) in the sensor frame, in radians."""
+    return np.asarray(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+
+
+def cones(rings: Ints, elevation: Floats) -> tuple[Ints, Floats, float]:
+    """Return the numbers and median elevations (r,) of rings, and their deviation from cones.
+
+    The highest ring is first. The deviation is the median interquartile range of the elevations
+    within a ring, in radians.
+    """
+    numbers, index = np.unique(rings, return_inverse=True)
+    parts = [elevation[index == row] for row in range(len(numbers))]
+    low, medians, high = np.array([np.quantile(part, (0.25, 0.5, 0.75)) for part in parts]).T
+    order = np.argsort(-medians, kind="stable")
+    return numbers[order], medians[order], float(np.median(high - low))
+
+
+def _clusters(points: Floats) -> Floats | None:
+    """Return the elevations (r,) of the cones that contain points (n, 3), the highest first.
+
+    The gaps between clusters of elevations must be larger than the widest cluster. Otherwise,
+    return None.
+    """
+    elevation = np.sort(elevations(points))
+    gaps = np.diff(elevation)
+    largest = np.sort(gaps)[::-1][:_MAX_CLUSTERS]
+    if len(largest) < _MAX_CLUSTERS:
+        return None
+    ratios = largest[:-1] / np.maximum(largest[1:], 1e-9)
+    ratios[: MIN_RINGS - 2] = 0
+    last = int(ratios.argmax())  # of the gaps between clusters
+    starts = np.append(0, np.flatnonzero(gaps >= largest[last]) + 1)
+    stops = np.append(starts[1:], len(elevation)) - 1
+    widest = float((elevation[stops] - elevation[starts]).max())
+    smallest = (stops - starts + 1).min()
+    if largest[last] < max(widest, _MIN_GAP_RATIO * largest[last + 1]):
+        return None
+    if smallest < _MIN_CLUSTER * len(elevation):
+        return None
+    return _medians(elevation, starts)[::-1]
+
+
+def _runs(points: Floats) -> tuple[Ints, Bools]:
+    """Return the starts (k,) of runs of increasing or decreasing azimuths, and which are rings."""
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    steps = np.diff(azimuth)
+    direction = np.sign(np.sum(np.sign(steps)))
+    starts = np.append(0, np.flatnonzero(direction * steps < -_BACKWARD_DEG) + 1)
+    lengths = np.diff(np.append(starts, len(points)))
+    return starts, lengths > _SHORT_RING * np.median(lengths)
+
+
+def _medians(values: Floats, starts: Ints) -> Floats:
+    """Return the medians (k,) of runs of values (n,)."""
+    return np.array([np.median(run) for run in np.split(values, starts[1:])])
+
+
+def _runs_in_order(points: Floats) -> Floats | None:
+    """Return the median elevations (k,) of runs in radians, or None if the runs are not rings."""
+    if len(points) < _MAX_RINGS:
+        return None
+    starts, is_ring = _runs(points)
+    if not MIN_RINGS <= is_ring.sum() <= _MAX_RINGS:
+        return None
+    medians = _medians(elevations(points), starts)[is_ring]
+    steps = np.sign(np.diff(medians))
+    return medians if abs(steps.mean()) > 2 * _MIN_IN_ORDER - 1 else None

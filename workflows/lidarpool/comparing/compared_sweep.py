@@ -1,0 +1,69 @@
+"""Sweeps of a recording with only the columns that are compared or fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarsim.base.arrays import Ints
+from lidarsim.base.errors import LidarError
+from lidarsim.columns.sweep import Columns, Sweep
+
+from ..clouds.recording import Recording
+
+RAY_KEY = "ray_key"  # column that numbers the rays of a sweep, and the returns of each ray
+
+
+def compared_sweep(
+    recording: Recording, number: int, *, in_world: bool = False, with_rays: bool = False
+) -> Sweep:
+    """Read the returns of a sweep or of a part of a cloud, in the sensor frame or the world frame.
+
+    The columns are `channel` and `intensity` where the recording has these, and `RAY_KEY` if
+    `with_rays`. In the world frame, the only column is `intensity`.
+
+    Raises LidarError if the recording cannot be read, or if the pose is required but unknown.
+    """
+    sweep = with_compared_columns(recording[number], with_rays=with_rays)
+    if not in_world:
+        return sweep.returns()
+    sweep = sweep.with_columns(intensity=sweep.intensity).returns()
+    if recording.is_cloud:
+        return sweep
+    if sweep.pose is None:
+        raise LidarError(
+            f"{recording.name} is in sensor coordinates and does not contain the pose of the "
+            "sensor. Compare it with a recording that consists of sweeps."
+        )
+    return sweep.replace(points=sweep.in_world())
+
+
+def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
+    """Return a sweep with only the columns that are described in `compared_sweep`.
+
+    Without the column `channel`, the rings are determined when they are first requested.
+    """
+    columns = {}
+    if "channel" in sweep.columns:
+        columns["channel"] = np.asarray(sweep.columns["channel"]).astype(np.int64)
+    if sweep.intensity is not None:
+        columns["intensity"] = np.asarray(sweep.intensity, np.float64)
+    if with_rays:
+        columns[RAY_KEY] = _ray_keys(sweep.columns)
+    return sweep.replace(columns=columns)
+
+
+def rings_note(recording: Recording, sweep: Sweep) -> list[str]:
+    """Return a note on how the rings of a sweep were found, unless they are in a column."""
+    is_stated = "channel" in sweep.columns or sweep.rings is None
+    return [] if is_stated else [recording.rings.note.removesuffix(".")]
+
+
+def _ray_keys(columns: Columns) -> Ints:
+    """Return keys (n,) that differ for all rays of a sweep, and for all returns of a ray."""
+    if "time" in columns:
+        rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
+    else:
+        rays = columns["scan"].astype(np.int64) << 32 | columns["ray"]
+    _, first, ray = np.unique(rays, return_index=True, return_inverse=True)
+    order: Ints = np.arange(len(rays)) - first[ray]  # returns of a ray are together
+    return rays << 8 | columns.get("return_number", order)

@@ -1,0 +1,259 @@
+"""Points of one sweep of a lidar, as they were recorded or simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+
+from ..base.arrays import AnyArray, Bools, Floats, Indices, Ints32
+from .column_names import STRENGTHS
+
+Columns = Mapping[str, AnyArray]
+
+
+class Sweep:
+    """Points of one sweep of a sensor, or of one part of a large cloud.
+
+    Parameters
+    ----------
+    points
+        Positions in meters, of shape (n, 3), in the sensor frame. x is forward, y is left and z is
+        up, unless the mount is rotated. Parts of a cloud are in the frame of the cloud. Pulses
+        without a return are NaN or zero in organized sweeps; `returns` removes them.
+    columns
+        Further values of each point as {name: array of shape (n,)}, under the names and in the
+        units of lidarpool where these are known. Columns without a standard name keep their names.
+    pose
+        Transformation from the sensor frame to the world frame, of shape (4, 4), or None if it is
+        unknown. A function is called when the pose is requested.
+    time_ns
+        Timestamp of the sweep in nanoseconds, or None if it is unknown. For results, this is the
+        time since the start of the survey.
+    compensated
+        Whether the points are compensated for the motion during the sweep, or None if unknown.
+    firing_poses
+        Poses of the sensor at the firing of each point
+        (`lidarsim.sweeps.sweep_motion.FiringPoses`), or None if they are unknown. They refer to
+        points as fired.
+    scanner
+        Position of the scanner in the frame of the file, in meters, of shape (3,), or None.
+    units_m
+        Lengths of the units of the points in meters, if the file states them for this sweep.
+    boxes
+        Bounding boxes of actors in the sensor frame, a function that returns them, or None.
+    sensor, number
+        Name of the sensor, and index of the sweep among the sweeps of the sensor.
+    job, job_number, split, values
+        Job of a data set to which the sweep belongs, and the varied values of this job by path.
+    object_names
+        Names of the objects that the column `object` numbers.
+    faults
+        Faults of the sensor during the sweep.
+    notes
+        Clauses about the points that follow the name of the file.
+    skipped
+        Names of columns in the file that cannot be represented.
+    recording
+        Recording to which the sweep belongs. It determines `rings` and `times_s` where the file
+        does not state them.
+    """
+
+    def __init__(
+        self,
+        points: AnyArray,
+        columns: Columns | None = None,
+        *,
+        pose: Floats | Callable[[], Floats | None] | None = None,
+        time_ns: int | float | None = None,
+        compensated: bool | None = None,
+        firing_poses: Any = None,
+        scanner: Floats | None = None,
+        units_m: tuple[float, float, float] | None = None,
+        boxes: Any = None,
+        sensor: str = "",
+        number: int = 0,
+        job: str = "",
+        job_number: int | None = None,
+        split: str | None = None,
+        values: Mapping[str, Any] | None = None,
+        object_names: tuple[str, ...] = (),
+        faults: tuple[Any, ...] = (),
+        notes: Sequence[str] = (),
+        skipped: Sequence[str] = (),
+        recording: Any = None,
+    ) -> None:
+        self.points = points
+        self.columns: Columns = {} if columns is None else columns
+        self.time_ns = time_ns
+        self.compensated = compensated
+        self.firing_poses = firing_poses
+        self.scanner = scanner
+        self.units_m = units_m
+        self.sensor = sensor
+        self.number = number
+        self.job = job
+        self.job_number = job_number
+        self.split = split
+        self.values: Mapping[str, Any] = {} if values is None else values
+        self.object_names = object_names
+        self.faults = faults
+        self.notes = notes
+        self.skipped = skipped
+        self._pose = pose
+        self._boxes = boxes
+        self._recording = recording
+        # The sweep of which these are selected rows, and the rows.
+        self._whole: tuple[Self, Bools | Indices | slice] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Values that the recording determines are computed before the sweep leaves the process.
+        state = dict(self.__dict__)
+        if self._recording is not None:
+            state |= {"rings": self.rings, "times_s": self.times_s}
+        return state | {
+            "_pose": self.pose,
+            "_boxes": self.boxes,
+            "_recording": None,
+            "_whole": None,
+        }
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        sensor = f" of {self.sensor}" if self.sensor else ""
+        job = f" in job {self.job}" if self.job else ""
+        return f"<Sweep {self.number}{sensor}{job}: {len(self):,} points>"
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other points, columns or further parameters of the constructor."""
+        other = object.__new__(type(self))
+        cached = ("pose", "boxes", "rings", "times_s")
+        other.__dict__ |= {k: v for k, v in self.__dict__.items() if k not in cached}
+        for name, value in changes.items():
+            hidden = f"_{name}"
+            other.__dict__[hidden if hidden in self.__dict__ else name] = value
+        return other
+
+    @cached_property
+    def pose(self) -> Floats | None:
+        """Transformation from the sensor frame to the world frame, (4, 4), or None if unknown."""
+        pose: Floats | None = self._pose() if callable(self._pose) else self._pose
+        return pose
+
+    @cached_property
+    def boxes(self) -> Any:
+        """Bounding boxes of the actors that are in the scene, in the sensor frame, or None."""
+        return self._boxes() if callable(self._boxes) else self._boxes
+
+    @cached_property
+    def rings(self) -> AnyArray | None:
+        """Ring of each point, integers of shape (n,), or None if the rings are unknown.
+
+        Without a column `channel`, the recording determines the rings from the order or the
+        elevation angles of the points. Rings are then counted from the lowest, and points that
+        belong to no ring have the value -1.
+        """
+        if "channel" in self.columns:
+            return np.asarray(self.columns["channel"])
+        if self._whole is not None:
+            sweep, rows = self._whole
+            return None if sweep.rings is None else sweep.rings[rows]
+        return None if self._recording is None else self._recording.rings_of(self)
+
+    @cached_property
+    def times_s(self) -> Floats | None:
+        """Time of each point relative to the timestamp of the sweep in seconds, (n,), or None."""
+        if self._whole is not None:
+            sweep, rows = self._whole
+            return None if sweep.times_s is None else sweep.times_s[rows]
+        return None if self._recording is None else self._recording.times_of(self)
+
+    @property
+    def intensity(self) -> AnyArray | None:
+        """Intensity of each point, (n,), or None if it is unknown.
+
+        This is the column `intensity`, which contains received energies in results, or the column
+        `reflectivity`.
+        """
+        return next((self.columns[name] for name in STRENGTHS if name in self.columns), None)
+
+    @property
+    def classes(self) -> AnyArray | None:
+        """Semantic class of each point, integers of shape (n,), or None.
+
+        Points without a class have the value 0.
+        """
+        return self.columns.get("class")
+
+    @property
+    def objects(self) -> Ints32 | None:
+        """Indices into `object_names`, int32 of shape (n,), or None without such a column."""
+        return self.columns.get("object")
+
+    @property
+    def has_return(self) -> Bools:
+        """Mask of the points that have a return, bool of shape (n,).
+
+        Drivers store NaN or zeros for pulses without a return.
+        """
+        return np.asarray(np.isfinite(self.points).all(axis=1) & self.points.any(axis=1))
+
+    def returns(self) -> Self:
+        """Return the sweep without pulses that have no return, in double precision."""
+        points = np.asarray(self.points, np.float64)
+        sweep = self if points is self.points else self.replace(points=points)
+        mask = sweep.has_return
+        return sweep if mask.all() else sweep.select(mask)
+
+    def select(self, rows: Bools | Indices | slice) -> Self:
+        """Return selected points."""
+        columns = {name: np.asarray(values)[rows] for name, values in self.columns.items()}
+        poses = self.firing_poses
+        selected = self.replace(
+            points=self.points[rows],
+            columns=columns,
+            firing_poses=None if poses is None else poses.select(rows),
+        )
+        if self._recording is not None:
+            selected._whole = self, rows  # the recording needs all points of the sweep
+        return selected
+
+    def with_columns(self, **columns: AnyArray | None) -> Self:
+        """Return the same points with only the given columns, without those that are None."""
+        return self.replace(
+            columns={name: values for name, values in columns.items() if values is not None},
+            recording=None,
+        )
+
+    def in_world(self) -> Floats:
+        """Return the points in the world frame, (n, 3), at the pose of the sweep."""
+        assert self.pose is not None
+        return np.asarray(self.points @ self.pose[:3, :3].T + self.pose[:3, 3])
+
+    @classmethod
+    def joined(cls, sweeps: Sequence[Self], *, only_shared: bool = False) -> Self:
+        """Concatenate the points of sweeps.
+
+        Columns that only some sweeps have are NaN in the others, or are omitted with `only_shared`.
+        """
+        filled = [sweep for sweep in sweeps if len(sweep)] or sweeps[:1]
+        if not filled:
+            return cls(np.empty((0, 3)))
+        names = dict.fromkeys(name for sweep in filled for name in sweep.columns)
+        if only_shared:
+            shared = set.intersection(*(set(sweep.columns) for sweep in filled))
+            names = {name: None for name in names if name in shared}
+        columns = {
+            name: np.concatenate(
+                [
+                    np.asarray(sweep.columns.get(name, np.full(len(sweep), np.nan)))
+                    for sweep in filled
+                ]
+            )
+            for name in names
+        }
+        return cls(np.concatenate([sweep.points for sweep in filled]), columns)
