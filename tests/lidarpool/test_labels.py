@@ -10,7 +10,7 @@ import yaml
 from tests.drives import points_of, the_scene, the_sweeps
 
 from lidarpool.clouds.format_table import FORMATS
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -47,7 +47,7 @@ def test_names_of_classes_are_in_the_formats_that_the_page_says(tmp_path):
     for name, row in FORMATS.items():
         if name in ("pcap", "rrd", "images") or row.missing_packages:
             continue  # of a maker's sensors, of a large package, of all rays
-        Format(name).write(tmp_path / row.file, points_of(scene, 0), sweeps)
+        ExportSpec(name).write(tmp_path / row.file, points_of(scene, 0), sweeps)
         files = [tmp_path / row.file, *(tmp_path / row.file).rglob("*")]
         if any(b"cobblestone" in file.read_bytes() for file in files if file.is_file()):
             holding.add(name)
@@ -129,12 +129,12 @@ def test_the_note_on_classes_without_names_says_what_to_give():
     cloud = points_of(scene, 0)
     assert "class" in {column.name for column in cloud.table}
     for name, title in (("mcap", "MCAP"), ("nuscenes", "nuScenes")):
-        told = [note for note in Format(name).notes(cloud, sweeps) if "class" in note]
+        told = [note for note in ExportSpec(name).notes(cloud, sweeps) if "class" in note]
         assert told == [
             f"{title} can store class only if classes have names. Set `classes: {{1: ground, …}}`; "
             "see docs/how-to/labels.md"
         ]
         named = replace(sweeps, classes={1: "ground"})
-        assert not [note for note in Format(name).notes(cloud, named) if "class" in note]
-    (note,) = [note for note in Format("e57").notes(cloud, sweeps) if "class" in note]
+        assert not [note for note in ExportSpec(name).notes(cloud, named) if "class" in note]
+    (note,) = [note for note in ExportSpec("e57").notes(cloud, sweeps) if "class" in note]
     assert note.startswith("E57 cannot store ") and "classes:" not in note

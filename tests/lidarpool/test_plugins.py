@@ -12,7 +12,7 @@ from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
 from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import row_of
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_jobs import file_hashes
@@ -233,10 +233,10 @@ def test_formats_of_clouds_that_cannot_be_used(distribution):
             "taken = FormatRow('cloud.ply', 'half_cloud', 'write')"
         },
     )
-    assert "half_cloud.write" in refused(Format("half").check_installed)
+    assert "half_cloud.write" in refused(ExportSpec("half").check_installed)
     assert "defines the data set" in refused(row_of, "set")
     assert "writes 'cloud.ply'" in refused(row_of, "taken")
-    told = refused(Format, "quarter")
+    told = refused(ExportSpec, "quarter")
     assert "Unknown cloud format 'quarter'" in told and "half" in told
 
 

@@ -33,7 +33,7 @@ from lidarpool.cli.result_commands import export
 from lidarpool.clouds.format_table import FORMATS
 from lidarpool.clouds.ros import layouts
 from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import COLORS, SCAN
@@ -444,9 +444,9 @@ def test_layouts_of_the_table_are_those_of_the_module():
 
 def test_what_cannot_be_organized_is_one_line(tmp_path):
     with pytest.raises(LidarError, match="The layout hesai does not support `organized`"):
-        Format("mcap", "hesai", organized=True)
+        ExportSpec("mcap", "hesai", organized=True)
     with pytest.raises(LidarError, match="laz does not support `organized`"):
-        Format("laz", organized=True)
+        ExportSpec("laz", organized=True)
     cloud = cast("velodyne/vlp16")
     without = Cloud(
         cloud.positions,

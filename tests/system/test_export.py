@@ -12,7 +12,7 @@ from rosbags.highlevel import AnyReader
 from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
 from lidarpool.clouds import pieces
 from lidarpool.clouds.folder import result_folder
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -169,14 +169,14 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
     columns = {name: np.zeros(3) for name in ("scan", "channel", "object", "intensity")}
     save_cloud(Cloud(np.zeros((3, 3)), columns), tmp_path / "cloud.ply")
     (tmp_path / "report.json").write_text("{}")
-    write = Format.write
+    write = ExportSpec.write
 
     def interrupted(one, *given, **more):
         if one.format == "nuscenes":
             raise KeyboardInterrupt
         write(one, *given, **more)
 
-    monkeypatch.setattr(Format, "write", interrupted)
+    monkeypatch.setattr(ExportSpec, "write", interrupted)
     told = lidarpool("export", tmp_path, "-f", "las", "-f", "nuscenes")
     assert told.code == 130
     assert (

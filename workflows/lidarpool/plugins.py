@@ -3,17 +3,21 @@
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import Sweeps
 
+from .clouds.cloud_format import CloudFormat
 from .clouds.file_points import FilePoints
 from .clouds.format_table import FormatRow
-from .clouds.pieces import Pieces
+from .clouds.multi_file_format import MultiFileFormat
 from .clouds.recording import Recording, RecordingSource
+from .clouds.writing import ExportSpec
 
 __all__ = [
     "Cloud",
+    "CloudFormat",
     "CloudLike",
+    "ExportSpec",
     "FilePoints",
     "FormatRow",
-    "Pieces",
+    "MultiFileFormat",
     "Recording",
     "RecordingSource",
     "Sweeps",

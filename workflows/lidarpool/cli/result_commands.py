@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -15,12 +15,12 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.vocabulary import PICTURES, UNITS_M
 
-from ..clouds.format_table import EXPORTS, LAYOUTS, row_of
+from ..clouds.format_table import EXPORTS, LAYOUTS, format_named, row_of
 from . import completion
 from . import shared_options as options
 
 if TYPE_CHECKING:
-    from ..clouds.writing import Format
+    from ..clouds.writing import ExportSpec
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -235,30 +235,31 @@ def _chosen_formats(
     pose_rate_hz: float | None,
     organized: bool,
     intensity_full_scale: float | None,
-) -> list[Format]:
+) -> list[ExportSpec]:
     """Return formats with the options that each has.
 
     An option that none of the formats has goes to all of them, which refuse it.
     """
-    from ..clouds.writing import Format
+    from ..clouds.writing import ExportSpec
 
-    rows = {name: row_of(name) for name in names}
-    compensating = {name for name, row in rows.items() if row.raw_or_compensated} or rows
-    moving = {name for name, row in rows.items() if row.positions_of_sweeps} or rows
-    with_frames = {name for name, row in rows.items() if row.layouts} or rows
-    organizing = {name for name, row in rows.items() if row.organized_layouts} or rows
-    scaling = {name for name, row in rows.items() if row.integer_intensities} or rows
+    formats = {name: format_named(name) for name in names}
+
+    def supporting(option: str) -> Collection[str]:
+        return {name for name in formats if formats[name].supports(option)} or formats
+
     return [
-        Format(
+        ExportSpec(
             name,
             layout,
-            compensated=compensated and name in compensating,
-            compensated_actors=compensated_actors and name in moving,
-            pose_rate_hz=pose_rate_hz if name in with_frames else None,
-            organized=organized and name in organizing,
-            intensity_full_scale=intensity_full_scale if name in scaling else None,
+            compensated=compensated and name in supporting("compensated"),
+            compensated_actors=compensated_actors and name in supporting("compensated_actors"),
+            pose_rate_hz=pose_rate_hz if name in supporting("pose_rate_hz") else None,
+            organized=organized and name in supporting("organized"),
+            intensity_full_scale=(
+                intensity_full_scale if name in supporting("intensity_full_scale") else None
+            ),
         )
-        for name in rows
+        for name in formats
     ]
 
 

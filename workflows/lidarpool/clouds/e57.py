@@ -2,40 +2,32 @@
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pye57
-from pye57 import libe57
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
 from lidarsim.base.words import printable
-from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.cloud_scan import CloudScan
 from lidarsim.scene.files.intensity_scales import Limits, scales_of
 from lidarsim.scene.files.stated_system import StatedSystem, check_metric_format
 from lidarsim.scene.transform import affine
-from lidarsim.sweeps.sweeps import Sweeps
 
-from ..base.fingerprint import fingerprint
+from .cloud_format import CloudFormat
 from .file_points import FilePoints, check_count, of_scans
-from .gps_time import gps_start_s
 from .recording import Read, Recording, RecordingSource, SweepFiles
-from .well_known_text import wkt
 
-_NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
+if TYPE_CHECKING:
+    from .writing import ExportSpec
+
 _THIN = "downsample it first"
 _POINT_BYTES = 24  # least bytes of the coordinates of a point
 _COORDINATES = {
@@ -53,169 +45,40 @@ _COLUMNS = {
 # Columns whose values the flags mark as invalid.
 _FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
 _GRAY = 188  # byte of a color that is unknown: half of the light
-_MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
+MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
 _MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
-_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
-def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write each sweep that has points, in the sensor frame: pose, intensity, colors, normals.
+class E57(CloudFormat):
+    """A file with a scan for each sweep that has points: pose, intensity, colors and normals.
 
-    Poses are in world coordinates, whose coordinate system is stored as WKT. Normals are in the
-    extension for surface normals; 0, 0, 0 without a surface. The intensity limits of all scans are
-    0 and the highest intensity of the cloud. Acquisition times are GPS times of the first and the
-    last firing, and the creation time is the start of the survey.
+    Points are in the sensor frame. Poses are in world coordinates, whose coordinate system is
+    stored as WKT. Normals are in the extension for surface normals; 0, 0, 0 without a surface. The
+    intensity limits of all scans are 0 and the highest intensity of the cloud. Acquisition times
+    are GPS times of the first and the last firing, and the creation time is the start of the
+    survey.
     """
-    content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
-    normals = {*NORMAL} <= {column.name for column in cloud.table}
-    file_class, fields = (_WithNormals, _normal_fields) if normals else (_File, nullcontext)
-    system = "" if sweeps.epsg is None else wkt(sweeps.epsg)
-    highest = _highest_intensity(cloud)
-    with _named_by(content), fields(), file_class(path, system, sweeps) as file:
-        if normals:
-            file.image_file.extensionsAdd("nor", _NORMALS_URI)
-        try:
-            for sweep, points in enumerate(sweeps.points(cloud)):
-                if len(points):
-                    _write_scan(file, sweeps, sweep, points, highest)
-            file.close()
-        except libe57.E57Exception as error:
-            del file.image_file  # closing it would fail again
-            raise OSError(f"{str(error).splitlines()[0]}. The disk may be full") from error
 
+    title = "E57"
+    by_sweep = True
+    frame = "sweep"
+    stored = ("intensity", *COLORS, *NORMAL)
 
-def _highest_intensity(cloud: CloudLike) -> float:
-    """Return the highest intensity of a cloud, or 0 without intensities."""
-    if all(column.name != "intensity" for column in cloud.table):
-        return 0.0
-    chunks = cloud.chunks()
-    return max((float(chunk["intensity"].max(initial=0)) for chunk in chunks), default=0.0)
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the file."""
+        from .e57_writer import write_e57
 
+        write_e57(path, self.cloud, self.sweeps)
 
-def _write_scan(
-    file: Any, sweeps: Sweeps, sweep: int, points: Cloud, highest_intensity: float
-) -> None:
-    positions = sweeps.compensated(sweep, points)
-    x, y, z = positions.T.copy()
-    data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
-    if "intensity" in points.columns:
-        data["intensity"] = points["intensity"]
-    if {*COLORS} <= {*points.columns}:
-        data |= {f"color{name.capitalize()}": points[name] for name in COLORS}
-    if {*NORMAL} <= {*points.columns}:
-        columns = sweeps.columns_compensated(sweep, points)
-        data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
-    quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
-    position = sweeps.pose.positions[sweep]
-    start_s = gps_start_s(sweeps)
-    # Fields that pye57 would fill with zeros, with the limits of each scan, or with corners of the
-    # bounds in world coordinates, which the format has in the frame of the points.
-    header: dict[str, Any] = {
-        "acquisitionStart_dateTimeValue": start_s + float(sweeps.begins_ns[sweep]) / 1e9,
-        "acquisitionEnd_dateTimeValue": start_s + float(sweeps.ends_ns[sweep]) / 1e9,
-        "acquisitionStart_isAtomicClockReferenced": sweeps.start_ns is not None,
-        "acquisitionEnd_isAtomicClockReferenced": sweeps.start_ns is not None,
-        "intensityMinimum": 0.0,
-        "intensityMaximum": highest_intensity,
-    }
-    for axis, low, high in zip("xyz", positions.min(axis=0), positions.max(axis=0), strict=True):
-        header |= {f"{axis}Minimum": float(low), f"{axis}Maximum": float(high)}
-    file.write_scan_raw(
-        data,
-        name=_scan_name(sweeps, sweep),
-        rotation=quaternion,
-        translation=position,
-        scan_header=SimpleNamespace(**header),
-    )
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open the scans of a file."""
+        return open_file(source)
 
-
-def _scan_name(sweeps: Sweeps, sweep: int) -> str:
-    """Return the name of a scan, such as "station 3" or "roof, sweep 1, motion compensated"."""
-    sensor = sweeps.sensor[sweep]
-    number = int(sweeps.numbers[sweep])
-    per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
-    parts = [sweeps.sensors[sensor]] if len(sweeps.sensors) > 1 else []
-    is_standing = not len(sweeps.knots)
-    if is_standing:
-        parts.append(f"station {max(int(sweeps.station_numbers[sweep]), 1)}")
-    if not is_standing or per_station > 1:
-        parts.append(f"sweep {number % per_station + 1}")
-    return ", ".join(parts) + ("" if is_standing else _MOVING)
-
-
-class _File(pye57.E57):
-    """A new file whose header states coordinate system and time, which pye57 leaves empty."""
-
-    def __init__(self, path: Path, system: str, sweeps: Sweeps) -> None:
-        self._system = system
-        self._sweeps = sweeps
-        self._in_header = False
-        super().__init__(str(path), mode="w")
-
-    def write_default_header(self) -> None:
-        """Write the header, with the system as coordinateMetadata, and the creation time."""
-        self._in_header = True
-        super().write_default_header()
-        self._in_header = False
-
-    @property
-    def root(self) -> Any:
-        """Root of the file, or an object that takes its fields while the header is written."""
-        return SimpleNamespace(set=self._set_field) if self._in_header else super().root
-
-    def _set_field(self, name: str, node: Any) -> None:
-        if name == "coordinateMetadata":  # no field can be set twice
-            node = libe57.StringNode(self.image_file, self._system)
-        if name == "creationDateTime":
-            has_start = self._sweeps.start_ns is not None
-            time = libe57.FloatNode(self.image_file, gps_start_s(self._sweeps))
-            node = libe57.StructureNode(self.image_file)
-            node.set("dateTimeValue", time)
-            node.set("isAtomicClockReferenced", libe57.IntegerNode(self.image_file, has_start))
-        super().root.set(name, node)
-
-
-class _WithNormals(_File):
-    """A file whose scans have normals, which pye57 leaves out."""
-
-    def make_buffers(self, field_names: Sequence[str], *arguments: Any, **options: Any) -> Any:
-        """Return buffers with the fields of normals added."""
-        return super().make_buffers([*field_names, *_FIELDS], *arguments, **options)
-
-
-@contextmanager
-def _normal_fields() -> Iterator[None]:
-    """Have pye57 write fields of normals."""
-    supported = pye57.e57.SUPPORTED_POINT_FIELDS
-    library = pye57.e57.libe57
-
-    def vector_node(image_file: Any, prototype: Any, codecs: Any) -> Any:
-        for field in _FIELDS:
-            node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE, -1.0, 1.0)
-            prototype.set(field, node)
-        return libe57.CompressedVectorNode(image_file, prototype, codecs)
-
-    pye57.e57.SUPPORTED_POINT_FIELDS = supported | dict.fromkeys(_FIELDS, "f")
-    pye57.e57.libe57 = SimpleNamespace(**vars(libe57) | {"CompressedVectorNode": vector_node})
-    try:
-        yield
-    finally:
-        pye57.e57.SUPPORTED_POINT_FIELDS = supported
-        pye57.e57.libe57 = library
-
-
-@contextmanager
-def _named_by(content: str) -> Iterator[None]:
-    """Derive the GUIDs of a file and its scans from a text, where pye57 draws random GUIDs."""
-    numbers = count()
-    uuid_module = pye57.e57.uuid
-    pye57.e57.uuid = SimpleNamespace(
-        uuid4=lambda: uuid.uuid5(uuid.NAMESPACE_OID, f"{content} {next(numbers)}")
-    )
-    try:
-        yield
-    finally:
-        pye57.e57.uuid = uuid_module
+    @classmethod
+    def read_points(cls, path: Path) -> FilePoints:
+        """Return the points of all scans, joined in the frame of the file."""
+        return read_points(path)
 
 
 # -- reading ---------------------------------------------------------------------------------
@@ -230,6 +93,8 @@ class _Scale(NamedTuple):
 
 def open_file(source: RecordingSource) -> Recording:
     """Open the scans of an E57, each in the axes of its scanner, with its pose."""
+    import pye57
+
     with reading(source.name):
         size = input_size(source.path)
         file = pye57.E57(str(source.path))
@@ -262,7 +127,7 @@ def open_file(source: RecordingSource) -> Recording:
             # Else the points are in no such system.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
         names = [_stated_name(header) for header in headers]
-        stations = [] if any(name.endswith(_MOVING) for name in names) else names
+        stations = [] if any(name.endswith(MOVING) for name in names) else names
         sweeps = SweepFiles(
             len(headers), read, notes=tuple(notes), epsg=epsg, stations=tuple(stations)
         )
@@ -271,6 +136,8 @@ def open_file(source: RecordingSource) -> Recording:
 
 def read_points(path: Path) -> FilePoints:
     """Read all scans, joined in the frame of the file, with their scanners' positions."""
+    import pye57
+
     file = pye57.E57(str(path))
     try:
         headers = [file.get_header(number) for number in range(file.scan_count)]
@@ -332,6 +199,8 @@ def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
 
     pye57 would read into types that do not hold every value: bytes of colors, 16 bits of rows.
     """
+    from pye57 import libe57
+
     points = header.points
     prototype = libe57.StructureNode(points.prototype())
     known = {*_COLUMNS, *_FLAGS, *sum(_COORDINATES.values(), ()), *_states("")}
@@ -382,6 +251,8 @@ def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, An
 
 def _full_color(header: Any, highest: float) -> float:
     """Return the value of full color of a scan, by its limits and its highest color."""
+    from pye57 import libe57
+
     prototype = libe57.StructureNode(header.points.prototype())
     nodes = [prototype[f"color{color}"] for color in _COLORS]
     are_real = not all(isinstance(node, libe57.IntegerNode) for node in nodes)
@@ -431,6 +302,8 @@ def _limit(header: Any, group: str, name: str) -> float | None:
 
 def _number(node: Any) -> float:
     """Return the value of a node that is a number."""
+    from pye57 import libe57
+
     is_scaled = isinstance(node, libe57.ScaledIntegerNode)
     return float(node.scaledValue() if is_scaled else node.value())
 

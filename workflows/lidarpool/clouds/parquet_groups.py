@@ -7,17 +7,20 @@ size.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
-
-import pyarrow as pa
+from typing import TYPE_CHECKING, Any
 
 from lidarsim.base.allowance import Allowance
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 _ADVICE = "write fewer points, or smaller row groups"
 
 
 def number_columns(schema: pa.Schema) -> list[str]:
     """Return the names of the columns of numbers and times, whose values have a fixed size."""
+    import pyarrow as pa
+
     return [field.name for field in schema if pa.types.is_primitive(field.type)]
 
 

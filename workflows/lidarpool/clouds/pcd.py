@@ -17,14 +17,14 @@ from lidarsim.scene.colors import as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation
 
-from . import pieces
 from .file_points import FilePoints, of_scans
+from .multi_file_format import MultiFileFormat
 from .recording import NoiseFilter, Read, Recording, RecordingSource
 
 _COMMENT_BYTES = 1000  # of the first line that is searched
 
 
-class Pieces(pieces.Pieces):
+class PCD(MultiFileFormat):
     """A file for each sweep, with all columns.
 
     Red, green and blue are a single field `rgb`.
@@ -35,6 +35,12 @@ class Pieces(pieces.Pieces):
     is the pose of the sensor in the world at the start of the sweep. Normals and origins of rays
     are in the frame of the points; normals have PCL's names.
     """
+
+    title = "PCD"
+    by_sweep = True
+    frame = "firing"
+    options = ("compensated",)
+    file_pattern = r"\d+\.pcd"
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
         """Return the file of a sweep."""
@@ -68,6 +74,16 @@ class Pieces(pieces.Pieces):
             fields.append((name, values))
         return fields
 
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a file as a sweep, or the files of a folder as sweeps."""
+        return open_folder(source) if source.path.is_dir() else open_file(source)
+
+    @classmethod
+    def read_points(cls, path: Path) -> FilePoints:
+        """Return the points of a file."""
+        return read_points(path)
+
 
 def open_file(source: RecordingSource) -> Recording:
     """Open a file as a sweep, with the pose of the sensor from VIEWPOINT."""
@@ -97,7 +113,7 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
 
 
 def _stated_compensation(path: Path) -> bool | None:
-    """Return what the comment of a file of `Pieces` states, or None for other files."""
+    """Return what the comment of a file of `PCD` states, or None for other files."""
     try:
         with open_input(path) as file:
             comment = file.readline(_COMMENT_BYTES).decode(errors="replace")

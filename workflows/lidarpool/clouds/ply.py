@@ -7,8 +7,9 @@ import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
 from lidarsim.base.validation import checked
 from lidarsim.base.words import printable
-from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
 from lidarsim.columns.table import AXES as POSITION
@@ -29,9 +30,13 @@ from lidarsim.scene.files.stated_system import StatedSystem, stated_meters
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
-from . import sweep_reader
+from .cloud_format import CloudFormat, PointColumns
 from .file_points import FilePoints, from_columns
+from .job_reader import JobReader
 from .recording import NoiseFilter, Read, Recording, RecordingSource, open_cloud, positions_of
+
+if TYPE_CHECKING:
+    from .writing import ExportSpec
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
@@ -40,20 +45,49 @@ FIRST_POINTS = 65_536  # points that Open3D writes; it takes five times as long 
 _BLOCK_BYTES = 1 << 23  # moved at a time
 
 
-def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
+class PLY(CloudFormat):
+    """A binary PLY file, which Open3D writes.
 
     About a million points are in memory at a time. float64 positions are stored in single precision
     if the error is below a twentieth of the precision of the sweeps, else in double. Names of
     classes and materials are comments: `class 40 road`, `material 0 Brick`. A comment says if
     points are not in the world frame, and which coordinate system the world has: `crs: EPSG:25832`.
     """
-    position_type = real_type(cloud.bounds, sweeps.precision_m)
-    with GrowingPly(path, cloud.table, position_type, sweeps, len(cloud)) as file:
-        file.check_room(len(cloud))
-        for chunk in cloud.chunks():
-            file.append(len(chunk), chunk.by_name.items())
-        file.finish()
+
+    title = "PLY"
+    job_path = "jobs/{name}/cloud.ply"
+
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the file."""
+        cloud = self.cloud
+        position_type = real_type(cloud.bounds, self.sweeps.precision_m)
+        with GrowingPly(path, cloud.table, position_type, self.sweeps, len(cloud)) as file:
+            file.check_room(len(cloud))
+            for chunk in cloud.chunks():
+                file.append(len(chunk), chunk.by_name.items())
+            file.finish()
+
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return the points of a sweep in a data set, with all columns."""
+        name = cls.path_of_job(job.entry)
+        file = job.cached("cloud", lambda: CloudFile(job.local(name)))
+        first, stop = (file.row_of(scan) for scan in job.sweeps.scans[sweep : sweep + 2])
+        cloud = next(file.chunks(max(1, stop - first), first), None)
+        if cloud is None or first == stop:
+            kinds = {column.name: np.empty(0, column.dtype) for column in file.table}
+            cloud = Cloud(np.empty((0, 3)), kinds)
+        return job.in_sensor(sweep, cloud)
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a file, or the cloud of a result."""
+        return open_folder(source) if source.path.is_dir() else open_file(source)
+
+    @classmethod
+    def read_points(cls, path: Path) -> FilePoints:
+        """Return the points of a file."""
+        return read_points(path)
 
 
 class GrowingPly:
@@ -292,27 +326,6 @@ def read_cloud(path: str | Path) -> Cloud:
 def _comment(name: str) -> str:
     """Return a name for a comment, in ASCII."""
     return printable(name).encode("ascii", "backslashreplace").decode()
-
-
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: all columns of each point."""
-
-    def files(self, sweep: int) -> list[str]:
-        """Return the name of the job's cloud."""
-        return [self.entry.path_of("ply")]
-
-    @cached_property
-    def _cloud(self) -> CloudFile:
-        return CloudFile(self.local(self.files(0)[0]))
-
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep."""
-        first, stop = (self._cloud.row_of(scan) for scan in self.sweeps.scans[sweep : sweep + 2])
-        cloud = next(self._cloud.chunks(max(1, stop - first), first), None)
-        if cloud is None or first == stop:
-            kinds = {column.name: np.empty(0, column.dtype) for column in self._cloud.table}
-            cloud = Cloud(np.empty((0, 3)), kinds)
-        return self.inside(sweep, cloud)
 
 
 def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:

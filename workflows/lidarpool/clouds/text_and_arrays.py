@@ -10,8 +10,23 @@ from lidarsim.base.extras import reading
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 from lidarsim.scene.files.ptx import read_ptx
 
+from .cloud_format import CloudFormat
 from .file_points import FilePoints, of_scans
 from .recording import METERS, NoiseFilter, Read, Recording, RecordingSource
+
+
+class TextFormats(CloudFormat):
+    """Text files and NumPy arrays of points, which can only be read."""
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a cloud, or the scans of a .ptx file."""
+        return open_file(source)
+
+    @classmethod
+    def read_points(cls, path: Path) -> FilePoints:
+        """Return the points of a file, with the scanners' positions if it has them."""
+        return read_points(path)
 
 
 def open_file(source: RecordingSource) -> Recording:

@@ -17,7 +17,7 @@ from lidarsim.survey.faults import Fault
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.boxes import Boxes, SweepBoxes
-from ..clouds.sweep_reader import PointColumns
+from ..clouds.cloud_format import PointColumns
 from .job_table import JobRow, Value
 
 

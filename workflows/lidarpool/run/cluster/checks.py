@@ -22,7 +22,7 @@ from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
 from ...base.software import difference, software, software_query
-from ...clouds.writing import Format
+from ...clouds.writing import ExportSpec
 from ...scenario.build import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
@@ -210,7 +210,7 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
             )
 
 
-def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None:
+def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> None:
     """Check that the LIDAR workers can write the formats of plug-ins.
 
     LidarError if a worker has another version of a plug-in, or cannot import it.
@@ -218,7 +218,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None
     written = [
         file_format
         for file_format in formats
-        if file_format.row.in_pieces and file_format.row.plugin is not None
+        if file_format.has_many_files and file_format.row.plugin is not None
     ]
     if not written:
         return
@@ -241,7 +241,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None
             ) from answer
 
 
-def _check_installed(formats: Iterable[Format]) -> None:
+def _check_installed(formats: Iterable[ExportSpec]) -> None:
     for file_format in formats:
         file_format.check_installed()
 
