@@ -44,9 +44,10 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.clouds import parquet, pieces, well_known_text
+from lidarpool.clouds import multi_file_format, parquet, well_known_text
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.format_table import EXPORTS, FORMATS, LAYOUTS
+from lidarpool.clouds.format_table import EXPORTS, FORMATS
+from lidarpool.clouds.ros.layouts import LAYOUTS
 from lidarpool.clouds.well_known_text import wkt
 from lidarpool.clouds.writing import ExportSpec
 from lidarsim.base.storage import Storage
@@ -823,8 +824,8 @@ def test_documentation_and_installation_follow_the_table_of_formats():
         files, extra = next((c[2], c[4]) for c in cells if len(c) > 5 and name in c[1])
         assert row.file in [file.rstrip("/") for file in files], name
         assert extra == ([row.extra] if row.packages else []), name
-    for layout, needed in LAYOUTS.items():
-        assert re.search(rf"\| `{layout}` \|.*\| {', '.join(needed)} \|", text), layout
+    for name, layout in LAYOUTS.items():
+        assert re.search(rf"\| `{name}` \|.*\| {', '.join(layout.columns)} \|", text), name
 
 
 @pytest.mark.extended
@@ -832,7 +833,7 @@ def test_documentation_and_installation_follow_the_table_of_formats():
 def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name, monkeypatch):
     """What workers do not see is written here."""
     monkeypatch.setattr(parquet, "CHUNK_POINTS", 1000)
-    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
+    monkeypatch.setattr(multi_file_format, "RANGE_PIECES", 1)
     ExportSpec(name).write(tmp_path / "threads", cloud, sweeps)
     ranges = []
     sent = []

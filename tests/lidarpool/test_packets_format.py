@@ -22,8 +22,7 @@ from lidarpool import (
     load_sensor,
     save_cloud,
 )
-from lidarpool.clouds.packets import with_packet_columns
-from lidarpool.clouds.writing import ExportSpec
+from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN, TABLE
@@ -136,4 +135,4 @@ def test_a_scenario_that_writes_packets_keeps_what_they_hold():
     ):
         with pytest.raises(LidarError, match=says):
             build(scenario_of(output=write, **sections))
-    assert with_packet_columns(survey, ["laz"]) is survey
+    assert with_format_columns(survey, [ExportSpec("laz")]) is survey

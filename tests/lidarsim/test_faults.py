@@ -29,8 +29,9 @@ from lidarpool import (
 )
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.images import Image
-from lidarpool.clouds.ros.bags import write_rosbag2
+from lidarpool.clouds.ros.bags import Rosbag2
 from lidarpool.clouds.webdataset import Pieces
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
@@ -280,7 +281,7 @@ def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
         boxes.append(
             [Boxes.from_points(sweeps, k, points) for k, points in enumerate(sweeps.points(cloud))]
         )
-        write_rosbag2(path := tmp_path / f"{len(bags)}", cloud, sweeps, "velodyne")
+        Rosbag2(cloud, sweeps).write(path := tmp_path / f"{len(bags)}", ExportSpec("rosbag2"))
         with AnyReader([path]) as bag:
             bags.append([
                 (bag.deserialize(data, one.msgtype), when)
