@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -194,14 +194,14 @@ def export(
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
         pictures = partial(PictureContent.load_from, source)
-        chosen_formats = _chosen_formats(formats, **settings)
+        specs = _chosen_specs(formats, **settings)
         written: list[str] = []
         with result_folder(target) as folder:
-            for chosen in chosen_formats:  # before any is written, which may take long
+            for chosen in specs:  # before any is written, which may take long
                 chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
                 _check_free(target, chosen.row.file, overwrite=overwrite)
             try:
-                for chosen in chosen_formats:
+                for chosen in specs:
                     file = folder / chosen.row.file
                     full_scale = chosen.write(
                         file, cloud, sweeps, overwrite=overwrite, content=pictures
@@ -227,39 +227,30 @@ def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
         )
 
 
-def _chosen_formats(
-    names: Iterable[str],
-    layout: str,
-    compensated: bool,
-    compensated_actors: bool,
-    pose_rate_hz: float | None,
-    organized: bool,
-    intensity_full_scale: float | None,
-) -> list[ExportSpec]:
-    """Return formats with the options that each has.
+def _chosen_specs(names: Iterable[str], layout: str, **options: Any) -> list[ExportSpec]:
+    """Return formats with the options that each supports.
 
-    An option that none of the formats has goes to all of them, which refuse it.
+    An option that none of the formats supports goes to all of them, which refuse it.
     """
     from ..clouds.writing import ExportSpec
 
     formats = {name: format_named(name) for name in names}
-
-    def supporting(option: str) -> Collection[str]:
-        return {name for name in formats if formats[name].supports(option)} or formats
-
+    refused = [
+        option
+        for option in options
+        if not any(cloud_format.supports(option) for cloud_format in formats.values())
+    ]
     return [
         ExportSpec(
             name,
             layout,
-            compensated=compensated and name in supporting("compensated"),
-            compensated_actors=compensated_actors and name in supporting("compensated_actors"),
-            pose_rate_hz=pose_rate_hz if name in supporting("pose_rate_hz") else None,
-            organized=organized and name in supporting("organized"),
-            intensity_full_scale=(
-                intensity_full_scale if name in supporting("intensity_full_scale") else None
-            ),
+            **{
+                option: value
+                for option, value in options.items()
+                if option in refused or cloud_format.supports(option)
+            },
         )
-        for name in formats
+        for name, cloud_format in formats.items()
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -49,8 +50,8 @@ class Entry:
 class CloudFormat(ABC):
     """A point cloud in a format. Each format is a subclass.
 
-    The class attributes state what the format can store. They can be read without the packages
-    that write the format, which are imported when they are used.
+    Class attributes state what the format can store. They can be read without the packages of the
+    format, which are imported when they are used.
 
     Parameters
     ----------
@@ -60,53 +61,25 @@ class CloudFormat(ABC):
         Sweeps of the points.
     entry
         The job of the points in a data set. By default, the cloud is not part of a data set.
-
-    Attributes
-    ----------
-    row
-        File and extensions of the format. Only plug-ins state them in the class.
-    title
-        Proper name of the format in sentences. By default, the name of the format.
-    by_sweep
-        Whether the points of each sweep are stored separately.
-    frame
-        Frame in which points are stored.
-    required
-        Names of the columns that a cloud must have, in addition to `scan` of formats by sweep.
-    stored
-        Names of the columns that can be stored, or None for all columns.
-    named
-        Names of the columns that can only be stored if classes have names.
-    options
-        Names of the options of `ExportSpec` that only some formats support, without
-        `compensated_actors`, which all formats support that store positions by sweep.
-    actor_boxes
-        Whether the boxes of actors are stored.
-    file_pattern
-        Pattern of the names of the files in the folder of the format.
-    job_path
-        Path of a job's file or folder in a data set, as a format string with fields of `Entry`.
-    separate_sweeps
-        Whether a sweep in a data set is read without opening a file of the whole job.
-    raw_sweeps
-        Whether each sweep in a data set has separate files, which contain rows of numbers.
-    content
-        Returns the scene and the planned path, for formats that can store these.
     """
 
-    row: ClassVar[FormatRow] = FormatRow("")
-    title: ClassVar[str] = ""
-    by_sweep: ClassVar[bool] = False
-    frame: ClassVar[Frame] = "cloud"
+    row: ClassVar[FormatRow] = FormatRow("")  # files of the format, if it is a plug-in
+    title: ClassVar[str] = ""  # proper name in sentences; by default, the name of the format
+    by_sweep: ClassVar[bool] = False  # whether the points of each sweep are stored separately
+    frame: ClassVar[Frame] = "cloud"  # frame in which points are stored
+    # Columns that a cloud must have, in addition to `scan` of formats by sweep.
     required: ClassVar[tuple[str, ...]] = ()
-    stored: ClassVar[tuple[str, ...] | None] = None
-    named: ClassVar[tuple[str, ...]] = ()
-    options: ClassVar[tuple[str, ...]] = ()
-    actor_boxes: ClassVar[bool] = False
-    file_pattern: ClassVar[str] = ""
+    stored: ClassVar[tuple[str, ...] | None] = None  # columns that can be stored; None for all
+    named: ClassVar[tuple[str, ...]] = ()  # columns that are also stored if classes have names
+    options: ClassVar[tuple[str, ...]] = ()  # options of `ExportSpec` that few formats support
+    actor_boxes: ClassVar[bool] = False  # whether the boxes of actors are stored
+    file_pattern: ClassVar[str] = ""  # pattern of the names of the files in the format's folder
+    # In data sets: path of a job's file or folder, with fields of `Entry`; whether a sweep is read
+    # without opening a file of the whole job; and whether each sweep has files of rows of numbers.
     job_path: ClassVar[str] = ""
     separate_sweeps: ClassVar[bool] = False
     raw_sweeps: ClassVar[bool] = False
+    # Returns scene and planned path, for formats that store these.
     content: Callable[[], PictureContent | None] = staticmethod(lambda: None)
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
@@ -118,17 +91,12 @@ class CloudFormat(ABC):
     def write(self, path: Path, spec: ExportSpec) -> float | None:
         """Write the cloud to a new file or folder.
 
+        LidarError if the format cannot store the cloud; OSError if the file cannot be written.
+
         Returns
         -------
         The intensity that is stored as the highest integer, or None if the format has real numbers
         or the cloud has no intensities.
-
-        Raises
-        ------
-        LidarError
-            If the format cannot store the cloud.
-        OSError
-            If the file cannot be written.
         """
 
     @classmethod
@@ -145,39 +113,35 @@ class CloudFormat(ABC):
 
     @classmethod
     def option_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
-        """Return the names of the columns that the options require and store in addition."""
+        """Return the columns that the options require and store in addition."""
         return ()
 
     @classmethod
     def required_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
-        """Return the names of the columns that a cloud must have."""
+        """Return the columns that a cloud must have."""
         scan = ("scan",) if cls.by_sweep else ()
         required = (*scan, *cls.required, *cls.option_columns(spec))
-        return (
-            (*required, "time") if spec.compensated_actors and "time" not in required else required
-        )
+        time = ("time",) if spec.compensated_actors and "time" not in required else ()
+        return required + time
 
     @classmethod
     def optional_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> tuple[str, ...]:
-        """Return the names of the columns that can be stored in addition for a survey's sweeps."""
+        """Return the columns that can be stored in addition to `stored`."""
         return cls.option_columns(spec) + (cls.named if sweeps.classes else ())
 
     @classmethod
     def survey_columns(cls, survey: Survey) -> tuple[str, ...]:
-        """Return the names of the columns that the format requires from a survey's sensors.
-
-        Raises LidarError if the format cannot store the data of a sensor.
-        """
+        """Return the columns that the survey's sensors require, or raise LidarError."""
         return ()
 
     @classmethod
     def survey_notes(cls, survey: Survey) -> list[str]:
-        """Return notes for the user on what the format cannot store of a survey."""
+        """Return notes for the user on what cannot be stored of a survey."""
         return []
 
     @classmethod
     def renamed(cls, sensors: Sequence[str]) -> list[str]:
-        """Return a note if sensors with these names, "" without a name, have other names."""
+        """Return a note if sensors of these names, "" without one, have others in the format."""
         return []
 
     @classmethod
@@ -200,13 +164,17 @@ class CloudFormat(ABC):
 
     @classmethod
     def open(cls, source: Any) -> Any:
-        """Open the file or folder of a `RecordingSource` as a `Recording`."""
-        raise NotImplementedError
+        """Open the file or folder of a `RecordingSource` as a `Recording`.
+
+        By default, the function `open_file` or `open_folder` of the format's module opens it.
+        """
+        function = "open_folder" if source.path.is_dir() else "open_file"
+        return getattr(import_module(cls.__module__), function)(source)
 
     @classmethod
     def read_points(cls, path: Path) -> Any:
-        """Return the points of a file as `FilePoints`.
+        """Return the points of a file as `FilePoints`, or raise ValueError if it is damaged.
 
-        Raises ValueError for a damaged file.
+        By default, the function `read_points` of the format's module reads it.
         """
-        raise NotImplementedError
+        return import_module(cls.__module__).read_points(path)

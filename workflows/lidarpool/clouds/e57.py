@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,20 +16,24 @@ from lidarsim.base.arrays import AnyArray, Floats
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
 from lidarsim.base.words import printable
+from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.motion.rotations import matrices
 from lidarsim.scene.files.cloud_scan import CloudScan
 from lidarsim.scene.files.intensity_scales import Limits, scales_of
 from lidarsim.scene.files.stated_system import StatedSystem, check_metric_format
 from lidarsim.scene.transform import affine
+from lidarsim.sweeps.sweeps import Sweeps
 
+from ..base.fingerprint import fingerprint
 from .cloud_format import CloudFormat
 from .file_points import FilePoints, check_count, of_scans
+from .gps_time import gps_start_s
 from .recording import Read, Recording, RecordingSource, SweepFiles
+from .well_known_text import wkt
+from .writing import ExportSpec
 
-if TYPE_CHECKING:
-    from .writing import ExportSpec
-
+_NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _THIN = "downsample it first"
 _POINT_BYTES = 24  # least bytes of the coordinates of a point
 _COORDINATES = {
@@ -45,8 +51,9 @@ _COLUMNS = {
 # Columns whose values the flags mark as invalid.
 _FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
 _GRAY = 188  # byte of a color that is unknown: half of the light
-MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
+_MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
 _MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
+NORMAL_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
 class E57(CloudFormat):
@@ -66,19 +73,87 @@ class E57(CloudFormat):
 
     def write(self, path: Path, spec: ExportSpec) -> None:
         """Write the file."""
-        from .e57_writer import write_e57
+        from pye57 import libe57
 
-        write_e57(path, self.cloud, self.sweeps)
+        from .e57_writer import E57Writer, E57WriterWithNormals, named_by, normal_fields
 
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open the scans of a file."""
-        return open_file(source)
+        content = fingerprint(self.sweeps, len(self.cloud), np.asarray(self.cloud.bounds))
+        normals = {*NORMAL} <= {column.name for column in self.cloud.table}
+        file_class, fields = (
+            (E57WriterWithNormals, normal_fields) if normals else (E57Writer, nullcontext)
+        )
+        system = "" if self.sweeps.epsg is None else wkt(self.sweeps.epsg)
+        highest = _highest_intensity(self.cloud)
+        with named_by(content), fields(), file_class(path, system, self.sweeps) as file:
+            if normals:
+                file.image_file.extensionsAdd("nor", _NORMALS_URI)
+            try:
+                for sweep, points in enumerate(self.sweeps.points(self.cloud)):
+                    if len(points):
+                        _write_scan(file, self.sweeps, sweep, points, highest)
+                file.close()
+            except libe57.E57Exception as error:
+                del file.image_file  # closing it would fail again
+                raise OSError(f"{str(error).splitlines()[0]}. The disk may be full") from error
 
-    @classmethod
-    def read_points(cls, path: Path) -> FilePoints:
-        """Return the points of all scans, joined in the frame of the file."""
-        return read_points(path)
+
+def _highest_intensity(cloud: CloudLike) -> float:
+    """Return the highest intensity of a cloud, or 0 without intensities."""
+    if all(column.name != "intensity" for column in cloud.table):
+        return 0.0
+    chunks = cloud.chunks()
+    return max((float(chunk["intensity"].max(initial=0)) for chunk in chunks), default=0.0)
+
+
+def _write_scan(
+    file: Any, sweeps: Sweeps, sweep: int, points: Cloud, highest_intensity: float
+) -> None:
+    positions = sweeps.compensated(sweep, points)
+    x, y, z = positions.T.copy()
+    data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
+    if "intensity" in points.columns:
+        data["intensity"] = points["intensity"]
+    if {*COLORS} <= {*points.columns}:
+        data |= {f"color{name.capitalize()}": points[name] for name in COLORS}
+    if {*NORMAL} <= {*points.columns}:
+        columns = sweeps.columns_compensated(sweep, points)
+        data |= {field: np.nan_to_num(columns[name]) for field, name in NORMAL_FIELDS.items()}
+    quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
+    position = sweeps.pose.positions[sweep]
+    start_s = gps_start_s(sweeps)
+    # Fields that pye57 would fill with zeros, with the limits of each scan, or with corners of the
+    # bounds in world coordinates, which the format has in the frame of the points.
+    header: dict[str, Any] = {
+        "acquisitionStart_dateTimeValue": start_s + float(sweeps.begins_ns[sweep]) / 1e9,
+        "acquisitionEnd_dateTimeValue": start_s + float(sweeps.ends_ns[sweep]) / 1e9,
+        "acquisitionStart_isAtomicClockReferenced": sweeps.start_ns is not None,
+        "acquisitionEnd_isAtomicClockReferenced": sweeps.start_ns is not None,
+        "intensityMinimum": 0.0,
+        "intensityMaximum": highest_intensity,
+    }
+    for axis, low, high in zip("xyz", positions.min(axis=0), positions.max(axis=0), strict=True):
+        header |= {f"{axis}Minimum": float(low), f"{axis}Maximum": float(high)}
+    file.write_scan_raw(
+        data,
+        name=_scan_name(sweeps, sweep),
+        rotation=quaternion,
+        translation=position,
+        scan_header=SimpleNamespace(**header),
+    )
+
+
+def _scan_name(sweeps: Sweeps, sweep: int) -> str:
+    """Return the name of a scan, such as "station 3" or "roof, sweep 1, motion compensated"."""
+    sensor = sweeps.sensor[sweep]
+    number = int(sweeps.numbers[sweep])
+    per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
+    parts = [sweeps.sensors[sensor]] if len(sweeps.sensors) > 1 else []
+    is_standing = not len(sweeps.knots)
+    if is_standing:
+        parts.append(f"station {max(int(sweeps.station_numbers[sweep]), 1)}")
+    if not is_standing or per_station > 1:
+        parts.append(f"sweep {number % per_station + 1}")
+    return ", ".join(parts) + ("" if is_standing else _MOVING)
 
 
 # -- reading ---------------------------------------------------------------------------------
@@ -127,7 +202,7 @@ def open_file(source: RecordingSource) -> Recording:
             # Else the points are in no such system.
             epsg = system.epsg if system.horizontal_m == 1.0 else None
         names = [_stated_name(header) for header in headers]
-        stations = [] if any(name.endswith(MOVING) for name in names) else names
+        stations = [] if any(name.endswith(_MOVING) for name in names) else names
         sweeps = SweepFiles(
             len(headers), read, notes=tuple(notes), epsg=epsg, stations=tuple(stations)
         )

@@ -1,112 +1,25 @@
-"""Scans of E57 files, which pye57 writes."""
+"""Files of pye57 with what it leaves out: coordinate systems, times, normals, and fixed GUIDs."""
 
 from __future__ import annotations
 
 import uuid
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pye57
 from pye57 import libe57
 
-from lidarsim.columns.cloud import Cloud, CloudLike
-from lidarsim.columns.table import COLORS, NORMAL
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..base.fingerprint import fingerprint
-from .e57 import MOVING
+from .e57 import NORMAL_FIELDS
 from .gps_time import gps_start_s
-from .well_known_text import wkt
-
-_NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
-_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
-def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write the scans of a cloud (`E57`)."""
-    content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
-    normals = {*NORMAL} <= {column.name for column in cloud.table}
-    file_class, fields = (_WithNormals, _normal_fields) if normals else (_File, nullcontext)
-    system = "" if sweeps.epsg is None else wkt(sweeps.epsg)
-    highest = _highest_intensity(cloud)
-    with _named_by(content), fields(), file_class(path, system, sweeps) as file:
-        if normals:
-            file.image_file.extensionsAdd("nor", _NORMALS_URI)
-        try:
-            for sweep, points in enumerate(sweeps.points(cloud)):
-                if len(points):
-                    _write_scan(file, sweeps, sweep, points, highest)
-            file.close()
-        except libe57.E57Exception as error:
-            del file.image_file  # closing it would fail again
-            raise OSError(f"{str(error).splitlines()[0]}. The disk may be full") from error
-
-
-def _highest_intensity(cloud: CloudLike) -> float:
-    """Return the highest intensity of a cloud, or 0 without intensities."""
-    if all(column.name != "intensity" for column in cloud.table):
-        return 0.0
-    chunks = cloud.chunks()
-    return max((float(chunk["intensity"].max(initial=0)) for chunk in chunks), default=0.0)
-
-
-def _write_scan(
-    file: Any, sweeps: Sweeps, sweep: int, points: Cloud, highest_intensity: float
-) -> None:
-    positions = sweeps.compensated(sweep, points)
-    x, y, z = positions.T.copy()
-    data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
-    if "intensity" in points.columns:
-        data["intensity"] = points["intensity"]
-    if {*COLORS} <= {*points.columns}:
-        data |= {f"color{name.capitalize()}": points[name] for name in COLORS}
-    if {*NORMAL} <= {*points.columns}:
-        columns = sweeps.columns_compensated(sweep, points)
-        data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
-    quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
-    position = sweeps.pose.positions[sweep]
-    start_s = gps_start_s(sweeps)
-    # Fields that pye57 would fill with zeros, with the limits of each scan, or with corners of the
-    # bounds in world coordinates, which the format has in the frame of the points.
-    header: dict[str, Any] = {
-        "acquisitionStart_dateTimeValue": start_s + float(sweeps.begins_ns[sweep]) / 1e9,
-        "acquisitionEnd_dateTimeValue": start_s + float(sweeps.ends_ns[sweep]) / 1e9,
-        "acquisitionStart_isAtomicClockReferenced": sweeps.start_ns is not None,
-        "acquisitionEnd_isAtomicClockReferenced": sweeps.start_ns is not None,
-        "intensityMinimum": 0.0,
-        "intensityMaximum": highest_intensity,
-    }
-    for axis, low, high in zip("xyz", positions.min(axis=0), positions.max(axis=0), strict=True):
-        header |= {f"{axis}Minimum": float(low), f"{axis}Maximum": float(high)}
-    file.write_scan_raw(
-        data,
-        name=_scan_name(sweeps, sweep),
-        rotation=quaternion,
-        translation=position,
-        scan_header=SimpleNamespace(**header),
-    )
-
-
-def _scan_name(sweeps: Sweeps, sweep: int) -> str:
-    """Return the name of a scan, such as "station 3" or "roof, sweep 1, motion compensated"."""
-    sensor = sweeps.sensor[sweep]
-    number = int(sweeps.numbers[sweep])
-    per_station = int(np.count_nonzero(sweeps.sensor == sensor)) // sweeps.stations
-    parts = [sweeps.sensors[sensor]] if len(sweeps.sensors) > 1 else []
-    is_standing = not len(sweeps.knots)
-    if is_standing:
-        parts.append(f"station {max(int(sweeps.station_numbers[sweep]), 1)}")
-    if not is_standing or per_station > 1:
-        parts.append(f"sweep {number % per_station + 1}")
-    return ", ".join(parts) + ("" if is_standing else MOVING)
-
-
-class _File(pye57.E57):
+class E57Writer(pye57.E57):
     """A new file whose header states coordinate system and time, which pye57 leaves empty."""
 
     def __init__(self, path: Path, system: str, sweeps: Sweeps) -> None:
@@ -138,37 +51,37 @@ class _File(pye57.E57):
         super().root.set(name, node)
 
 
-class _WithNormals(_File):
+class E57WriterWithNormals(E57Writer):
     """A file whose scans have normals, which pye57 leaves out."""
 
     def make_buffers(self, field_names: Sequence[str], *arguments: Any, **options: Any) -> Any:
         """Return buffers with the fields of normals added."""
-        return super().make_buffers([*field_names, *_FIELDS], *arguments, **options)
+        return super().make_buffers([*field_names, *NORMAL_FIELDS], *arguments, **options)
 
 
 @contextmanager
-def _normal_fields() -> Iterator[None]:
+def normal_fields() -> Iterator[None]:
     """Have pye57 write fields of normals."""
-    supported = pye57.e57.SUPPORTED_POINT_FIELDS
+    supported = pye57.e57.SUPPORTED_POINTNORMAL_FIELDS
     library = pye57.e57.libe57
 
     def vector_node(image_file: Any, prototype: Any, codecs: Any) -> Any:
-        for field in _FIELDS:
+        for field in NORMAL_FIELDS:
             node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE, -1.0, 1.0)
             prototype.set(field, node)
         return libe57.CompressedVectorNode(image_file, prototype, codecs)
 
-    pye57.e57.SUPPORTED_POINT_FIELDS = supported | dict.fromkeys(_FIELDS, "f")
+    pye57.e57.SUPPORTED_POINTNORMAL_FIELDS = supported | dict.fromkeys(NORMAL_FIELDS, "f")
     pye57.e57.libe57 = SimpleNamespace(**vars(libe57) | {"CompressedVectorNode": vector_node})
     try:
         yield
     finally:
-        pye57.e57.SUPPORTED_POINT_FIELDS = supported
+        pye57.e57.SUPPORTED_POINTNORMAL_FIELDS = supported
         pye57.e57.libe57 = library
 
 
 @contextmanager
-def _named_by(content: str) -> Iterator[None]:
+def named_by(content: str) -> Iterator[None]:
     """Derive the GUIDs of a file and its scans from a text, where pye57 draws random GUIDs."""
     numbers = count()
     uuid_module = pye57.e57.uuid

@@ -84,33 +84,25 @@ _OSI: dict[str, Any] = {"packages": ("betterosi",), "extra": "osi"}
 _ROS: dict[str, Any] = {"packages": ("rosbags",), "extra": "ros"}
 FORMATS = {
     "ply": FormatRow(
-        "cloud.ply",
-        "lidarpool.clouds.ply:PLY",
-        suffixes=(".ply",),
-        folders=("cloud.ply",),
-        reads_points=True,
+        "cloud.ply", "lidarpool.clouds.ply:PLY", (".ply",), ("cloud.ply",), reads_points=True
     ),
     "las": FormatRow("cloud.las", "lidarpool.clouds.las:LAS", (".las",), **_LAS),
     "laz": FormatRow("cloud.laz", "lidarpool.clouds.las:LAZ", (".laz",), **_LAS),
     "parquet": FormatRow(
         "cloud.parquet",
         "lidarpool.clouds.parquet:Parquet",
-        suffixes=(".parquet",),
-        folders=("**/*.parquet",),
+        (".parquet",),
+        ("**/*.parquet",),
         packages=("pyarrow",),
         extra="parquet",
     ),
     "pcd": FormatRow(
-        "pcd",
-        "lidarpool.clouds.pcd:PCD",
-        suffixes=(".pcd",),
-        folders=("*.[pP][cC][dD]",),
-        reads_points=True,
+        "pcd", "lidarpool.clouds.pcd:PCD", (".pcd",), ("*.[pP][cC][dD]",), reads_points=True
     ),
     "e57": FormatRow(
         "cloud.e57",
         "lidarpool.clouds.e57:E57",
-        suffixes=(".e57",),
+        (".e57",),
         reads_points=True,
         packages=("pye57",),
         extra="e57",
@@ -118,8 +110,8 @@ FORMATS = {
     "kitti": FormatRow(
         "kitti",
         "lidarpool.clouds.kitti:KITTI",
-        suffixes=(".bin",),
-        folders=("sequences/*/velodyne", "velodyne/*.bin", "velodyne_points/data/*.bin", "*.bin"),
+        (".bin",),
+        ("sequences/*/velodyne", "velodyne/*.bin", "velodyne_points/data/*.bin", "*.bin"),
         reads_points=True,
     ),
     "nuscenes": FormatRow(
@@ -128,16 +120,11 @@ FORMATS = {
         folders=("v1.0-*/sample_data.json", "sample_data.json"),
     ),
     "webdataset": FormatRow(
-        "webdataset",
-        "lidarpool.clouds.webdataset:WebDataset",
-        suffixes=(".tar",),
-        folders=("**/*.tar",),
+        "webdataset", "lidarpool.clouds.webdataset:WebDataset", (".tar",), ("**/*.tar",)
     ),
     "images": FormatRow("images", "lidarpool.clouds.images:ImageFolder", folders=("*/*.npz",)),
     "pcap": FormatRow(
-        "packets",
-        "lidarpool.clouds.packets:PacketCapture",
-        suffixes=(".pcap", ".pcapng", ".osf"),
+        "packets", "lidarpool.clouds.packets:PacketCapture", (".pcap", ".pcapng", ".osf")
     ),
     "rrd": FormatRow("cloud.rrd", "lidarpool.clouds.rrd:Rerun", packages=("rerun",), extra="rerun"),
     # Readers take the type of messages from the part «sd» of the file's name.

@@ -96,11 +96,6 @@ class ImageFolder(MultiFileFormat):
         with open_archive(job.storage.path(file), partial(job.storage.read, file)) as images:
             return points_of_images(images)
 
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open the range images of a folder."""
-        return open_folder(source)
-
 
 def points_of_images(images: dict[str, AnyArray]) -> PointColumns:
     """Return the points of the images of a sweep, in the order of their rays."""

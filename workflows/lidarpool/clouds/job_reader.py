@@ -25,21 +25,7 @@ T = TypeVar("T")
 
 
 class JobReader:
-    """The files of a job in a data set, which are read in any order, in a single thread.
-
-    Parameters
-    ----------
-    storage
-        The data set.
-    sweeps
-        Sweeps of the job.
-    entry
-        The job.
-    layout
-        Layout of points in mcap.
-    classes
-        Names of the classes of all jobs.
-    """
+    """The files of a job in a data set, which are read in any order, in a single thread."""
 
     def __init__(
         self,
@@ -52,8 +38,8 @@ class JobReader:
         self.storage = storage
         self.sweeps = sweeps
         self.entry = entry
-        self.layout = layout
-        self.classes = classes
+        self.layout = layout  # of points in mcap
+        self.classes = classes  # names of the classes of all jobs
         self.last = ""  # name of the file of rows that was read last, for errors
         self.opened = ExitStack()  # opened files, which `close` closes
         self._cache: dict[str, Any] = {}

@@ -168,16 +168,6 @@ class KITTI(MultiFileFormat):
         classes = labels.view("<u2")[::2]
         return rows[:, :3], {"intensity": rows[:, 3], "class": classes, "object": instances}
 
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a .bin file of KITTI or nuScenes as a sweep, or a folder of sequences."""
-        return open_folder(source) if source.path.is_dir() else open_file(source)
-
-    @classmethod
-    def read_points(cls, path: Path) -> FilePoints:
-        """Return the points of a .bin file."""
-        return read_points(path)
-
 
 def intensity_of(points: Cloud) -> Floats32:
     """Return the intensity of KITTI (n,): reflectivity from 0 to 1, independent of the range."""

@@ -10,7 +10,7 @@ from shutil import copyfileobj
 from struct import Struct
 from tempfile import TemporaryFile
 from textwrap import shorten
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +33,10 @@ from .intensity_full_scale import full_scale_of
 from .las_header import las_system, noise_classes, open_las
 from .recording import NoiseFilter, Read, Recording, RecordingSource
 from .well_known_text import wkt
+from .writing import ExportSpec
 
 if TYPE_CHECKING:
     import laspy
-
-    from .writing import ExportSpec
 
 # A sample consists of this many runs of points, which begin where chunks of a .laz begin: 50,000
 # points each, unless a program chooses otherwise.
@@ -92,9 +91,11 @@ class LAS(CloudFormat):
     title = "LAS"
     frame = "world"
     options = ("intensity_full_scale",)
+    is_compressed: ClassVar[bool] = False
 
     def write(self, path: Path, spec: ExportSpec) -> float | None:
         """Write the file, and return the intensity that is stored as 65,535."""
+        import laspy
         import lazrs
 
         full_scale = full_scale_of(self.cloud)
@@ -108,62 +109,39 @@ class LAS(CloudFormat):
         extra = [column for column in self.cloud.table if column.name not in format_fields]
         header.add_extra_dims([_extra_bytes(column) for column in extra])
         names = [column.name for column in extra]
+        options = {"header": header, "do_compress": self.is_compressed, "closefd": False}
         try:
             with (
                 path.open("wb+") as file,  # laspy leaves a file open that it cannot finish
                 TemporaryFile(dir=path.parent) as packet_file,
             ):
-                self._write_points(file, header, names, full_scale, packets, packet_file)
+                with laspy.open(file, "w", **options) as writer:
+                    for chunk, lines in FlightLines(self.sweeps).with_fields(self.cloud.chunks()):
+                        points = _points(chunk, header, names, _start_s(self.sweeps))
+                        if full_scale is not None:
+                            points.intensity = _as_integers(chunk["intensity"], full_scale)
+                        points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype("i2")
+                        points.scan_direction_flag = lines.direction
+                        points.edge_of_flight_line = lines.edge
+                        points.point_source_id = lines.source
+                        if packets is not None:
+                            packets.put(points, chunk, packet_file)
+                        with deferred_interrupts():  # lazrs replaces errors raised within it
+                            writer.write_points(points)
+                    with deferred_interrupts():
+                        writer.close()
                 if packets is not None:
                     packets.append(file, packet_file)
         except lazrs.LazrsError as error:
             raise OSError(f"{error}. The disk may be full") from error
         return full_scale
 
-    def _write_points(
-        self,
-        file: IO[bytes],
-        header: laspy.LasHeader,
-        names: list[str],
-        full_scale: float | None,
-        packets: _Packets | None,
-        packet_file: IO[bytes],
-    ) -> None:
-        """Write all points, and their waveform packets to a separate file."""
-        import laspy
-
-        compress = self.title == "LAZ"
-        with laspy.open(file, "w", header=header, do_compress=compress, closefd=False) as writer:
-            for chunk, lines in FlightLines(self.sweeps).with_fields(self.cloud.chunks()):
-                points = _points(chunk, header, names, _start_s(self.sweeps))
-                if full_scale is not None:
-                    points.intensity = _as_integers(chunk["intensity"], full_scale)
-                points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype(np.int16)
-                points.scan_direction_flag = lines.direction
-                points.edge_of_flight_line = lines.edge
-                points.point_source_id = lines.source
-                if packets is not None:
-                    packets.put(points, chunk, packet_file)
-                with deferred_interrupts():  # lazrs replaces errors raised within it
-                    writer.write_points(points)
-            with deferred_interrupts():
-                writer.close()
-
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a file in parts."""
-        return open_file(source)
-
-    @classmethod
-    def read_points(cls, path: Path) -> FilePoints:
-        """Return the points of a file."""
-        return read_points(path)
-
 
 class LAZ(LAS):
     """A .laz file, which is a compressed .las file."""
 
     title = "LAZ"
+    is_compressed = True
 
 
 def _start_s(sweeps: Sweeps) -> float:

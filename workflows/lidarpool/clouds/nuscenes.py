@@ -157,8 +157,13 @@ class NuScenes(MultiFileFormat):
     @classmethod
     def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the names of the files of points and, with names, classes."""
-        file = job.cached("files", lambda: _files_of_job(job))[sweep]
-        return [file, LABELS + file.replace("/", "-")] if job.sweeps.classes else [file]
+        sweeps = job.sweeps
+        names = job.cached(
+            "names",
+            lambda: _files(sweeps, _channels(sweeps), _samples(sweeps)[1], job.entry),
+        )
+        file = names[sweep]
+        return [file, LABELS + file.replace("/", "-")] if sweeps.classes else [file]
 
     @classmethod
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
@@ -172,11 +177,6 @@ class NuScenes(MultiFileFormat):
             labels_of_points = job.rows(labels[0], np.dtype("u1"), len(rows))
             columns["class"] = np.array([0, *sorted(job.classes)], "u2")[labels_of_points]
         return rows[:, :3], columns
-
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a data set of nuScenes."""
-        return open_folder(source)
 
 
 def _channels(sweeps: Sweeps) -> list[str]:
@@ -198,11 +198,6 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
         f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{below}{number:06}.pcd.bin"
         for key, sensor, number in zip(first, sweeps.sensor, sweeps.numbers, strict=True)
     ]
-
-
-def _files_of_job(job: JobReader) -> list[str]:
-    """Return the names of the files of all sweeps of a job in a data set."""
-    return _files(job.sweeps, _channels(job.sweeps), _samples(job.sweeps)[1], job.entry)
 
 
 def _labels_of_classes(classes: Collection[int]) -> Bytes:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,9 +26,7 @@ from lidarsim.sweeps.sweeps import Sweeps, plain_names
 from .boxes import Boxes, SweepBoxes
 from .cloud_format import CloudFormat
 from .gps_time import GPS_NS
-
-if TYPE_CHECKING:
-    from .writing import ExportSpec
+from .writing import ExportSpec
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
 # Numbers of fields, by osi_sensordata.proto and osi_featuredata.proto of OSI 3.

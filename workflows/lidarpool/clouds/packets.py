@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_of
 from lidarsim.packets.pcap import PcapWriter
@@ -15,9 +15,7 @@ from lidarsim.sweeps.sweeps import plain_names
 
 from .cloud_format import CloudFormat
 from .recording import Read, Recording, RecordingSource, positions_of
-
-if TYPE_CHECKING:
-    from .writing import ExportSpec
+from .writing import ExportSpec
 
 
 class PacketCapture(CloudFormat):
@@ -77,11 +75,6 @@ class PacketCapture(CloudFormat):
         for name, encoder in zip(names, encoders, strict=True):
             for suffix, content in encoder.files().items():
                 (path / f"{name}{suffix}").write_bytes(content)
-
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open the packets of a sensor."""
-        return open_file(source)
 
 
 def open_file(source: RecordingSource) -> Recording:

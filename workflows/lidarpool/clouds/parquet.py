@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from .job_reader import JobReader
 from .multi_file_format import MultiFileFormat
 from .parquet_groups import check_groups, group_allowance, number_columns, read_group
 from .recording import Read, Recording, RecordingSource, SweepFiles, take_positions
-
-if TYPE_CHECKING:
-    import pyarrow as pa
 
 _GROUP_ROWS = 65_536
 
@@ -83,7 +80,7 @@ class Parquet(MultiFileFormat):
         """Return a file without rows for a data set without pieces."""
         return {} if pieces else self._file(0, self.schema.empty_table())
 
-    def _file(self, number: int, table: pa.Table) -> dict[str, bytes]:
+    def _file(self, number: int, table: Any) -> dict[str, bytes]:
         import pyarrow as pa
         import pyarrow.parquet as pq
 
@@ -119,11 +116,6 @@ class Parquet(MultiFileFormat):
         columns = {names.get(name, name): rows[name].to_numpy() for name in rows.column_names}
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
         return job.in_sensor(sweep, Cloud(positions, columns))
-
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a file or a folder of files in their groups of rows."""
-        return open_folder(source) if source.path.is_dir() else open_file(source)
 
 
 def _dataset(storage: Storage, folder: str) -> Any:

@@ -74,16 +74,6 @@ class PCD(MultiFileFormat):
             fields.append((name, values))
         return fields
 
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a file as a sweep, or the files of a folder as sweeps."""
-        return open_folder(source) if source.path.is_dir() else open_file(source)
-
-    @classmethod
-    def read_points(cls, path: Path) -> FilePoints:
-        """Return the points of a file."""
-        return read_points(path)
-
 
 def open_file(source: RecordingSource) -> Recording:
     """Open a file as a sweep, with the pose of the sensor from VIEWPOINT."""

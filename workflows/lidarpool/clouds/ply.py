@@ -9,7 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -34,9 +33,7 @@ from .cloud_format import CloudFormat, PointColumns
 from .file_points import FilePoints, from_columns
 from .job_reader import JobReader
 from .recording import NoiseFilter, Read, Recording, RecordingSource, open_cloud, positions_of
-
-if TYPE_CHECKING:
-    from .writing import ExportSpec
+from .writing import ExportSpec
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
@@ -78,16 +75,6 @@ class PLY(CloudFormat):
             kinds = {column.name: np.empty(0, column.dtype) for column in file.table}
             cloud = Cloud(np.empty((0, 3)), kinds)
         return job.in_sensor(sweep, cloud)
-
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a file, or the cloud of a result."""
-        return open_folder(source) if source.path.is_dir() else open_file(source)
-
-    @classmethod
-    def read_points(cls, path: Path) -> FilePoints:
-        """Return the points of a file."""
-        return read_points(path)
 
 
 class GrowingPly:

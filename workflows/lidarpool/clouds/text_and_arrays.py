@@ -18,16 +18,6 @@ from .recording import METERS, NoiseFilter, Read, Recording, RecordingSource
 class TextFormats(CloudFormat):
     """Text files and NumPy arrays of points, which can only be read."""
 
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a cloud, or the scans of a .ptx file."""
-        return open_file(source)
-
-    @classmethod
-    def read_points(cls, path: Path) -> FilePoints:
-        """Return the points of a file, with the scanners' positions if it has them."""
-        return read_points(path)
-
 
 def open_file(source: RecordingSource) -> Recording:
     """Open the scans of a .ptx, each in the frame of its scanner, or a cloud that is read at once.

@@ -165,11 +165,6 @@ class WebDataset(MultiFileFormat):
                     arrays[name] = read_npy(data.read(member.size), name)
         return arrays.pop("points"), arrays
 
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open the samples of a tar file, or of the tar files in a folder."""
-        return open_folder(source) if source.path.is_dir() else open_file(source)
-
 
 def _offsets(job: JobReader) -> Ints:
     """Return the offsets of the sweeps of a job (`WebDataset`)."""

@@ -126,7 +126,8 @@ class DataSet:
     made_with: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def _job_format(self) -> ExportSpec:
+    def spec(self) -> ExportSpec:
+        """Format of the files of a job, with its options."""
         return ExportSpec(
             DATA_SETS[self.format],
             self.layout,
@@ -138,11 +139,11 @@ class DataSet:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that clouds of jobs must have."""
-        return self._job_format.needs
+        return self.spec.needs
 
     def check_installed(self) -> None:
         """Raise LidarError if a package that writes the format is missing in this environment."""
-        self._job_format.check_installed()
+        self.spec.check_installed()
 
     def write_job(
         self,
@@ -168,7 +169,7 @@ class DataSet:
             cannot be written to.
         """
         name = row.name
-        spec = self._job_format
+        spec = self.spec
         entry = Entry(row.number, name, row.split, row.values)
         spec.check_installed()
         tally = Tally.from_cloud(cloud)

@@ -34,8 +34,7 @@ from ..clouds.cloud_format import Entry
 from ..clouds.folder import refuse_missing
 from ..clouds.format_table import DATA_SETS
 from ..clouds.job_reader import JobReader
-from ..clouds.writing import ExportSpec
-from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
+from .dataset import BOXES_FILE, INDEX_FILE, VERSION, DataSet, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import Sweep
 
@@ -62,17 +61,8 @@ class SavedSweeps:
 
     classes: Mapping[int, str]
 
-    def __init__(
-        self,
-        storage: Storage,
-        data_format: str,
-        written: ExportSpec,
-        runs: Sequence[_Run],
-        shuffle: int | None,
-    ) -> None:
-        self._storage = storage
-        self._format = data_format
-        self._written = written
+    def __init__(self, dataset: DataSet, runs: Sequence[_Run], shuffle: int | None) -> None:
+        self._dataset = dataset
         self._runs = runs
         self._run_stops = np.cumsum([run.count for run in runs], dtype=np.int64)
         self._order = None  # int64 (n,): 8 bytes for each sweep
@@ -87,7 +77,7 @@ class SavedSweeps:
         self.__dict__ |= state | {"_local": threading.local()}
 
     def __repr__(self) -> str:
-        return f"<{len(self):,} sweeps of {self._storage} ({self._format})>"
+        return f"<{len(self):,} sweeps of {self._dataset.storage} ({self._dataset.format})>"
 
     def __len__(self) -> int:
         return int(self._run_stops[-1]) if len(self._run_stops) else 0
@@ -97,7 +87,9 @@ class SavedSweeps:
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
         """Yield the sweeps with these indices in order, and read the next ones in advance."""
-        if self._storage.is_local and self._written.cloud_format.raw_sweeps:
+        cloud_format = self._dataset.spec.cloud_format
+        is_local = self._dataset.storage.is_local
+        if is_local and cloud_format.raw_sweeps:
             # Handing such a sweep from thread to thread takes as long as reading it.
             upcoming, current = tee(map(self._locate, indices))
             for job, number in islice(upcoming, _REQUESTS):
@@ -108,8 +100,7 @@ class SavedSweeps:
                 yield job.read(number)
             return
         # At a URL each request takes long. A job with one file for all sweeps is opened once.
-        separate_sweeps = self._written.cloud_format.separate_sweeps
-        threads = _REQUESTS if separate_sweeps and not self._storage.is_local else 1
+        threads = _REQUESTS if cloud_format.separate_sweeps and not is_local else 1
         coming: deque[Future[Sweep]] = deque()
         with ThreadPoolExecutor(threads, "sweeps") as pool:
             try:
@@ -192,9 +183,7 @@ class SavedSweeps:
             local.jobs = OrderedDict()
         jobs: OrderedDict[int, _OpenJob] = local.jobs
         if job.number not in jobs:
-            jobs[job.number] = _OpenJob(
-                self._storage, self._format, self._written, job, self.classes
-            )
+            jobs[job.number] = _OpenJob(self._dataset, job, self.classes)
             if len(jobs) > _OPEN_JOBS:
                 jobs.popitem(last=False)[1].reader.close()
         jobs.move_to_end(job.number)
@@ -204,22 +193,15 @@ class SavedSweeps:
 class _OpenJob:
     """Poses, boxes and reader of a job whose sweeps are read."""
 
-    def __init__(
-        self,
-        storage: Storage,
-        data_format: str,
-        written: ExportSpec,
-        job: JobRow,
-        classes: Mapping[int, str],
-    ) -> None:
-        self.storage = storage
+    def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
+        self.storage = storage = dataset.storage
         self.job = job
-        self.cloud_format = written.cloud_format
-        name = job_file(data_format, job.name, SWEEPS_FILE)
+        self.cloud_format = dataset.spec.cloud_format
+        name = job_file(dataset.format, job.name, SWEEPS_FILE)
         self.sweeps = Sweeps.load(storage.path(name), partial(storage.read, name))
         self.boxes: Boxes | None = None
         if self.sweeps.actors:
-            name = job_file(data_format, job.name, BOXES_FILE)
+            name = job_file(dataset.format, job.name, BOXES_FILE)
             with open_archive(storage.path(name), partial(storage.read, name)) as arrays:
                 sizes = np.broadcast_to(
                     np.ptp(self.sweeps.actor_bounds, axis=1), arrays["centers"].shape
@@ -233,7 +215,7 @@ class _OpenJob:
                 )
                 self.boxes = boxes.inward(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
-        self.reader = JobReader(storage, self.sweeps, entry, written.layout, classes)
+        self.reader = JobReader(storage, self.sweeps, entry, dataset.layout, classes)
 
     def expect(self, sweep: int) -> None:
         """Have the system load the files of a sweep into its memory."""
@@ -290,8 +272,8 @@ def sweeps(
     """
     storage = replace(Storage.at(location), named="")  # the user's own links may be followed
     head = read_index(storage)
-    written = ExportSpec(DATA_SETS[head["format"]], head["layout"], head["compensated"])
-    written.check_installed()
+    dataset = DataSet(storage, head["format"], head["layout"], head["compensated"])
+    dataset.check_installed()
     sweep_counts = head["jobs"]
     table = read_table(storage, head["table"])
     rows = [job for job in table if job.number in sweep_counts]
@@ -311,7 +293,7 @@ def sweeps(
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
-    saved = SavedSweeps(storage, head["format"], written, runs, shuffle)
+    saved = SavedSweeps(dataset, runs, shuffle)
     saved.classes = {int(number): name for number, name in head.get("classes", {}).items()}
     return saved
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,12 +39,8 @@ from ..cloud_format import CloudFormat, PointColumns
 from ..frame_names import survey_start_ns
 from ..job_reader import JobReader
 from ..recording import Read, Recording, RecordingSource, positions_of
+from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
-
-if TYPE_CHECKING:
-    from lidarsim.columns.closing_bag import ClosingBag
-
-    from ..writing import ExportSpec
 
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
 _MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
@@ -152,19 +148,9 @@ class Rosbag2(CloudFormat):
     @classmethod
     def survey_notes(cls, survey: Survey) -> list[str]:
         """Return a note if 2D scanners have no LaserScan messages."""
-        if survey.keep_every == 1 or not laser_scan.has_planar_sensors(survey):
-            return []
-        return [
-            (
-                "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
-                "`cloud.keep_every: 1`"
-            )
-        ]
-
-    @classmethod
-    def open(cls, source: RecordingSource) -> Recording:
-        """Open a topic of a bag."""
-        return open_file(source)
+        note = "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
+        note += "`cloud.keep_every: 1`"
+        return [note] if survey.keep_every > 1 and laser_scan.has_planar_sensors(survey) else []
 
 
 class MCAP(Rosbag2):
@@ -222,7 +208,7 @@ def _latched_profile() -> Any:
     )
 
 
-def _open_job(job: JobReader, file: str) -> ClosingBag:
+def _open_job(job: JobReader, file: str) -> Any:
     """Open the bag of a job in a data set."""
     from lidarsim.columns.closing_bag import ClosingBag
 

@@ -215,16 +215,10 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> 
 
     LidarError if a worker has another version of a plug-in, or cannot import it.
     """
-    written = [
-        file_format
-        for file_format in formats
-        if file_format.has_many_files and file_format.row.plugin is not None
-    ]
+    written = [spec for spec in formats if spec.has_many_files and spec.row.plugin is not None]
     if not written:
         return
-    plugins = [
-        file_format.row.plugin for file_format in written if file_format.row.plugin is not None
-    ]
+    plugins = [spec.row.plugin for spec in written if spec.row.plugin is not None]
     required = software(plugins=plugins)
     writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
     for address, answer in _answers(client, software_query(plugins=plugins), writing).items():

@@ -10,7 +10,7 @@ import rerun as rr
 from lidarsim.base.arrays import Floats
 from lidarsim.base.errors import LidarError
 
-from ...clouds.rerun_log import APPLICATION, RerunLog
+from ...clouds.rrd import APPLICATION, RerunLog
 from ...clouds.shown_sweeps import ShownSweep, Surroundings
 from . import attached_child
 from .viewer import Address, Viewer
