@@ -5,6 +5,7 @@ import json
 import pickle
 import re
 import signal
+import subprocess
 import sys
 import tarfile
 import threading
@@ -806,6 +807,18 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     with pytest.raises(LidarError, match="or come from a different survey than the sweeps"):
         save_cloud(replace(cloud, sweeps=lambda: shorter), tmp_path / "x.mcap")
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_classes_of_formats_need_no_optional_packages():
+    """Options are checked, and errors listed, also where nothing can be written."""
+    packages = {package for row in FORMATS.values() for package in row.packages}
+    code = (
+        f"import sys; sys.modules |= dict.fromkeys({packages})\n"
+        "from lidarpool.clouds.format_table import FORMATS\n"
+        "from lidarpool.clouds.writing import ExportSpec\n"
+        "assert all(ExportSpec(name).cloud_format.__name__ for name in FORMATS)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_documentation_and_installation_follow_the_table_of_formats():

@@ -62,7 +62,7 @@ class E57WriterWithNormals(E57Writer):
 @contextmanager
 def normal_fields() -> Iterator[None]:
     """Have pye57 write fields of normals."""
-    supported = pye57.e57.SUPPORTED_POINTNORMAL_FIELDS
+    supported = pye57.e57.SUPPORTED_POINT_FIELDS
     library = pye57.e57.libe57
 
     def vector_node(image_file: Any, prototype: Any, codecs: Any) -> Any:
@@ -71,12 +71,12 @@ def normal_fields() -> Iterator[None]:
             prototype.set(field, node)
         return libe57.CompressedVectorNode(image_file, prototype, codecs)
 
-    pye57.e57.SUPPORTED_POINTNORMAL_FIELDS = supported | dict.fromkeys(NORMAL_FIELDS, "f")
+    pye57.e57.SUPPORTED_POINT_FIELDS = supported | dict.fromkeys(NORMAL_FIELDS, "f")
     pye57.e57.libe57 = SimpleNamespace(**vars(libe57) | {"CompressedVectorNode": vector_node})
     try:
         yield
     finally:
-        pye57.e57.SUPPORTED_POINTNORMAL_FIELDS = supported
+        pye57.e57.SUPPORTED_POINT_FIELDS = supported
         pye57.e57.libe57 = library
 
 
