@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidarpool import Material, Mounted, Pose, Scene, Survey, Track, load_sensor
-from lidarpool.clouds.packets import with_packet_columns
+from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarsim.base.arrays import Floats, Ints
 from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.table import SCAN
@@ -122,7 +122,7 @@ def packets_of(model: str, scene: Scene, revolutions: int) -> Drive:
         precision_m=1e-5,
         keep_every=1,
     )
-    return Drive(with_packet_columns(survey, ["pcap"]), scene)
+    return Drive(with_format_columns(survey, [ExportSpec("pcap")]), scene)
 
 
 def drive_of(scene: Scene, sweeps: int) -> Drive:

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from lidarpool import Cloud, Scene, Sensor, Survey, Track, save_cloud
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import layout
 from lidarsim.sweeps.sweeps import Sweeps
@@ -61,7 +61,7 @@ def export(name, folder, path):
     """Export a cloud as `lidarpool export` does."""
     cloud = CloudFile(folder / "cloud.ply")
     sweeps = Sweeps.load(folder / "sweeps.npz")
-    Format(name).write(path, cloud, sweeps)
+    ExportSpec(name).write(path, cloud, sweeps)
 
 
 def las(rows, path):

@@ -51,7 +51,7 @@ _SECTIONS = {
     "faults": "Fault",
     "cloud": "CloudOptions",
     "output": "OutputSection",
-    "output: write": "Format",
+    "output: write": "ExportSpec",
     "planning": "PlanningSection",
     "planning: obstacles": "Obstacle",
     "pool": "PoolSection",

@@ -12,7 +12,7 @@ from tests.packet_surveys import points_of
 from tests.shapes import room
 
 from lidarpool import LidarError, Mounted, Pose, Survey, Track, load_sensor
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.showing.pages import opened, recorded
 from lidarpool.showing.pages.job_list import JobList
 from lidarpool.showing.pages.opened import growing_view, is_data_set, open_view
@@ -49,14 +49,14 @@ def kinds(tmp_path_factory):
     cloud, sweeps = points_of(survey, room())
     cloud = replace(cloud, sweeps=lambda: sweeps)
     for name in FORMATS:
-        row = Format(name).row
+        row = ExportSpec(name).row
         (folder / name).mkdir()
         try:
-            Format(name).write(folder / name / row.file, cloud, sweeps)
+            ExportSpec(name).write(folder / name / row.file, cloud, sweeps)
         except LidarError:  # its package is missing, and so is its file
             shutil.rmtree(folder / name)
     (folder / "result").mkdir()
-    Format("ply").write(folder / "result" / "cloud.ply", cloud, sweeps)
+    ExportSpec("ply").write(folder / "result" / "cloud.ply", cloud, sweeps)
     sweeps.save(folder / "result" / SWEEPS_FILE)
     content, _ = PictureContent.before_casting(room(), survey, None)
     content.save(folder / "result" / PICTURE_FILE)
@@ -72,7 +72,7 @@ def place_of(kinds, name):
     """Return the file or folder of a kind."""
     if name in FILES:
         return kinds / name
-    path = kinds / name / Format(name).row.file
+    path = kinds / name / ExportSpec(name).row.file
     return next(path.glob("*.pcap")) if name == "pcap" else path
 
 

@@ -24,7 +24,7 @@ from lidarpool import (
     save_cloud,
 )  # fmt: skip
 from lidarpool.clouds.boxes import Boxes, SweepBoxes
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarsim.base.storage import Storage
@@ -512,10 +512,10 @@ def test_actors_are_compensated_in_both_coordinates(coordinates):
 def test_formats_without_sweeps_refuse_to_move_the_points_of_actors():
     for name in ("laz", "parquet", "pcap"):
         with pytest.raises(LidarError, match=f"{name} does not support `compensated_actors"):
-            Format(name, compensated_actors=True)
+            ExportSpec(name, compensated_actors=True)
     with pytest.raises(LidarError, match="kitti does not support `pose_rate_hz`"):
-        Format("kitti", pose_rate_hz=10)
-    assert "time" in Format("kitti", compensated_actors=True).needs
+        ExportSpec("kitti", pose_rate_hz=10)
+    assert "time" in ExportSpec("kitti", compensated_actors=True).needs
 
 
 def test_an_actor_whose_box_is_beside_its_origin_has_the_velocity_of_the_box(tmp_path):
@@ -582,6 +582,8 @@ def test_the_first_sensor_of_nuscenes_is_lidar_top_and_a_note_says_so(drive, tmp
         ]  # fmt: skip
         times = {row["token"]: row["timestamp"] for row in tables["sample"].values()}
         assert {row["sample_token"]: row["timestamp"] for row in top} == times
-        notes = Format("nuscenes").notes(cloud, cloud.sweeps())
+        notes = ExportSpec("nuscenes").notes(cloud, cloud.sweeps())
         assert [words in note for note in notes if "LIDAR_TOP" in note] == [True] * bool(words)
-        assert not any("LIDAR_TOP" in note for note in Format("kitti").notes(cloud, cloud.sweeps()))
+        assert not any(
+            "LIDAR_TOP" in note for note in ExportSpec("kitti").notes(cloud, cloud.sweeps())
+        )

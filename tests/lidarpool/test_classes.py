@@ -19,7 +19,7 @@ import lidarpool
 from lidarpool import LidarError, Material, Sensor, Survey, read_cloud
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.report.charts import draw_sweep
@@ -48,7 +48,7 @@ def saved(scene, sweeps, tmp_path):
     """Write points of the drive in a format, with names or without."""
 
     def save(name, sweeps=sweeps, **more):
-        one = Format(name, **more)
+        one = ExportSpec(name, **more)
         one.write(tmp_path / one.row.file, points_of(scene, 0), sweeps, overwrite=True)
         return tmp_path / one.row.file
 
@@ -169,8 +169,8 @@ def test_formats_hold_classes_that_have_names(scene, sweeps):
     cloud = points_of(scene, 0)
     plain = replace(sweeps, classes={})
     for name in ("nuscenes", "mcap", "rosbag2"):
-        assert "class" in Format(name).left_out(cloud, plain)
-        assert "class" not in Format(name).left_out(cloud, sweeps)
+        assert "class" in ExportSpec(name).left_out(cloud, plain)
+        assert "class" not in ExportSpec(name).left_out(cloud, sweeps)
 
 
 def tables_of(folder):

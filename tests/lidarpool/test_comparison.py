@@ -14,7 +14,7 @@ from tests.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey, compare, save_cloud
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.comparing import comparison, range_image, two_clouds
 from lidarpool.datasets.figures import rank_correlation
 from lidarpool.recordings.opening import open_recording
@@ -301,7 +301,7 @@ def written(tmp_path_factory):
         clouds.append(Cloud(inside.reshape(-1, 3) + pose, columns))  # fmt: skip
     made = Cloud.joined(clouds)
     for name in ("ply", "laz", "las", "pcd", "mcap", "rosbag2"):
-        one = Format(name)
+        one = ExportSpec(name)
         one.write(folder / one.row.file, made, sweeps)
     sweeps.save(folder / "sweeps.npz")
     (folder / "bare.ply").write_bytes((folder / "cloud.ply").read_bytes())
@@ -427,7 +427,7 @@ def test_one_of_several_sensors_is_chosen(tmp_path):
     of = the_sweeps(scene)
     made = points_of(scene, 0)
     for name in ("ply", "mcap"):
-        form = Format(name, compensated=name == "mcap")
+        form = ExportSpec(name, compensated=name == "mcap")
         form.write(tmp_path / form.row.file, made, of)
     of.save(tmp_path / "sweeps.npz")
     bag = tmp_path / "cloud.mcap"
@@ -605,11 +605,11 @@ def test_compensated_sweeps_are_told_from_sweeps_as_fired(tmp_path, name):
     result, fired, compensated = (tmp_path / kind for kind in ("result", "fired", "compensated"))
     for folder in (result, fired, compensated):
         folder.mkdir()
-    Format("ply").write(result / "cloud.ply", made, sweeps)
+    ExportSpec("ply").write(result / "cloud.ply", made, sweeps)
     sweeps.save(result / "sweeps.npz")
-    file = Format(name).row.file
-    Format(name).write(fired / file, made, sweeps)
-    Format(name, compensated=True).write(compensated / file, made, sweeps)
+    file = ExportSpec(name).row.file
+    ExportSpec(name).write(fired / file, made, sweeps)
+    ExportSpec(name, compensated=True).write(compensated / file, made, sweeps)
     for a, b in ((result, fired / file), (fired / file, compensated / file)):
         found = compare(a, b).figures
         first, second = (b, a) if a == fired / file else (a, b)

@@ -20,7 +20,7 @@ from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 from lidarpool import Cloud, LidarError, Scene, Sensor, Survey
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.format_table import DATA_SETS
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet, Listing
 from lidarpool.datasets.job_table import JobRow
 from lidarsim.base.storage import Storage
@@ -69,7 +69,7 @@ def test_kitti_has_a_sequence_for_each_sensor_of_each_job(written, job, sweeps, 
     assert names == {f"{n:02}{s}" for n in (0, 1, 7) for s in ("", "_rear_left")}
     assert {path.stem for path in (place / "poses").iterdir()} == names
     # Its files are those of a job by itself.
-    Format("kitti").write(tmp_path / "alone", job(7), sweeps)
+    ExportSpec("kitti").write(tmp_path / "alone", job(7), sweeps)
     for sensor, name in enumerate(("07", "07_rear_left")):
         own = files_of(place / "sequences" / name)
         assert own == files_of(tmp_path / f"alone/sequences/{sensor:02}")

@@ -26,7 +26,7 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.clouds.recording import Recording
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.comparing.fit.estimates import Estimate
 from lidarpool.comparing.fit.fitting import _with_performance
 from lidarpool.recordings.opening import open_recording
@@ -732,7 +732,7 @@ def test_a_result_is_fitted_as_a_cloud_and_as_files(cluster_client, tmp_path):
         steps=36, columns=["intensity"], noise=NOISE, precision_m=1e-4,
     )  # fmt: skip
     cloud = simulate(street(), survey, client=cluster_client).cloud
-    Format("pcd").write(tmp_path / "sweeps", cloud, Sweeps.from_survey(survey, Scene.seed()))
+    ExportSpec("pcd").write(tmp_path / "sweeps", cloud, Sweeps.from_survey(survey, Scene.seed()))
     for found in (fit(cloud), fit(tmp_path / "sweeps", white=1.0)):
         one = found.figures["figures"]["range_m"]
         assert one["low"] - 0.001 < 0.02 < one["high"] + 0.001

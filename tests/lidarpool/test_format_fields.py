@@ -36,7 +36,7 @@ from lidarpool import (
     read_cloud,
     save_cloud,
 )
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarscenes.procedural.city import city
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.table import SCAN
@@ -417,13 +417,13 @@ def test_scans_of_an_e57_are_named_by_their_stations(tmp_path, poses, turns, nam
 
 
 def test_what_contradicts_a_frame_is_noted():
-    assert Format("kitti").contradictions("world") == []
-    assert Format("mcap").contradictions("sensor") == []
-    for one in (Format("laz"), Format("kitti"), Format("mcap", compensated=True)):
+    assert ExportSpec("kitti").contradictions("world") == []
+    assert ExportSpec("mcap").contradictions("sensor") == []
+    for one in (ExportSpec("laz"), ExportSpec("kitti"), ExportSpec("mcap", compensated=True)):
         (note,) = one.contradictions("sensor")
         assert "cloud.coordinates" in note
     with pytest.raises(LidarError, match="kitti does not support `compensated`"):
-        Format("kitti", compensated=True)
+        ExportSpec("kitti", compensated=True)
 
 
 # -- normals and origins of rays -------------------------------------------------------------------

@@ -5,6 +5,7 @@ import json
 import pickle
 import re
 import signal
+import subprocess
 import sys
 import tarfile
 import threading
@@ -44,11 +45,12 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.base.open3d_module import load_open3d
-from lidarpool.clouds import parquet, pieces, well_known_text
+from lidarpool.clouds import multi_file_format, parquet, well_known_text
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.format_table import EXPORTS, FORMATS, LAYOUTS
+from lidarpool.clouds.format_table import EXPORTS, FORMATS
+from lidarpool.clouds.ros.layouts import LAYOUTS
 from lidarpool.clouds.well_known_text import wkt
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarsim.base.storage import Storage
 from lidarsim.base.yamlfile import load_yaml
 from lidarsim.columns.bags import point_columns
@@ -129,7 +131,7 @@ def written(cloud, sweeps, tmp_path):
     save_cloud(cloud, tmp_path / "cloud.ply")
 
     def write(name, layout="velodyne", compensated=False):
-        one = Format(name, layout, compensated)
+        one = ExportSpec(name, layout, compensated)
         one.write(tmp_path / one.row.file, CloudFile(tmp_path / "cloud.ply"), sweeps)
         assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
         return tmp_path / one.row.file
@@ -406,7 +408,7 @@ def test_las_has_a_scale_of_intensities_that_suits_the_cloud(
     intensity = scale * np.linspace(0, 1, len(cloud), dtype=np.float32)
     intensity[-int(0.009 * len(cloud)) :] *= 100
     scaled = Cloud(cloud.positions, {**cloud.columns, "intensity": rng.permutation(intensity)})
-    full_scale = Format("laz").write(tmp_path / "a.laz", scaled, sweeps)
+    full_scale = ExportSpec("laz").write(tmp_path / "a.laz", scaled, sweeps)
     las = laspy.read(tmp_path / "a.laz")
     (record,) = [vlr for vlr in las.header.vlrs if (vlr.user_id, vlr.record_id) == ("lidarpool", 2)]
     assert json.loads(record.record_data) == {"intensity_full_scale": expected}
@@ -422,7 +424,7 @@ def test_the_full_scale_is_that_at_which_one_percent_is_saturated(cloud, sweeps,
     def full_scale(saturated):
         intensity = np.full(len(cloud), 0.25, np.float32)
         intensity[:saturated] = 0.5
-        return Format("las").write(
+        return ExportSpec("las").write(
             tmp_path / "a.las",
             Cloud(cloud.positions, {**cloud.columns, "intensity": intensity}),
             sweeps,
@@ -439,16 +441,16 @@ def test_the_full_scale_can_be_set(cloud, sweeps, tmp_path):
     las = laspy.read(tmp_path / "a.las")
     np.testing.assert_allclose(las.intensity / 65_535 * 2.5, cloud.intensity, atol=2e-5)
     with pytest.raises(LidarError, match="e57 does not support `intensity_full_scale`"):
-        Format("e57", intensity_full_scale=1.0)
+        ExportSpec("e57", intensity_full_scale=1.0)
     with pytest.raises(LidarError, match="intensity_full_scale"):
-        Format("las", intensity_full_scale=0.0)
+        ExportSpec("las", intensity_full_scale=0.0)
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
-    assert Format("las").write(tmp_path / "b.las", bare, sweeps) is None
+    assert ExportSpec("las").write(tmp_path / "b.las", bare, sweeps) is None
 
 
 def test_e57_states_when_each_sweep_was_scanned(cloud, sweeps, tmp_path):
     def times(start_ns):
-        Format("e57").write(
+        ExportSpec("e57").write(
             tmp_path / "cloud.e57", cloud, replace(sweeps, start_ns=start_ns), overwrite=True
         )
         with pye57.E57(str(tmp_path / "cloud.e57")) as file:
@@ -488,7 +490,7 @@ def test_colors_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
     colors = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLORS}
     colored = Cloud(cloud.positions, {**cloud.columns, **colors})
     for name in ("las", "e57", "pcd"):
-        one = Format(name, "velodyne")
+        one = ExportSpec(name, "velodyne")
         one.write(tmp_path / one.row.file, colored, sweeps)
     las = laspy.read(tmp_path / "cloud.las")
     assert las.header.point_format.id == 7
@@ -508,7 +510,7 @@ def test_colors_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
         np.testing.assert_array_equal(found[f"color{name.capitalize()}"], first[name])
     # One of them alone is a column like others.
     alone = Cloud(cloud.positions, {**cloud.columns, "red": colors["red"]})
-    Format("laz", "velodyne").write(tmp_path / "red.laz", alone, sweeps)
+    ExportSpec("laz", "velodyne").write(tmp_path / "red.laz", alone, sweeps)
     las = laspy.read(tmp_path / "red.laz")
     assert las.header.point_format.id == 6
     np.testing.assert_array_equal(las["red"], colors["red"])
@@ -519,7 +521,7 @@ def test_an_empty_cloud_can_be_written(sweeps, tmp_path, name):
     columns = {
         key: np.empty(0, TABLE[key].dtype) for key in ("scan", "channel", "object", *COLUMNS)
     }
-    one = Format(name)
+    one = ExportSpec(name)
     one.write(tmp_path / one.row.file, Cloud(np.empty((0, 3)), columns), sweeps)
     assert (tmp_path / one.row.file).exists()
 
@@ -533,31 +535,31 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
         match=r"kitti requires the columns reflectivity and class, which.*`output: \{write: "
         r"\[kitti\]\}`, or add reflectivity and class",
     ):
-        Format("kitti").write(tmp_path / "kitti", bare, sweeps)
+        ExportSpec("kitti").write(tmp_path / "kitti", bare, sweeps)
     with pytest.raises(
         LidarError, match="mcap with the layout ouster requires the columns signal, time"
     ):
-        Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
+        ExportSpec("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
     for organized in (
-        Format("rosbag2", "robosense", organized=True),
-        Format("mcap", organized=True),
-        Format("pcd", compensated_actors=True),
+        ExportSpec("rosbag2", "robosense", organized=True),
+        ExportSpec("mcap", organized=True),
+        ExportSpec("pcd", compensated_actors=True),
     ):
         with pytest.raises(LidarError) as refused:
             organized.check_columns(bare)
         [entry] = re.findall(r"again with `output: (.*?)`, or add", str(refused.value))
-        assert Format.from_entry(yaml.safe_load(entry)["write"][0]) == organized
+        assert ExportSpec.from_entry(yaml.safe_load(entry)["write"][0]) == organized
     (tmp_path / "cloud.laz").write_text("mine")
     with pytest.raises(LidarError, match=r"exists.* `--overwrite`"):
-        Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
+        ExportSpec("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
     assert (tmp_path / "cloud.laz").read_text() == "mine"
-    Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps, overwrite=True)
+    ExportSpec("laz").write(tmp_path / "cloud.laz", cloud, sweeps, overwrite=True)
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
     with pytest.raises(LidarError, match=r"gone does not exist\. Create it first"):
-        Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
+        ExportSpec("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
     monkeypatch.setattr("lidarpool.clouds.format_table.find_spec", lambda name: None)
     with pytest.raises(LidarError, match=r'laspy and lazrs\. Run pip install -e "\.\[las\]"'):
-        Format("las").check_installed()
+        ExportSpec("las").check_installed()
     assert {path.name for path in tmp_path.iterdir()} == {"cloud.laz"}
 
 
@@ -567,7 +569,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
 def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(cloud, sweeps, tmp_path, name):
     import resource
 
-    one = Format(name)
+    one = ExportSpec(name)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # as a full disk does
     try:
@@ -593,7 +595,7 @@ def test_an_interrupt_waits_for_what_lazrs_writes(cloud, sweeps, tmp_path, monke
 
     monkeypatch.setattr(laspy.LasWriter, method, interrupted)
     with pytest.raises(KeyboardInterrupt):
-        Format("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
+        ExportSpec("laz").write(tmp_path / "cloud.laz", cloud, sweeps)
     assert done
     assert not list(tmp_path.iterdir())
 
@@ -601,10 +603,10 @@ def test_an_interrupt_waits_for_what_lazrs_writes(cloud, sweeps, tmp_path, monke
 def test_any_name_makes_a_topic_a_frame_and_a_folder(cloud, sweeps, tmp_path):
     """Also one that would lead out of the folder, and an actor called as the world's frame."""
     odd = replace(sweeps, sensors=("base_link", "../front"), actors=("map",))
-    Format("nuscenes").write(tmp_path / "nuscenes", cloud, odd)
+    ExportSpec("nuscenes").write(tmp_path / "nuscenes", cloud, odd)
     folders = {path.name for path in (tmp_path / "nuscenes/samples").iterdir()}
     assert folders == {"LIDAR_TOP", "___front"}
-    Format("mcap").write(tmp_path / "cloud.mcap", cloud, odd)
+    ExportSpec("mcap").write(tmp_path / "cloud.mcap", cloud, odd)
     store = get_typestore(Stores.ROS2_HUMBLE)
     frames = set()
     with AnyReader([tmp_path / "cloud.mcap"], default_typestore=store) as bag:
@@ -623,7 +625,7 @@ def test_a_start_and_a_coordinate_system_are_in_files_that_hold_them(
     start = datetime(2026, 11, 21, 12, 0, tzinfo=timezone(timedelta(hours=2)))
     Sweeps.from_survey(replace(survey, start=start, epsg=25832), scene).save(tmp_path / "s.npz")
     dated = Sweeps.load(tmp_path / "s.npz")
-    Format("laz").write(tmp_path / "a.laz", cloud, dated)
+    ExportSpec("laz").write(tmp_path / "a.laz", cloud, dated)
     las = laspy.read(tmp_path / "a.laz")
     assert str(las.header.creation_date) == "2026-11-21"
     assert las.header.global_encoding.gps_time_type == GpsTimeType.STANDARD
@@ -636,7 +638,7 @@ def test_a_start_and_a_coordinate_system_are_in_files_that_hold_them(
     assert 'PROJCS["ETRS89 / UTM zone 32N"' in system.string and 'AUTHORITY["EPSG","25832"]]' in (
         system.string
     )
-    Format("mcap").write(tmp_path / "a.mcap", cloud, dated)
+    ExportSpec("mcap").write(tmp_path / "a.mcap", cloud, dated)
     store = get_typestore(Stores.ROS2_HUMBLE)
     with AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
         assert bag.start_time == start.timestamp() * 1e9
@@ -807,6 +809,18 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_classes_of_formats_need_no_optional_packages():
+    """Options are checked, and errors listed, also where nothing can be written."""
+    packages = {package for row in FORMATS.values() for package in row.packages}
+    code = (
+        f"import sys; sys.modules |= dict.fromkeys({packages})\n"
+        "from lidarpool.clouds.format_table import FORMATS\n"
+        "from lidarpool.clouds.writing import ExportSpec\n"
+        "assert all(ExportSpec(name).cloud_format.__name__ for name in FORMATS)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_documentation_and_installation_follow_the_table_of_formats():
     root = Path(__file__).parents[2]
     project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
@@ -823,8 +837,8 @@ def test_documentation_and_installation_follow_the_table_of_formats():
         files, extra = next((c[2], c[4]) for c in cells if len(c) > 5 and name in c[1])
         assert row.file in [file.rstrip("/") for file in files], name
         assert extra == ([row.extra] if row.packages else []), name
-    for layout, needed in LAYOUTS.items():
-        assert re.search(rf"\| `{layout}` \|.*\| {', '.join(needed)} \|", text), layout
+    for name, layout in LAYOUTS.items():
+        assert re.search(rf"\| `{name}` \|.*\| {', '.join(layout.columns)} \|", text), name
 
 
 @pytest.mark.extended
@@ -832,8 +846,8 @@ def test_documentation_and_installation_follow_the_table_of_formats():
 def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name, monkeypatch):
     """What workers do not see is written here."""
     monkeypatch.setattr(parquet, "CHUNK_POINTS", 1000)
-    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
-    Format(name).write(tmp_path / "threads", cloud, sweeps)
+    monkeypatch.setattr(multi_file_format, "RANGE_PIECES", 1)
+    ExportSpec(name).write(tmp_path / "threads", cloud, sweeps)
     ranges = []
     sent = []
 
@@ -844,7 +858,7 @@ def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name,
         assert all(made.values())
         return made
 
-    Format(name).write(tmp_path / "workers", cloud, sweeps, workers=workers)
+    ExportSpec(name).write(tmp_path / "workers", cloud, sweeps, workers=workers)
     assert len(ranges) == (3 if name == "parquet" else 10)
     one, two = (
         {path.relative_to(tmp_path / folder): path.read_bytes() for path in files if path.is_file()}
@@ -869,7 +883,7 @@ def test_an_interrupt_leaves_nothing_of_what_threads_write(sweeps, cloud, tmp_pa
 
     monkeypatch.setattr(Storage, "write", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
+        ExportSpec("kitti").write(tmp_path / "kitti", cloud, sweeps)
     assert not list(tmp_path.iterdir())
 
 

@@ -26,7 +26,7 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarscenes.procedural.city import city
@@ -116,7 +116,7 @@ def made(tmp_path_factory):
             folder = tmp_path_factory.mktemp("images") / "images"
             cloud = cloud_of(survey)
             sweeps = Sweeps.from_survey(survey, SCENE)
-            Format("images").write(folder, cloud, sweeps)
+            ExportSpec("images").write(folder, cloud, sweeps)
             kept[name] = cloud, sweeps, images_of(folder)
         return kept[name]
 
@@ -199,7 +199,7 @@ def test_what_has_no_return_has_no_values(made):
 def test_a_saved_survey_gives_the_same_images(made, tmp_path, name):
     cloud, sweeps, images = made(name)
     sweeps.save(tmp_path / "sweeps.npz")
-    Format("images").write(tmp_path / "images", cloud, Sweeps.load(tmp_path / "sweeps.npz"))
+    ExportSpec("images").write(tmp_path / "images", cloud, Sweeps.load(tmp_path / "sweeps.npz"))
     again = images_of(tmp_path / "images")
     assert {*again} == {*images}
     for file, arrays in again.items():
@@ -235,20 +235,20 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
     thinned = replace(SURVEYS["still"], keep_every=2)
     cloud = cloud_of(thinned)
     with pytest.raises(LidarError, match="keep_every 1 and the column ray"):
-        Format("images").write(tmp_path / "i", cloud, Sweeps.from_survey(thinned, SCENE))
+        ExportSpec("images").write(tmp_path / "i", cloud, Sweeps.from_survey(thinned, SCENE))
     own = replace(SURVEYS["still"], sensor=Upward(GRID.beams, GRID.head), trajectory=None)
     cloud = cloud_of(own)
     sweeps = Sweeps.from_survey(own, SCENE)
-    Format("images").write(tmp_path / "own", cloud, sweeps)
+    ExportSpec("images").write(tmp_path / "own", cloud, sweeps)
     sweeps.save(tmp_path / "sweeps.npz")
     with pytest.raises(LidarError, match="they can only be written during the run"):
-        Format("images").write(tmp_path / "i", cloud, Sweeps.load(tmp_path / "sweeps.npz"))
+        ExportSpec("images").write(tmp_path / "i", cloud, Sweeps.load(tmp_path / "sweeps.npz"))
     with pytest.raises(
         LidarError, match="requires the columns ray and range, which the cloud does"
     ):
         Cloud = type(cloud)  # noqa: N806
         bare = Cloud(cloud.positions, {"scan": cloud.scan, "channel": cloud.channel})
-        Format("images").write(tmp_path / "i", bare, sweeps)
+        ExportSpec("images").write(tmp_path / "i", bare, sweeps)
     assert not (tmp_path / "i").exists()
 
 
@@ -270,7 +270,7 @@ def test_a_scenario_keeps_every_return(entry):
 def test_bags_have_images_beside_the_points(made, tmp_path, name):
     """By two readers: that of rosbags, and the one of the MCAP project."""
     cloud, sweeps, images = made(name)
-    Format("mcap", "images").write(tmp_path / "a.mcap", cloud, sweeps)
+    ExportSpec("mcap", "images").write(tmp_path / "a.mcap", cloud, sweeps)
     store = get_typestore(Stores.ROS2_HUMBLE)
     with AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
         found = [

@@ -9,8 +9,8 @@ import pytest
 import yaml
 from tests.drives import points_of, the_scene, the_sweeps
 
-from lidarpool.clouds.format_table import FORMATS
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.format_table import FORMATS, format_named
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -31,13 +31,15 @@ def table_below(heading):
 def test_the_table_of_labels_is_that_of_the_registry():
     page = table_below("Labels in each format")
     assert page.keys() == FORMATS.keys()
-    for name, row in FORMATS.items():
+    for name in FORMATS:
         thing, semantic_class, boxes = page[name]
-        assert (thing != "no") == row.holds_column("object"), name
-        assert (semantic_class != "no") == row.holds_column("class", classes_have_names=True), name
-        only_named = not row.holds_column("class") and semantic_class != "no"
+        cloud_format = format_named(name)
+        stored = ("object", "class") if cloud_format.stored is None else cloud_format.stored
+        assert (thing != "no") == ("object" in stored), name
+        assert (semantic_class != "no") == ("class" in (*stored, *cloud_format.named)), name
+        only_named = "class" not in stored and semantic_class != "no"
         assert ("if classes have names" in semantic_class) == only_named, name
-        assert (boxes != "no") == row.actor_boxes, name
+        assert (boxes != "no") == cloud_format.actor_boxes, name
 
 
 def test_names_of_classes_are_in_the_formats_that_the_page_says(tmp_path):
@@ -47,7 +49,7 @@ def test_names_of_classes_are_in_the_formats_that_the_page_says(tmp_path):
     for name, row in FORMATS.items():
         if name in ("pcap", "rrd", "images") or row.missing_packages:
             continue  # of a maker's sensors, of a large package, of all rays
-        Format(name).write(tmp_path / row.file, points_of(scene, 0), sweeps)
+        ExportSpec(name).write(tmp_path / row.file, points_of(scene, 0), sweeps)
         files = [tmp_path / row.file, *(tmp_path / row.file).rglob("*")]
         if any(b"cobblestone" in file.read_bytes() for file in files if file.is_file()):
             holding.add(name)
@@ -129,12 +131,12 @@ def test_the_note_on_classes_without_names_says_what_to_give():
     cloud = points_of(scene, 0)
     assert "class" in {column.name for column in cloud.table}
     for name, title in (("mcap", "MCAP"), ("nuscenes", "nuScenes")):
-        told = [note for note in Format(name).notes(cloud, sweeps) if "class" in note]
+        told = [note for note in ExportSpec(name).notes(cloud, sweeps) if "class" in note]
         assert told == [
             f"{title} can store class only if classes have names. Set `classes: {{1: ground, …}}`; "
             "see docs/how-to/labels.md"
         ]
         named = replace(sweeps, classes={1: "ground"})
-        assert not [note for note in Format(name).notes(cloud, named) if "class" in note]
-    (note,) = [note for note in Format("e57").notes(cloud, sweeps) if "class" in note]
+        assert not [note for note in ExportSpec(name).notes(cloud, named) if "class" in note]
+    (note,) = [note for note in ExportSpec("e57").notes(cloud, sweeps) if "class" in note]
     assert note.startswith("E57 cannot store ") and "classes:" not in note

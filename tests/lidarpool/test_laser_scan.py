@@ -14,8 +14,8 @@ from lidarpool.clouds.laser_scan import (
     has_laser_scans,
     has_planar_sensors,
     is_planar,
-    with_laser_scans,
 )
+from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarsim.columns.table import SCAN
 from lidarsim.sensor.beams import Mirror
 from lidarsim.sensor.sensor import LineSensor
@@ -49,14 +49,15 @@ def test_a_sensor_is_planar_if_a_beam_turns_in_a_plane_about_its_center(sensor, 
     assert is_planar(sensor) is planar
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=4)
     assert has_planar_sensors(survey) is planar
-    complete = with_laser_scans(survey, ["mcap"])
+    complete = with_format_columns(survey, [ExportSpec("mcap")])
     assert has_laser_scans(Sweeps.from_survey(complete, room())) is planar
     assert not has_laser_scans(Sweeps.from_survey(survey, room()))
     for formats, added in ((["mcap"], planar), (["rosbag2", "las"], planar), (["las"], False)):
-        names = [column.name for column in with_laser_scans(survey, formats).stored_columns]
+        complete = with_format_columns(survey, [*map(ExportSpec, formats)])
+        names = [column.name for column in complete.stored_columns]
         assert ({"ray", "range"} <= {*names}) is added
     thinned = replace(survey, keep_every=2)
-    assert with_laser_scans(thinned, ["mcap"]) == thinned
+    assert with_format_columns(thinned, [ExportSpec("mcap")]) == thinned
 
 
 @pytest.mark.parametrize("light", ["intensity", "signal", None])

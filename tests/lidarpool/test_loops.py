@@ -17,7 +17,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import lidarpool
 from lidarpool import Pose, Scene, Survey, load_sensor
-from lidarpool.clouds.ros.bags import write_mcap
+from lidarpool.clouds.ros.bags import MCAP
+from lidarpool.clouds.writing import ExportSpec
 from lidarsim.sweeps.sweeps import Sweeps
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -182,7 +183,8 @@ def test_a_node_publishes_what_a_bag_holds(tmp_path):
     message = node["message_of"](cloud, 0, header, kinds)
     columns = ["intensity", "time"]
     survey = Survey(load_sensor("velodyne/vlp16"), [pose], columns=columns, coordinates="sensor")
-    write_mcap(tmp_path / "a.mcap", cloud, Sweeps.from_survey(survey, scene), "velodyne")
+    bag = MCAP(cloud, Sweeps.from_survey(survey, scene))
+    bag.write(tmp_path / "a.mcap", ExportSpec("mcap"))
     with AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
         [(connection, _, written)] = bag.messages(
             [c for c in bag.connections if "points" in c.topic]

@@ -5,7 +5,7 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError, Scene, box, fit, twin
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario import build as build_module
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -58,7 +58,7 @@ def test_packages_of_formats(unread, tmp_path, monkeypatch):
     def check_installed(self):
         raise LidarError(f"The format {self.format} needs something")
 
-    monkeypatch.setattr(Format, "check_installed", check_installed)
+    monkeypatch.setattr(ExportSpec, "check_installed", check_installed)
     arguments = ["run", str(tmp_path / "room.glb"), "--format", "laz", "--out", f"{tmp_path}/out"]
     outcome = CliRunner().invoke(cli, arguments)
     assert "The format laz needs something" in outcome.output + str(outcome.exception)

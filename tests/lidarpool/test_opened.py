@@ -26,7 +26,7 @@ from lidarpool import (
 from lidarpool.cli.result_commands import view as view_command
 from lidarpool.clouds import las
 from lidarpool.clouds.ros import bags
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarpool.showing.pages import recorded
 from lidarpool.showing.pages.job_list import JobList
@@ -70,7 +70,7 @@ def exported(tmp_path_factory):
     sweeps = Sweeps.from_survey(survey, scene)
     cloud = replace(cloud, sweeps=lambda: sweeps)
     for name in FORMATS:
-        written = Format(name)
+        written = ExportSpec(name)
         written.write(folder / written.row.file, cloud, sweeps)
     return folder, cloud, sweeps
 
@@ -83,7 +83,7 @@ def state_of(view):
 @pytest.mark.parametrize("name", FORMATS)
 def test_each_format_is_opened_at_its_place_with_its_sweeps(exported, name):
     folder, cloud, sweeps = exported
-    view = open_view(folder / Format(name).row.file)
+    view = open_view(folder / ExportSpec(name).row.file)
     state = state_of(view)
     names = {column["name"] for column in state["columns"]}
     sensors = 1 if name == "kitti" else 2
@@ -111,7 +111,7 @@ def test_each_format_is_opened_at_its_place_with_its_sweeps(exported, name):
 @pytest.mark.parametrize("name", ["nuscenes", "webdataset", "mcap"])
 def test_a_recording_is_played_sweep_by_sweep(exported, name):
     folder, cloud, _ = exported
-    view = open_view(folder / Format(name).row.file)
+    view = open_view(folder / ExportSpec(name).row.file)
     assert state_of(view)["duration"] == pytest.approx(0.3, abs=0.01)
     assert len(view.sensors) == 2 and view.sweeps.begins_ns.max() == pytest.approx(2e8, rel=0.01)
     counts = [
@@ -383,7 +383,7 @@ def test_single_sweeps_of_kitti_and_nuscenes_have_their_columns(tmp_path):
 @pytest.mark.parametrize("name", BAGS)
 def test_sweeps_of_a_bag_are_where_its_frames_say(exported, name, monkeypatch):
     folder, _, sweeps = exported
-    view = open_view(folder / Format(name).row.file)
+    view = open_view(folder / ExportSpec(name).row.file)
     assert not state_of(view)["by_sweep"] and not state_of(view)["note"]
     for number, sensor in enumerate(("roof", "nose")):
         assert view.sweeps.sensors[number] == f"/{sensor}/points"
@@ -391,7 +391,7 @@ def test_sweeps_of_a_bag_are_where_its_frames_say(exported, name, monkeypatch):
         expected = sweeps.pose.positions[sweeps.sensor == sweeps.sensors.index(sensor)]
         np.testing.assert_allclose(view.sweeps.pose.positions[of_sensor], expected, atol=1e-4)
     monkeypatch.setattr(bags, "_MAX_DISTANCE_NS", -1)  # no pose is near enough
-    state = state_of(open_view(folder / Format(name).row.file))
+    state = state_of(open_view(folder / ExportSpec(name).row.file))
     assert state["by_sweep"] and IN_SENSOR_AXES in state["note"]
 
 

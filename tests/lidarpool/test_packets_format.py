@@ -22,8 +22,7 @@ from lidarpool import (
     load_sensor,
     save_cloud,
 )
-from lidarpool.clouds.packets import with_packet_columns
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec, with_format_columns
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarsim.columns.table import SCAN, TABLE
@@ -81,7 +80,7 @@ def test_an_empty_cloud_has_packets_without_returns(tmp_path):
     _, sweeps = two_sensors()
     names = ("scan", "channel", "object", *COLUMNS)
     empty = Cloud(np.empty((0, 3)), {name: np.empty(0, TABLE[name].dtype) for name in names})
-    Format("pcap").write(tmp_path / "packets", empty, sweeps)
+    ExportSpec("pcap").write(tmp_path / "packets", empty, sweeps)
     assert ports_of(tmp_path / "packets/roof.pcap") == {2368: 75, 8308: 5}
 
 
@@ -94,7 +93,7 @@ def test_a_file_that_cannot_grow_is_one_line_and_leaves_nothing(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # as a full disk does
     try:
         with pytest.raises(LidarError, match="cannot be written") as raised:
-            Format("pcap").write(tmp_path / "packets", cloud, sweeps)
+            ExportSpec("pcap").write(tmp_path / "packets", cloud, sweeps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert "\n" not in str(raised.value) and not list(tmp_path.iterdir())
@@ -112,7 +111,7 @@ def test_what_cannot_be_packets_is_refused_before_a_file_is_written(tmp_path):
         (cloud, replace(sweeps, fired=grids), r"has no packet format.* vlp16"),
     ):
         with pytest.raises(LidarError, match=says) as raised:
-            Format("pcap").write(tmp_path / "packets", points, of_survey)
+            ExportSpec("pcap").write(tmp_path / "packets", points, of_survey)
         assert len(str(raised.value).splitlines()) == 1 and not list(tmp_path.iterdir())
 
 
@@ -136,4 +135,4 @@ def test_a_scenario_that_writes_packets_keeps_what_they_hold():
     ):
         with pytest.raises(LidarError, match=says):
             build(scenario_of(output=write, **sections))
-    assert with_packet_columns(survey, ["laz"]) is survey
+    assert with_format_columns(survey, [ExportSpec("laz")]) is survey

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from lidarpool import LidarError
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.showing.playback import bridge as bridges
 from lidarpool.showing.playback.bridge import Bridge
 from lidarpool.showing.playback.bridge_table import BRIDGES, BridgeEntry
@@ -31,7 +31,7 @@ steps: 108
 class Kept(Bridge):
     """Keeps the sweeps that it is sent, and when."""
 
-    format = Format("pcap")
+    format = ExportSpec("pcap")
     sent: list = []  # noqa: RUF012 - the test reads it
 
     description = "nowhere"

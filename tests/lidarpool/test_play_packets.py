@@ -38,7 +38,7 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.commands import cli
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.showing.playback.live_sensor import RepeatedInstruments
 from lidarpool.showing.playback.pcap_recording import PcapRecording
 from lidarpool.showing.playback.sources import open_source, scenario_job
@@ -65,7 +65,7 @@ def played(tmp_path_factory):
     folder = tmp_path_factory.mktemp("played")
     (folder / "s.yaml").write_text(VLP16)
     (folder / "out").mkdir()
-    with open_source(folder / "s.yaml", Format("pcap")) as source:
+    with open_source(folder / "s.yaml", ExportSpec("pcap")) as source:
         cloud = replace(
             Cloud.joined([points for _, points in source]), sweeps=lambda: source.sweeps
         )

@@ -12,7 +12,7 @@ from lidarpool import Cloud, LidarError, Scene, load_sensor, save_cloud
 from lidarpool.base.software import difference, plugin_versions, software
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.format_table import row_of
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign_jobs import file_hashes
@@ -223,21 +223,21 @@ def test_a_line_names_the_distribution(tmp_path, distribution, name, text, value
 
 
 def test_formats_of_clouds_that_cannot_be_used(distribution):
-    row = "from lidarpool.plugins import FormatRow\n"
     distribution(
         "half-cloud",
-        {"lidarpool.clouds": {name: f"half_cloud:{name}" for name in ("half", "set", "taken")}},
+        {"lidarpool.clouds": {name: f"half_cloud:{name}" for name in ("Half", "Row", "Taken")}},
         {
-            "half_cloud.py": f"{row}half = FormatRow('half.txt', 'half_cloud', 'write')\n"
-            "set = FormatRow('set', 'half_cloud', 'write', data_set='set')\n"
-            "taken = FormatRow('cloud.ply', 'half_cloud', 'write')"
+            "half_cloud.py": "from lidarpool.plugins import CloudFormat, FormatRow\n"
+            "class Half(CloudFormat): row = FormatRow('half.txt')\n"
+            "class Row: pass\n"
+            "class Taken(CloudFormat): row = FormatRow('cloud.ply')\n"
         },
     )
-    assert "half_cloud.write" in refused(Format("half").check_installed)
-    assert "defines the data set" in refused(row_of, "set")
-    assert "writes 'cloud.ply'" in refused(row_of, "taken")
-    told = refused(Format, "quarter")
-    assert "Unknown cloud format 'quarter'" in told and "half" in told
+    assert "lacks half_cloud.Half.write" in refused(row_of, "Half")
+    assert "lacks a subclass of lidarpool.plugins.CloudFormat" in refused(row_of, "Row")
+    assert "writes 'cloud.ply'" in refused(row_of, "Taken")
+    told = refused(ExportSpec, "quarter")
+    assert "Unknown cloud format 'quarter'" in told and "Half" in told
 
 
 def test_sensors_that_cannot_be_used(distribution):
@@ -271,11 +271,12 @@ def test_commands_that_cannot_be_used(distribution, capsys):
 def test_a_plugin_writes_a_cloud_to_a_file(tmp_path, distribution):
     distribution(
         "text-cloud",
-        {"lidarpool.clouds": {"text": "text_cloud:ROW"}},
+        {"lidarpool.clouds": {"text": "text_cloud:Text"}},
         {
-            "text_cloud.py": "from lidarpool.plugins import FormatRow\n"
-            "ROW = FormatRow('cloud.text', 'text_cloud', 'write', packages=('no_such',))\n"
-            "def write(path, cloud, sweeps): path.write_text(f'{len(cloud)} points')\n"
+            "text_cloud.py": "from lidarpool.plugins import CloudFormat, FormatRow\n"
+            "class Text(CloudFormat):\n"
+            "    row = FormatRow('cloud.text', packages=('no_such',))\n"
+            "    def write(self, path, spec): path.write_text(f'{len(self.cloud)} points')\n"
         },
     )
     cloud = Cloud([[0.0, 0.0, 1.0]], {})
@@ -292,14 +293,17 @@ def test_a_plugin_writes_a_cloud_to_a_file(tmp_path, distribution):
 def test_a_plugin_reads_a_cloud_as_sweeps_and_as_points(tmp_path, distribution):
     distribution(
         "line-cloud",
-        {"lidarpool.clouds": {"lines": "line_cloud:ROW"}},
+        {"lidarpool.clouds": {"lines": "line_cloud:Lines"}},
         {
             "line_cloud.py": "import numpy as np\n"
-            "from lidarpool.plugins import FormatRow, Sweep\n"
-            "ROW = FormatRow('', 'line_cloud', suffixes=('.lines',), reads=('sweeps', 'points'))\n"
-            "def open_file(source):\n"
-            "    points = np.loadtxt(source.path)\n"
-            "    return source.recording(1, lambda number: Sweep(points))\n"
+            "from lidarpool.plugins import CloudFormat, FormatRow, Sweep\n"
+            "class Lines(CloudFormat):\n"
+            "    row = FormatRow('', suffixes=('.lines',))\n"
+            "    for_scenes = True\n"
+            "    @classmethod\n"
+            "    def open(cls, source):\n"
+            "        points = np.loadtxt(source.path)\n"
+            "        return source.recording(1, lambda number: Sweep(points))\n"
         },
     )
     points = np.arange(60.0).reshape(20, 3)

@@ -30,10 +30,10 @@ from lidarpool import (
     save_cloud,
 )
 from lidarpool.cli.result_commands import export
-from lidarpool.clouds.format_table import FORMATS
+from lidarpool.clouds.format_table import LAYOUTS
 from lidarpool.clouds.ros import layouts
 from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
 from lidarsim.columns.table import COLORS, SCAN
@@ -383,8 +383,8 @@ def test_a_column_of_an_organized_ouster_looks_in_one_direction(tmp_path):
 @pytest.mark.parametrize(
     ("layout", "organized"),
     [
-        *((layout, False) for layout in FORMATS["mcap"].layouts),
-        *((layout, True) for layout in FORMATS["mcap"].organized_layouts),
+        *((layout, False) for layout in LAYOUTS),
+        *((layout, True) for layout in LAYOUTS if layouts.LAYOUTS[layout].lines),
     ],
 )
 def test_recordings_of_each_layout_are_read_back(layout, organized, tmp_path):
@@ -436,17 +436,14 @@ def test_a_bag_of_an_older_driver_of_livox_has_no_point_cloud(tmp_path):
 
 
 def test_layouts_of_the_table_are_those_of_the_module():
-    row = FORMATS["mcap"]
-    assert tuple(row.layouts) == tuple(layouts.LAYOUTS)
-    organized = {name for name, layout in layouts.LAYOUTS.items() if layout.lines}
-    assert organized == {*row.organized_layouts}
+    assert tuple(layouts.LAYOUTS) == LAYOUTS
 
 
 def test_what_cannot_be_organized_is_one_line(tmp_path):
     with pytest.raises(LidarError, match="The layout hesai does not support `organized`"):
-        Format("mcap", "hesai", organized=True)
+        ExportSpec("mcap", "hesai", organized=True)
     with pytest.raises(LidarError, match="laz does not support `organized`"):
-        Format("laz", organized=True)
+        ExportSpec("laz", organized=True)
     cloud = cast("velodyne/vlp16")
     without = Cloud(
         cloud.positions,

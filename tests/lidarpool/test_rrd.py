@@ -20,7 +20,7 @@ from tests.lidarpool.test_viewers import SCENARIO as VIEWED
 
 from lidarpool import Cloud, LidarError, save_cloud
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.showing.playback.sources import open_source
 from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import SweepPoses
@@ -92,7 +92,7 @@ def check(rows, sweeps, points_of_sweeps, origin):
 def test_clouds_poses_boxes_and_scene_are_read_back(scanned, tmp_path):
     sweeps, points, content = scanned
     path = tmp_path / "cloud.rrd"
-    Format("rrd").write(path, Cloud.joined(points), sweeps, content=lambda: content)
+    ExportSpec("rrd").write(path, Cloud.joined(points), sweeps, content=lambda: content)
     rows = read(path)
     check(rows, sweeps, points, np.zeros(3))
     ((_, vertices),) = rows["/map/scene", "Mesh3D:vertex_positions"]
@@ -134,7 +134,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(scanned, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
     try:
         with pytest.raises(LidarError, match="cannot be written"):
-            Format("rrd").write(tmp_path / "cloud.rrd", Cloud.joined(points), sweeps)
+            ExportSpec("rrd").write(tmp_path / "cloud.rrd", Cloud.joined(points), sweeps)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [*tmp_path.iterdir()] == []

@@ -6,7 +6,6 @@ import gc
 import multiprocessing
 import os
 import pickle
-import pydoc
 import shutil
 import threading
 import types
@@ -25,7 +24,7 @@ from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps,
 import lidarpool
 from lidarpool import LidarError, Scene, Sweep
 from lidarpool.clouds.boxes import Boxes
-from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS
+from lidarpool.clouds.format_table import DATA_SETS, LAYOUTS, format_named
 from lidarpool.datasets.dataset import INDEX_FILE, DataSet
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.recordings.opening import open_recording
@@ -295,16 +294,16 @@ def test_threads_and_forks_read_beside_each_other(written, name):
 @pytest.mark.parametrize("url", [False, True])
 def test_a_loop_reads_a_few_sweeps_ahead(written, monkeypatch, url):
     name = "kitti" if url else "webdataset"
-    reader = f"lidarpool.clouds.{name}.Reader.read"
-    read = pydoc.locate(reader)
+    cloud_format = format_named(name)
+    read = cloud_format.read_sweep
     threads: list[str] = []
 
-    def noted(self: Any, sweep: int) -> Any:
+    def noted(job: Any, sweep: int) -> Any:
         if threading.current_thread() is not threading.main_thread():
             threads.append(threading.current_thread().name)
-        return read(self, sweep)
+        return read(job, sweep)
 
-    monkeypatch.setattr(reader, noted)
+    monkeypatch.setattr(cloud_format, "read_sweep", noted)
     place = written(name)
     data = lidarpool.sweeps(place.as_uri() if url else place, shuffle=1)
     loop = iter(data)

@@ -16,7 +16,7 @@ from tests.lidarscenes.test_rasters import SLOPE, X0, Y0, write
 from lidarpool import LidarError, Scene, read_cloud
 from lidarpool.cli.commands import cli
 from lidarpool.clouds.las_header import las_system
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.empty_cloud import empty_cloud_reason
@@ -54,7 +54,7 @@ def test_a_local_plan_is_written_in_its_system(tmp_path, origin, added):
     expected = np.round(local + added, 6)
     np.testing.assert_array_equal(cloud.positions, expected)
     for name in ("las", "laz", "ply", "e57", "parquet"):
-        Format(name).write(tmp_path / f"cloud.{name}", cloud, job.sweeps)
+        ExportSpec(name).write(tmp_path / f"cloud.{name}", cloud, job.sweeps)
     for name in ("las", "laz"):
         las = laspy.read(tmp_path / f"cloud.{name}")
         np.testing.assert_allclose(las.xyz, expected, rtol=0, atol=1e-8)
@@ -79,7 +79,7 @@ def test_without_a_world_files_state_no_system(tmp_path):
     job = job_of()
     cloud = cloud_of(job)
     for name in ("las", "ply", "e57", "parquet"):
-        Format(name).write(tmp_path / f"cloud.{name}", cloud, job.sweeps)
+        ExportSpec(name).write(tmp_path / f"cloud.{name}", cloud, job.sweeps)
     assert las_system(tmp_path / "cloud.las") is None
     assert b"crs" not in (tmp_path / "cloud.ply").read_bytes().partition(b"end_header")[0]
     assert b"crs" not in pq.read_schema(tmp_path / "cloud.parquet/part-00000.parquet").metadata

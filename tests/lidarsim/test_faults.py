@@ -29,8 +29,9 @@ from lidarpool import (
 )
 from lidarpool.clouds.boxes import Boxes
 from lidarpool.clouds.images import Image
-from lidarpool.clouds.ros.bags import write_rosbag2
-from lidarpool.clouds.webdataset import Pieces
+from lidarpool.clouds.ros.bags import Rosbag2
+from lidarpool.clouds.webdataset import WebDataset
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.job_table import JobRow
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
@@ -255,9 +256,9 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     assert [len(frozen.faults_in(k)) for k in range(3)] == [0, 0, 1]  # those that repeat another
     job = JobRow(0, "0", "", {}, {})
     assert Sweep.from_points(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
-    pieces = Pieces(cloud, sweeps)
+    output = WebDataset(cloud, sweeps)
     told = [
-        b"".join(pieces.sample_files(k, points, None))
+        b"".join(output.sample_files(k, points, None))
         for k, points in enumerate(sweeps.points(cloud))
     ]
     with tarfile.open(fileobj=io.BytesIO(told[2] + bytes(1024))) as tar:
@@ -280,7 +281,7 @@ def test_bags_have_wrong_stamps_and_boxes_true_places(tmp_path):
         boxes.append(
             [Boxes.from_points(sweeps, k, points) for k, points in enumerate(sweeps.points(cloud))]
         )
-        write_rosbag2(path := tmp_path / f"{len(bags)}", cloud, sweeps, "velodyne")
+        Rosbag2(cloud, sweeps).write(path := tmp_path / f"{len(bags)}", ExportSpec("rosbag2"))
         with AnyReader([path]) as bag:
             bags.append([
                 (bag.deserialize(data, one.msgtype), when)

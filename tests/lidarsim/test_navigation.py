@@ -26,7 +26,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.clouds.navigation_files import instrument_bytes, write_instruments
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
@@ -341,7 +341,7 @@ def test_bags_have_the_instruments(tmp_path):
     survey, cloud, sweeps = of_drive(gnss={"origin": (48.7758, 9.1829, 290.0)})
     found = written(tmp_path, survey, sweeps)
     assert found.instruments.folder == tmp_path
-    Format("mcap").write(tmp_path / "cloud.mcap", cloud, found)
+    ExportSpec("mcap").write(tmp_path / "cloud.mcap", cloud, found)
     messages = read_bag(tmp_path / "cloud.mcap")
     rows = (tmp_path / IMU_FILE).read_text().splitlines()
     imu = [(time, message) for topic, time, message in messages if topic == "/imu/data_raw"]
@@ -385,7 +385,7 @@ def test_latitudes_by_epsg(tmp_path):
 
 def test_a_cloud_by_itself_has_no_instruments(tmp_path):
     survey, cloud, sweeps = of_drive()
-    Format("mcap").write(tmp_path / "cloud.mcap", cloud, sweeps)  # nothing is written yet
+    ExportSpec("mcap").write(tmp_path / "cloud.mcap", cloud, sweeps)  # nothing is written yet
     assert not {"/imu/data_raw"} & {topic for topic, *_ in read_bag(tmp_path / "cloud.mcap")}
     plain = replace(survey, navigation=None)
     assert Instruments.from_survey(plain) is None

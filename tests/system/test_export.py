@@ -10,9 +10,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
-from lidarpool.clouds import pieces
+from lidarpool.clouds import multi_file_format
 from lidarpool.clouds.folder import result_folder
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarsim.base.storage import Storage
 from lidarsim.sweeps.sweeps import Sweeps
 
@@ -169,14 +169,14 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
     columns = {name: np.zeros(3) for name in ("scan", "channel", "object", "intensity")}
     save_cloud(Cloud(np.zeros((3, 3)), columns), tmp_path / "cloud.ply")
     (tmp_path / "report.json").write_text("{}")
-    write = Format.write
+    write = ExportSpec.write
 
     def interrupted(one, *given, **more):
         if one.format == "nuscenes":
             raise KeyboardInterrupt
         write(one, *given, **more)
 
-    monkeypatch.setattr(Format, "write", interrupted)
+    monkeypatch.setattr(ExportSpec, "write", interrupted)
     told = lidarpool("export", tmp_path, "-f", "las", "-f", "nuscenes")
     assert told.code == 130
     assert (
@@ -201,7 +201,7 @@ def test_a_worker_that_cannot_write_is_one_line_and_nothing_is_lost(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         write(storage, name, data)
 
-    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
+    monkeypatch.setattr(multi_file_format, "RANGE_PIECES", 1)
     run = many_files(lidarpool, tmp_path, cluster)
     write = Storage.write
     out = tmp_path / "out"
@@ -237,7 +237,7 @@ Storage.write = write_and_die
 def test_another_worker_writes_the_range_of_one_that_dies(
     cluster, outside, lidarpool, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
+    monkeypatch.setattr(multi_file_format, "RANGE_PIECES", 1)
     armed = tmp_path / "armed"
     armed.touch()
     own = outside()

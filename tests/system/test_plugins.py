@@ -110,7 +110,7 @@ def test_a_worker_without_the_plugin_is_named(tmp_path, monkeypatch, installed, 
 
 
 def test_a_worker_that_joins_with_another_version_does_no_task(cluster_client):
-    plugin = Plugin("lidarpool.clouds", "gone", "gone:ROW", "lidar-gone", "0.2")
+    plugin = Plugin("lidarpool.clouds", "gone", "gone:Gone", "lidar-gone", "0.2")
     task = cluster_client.submit(call_with_plugins, {plugin: "0.2 (sources 12345678)"}, int)
     with pytest.raises(LidarError, match=r"no plug-in lidar-gone, but the run requires .* 0\.2"):
         task.result()
@@ -120,15 +120,13 @@ def test_a_worker_that_joins_with_another_version_does_no_task(cluster_client):
 # A format that only the process of the tests can import.
 HERE_ALONE = """
 from multiprocessing import parent_process
-from lidarpool.plugins import FormatRow, Pieces
+from lidarpool.plugins import FormatRow, MultiFileFormat
 
 if parent_process() is not None:
     raise ImportError("no library")
 
-ROW = FormatRow("alone", "alone_cloud", "Files", in_pieces=True)
-
-class Files(Pieces):
-    pass
+class Files(MultiFileFormat):
+    row = FormatRow("alone")
 """
 
 
@@ -137,7 +135,7 @@ def test_a_worker_that_cannot_import_the_plugin_is_named(tmp_path, monkeypatch, 
     folder = write_distribution(
         tmp_path / "installed",
         "alone-cloud",
-        {"lidarpool.clouds": {"alone": "alone_cloud:ROW"}},
+        {"lidarpool.clouds": {"alone": "alone_cloud:Files"}},
         {"alone_cloud.py": HERE_ALONE},
     )
     monkeypatch.syspath_prepend(folder)

@@ -4,15 +4,19 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps
 
+from .clouds.cloud_format import CloudFormat
 from .clouds.format_table import FormatRow
-from .clouds.pieces import Pieces
+from .clouds.multi_file_format import MultiFileFormat
 from .clouds.recording import Recording, RecordingSource
+from .clouds.writing import ExportSpec
 
 __all__ = [
     "Cloud",
+    "CloudFormat",
     "CloudLike",
+    "ExportSpec",
     "FormatRow",
-    "Pieces",
+    "MultiFileFormat",
     "Recording",
     "RecordingSource",
     "Sweep",

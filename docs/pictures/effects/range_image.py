@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lidarpool import Material, Noise, Survey, load_sensor
-from lidarpool.clouds.writing import Format
+from lidarpool.clouds.writing import ExportSpec
 from lidarscenes.procedural.city import city
 from lidarsim.columns.table import SCAN
 from lidarsim.scene.scene import Scene
@@ -43,7 +43,7 @@ def image_of(scene: Scene, survey: Survey) -> dict[str, np.ndarray]:
     part = columns_of(list(rig.cast(0, survey.scan_count)))
     cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
     with tempfile.TemporaryDirectory() as folder:
-        Format("images").write(Path(folder, "images"), cloud, Sweeps.from_survey(survey, scene))
+        ExportSpec("images").write(Path(folder, "images"), cloud, Sweeps.from_survey(survey, scene))
         return dict(np.load(Path(folder, "images/lidar/000000.npz")).items())
 
 

@@ -1,25 +1,22 @@
-"""Writer and reader for point clouds as folders of NumPy files, one per sweep."""
+"""Point clouds as folders of NumPy files, one per sweep."""
 
 import io
 
 import numpy as np
 
-from lidarpool.plugins import Cloud, FormatRow, Pieces, Recording, RecordingSource
-
-ROW = FormatRow(
-    "npy",  # name of the folder in a result
-    "lidar_example.clouds",
-    "SweepFiles",
-    in_pieces=True,
-    needs=("scan",),
-    holds=(),
-    inside=r"\d+\.npy",
-    folders=("[0-9]*.npy",),  # files that open_folder reads
-)
+from lidarpool.plugins import Cloud, FormatRow, MultiFileFormat, Recording, RecordingSource, Sweep
 
 
-class SweepFiles(Pieces):
-    """Write one file per sweep, on the workers of a cluster."""
+class SweepFolder(MultiFileFormat):
+    """A folder with one file per sweep, which the workers of a cluster write."""
+
+    row = FormatRow(
+        "npy",  # name of the folder in a result
+        folders=("[0-9]*.npy",),  # files in folders that the format opens
+    )
+    by_sweep = True
+    stored = ()
+    file_pattern = r"\d+\.npy"
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
         """Return {name: content} for a sweep: its positions in meters, float32 (n, 3)."""
@@ -27,8 +24,10 @@ class SweepFiles(Pieces):
         np.save(file, points.positions.astype(np.float32))
         return {f"{number:06}.npy": file.getvalue()}, None
 
-
-def open_folder(source: RecordingSource) -> Recording:
-    """Open the files in a folder as sweeps, with positions in world coordinates."""
-    files = sorted(source.path.glob("[0-9]*.npy"))
-    return source.recording(len(files), lambda number: (np.load(files[number]), {}, np.eye(4)))
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open the files in a folder as sweeps, with positions in world coordinates."""
+        files = sorted(source.path.glob("[0-9]*.npy"))
+        return source.recording(
+            len(files), lambda number: Sweep(np.load(files[number]), pose=np.eye(4))
+        )

@@ -74,10 +74,10 @@ class Result(RunResult):
             if a format requires a missing package or column.
         """
         from ..clouds.folder import output_place
-        from ..clouds.writing import Format
+        from ..clouds.writing import ExportSpec
         from ..report.output import SurveyOutput
 
-        further_formats = [Format.from_entry(entry) for entry in formats]
+        further_formats = [ExportSpec.from_entry(entry) for entry in formats]
         extent = "cloud" if only_cloud else "pictures" if pictures else "page"
         output = SurveyOutput(output_place(folder), self.survey, further_formats, extent)
         with output.held():

@@ -15,12 +15,12 @@ from lidarsim.base.errors import LidarError
 from lidarsim.base.storage import Storage
 from lidarsim.base.vocabulary import PICTURES, UNITS_M
 
-from ..clouds.format_table import EXPORTS, LAYOUTS, row_of
+from ..clouds.format_table import EXPORTS, LAYOUTS, format_named, row_of
 from . import completion
 from . import shared_options as options
 
 if TYPE_CHECKING:
-    from ..clouds.writing import Format
+    from ..clouds.writing import ExportSpec
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -194,14 +194,14 @@ def export(
         sweeps = Sweeps.load(source / SWEEPS_FILE)
         cloud = CloudFile(source / "cloud.ply")
         pictures = partial(PictureContent.load_from, source)
-        chosen_formats = _chosen_formats(formats, **settings)
+        specs = _chosen_specs(formats, **settings)
         written: list[str] = []
         with result_folder(target) as folder:
-            for chosen in chosen_formats:  # before any is written, which may take long
+            for chosen in specs:  # before any is written, which may take long
                 chosen.check(folder / chosen.row.file, cloud, overwrite=overwrite)
                 _check_free(target, chosen.row.file, overwrite=overwrite)
             try:
-                for chosen in chosen_formats:
+                for chosen in specs:
                     file = folder / chosen.row.file
                     full_scale = chosen.write(
                         file, cloud, sweeps, overwrite=overwrite, content=pictures
@@ -227,38 +227,30 @@ def _check_free(target: Path | Storage, file: str, *, overwrite: bool) -> None:
         )
 
 
-def _chosen_formats(
-    names: Iterable[str],
-    layout: str,
-    compensated: bool,
-    compensated_actors: bool,
-    pose_rate_hz: float | None,
-    organized: bool,
-    intensity_full_scale: float | None,
-) -> list[Format]:
-    """Return formats with the options that each has.
+def _chosen_specs(names: Iterable[str], layout: str, **options: Any) -> list[ExportSpec]:
+    """Return formats with the options that each supports.
 
-    An option that none of the formats has goes to all of them, which refuse it.
+    An option that none of the formats supports goes to all of them, which refuse it.
     """
-    from ..clouds.writing import Format
+    from ..clouds.writing import ExportSpec
 
-    rows = {name: row_of(name) for name in names}
-    compensating = {name for name, row in rows.items() if row.raw_or_compensated} or rows
-    moving = {name for name, row in rows.items() if row.positions_of_sweeps} or rows
-    with_frames = {name for name, row in rows.items() if row.layouts} or rows
-    organizing = {name for name, row in rows.items() if row.organized_layouts} or rows
-    scaling = {name for name, row in rows.items() if row.integer_intensities} or rows
+    formats = {name: format_named(name) for name in names}
+    refused = [
+        option
+        for option in options
+        if not any(cloud_format.supports(option) for cloud_format in formats.values())
+    ]
     return [
-        Format(
+        ExportSpec(
             name,
             layout,
-            compensated=compensated and name in compensating,
-            compensated_actors=compensated_actors and name in moving,
-            pose_rate_hz=pose_rate_hz if name in with_frames else None,
-            organized=organized and name in organizing,
-            intensity_full_scale=intensity_full_scale if name in scaling else None,
+            **{
+                option: value
+                for option, value in options.items()
+                if option in refused or cloud_format.supports(option)
+            },
         )
-        for name in rows
+        for name, cloud_format in formats.items()
     ]
 
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import uuid
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
-from itertools import count
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-import pye57
-from pye57 import libe57
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.arrays import AnyArray, Floats
@@ -29,9 +25,11 @@ from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..base.fingerprint import fingerprint
+from .cloud_format import CloudFormat
 from .gps_time import gps_start_s
 from .recording import Recording, RecordingSource
 from .well_known_text import wkt
+from .writing import ExportSpec
 
 _NORMALS_URI = "http://www.libe57.org/E57_NOR_surface_normals.txt"
 _THIN = "downsample it first"
@@ -51,33 +49,54 @@ _COLUMNS = {
 _FLAGS = {"isIntensityInvalid": ("intensity",), "isColorInvalid": COLORS}
 _MOVING = ", motion compensated"  # end of the name of a sweep of a moving sensor
 _MIN_QUATERNION = 1e-6  # length below which a quaternion is zero
-_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
+NORMAL_FIELDS = {f"nor:normal{name[-1].upper()}": name for name in NORMAL}  # {field: column}
 
 
-def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write each sweep that has points, in the sensor frame: pose, intensity, colors, normals.
+class E57(CloudFormat):
+    """A file with a scan for each sweep that has points: pose, intensity, colors and normals.
 
-    Poses are in world coordinates, whose coordinate system is stored as WKT. Normals are in the
-    extension for surface normals; 0, 0, 0 without a surface. The intensity limits of all scans are
-    0 and the highest intensity of the cloud. Acquisition times are GPS times of the first and the
-    last firing, and the creation time is the start of the survey.
+    Points are in the sensor frame. Poses are in world coordinates, whose coordinate system is
+    stored as WKT. Normals are in the extension for surface normals; 0, 0, 0 without a surface. The
+    intensity limits of all scans are 0 and the highest intensity of the cloud. Acquisition times
+    are GPS times of the first and the last firing, and the creation time is the start of the
+    survey.
     """
-    content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
-    normals = {*NORMAL} <= {column.name for column in cloud.table}
-    file_class, fields = (_WithNormals, _normal_fields) if normals else (_File, nullcontext)
-    system = "" if sweeps.epsg is None else wkt(sweeps.epsg)
-    highest = _highest_intensity(cloud)
-    with _named_by(content), fields(), file_class(path, system, sweeps) as file:
-        if normals:
-            file.image_file.extensionsAdd("nor", _NORMALS_URI)
-        try:
-            for sweep, points in enumerate(sweeps.points(cloud)):
-                if len(points):
-                    _write_scan(file, sweeps, sweep, points, highest)
-            file.close()
-        except libe57.E57Exception as error:
-            del file.image_file  # closing it would fail again
-            raise OSError(f"{str(error).splitlines()[0]}. The disk may be full") from error
+
+    title = "E57"
+    by_sweep = True
+    frame = "sweep"
+    stored = ("intensity", *COLORS, *NORMAL)
+    for_scenes = True
+
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the file."""
+        from pye57 import libe57
+
+        from .e57_writer import E57Writer, E57WriterWithNormals, named_by, normal_fields
+
+        content = fingerprint(self.sweeps, len(self.cloud), np.asarray(self.cloud.bounds))
+        normals = {*NORMAL} <= {column.name for column in self.cloud.table}
+        file_class, fields = (
+            (E57WriterWithNormals, normal_fields) if normals else (E57Writer, nullcontext)
+        )
+        system = "" if self.sweeps.epsg is None else wkt(self.sweeps.epsg)
+        highest = _highest_intensity(self.cloud)
+        with named_by(content), fields(), file_class(path, system, self.sweeps) as file:
+            if normals:
+                file.image_file.extensionsAdd("nor", _NORMALS_URI)
+            try:
+                for sweep, points in enumerate(self.sweeps.points(self.cloud)):
+                    if len(points):
+                        _write_scan(file, self.sweeps, sweep, points, highest)
+                file.close()
+            except libe57.E57Exception as error:
+                del file.image_file  # closing it would fail again
+                raise OSError(f"{str(error).splitlines()[0]}. The disk may be full") from error
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open the scans of an E57 file, each in the axes of its scanner, with its pose."""
+        return _open_e57(source)
 
 
 def _highest_intensity(cloud: CloudLike) -> float:
@@ -100,7 +119,7 @@ def _write_scan(
         data |= {f"color{name.capitalize()}": points[name] for name in COLORS}
     if {*NORMAL} <= {*points.columns}:
         columns = sweeps.columns_compensated(sweep, points)
-        data |= {field: np.nan_to_num(columns[name]) for field, name in _FIELDS.items()}
+        data |= {field: np.nan_to_num(columns[name]) for field, name in NORMAL_FIELDS.items()}
     quaternion = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
     position = sweeps.pose.positions[sweep]
     start_s = gps_start_s(sweeps)
@@ -139,81 +158,6 @@ def _scan_name(sweeps: Sweeps, sweep: int) -> str:
     return ", ".join(parts) + ("" if is_standing else _MOVING)
 
 
-class _File(pye57.E57):
-    """A new file whose header states coordinate system and time, which pye57 leaves empty."""
-
-    def __init__(self, path: Path, system: str, sweeps: Sweeps) -> None:
-        self._system = system
-        self._sweeps = sweeps
-        self._in_header = False
-        super().__init__(str(path), mode="w")
-
-    def write_default_header(self) -> None:
-        """Write the header, with the system as coordinateMetadata, and the creation time."""
-        self._in_header = True
-        super().write_default_header()
-        self._in_header = False
-
-    @property
-    def root(self) -> Any:
-        """Root of the file, or an object that takes its fields while the header is written."""
-        return SimpleNamespace(set=self._set_field) if self._in_header else super().root
-
-    def _set_field(self, name: str, node: Any) -> None:
-        if name == "coordinateMetadata":  # no field can be set twice
-            node = libe57.StringNode(self.image_file, self._system)
-        if name == "creationDateTime":
-            has_start = self._sweeps.start_ns is not None
-            time = libe57.FloatNode(self.image_file, gps_start_s(self._sweeps))
-            node = libe57.StructureNode(self.image_file)
-            node.set("dateTimeValue", time)
-            node.set("isAtomicClockReferenced", libe57.IntegerNode(self.image_file, has_start))
-        super().root.set(name, node)
-
-
-class _WithNormals(_File):
-    """A file whose scans have normals, which pye57 leaves out."""
-
-    def make_buffers(self, field_names: Sequence[str], *arguments: Any, **options: Any) -> Any:
-        """Return buffers with the fields of normals added."""
-        return super().make_buffers([*field_names, *_FIELDS], *arguments, **options)
-
-
-@contextmanager
-def _normal_fields() -> Iterator[None]:
-    """Have pye57 write fields of normals."""
-    supported = pye57.e57.SUPPORTED_POINT_FIELDS
-    library = pye57.e57.libe57
-
-    def vector_node(image_file: Any, prototype: Any, codecs: Any) -> Any:
-        for field in _FIELDS:
-            node = libe57.FloatNode(image_file, 0.0, libe57.E57_SINGLE, -1.0, 1.0)
-            prototype.set(field, node)
-        return libe57.CompressedVectorNode(image_file, prototype, codecs)
-
-    pye57.e57.SUPPORTED_POINT_FIELDS = supported | dict.fromkeys(_FIELDS, "f")
-    pye57.e57.libe57 = SimpleNamespace(**vars(libe57) | {"CompressedVectorNode": vector_node})
-    try:
-        yield
-    finally:
-        pye57.e57.SUPPORTED_POINT_FIELDS = supported
-        pye57.e57.libe57 = library
-
-
-@contextmanager
-def _named_by(content: str) -> Iterator[None]:
-    """Derive the GUIDs of a file and its scans from a text, where pye57 draws random GUIDs."""
-    numbers = count()
-    uuid_module = pye57.e57.uuid
-    pye57.e57.uuid = SimpleNamespace(
-        uuid4=lambda: uuid.uuid5(uuid.NAMESPACE_OID, f"{content} {next(numbers)}")
-    )
-    try:
-        yield
-    finally:
-        pye57.e57.uuid = uuid_module
-
-
 # -- reading ---------------------------------------------------------------------------------
 
 
@@ -224,8 +168,10 @@ class _Scale(NamedTuple):
     notes: tuple[str, ...] = ()  # clauses that follow the name of the file
 
 
-def open_file(source: RecordingSource) -> Recording:
+def _open_e57(source: RecordingSource) -> Recording:
     """Open the scans of an E57, each in the axes of its scanner, with its pose."""
+    import pye57
+
     with reading(source.name):
         size = input_size(source.path)
         file = pye57.E57(str(source.path))
@@ -306,6 +252,8 @@ def _read_fields(file: Any, header: Any) -> dict[str, AnyArray]:
 
     pye57 would read into types that do not hold every value: bytes of colors, 16 bits of rows.
     """
+    from pye57 import libe57
+
     points = header.points
     prototype = libe57.StructureNode(points.prototype())
     known = {*_COLUMNS, *_FLAGS, *sum(_COORDINATES.values(), ()), *_states("")}
@@ -356,6 +304,8 @@ def _color_columns(header: Any, columns: Mapping[str, AnyArray]) -> dict[str, An
 
 def _full_color(header: Any, highest: float) -> float:
     """Return the value of full color of a scan, by its limits and its highest color."""
+    from pye57 import libe57
+
     prototype = libe57.StructureNode(header.points.prototype())
     nodes = [prototype[f"color{color}"] for color in _COLORS]
     are_real = not all(isinstance(node, libe57.IntegerNode) for node in nodes)
@@ -405,6 +355,8 @@ def _limit(header: Any, group: str, name: str) -> float | None:
 
 def _number(node: Any) -> float:
     """Return the value of a node that is a number."""
+    from pye57 import libe57
+
     is_scaled = isinstance(node, libe57.ScaledIntegerNode)
     return float(node.scaledValue() if is_scaled else node.value())
 

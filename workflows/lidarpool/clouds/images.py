@@ -21,9 +21,10 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.ray_image import Image, fired_of
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
-from . import pieces, sweep_reader
 from .boxes import Boxes
-from .pieces import Entry
+from .cloud_format import Entry, PointColumns
+from .job_reader import JobReader
+from .multi_file_format import MultiFileFormat
 from .recording import Recording, RecordingSource
 
 _NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are not images
@@ -32,7 +33,7 @@ _NO_IMAGES = ("pose", "scan", "frame")  # arrays of a file that are not images
 _RAY_COLUMNS = ("scan", "ray", "channel", "sensor", "time", "azimuth", "elevation")
 
 
-class Pieces(pieces.Pieces):
+class ImageFolder(MultiFileFormat):
     """A NumPy archive for each sweep: `NAME/000000.npz`, NAME from the sensor, or `lidar`.
 
     In a data set, `images/JOB/NAME/000000.npz`. Arrays are images, (channels, firings): `range` and
@@ -43,10 +44,17 @@ class Pieces(pieces.Pieces):
     frame of the points in words.
     """
 
+    title = "range images"
+    by_sweep = True
+    required = ("ray", "range")
+    file_pattern = r"[^/]+/\d+\.npz"
+    job_path = "images/{name}"
+    separate_sweeps = True
+
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
         fired_of(sweeps)
-        self.folders = _folders(sweeps, entry)
+        self.folders = self._folders_of(sweeps, entry)
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes | None]:
         """Return the file of a sweep, and its boxes where there are actors."""
@@ -70,22 +78,34 @@ class Pieces(pieces.Pieces):
         boxes = Boxes.from_points(sweeps, number, points) if sweeps.actors and self.entry else None
         return {_file(sweeps, self.folders, number): packed(arrays)}, boxes
 
+    @classmethod
+    def _folders_of(cls, sweeps: Sweeps, entry: Entry | None) -> list[str]:
+        """Return the folders of the sensors."""
+        names = plain_names(name or "lidar" for name in sweeps.sensors)
+        return names if entry is None else [f"{cls.path_of_job(entry)}/{name}" for name in names]
 
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: all columns of each point, with time and angles of its ray."""
-
-    def files(self, sweep: int) -> list[str]:
+    @classmethod
+    def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the name of the file of the images."""
-        return [_file(self.sweeps, _folders(self.sweeps, self.entry), sweep)]
+        folders = job.cached("folders", lambda: cls._folders_of(job.sweeps, job.entry))
+        return [_file(job.sweeps, folders, sweep)]
 
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep, in the order of their rays."""
-        file = self.files(sweep)[0]
-        with open_archive(self.storage.path(file), partial(self.storage.read, file)) as images:
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return points with all columns, and time and angles of each ray, in the order of rays."""
+        (file,) = cls.sweep_files(job, sweep)
+        with open_archive(job.storage.path(file), partial(job.storage.read, file)) as images:
             return points_of_images(images)
 
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open the range images in a folder, whose folders are sensors."""
+        with reading(source.name):
+            sensors = _sensors(source)
+        return source.of_sensors(sensors)
 
-def points_of_images(images: dict[str, AnyArray]) -> sweep_reader.PointColumns:
+
+def points_of_images(images: dict[str, AnyArray]) -> PointColumns:
     """Return the points of the images of a sweep, in the order of their rays."""
     images = {name: image for name, image in images.items() if name not in _NO_IMAGES}
     planes = next(n for n in count(1) if _key("range", n) not in images)
@@ -107,21 +127,8 @@ def _key(name: str, plane: int) -> str:
     return f"{name}{plane + 1}" if plane else name
 
 
-def _folders(sweeps: Sweeps, entry: Entry | None) -> list[str]:
-    """Return the folders of the sensors."""
-    names = plain_names(name or "lidar" for name in sweeps.sensors)
-    return names if entry is None else [f"{entry.path_of('images')}/{name}" for name in names]
-
-
 def _file(sweeps: Sweeps, folders: Sequence[str], sweep: int) -> str:
     return f"{folders[sweeps.sensor[sweep]]}/{sweeps.numbers[sweep]:06}.npz"
-
-
-def open_folder(source: RecordingSource) -> Recording:
-    """Open the range images of a folder, whose folders are sensors."""
-    with reading(source.name):
-        sensors = _sensors(source)
-    return source.of_sensors(sensors)
 
 
 def _sensors(source: RecordingSource) -> dict[str, Recording]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +28,10 @@ from lidarsim.scene.files.float_rows import columns_by_name, read_float_columns
 from lidarsim.scene.files.text_rows import RowReader
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
-from . import pieces, sweep_reader
 from .boxes import Boxes
-from .pieces import Data, Entry, as_data
+from .cloud_format import Entry, PointColumns
+from .job_reader import JobReader
+from .multi_file_format import Data, MultiFileFormat, as_data
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
@@ -40,9 +40,13 @@ NAMES_FILE = "semantic-kitti.yaml"
 CALIBRATION_FILE = "calib.txt"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+_FILE_PATTERN = (
+    r"semantic-kitti\.yaml|(poses|label_02)/[^/]+\.txt|"
+    r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
+)
 
 
-class Pieces(pieces.Pieces):
+class KITTI(MultiFileFormat):
     """A sequence for each sensor: `sequences/00`, `01`, ...
 
     In a data set the first sensor of job 7 has `sequences/07`, further sensors `07_NAME`.
@@ -61,6 +65,17 @@ class Pieces(pieces.Pieces):
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
+
+    title = "KITTI"
+    by_sweep = True
+    frame = "sweep"
+    required = ("object", "reflectivity", "class")
+    stored = required
+    actor_boxes = True
+    file_pattern = _FILE_PATTERN
+    separate_sweeps = True
+    raw_sweeps = True
+    for_scenes = True
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         if len(sweeps.objects) + len(sweeps.actors) > MAX_INSTANCES:
@@ -136,34 +151,34 @@ class Pieces(pieces.Pieces):
                 lines.append(f"{frame} {instance} {kind} 0 {values}\n")
         return "".join(lines).encode()
 
-
-def intensity_of(points: Cloud) -> Floats32:
-    """Return the intensity of KITTI (n,): reflectivity from 0 to 1, independent of the range."""
-    return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
-
-
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: intensity (reflectivity, 0 to 1), class and object of points."""
-
-    def files(self, sweep: int) -> list[str]:
+    @classmethod
+    def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the names of the files of points and labels."""
-        folder = f"sequences/{self._names[self.sweeps.sensor[sweep]]}"
-        number = f"{self.sweeps.numbers[sweep]:06}"
+        names = job.cached("sequences", lambda: _names(job.sweeps, job.entry))
+        folder = f"sequences/{names[job.sweeps.sensor[sweep]]}"
+        number = f"{job.sweeps.numbers[sweep]:06}"
         return [f"{folder}/velodyne/{number}.bin", f"{folder}/labels/{number}.label"]
 
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep."""
-        file, labels_file = self.files(sweep)
-        rows = self.rows(file, np.dtype("<f4")).reshape(-1, 4)
-        labels = self.rows(labels_file, np.dtype("<u4"), len(rows))
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return points with intensity (reflectivity, 0 to 1), class and object."""
+        file, labels_file = cls.sweep_files(job, sweep)
+        rows = job.rows(file, np.dtype("<f4")).reshape(-1, 4)
+        labels = job.rows(labels_file, np.dtype("<u4"), len(rows))
         instances = (labels >> 16).view("<i4")
         instances -= 1
         classes = labels.view("<u2")[::2]
         return rows[:, :3], {"intensity": rows[:, 3], "class": classes, "object": instances}
 
-    @cached_property
-    def _names(self) -> list[str]:
-        return _names(self.sweeps, self.entry)
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a .bin file of KITTI or nuScenes, or a sequence of KITTI or SemanticKITTI."""
+        return _open_sequence(source) if source.path.is_dir() else _open_sweep(source)
+
+
+def intensity_of(points: Cloud) -> Floats32:
+    """Return the intensity of KITTI (n,): reflectivity from 0 to 1, independent of the range."""
+    return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
 
 
 def labels_file(classes: Mapping[int, str]) -> bytes:
@@ -229,13 +244,13 @@ def _labels(
 # -- reading ---------------------------------------------------------------------------------
 
 
-def open_file(source: RecordingSource) -> Recording:
+def _open_sweep(source: RecordingSource) -> Recording:
     """Open a .bin of KITTI or nuScenes, a sweep, with its labels."""
     labels = source.path.parent.parent / "labels" / f"{source.path.stem}.label"
     return source.recording(1, lambda _: _read_sweep(source.path, labels))
 
 
-def open_folder(source: RecordingSource) -> Recording:
+def _open_sequence(source: RecordingSource) -> Recording:
     """Open a sequence of KITTI odometry or SemanticKITTI."""
     with reading(source.name):
         sequences = _sequences(source)

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, date, datetime
-from functools import partial
 from os import SEEK_END
 from pathlib import Path
 from shutil import copyfileobj
 from struct import Struct
 from tempfile import TemporaryFile
 from textwrap import shorten
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any, ClassVar
 
-import laspy
-import lazrs
 import numpy as np
-from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
 from lidarsim.base.arrays import Floats, Floats32
@@ -29,11 +25,17 @@ from lidarsim.columns.table import COLORS, NORMAL, TABLE, Column
 from lidarsim.columns.waveforms import WAVEFORM, ZERO, records
 from lidarsim.sweeps.sweeps import AS_FIRED, IN_WORLD, Sweeps
 
+from .cloud_format import CloudFormat
 from .flight_lines import FlightLines
 from .gps_time import gps_start_s
+from .intensity_full_scale import full_scale_of
 from .las_header import las_system, noise_classes, open_las
 from .recording import Recording, RecordingSource
 from .well_known_text import wkt
+from .writing import ExportSpec
+
+if TYPE_CHECKING:
+    import laspy
 
 # A sample consists of this many runs of points, which begin where chunks of a .laz begin: 50,000
 # points each, unless a program chooses otherwise.
@@ -65,19 +67,14 @@ _MAX_STEPS = 2**31 - 1  # steps of precision from the offset to the farthest poi
 
 def _extra_bytes(column: Column) -> laspy.ExtraBytesParams:
     """Return the extra bytes of a column, with its unit and meaning in 32 letters."""
+    import laspy
+
     description = shorten(f"{column.unit} {column.meaning}", 32, placeholder="")
     return laspy.ExtraBytesParams(_name(column.in_files), column.dtype, description)
 
 
-def _write(
-    path: Path,
-    cloud: CloudLike,
-    sweeps: Sweeps,
-    *,
-    compress: bool,
-    intensity_full_scale: float | None = None,
-) -> None:
-    """Write a cloud: columns to fields of the format, further columns to extra bytes.
+class LAS(CloudFormat):
+    """A .las file: columns in fields of the format, and further columns in extra bytes.
 
     `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
     start. A coordinate system is stored as WKT. `return_number` and `returns` are unchanged. Scan
@@ -90,40 +87,67 @@ def _write(
     lidarpool, a list as JSON. Return numbers are 15 at most. A text area record names the frame of
     the points. Recorded waveforms make the point format 9, or 10 with colors (`_Packets`).
     """
-    packets = _Packets.from_cloud(cloud)
-    columns = {column.name for column in cloud.table}
-    header = _header(columns, sweeps, packets, intensity_full_scale)
-    _set_grid(header, cloud, sweeps.precision_m, path.suffix[1:].upper())
-    format_fields = (*_FORMAT_FIELDS, *COLORS) if {*COLORS} <= columns else _FORMAT_FIELDS
-    extra = [column for column in cloud.table if column.name not in format_fields]
-    header.add_extra_dims([_extra_bytes(column) for column in extra])
-    names = [column.name for column in extra]
-    try:
-        with (
-            path.open("wb+") as file,  # laspy leaves a file open that it cannot finish
-            TemporaryFile(dir=path.parent) as packet_file,
-        ):
-            with laspy.open(
-                file, "w", header=header, do_compress=compress, closefd=False
-            ) as writer:
-                for chunk, lines in FlightLines(sweeps).with_fields(cloud.chunks()):
-                    points = _points(chunk, header, names, _start_s(sweeps))
-                    if intensity_full_scale is not None:
-                        points.intensity = _as_integers(chunk["intensity"], intensity_full_scale)
-                    points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype(np.int16)
-                    points.scan_direction_flag = lines.direction
-                    points.edge_of_flight_line = lines.edge
-                    points.point_source_id = lines.source
-                    if packets is not None:
-                        packets.put(points, chunk, packet_file)
-                    with deferred_interrupts():  # lazrs replaces errors raised within it
-                        writer.write_points(points)
-                with deferred_interrupts():
-                    writer.close()
-            if packets is not None:
-                packets.append(file, packet_file)
-    except lazrs.LazrsError as error:
-        raise OSError(f"{error}. The disk may be full") from error
+
+    title = "LAS"
+    frame = "world"
+    options = ("intensity_full_scale",)
+    is_compressed: ClassVar[bool] = False
+    for_scenes = True
+
+    def write(self, path: Path, spec: ExportSpec) -> float | None:
+        """Write the file, and return the intensity that is stored as 65,535."""
+        import laspy
+        import lazrs
+
+        full_scale = full_scale_of(self.cloud)
+        if full_scale is not None:
+            full_scale = spec.intensity_full_scale or full_scale
+        packets = _Packets.from_cloud(self.cloud)
+        columns = {column.name for column in self.cloud.table}
+        header = _header(columns, self.sweeps, packets, full_scale)
+        _set_grid(header, self.cloud, self.sweeps.precision_m, self.title)
+        format_fields = (*_FORMAT_FIELDS, *COLORS) if {*COLORS} <= columns else _FORMAT_FIELDS
+        extra = [column for column in self.cloud.table if column.name not in format_fields]
+        header.add_extra_dims([_extra_bytes(column) for column in extra])
+        names = [column.name for column in extra]
+        options = {"header": header, "do_compress": self.is_compressed, "closefd": False}
+        try:
+            with (
+                path.open("wb+") as file,  # laspy leaves a file open that it cannot finish
+                TemporaryFile(dir=path.parent) as packet_file,
+            ):
+                with laspy.open(file, "w", **options) as writer:
+                    for chunk, lines in FlightLines(self.sweeps).with_fields(self.cloud.chunks()):
+                        points = _points(chunk, header, names, _start_s(self.sweeps))
+                        if full_scale is not None:
+                            points.intensity = _as_integers(chunk["intensity"], full_scale)
+                        points.scan_angle = np.round(lines.scan_angle_deg / ANGLE_DEG).astype("i2")
+                        points.scan_direction_flag = lines.direction
+                        points.edge_of_flight_line = lines.edge
+                        points.point_source_id = lines.source
+                        if packets is not None:
+                            packets.put(points, chunk, packet_file)
+                        with deferred_interrupts():  # lazrs replaces errors raised within it
+                            writer.write_points(points)
+                    with deferred_interrupts():
+                        writer.close()
+                if packets is not None:
+                    packets.append(file, packet_file)
+        except lazrs.LazrsError as error:
+            raise OSError(f"{error}. The disk may be full") from error
+        return full_scale
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open the points of a .las or .laz file, in parts."""
+        return _open_las(source)
+
+
+class LAZ(LAS):
+    """A .laz file, which is a compressed .las file."""
+
+    title = "LAZ"
+    is_compressed = True
 
 
 def _start_s(sweeps: Sweeps) -> float:
@@ -143,6 +167,9 @@ def _header(
     columns: set[str], sweeps: Sweeps, packets: _Packets | None, intensity_full_scale: float | None
 ) -> laspy.LasHeader:
     """Return the header of a file with its records, without grid and extra bytes."""
+    import laspy
+    from laspy.vlrs.known import WktCoordinateSystemVlr
+
     point_format = (6 if packets is None else 9) + int({*COLORS} <= columns)
     header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.generating_software = "lidarpool"
@@ -196,10 +223,6 @@ def _set_grid(header: laspy.LasHeader, cloud: CloudLike, precision_m: float, nam
         )
 
 
-write_las = partial(_write, compress=False)
-write_laz = partial(_write, compress=True)
-
-
 class _Packets:
     """Waveform packets of a LAS file, which follow its points in the same file.
 
@@ -211,6 +234,8 @@ class _Packets:
     """
 
     def __init__(self, samples: int, kinds: list[tuple[int, int]]) -> None:
+        from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr
+
         self._bytes = 2 * samples
         self._index = {kind: number for number, kind in enumerate(kinds, 1)}
         self._end = _EVLR.size  # end of the packets, after the head of their record
@@ -268,6 +293,8 @@ class _Packets:
 
 
 def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], start_s: float) -> Any:
+    import laspy
+
     record = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
     record.x, record.y, record.z = chunk.positions.T.astype(np.float64)
     columns = chunk.columns
@@ -297,7 +324,7 @@ def _name(name: str) -> str:
 # -- reading ---------------------------------------------------------------------------------
 
 
-def open_file(source: RecordingSource) -> Recording:
+def _open_las(source: RecordingSource) -> Recording:
     """Open the points of a .las or .laz, in parts.
 
     A sample consists of runs of points, evenly in the file.
@@ -355,4 +382,3 @@ def _some_positions(reader: laspy.LasReader, count: int) -> Floats:
             point = reader.read_points(1)
             positions.append([point.x[0], point.y[0], point.z[0]])
     return np.reshape(np.array(positions, np.float64), (-1, 3))
-

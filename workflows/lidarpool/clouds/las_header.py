@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import laspy
-
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.errors import CutShortError
 from lidarsim.base.input_files import open_input
@@ -46,6 +44,8 @@ def open_las(path: Path) -> Iterator[Any]:
     OSError
         If the file cannot be read.
     """
+    import laspy
+
     with open_input(path) as file:
         size = os.fstat(file.fileno()).st_size
         _, points_start, _ = _layout(file)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from lidarsim.sweeps.ray_image import Image
 from lidarsim.sweeps.sweeps import Sweeps
 
 COLUMNS = "ray", "range"  # columns that a LaserScan needs, with every return
-_BAGS = frozenset({"mcap", "rosbag2"})
 _MAX_STEP_DIFFERENCE = 1e-6  # largest difference between steps of rays, radians
 
 
@@ -30,17 +28,6 @@ def is_planar(sensor: Sensor) -> bool:
     firings = np.arange(first, max(stop, first + 3))
     rays = sensor.directions(firings)[:, 0]
     return bool(np.allclose(rays[:, 2], 0.0) and sensor.origins(firings) is None)
-
-
-def with_laser_scans(survey: Survey, formats: Collection[str]) -> Survey:
-    """Return a survey with the columns of LaserScan messages, if its bags have such messages.
-
-    `formats` are the formats that its cloud is written in. Surveys that thin out returns have no
-    such messages.
-    """
-    if _BAGS.isdisjoint(formats) or survey.keep_every > 1 or not has_planar_sensors(survey):
-        return survey
-    return replace(survey, columns=(*survey.columns, *COLUMNS))
 
 
 def has_planar_sensors(survey: Survey) -> bool:

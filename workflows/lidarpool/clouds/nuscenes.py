@@ -6,7 +6,6 @@ import io
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from functools import cached_property
 from hashlib import md5
 from itertools import chain
 from pathlib import Path
@@ -29,14 +28,14 @@ from lidarsim.scene.transform import affine
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from ..base.fingerprint import fingerprint
-from . import pieces, sweep_reader
 from .boxes import Boxes
-from .format_table import FORMATS
-from .pieces import Data, Entry, as_data
+from .cloud_format import Entry, PointColumns
+from .job_reader import JobReader
+from .multi_file_format import Data, MultiFileFormat, as_data
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 VERSION = "v1.0-lidarpool"
-FIRST_SENSOR = FORMATS["nuscenes"].first_sensor
+FIRST_SENSOR = "LIDAR_TOP"
 _SCENE = "scene-0001"
 _LOG = "survey"
 _DATE = "1980-01-06"  # surveys begin at time 0 of no date
@@ -47,6 +46,10 @@ _TABLES = (
     "sample_annotation", "sample_data", "scene", "sensor", "visibility",
 )  # fmt: skip
 LABELS = f"lidarseg/{VERSION}/"
+_FILE_PATTERN = (
+    r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png|"
+    r"lidarseg/v1\.0-lidarpool/[^/]+\.pcd\.bin"
+)
 _MAX_CLASSES = 255  # labels are bytes, and 0 is for points without a class
 _NO_CLASS = "none"
 _SWEEP_TABLE = "sample_data.json"
@@ -54,7 +57,7 @@ _Row = Mapping[str, Any]  # of a table
 _SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of a data set share
 
 
-class Pieces(pieces.Pieces):
+class NuScenes(MultiFileFormat):
     """A data set that nuscenes-devkit opens with `NuScenes("v1.0-lidarpool", path)`.
 
     Each sweep is `samples/NAME/000000.pcd.bin`: float32 x, y, z in the sensor frame at the start of
@@ -71,6 +74,17 @@ class Pieces(pieces.Pieces):
 
     Caesar et al., nuScenes, 2020.
     """
+
+    title = "nuScenes"
+    by_sweep = True
+    frame = "sweep"
+    required = ("object", "channel", "intensity")
+    stored = ("channel", "intensity")
+    named = ("class",)
+    actor_boxes = True
+    file_pattern = _FILE_PATTERN
+    separate_sweeps = True
+    raw_sweeps = True
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
@@ -128,30 +142,47 @@ class Pieces(pieces.Pieces):
             tables.rows["category"] = _categories(tables.rows["category"], self.sweeps.classes)
         return tables.rows
 
+    @classmethod
+    def renamed(cls, sensors: Sequence[str]) -> list[str]:
+        """Return a note if the first sensor has another name, because readers expect its name."""
+        if not sensors or sensors[0] in ("", FIRST_SENSOR):
+            return []
+        note = (
+            f"{cls.title} expects the first sensor to be named {FIRST_SENSOR!r}, so "
+            f"{sensors[0]!r} is renamed to {FIRST_SENSOR!r}"
+        )
+        if FIRST_SENSOR in sensors[1:]:
+            note += f" and {FIRST_SENSOR!r} to '{FIRST_SENSOR}_2'"
+        return [note]
 
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: intensity, channel and, with names, class of each point."""
-
-    @cached_property
-    def _names(self) -> list[str]:
-        return _files(self.sweeps, _channels(self.sweeps), _samples(self.sweeps)[1], self.entry)
-
-    def files(self, sweep: int) -> list[str]:
+    @classmethod
+    def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the names of the files of points and, with names, classes."""
-        file = self._names[sweep]
-        return [file, LABELS + file.replace("/", "-")] if self.sweeps.classes else [file]
+        sweeps = job.sweeps
+        names = job.cached(
+            "names",
+            lambda: _files(sweeps, _channels(sweeps), _samples(sweeps)[1], job.entry),
+        )
+        file = names[sweep]
+        return [file, LABELS + file.replace("/", "-")] if sweeps.classes else [file]
 
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep."""
-        file, *labels = self.files(sweep)
-        rows = self.rows(file, np.dtype("<f4")).reshape(-1, 5)
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return points with intensity, channel and, with names, class."""
+        file, *labels = cls.sweep_files(job, sweep)
+        rows = job.rows(file, np.dtype("<f4")).reshape(-1, 5)
         intensity, channel = np.ascontiguousarray(rows[:, 3:].T)
         intensity /= 255
         columns = {"intensity": intensity, "channel": channel.astype("u2")}
         if labels:
-            labels_of_points = self.rows(labels[0], np.dtype("u1"), len(rows))
-            columns["class"] = np.array([0, *sorted(self.classes)], "u2")[labels_of_points]
+            labels_of_points = job.rows(labels[0], np.dtype("u1"), len(rows))
+            columns["class"] = np.array([0, *sorted(job.classes)], "u2")[labels_of_points]
         return rows[:, :3], columns
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a lidar in a nuScenes data set."""
+        return _open_data_set(source)
 
 
 def _channels(sweeps: Sweeps) -> list[str]:
@@ -446,7 +477,7 @@ class _Tables:
 # -- reading ---------------------------------------------------------------------------------
 
 
-def open_folder(source: RecordingSource) -> Recording:
+def _open_data_set(source: RecordingSource) -> Recording:
     """Open a lidar of a nuScenes data set, by its root or the folder of its tables.
 
     LidarError for a root with the tables of several versions.

@@ -13,18 +13,20 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from lidarsim.base.arrays import AnyArray, Floats, Ints
 from lidarsim.base.elementary import arctan2
-from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.cloud import Cloud
 from lidarsim.motion.rotations import matrices
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
 from .boxes import Boxes, SweepBoxes
+from .cloud_format import CloudFormat
 from .gps_time import GPS_NS
+from .writing import ExportSpec
 
 GROUND_TRUTH_TOPIC = "/ground_truth"
 # Numbers of fields, by osi_sensordata.proto and osi_featuredata.proto of OSI 3.
@@ -53,48 +55,56 @@ _VEHICLES = {
 }  # fmt: skip
 
 
-def write_osi(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write an .osi trace: a message for each sweep, in the order of their starts."""
-    _write(path, ".osi", cloud, sweeps)
+class OSI(CloudFormat):
+    """An .osi trace: a message for each sweep, in the order of their starts."""
+
+    title = "OSI"
+    by_sweep = True
+    frame = "sweep"
+    required = ("object", "channel", "intensity")
+    stored = (*required, "reflectance", "radial_velocity", "sensor")
+    actor_boxes = True
+    suffix: ClassVar[str] = ".osi"  # by which the library chooses the kind of the trace
+
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the trace."""
+        osi: Any = import_module("betterosi")  # an extra
+        messages = _OSIMessages(osi, self.sweeps)
+        options: dict[str, Any] = {}
+        if self.suffix == ".mcap":
+            stamp = datetime.fromtimestamp(messages.start_ns / 1e9, UTC)
+            options["metadata"] = {"creation_time": stamp.strftime("%Y-%m-%dT%H:%M:%SZ")}
+        suffixed = path.with_name(path.name + self.suffix)
+        writer = osi.Writer(str(suffixed), **options)
+        try:
+            with writer:
+                self._write_messages(writer, messages)
+        finally:
+            writer.file.close()  # the library leaves the file open if its end cannot be written
+        suffixed.replace(path)
+
+    def _write_messages(self, writer: Any, messages: _OSIMessages) -> None:
+        sweeps = self.sweeps
+        topics = [f"/{name}/sensor_data" if name else "/sensor_data" for name in _names(sweeps)]
+        for sweep in np.argsort(sweeps.begins_ns, kind="stable").tolist():
+            (points,) = sweeps.points(self.cloud, sweep, sweep + 1)
+            boxes = Boxes.from_points(sweeps, sweep, points)
+            truth = messages.ground_truth(sweep, boxes)
+            time_ns = messages.time_ns(sweep)
+            if writer.write_mcap:
+                writer.add(truth, topic=GROUND_TRUTH_TOPIC, log_time=time_ns)
+            data = messages.sensor_data(sweep, points, boxes, truth)
+            writer.add(data, topic=topics[sweeps.sensor[sweep]], log_time=time_ns)
 
 
-def write_osi_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write the messages of an .osi trace as MCAP.
+class OSIInMCAP(OSI):
+    """The messages of an .osi trace as MCAP.
 
     Each sensor has a topic; the ground truth is on `GROUND_TRUTH_TOPIC` as well.
     """
-    _write(path, ".mcap", cloud, sweeps)
 
-
-def _write(path: Path, suffix: str, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a trace of the kind that the library chooses by a suffix."""
-    osi: Any = import_module("betterosi")  # an extra
-    messages = _Messages(osi, sweeps)
-    options: dict[str, Any] = {}
-    if suffix == ".mcap":
-        stamp = datetime.fromtimestamp(messages.start_ns / 1e9, UTC)
-        options["metadata"] = {"creation_time": stamp.strftime("%Y-%m-%dT%H:%M:%SZ")}
-    suffixed = path.with_name(path.name + suffix)
-    writer = osi.Writer(str(suffixed), **options)
-    try:
-        with writer:
-            _write_messages(writer, messages, cloud, sweeps)
-    finally:
-        writer.file.close()  # the library leaves the file open if its end cannot be written
-    suffixed.replace(path)
-
-
-def _write_messages(writer: Any, messages: _Messages, cloud: CloudLike, sweeps: Sweeps) -> None:
-    topics = [f"/{name}/sensor_data" if name else "/sensor_data" for name in _names(sweeps)]
-    for sweep in np.argsort(sweeps.begins_ns, kind="stable").tolist():
-        (points,) = sweeps.points(cloud, sweep, sweep + 1)
-        boxes = Boxes.from_points(sweeps, sweep, points)
-        truth = messages.ground_truth(sweep, boxes)
-        time_ns = messages.time_ns(sweep)
-        if writer.write_mcap:
-            writer.add(truth, topic=GROUND_TRUTH_TOPIC, log_time=time_ns)
-        data = messages.sensor_data(sweep, points, boxes, truth)
-        writer.add(data, topic=topics[sweeps.sensor[sweep]], log_time=time_ns)
+    title = "OSI in MCAP"
+    suffix = ".mcap"
 
 
 def _names(sweeps: Sweeps) -> list[str]:
@@ -136,7 +146,7 @@ class _EncodedMessage:
         return data + self.encoded_fields
 
 
-class _Messages:
+class _OSIMessages:
     """Makes the messages of sweeps.
 
     Identifiers are the numbers of objects in the column `object`; the host vehicle, which is the

@@ -2,75 +2,88 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from contextlib import ExitStack
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidarsim.columns.cloud import CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.packets.encoders import WHITE, PacketSource, decoder_of, encoder_of
 from lidarsim.packets.pcap import PcapWriter
 from lidarsim.packets.shots import Shots, check_columns
 from lidarsim.survey.survey import Survey
-from lidarsim.sweeps.sweeps import Sweeps, plain_names
+from lidarsim.sweeps.sweeps import plain_names
 
+from .cloud_format import CloudFormat
 from .recording import Recording, RecordingSource, sweep_from_columns
-
-_FORMAT = "pcap"
-
-
-def with_packet_columns(survey: Survey, formats: Collection[str]) -> Survey:
-    """Return a survey with the columns of its sensors' packets, if its cloud is written as pcap.
-
-    LidarError if a sensor has no packets, or its packets cannot be made.
-    """
-    if _FORMAT not in formats:
-        return survey
-    names: dict[str, None] = {}
-    for carried, returns in zip(survey.carried, survey.returns_each, strict=True):
-        encoder = encoder_of(PacketSource(carried.sensor, returns.mode, carried.name))
-        names |= dict.fromkeys(encoder.columns)
-    return replace(survey, columns=(*survey.columns, *names))
+from .writing import ExportSpec
 
 
-def write_pcap(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write the packets of each sensor: `NAME.pcap`, NAME from the sensor, or `lidar`.
+class PacketCapture(CloudFormat):
+    """A folder with the packets of each sensor: `NAME.pcap`, NAME from the sensor, or `lidar`.
 
     Datagrams have the ports, order and times of the sensor; those that a fault of the survey drops
     are left out. The maker's metadata, where a reader needs them, are beside in `NAME.json`.
     """
-    sources = [PacketSource.of_sensor(sweeps, number) for number in range(len(sweeps.sensors))]
-    encoders = [encoder_of(source) for source in sources]
-    cloud_columns = {column.name for column in cloud.table}
-    for encoder in encoders:
-        check_columns(cloud_columns, encoder.columns)
-    path.mkdir()
-    names = plain_names(name or "lidar" for name in sweeps.sensors)
-    with ExitStack() as stack:
-        writers = [
-            PcapWriter(
-                stack.enter_context((path / f"{name}.pcap").open("wb")),
-                encoder.address,
-                encoder.destination,
-                encoder.source.start_ns,
-            )
-            for name, encoder in zip(names, encoders, strict=True)
+
+    title = "PCAP"
+    by_sweep = True
+    frame = "none"
+    required = ("ray", "range")
+    stored = ("scan", "sensor", "channel", "ray", "range", "time", "reflectivity", "signal")
+    file_pattern = r"[^/]+\.(pcap|json)"
+
+    @classmethod
+    def survey_columns(cls, survey: Survey) -> tuple[str, ...]:
+        """Return the columns of the sensors' packets.
+
+        LidarError if a sensor has no packets, or its packets cannot be made.
+        """
+        names: dict[str, None] = {}
+        for carried, returns in zip(survey.carried, survey.returns_each, strict=True):
+            encoder = encoder_of(PacketSource(carried.sensor, returns.mode, carried.name))
+            names |= dict.fromkeys(encoder.columns)
+        return (*names,)
+
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the folder."""
+        sources = [
+            PacketSource.of_sensor(self.sweeps, number)
+            for number in range(len(self.sweeps.sensors))
         ]
-        for sweep, points in enumerate(sweeps.points(cloud)):
-            encoder = encoders[sweeps.sensor[sweep]]
-            shots = Shots.from_points(sweeps, sweep, points, encoder.columns)
-            writers[sweeps.sensor[sweep]].write(encoder.encode(shots))
-        for writer, encoder in zip(writers, encoders, strict=True):
-            writer.write(encoder.finish())
-    for name, encoder in zip(names, encoders, strict=True):
-        for suffix, content in encoder.files().items():
-            (path / f"{name}{suffix}").write_bytes(content)
+        encoders = [encoder_of(source) for source in sources]
+        cloud_columns = {column.name for column in self.cloud.table}
+        for encoder in encoders:
+            check_columns(cloud_columns, encoder.columns)
+        path.mkdir()
+        names = plain_names(name or "lidar" for name in self.sweeps.sensors)
+        with ExitStack() as stack:
+            writers = [
+                PcapWriter(
+                    stack.enter_context((path / f"{name}.pcap").open("wb")),
+                    encoder.address,
+                    encoder.destination,
+                    encoder.source.start_ns,
+                )
+                for name, encoder in zip(names, encoders, strict=True)
+            ]
+            for sweep, points in enumerate(self.sweeps.points(self.cloud)):
+                encoder = encoders[self.sweeps.sensor[sweep]]
+                shots = Shots.from_points(self.sweeps, sweep, points, encoder.columns)
+                writers[self.sweeps.sensor[sweep]].write(encoder.encode(shots))
+            for writer, encoder in zip(writers, encoders, strict=True):
+                writer.write(encoder.finish())
+        for name, encoder in zip(names, encoders, strict=True):
+            for suffix, content in encoder.files().items():
+                (path / f"{name}{suffix}").write_bytes(content)
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open the packets of a sensor with the decoder of its manufacturer."""
+        return _open_capture(source)
 
 
-def open_file(source: RecordingSource) -> Recording:
+def _open_capture(source: RecordingSource) -> Recording:
     """Open the packets of a sensor by the decoder of its maker."""
     decoder = decoder_of(source.path, source.name)
     name = source.choose("sensors", decoder.sensors)

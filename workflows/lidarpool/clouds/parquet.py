@@ -3,43 +3,47 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Iterator, Sequence
 from itertools import islice
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.dataset
-import pyarrow.parquet as pq
 
 from lidarsim.base.allowance import Allowance
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import input_size
+from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import AXES, TABLE
 from lidarsim.sweeps.sweeps import Sweeps
 
-from . import pieces, sweep_reader
+from .cloud_format import Entry, PointColumns
+from .job_reader import JobReader
+from .multi_file_format import MultiFileFormat
 from .parquet_groups import check_groups, group_allowance, number_columns, read_group
-from .pieces import Entry
 from .recording import Recording, RecordingSource, sweep_from_columns
 
 _GROUP_ROWS = 65_536
 
 
-class Pieces(pieces.Pieces):
+class Parquet(MultiFileFormat):
     """A file for each million points, with units and meanings in the metadata of the fields.
 
     In a data set it is a partition, `points/job=7`, in groups of rows; readers of single sweeps
     read one or two groups.
     """
 
+    title = "Parquet"
+    file_pattern = r"part-\d+\.parquet"
+    job_path = "points/job={number}"
+    for_scenes = True
+
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
+        import pyarrow as pa
+
         super().__init__(cloud, sweeps, entry)
-        self.folders = [] if entry is None else [entry.path_of("parquet")]
+        self.folders = [] if entry is None else [self.path_of_job(entry)]
         fields = [
             pa.field(
                 c.in_files, pa.from_numpy_dtype(kind), True, {"unit": c.unit, "meaning": c.meaning}
@@ -66,6 +70,8 @@ class Pieces(pieces.Pieces):
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
         """Return the file of a piece."""
+        import pyarrow as pa
+
         table = self.cloud.table
         arrays = [*points.positions.T.astype(np.float64), *(points[c.name] for c in table)]
         filled = [pa.array(np.ascontiguousarray(array)) for array in arrays]
@@ -75,75 +81,74 @@ class Pieces(pieces.Pieces):
         """Return a file without rows for a data set without pieces."""
         return {} if pieces else self._file(0, self.schema.empty_table())
 
-    def _file(self, number: int, table: pa.Table) -> dict[str, bytes]:
+    def _file(self, number: int, table: Any) -> dict[str, bytes]:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
         memory = pa.BufferOutputStream()
         pq.write_table(table, memory, row_group_size=_GROUP_ROWS if self.entry else None)
         name = f"part-{number:05}.parquet"
         return {"/".join([*self.folders, name]): memory.getvalue()}
 
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return the points of a sweep in a data set, with all columns.
 
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: all columns of each point, by their names in clouds."""
+        They are read from the groups of rows with its scans.
+        """
+        import pyarrow as pa
+        import pyarrow.dataset
 
-    _held: Mapping[tuple[str, int], Any] = MappingProxyType({})  # {(file, group): rows}
-
-    def files(self, sweep: int) -> list[str]:
-        """Return the name of the job's partition."""
-        return [self.entry.path_of("parquet")]
-
-    @cached_property
-    def _table(self) -> Any:
-        if self.storage.is_local:
-            return pyarrow.dataset.dataset(self.storage.path(self.files(0)[0]), format="parquet")
-        system, folder = self.storage.file_system()
-        return pyarrow.dataset.dataset(
-            f"{folder}/{self.files(0)[0]}", format="parquet", filesystem=system
-        )
-
-    @cached_property
-    def _size(self) -> int:
-        """Size of the files of the partition, bytes."""
-        table = self._table
-        return sum(info.size for info in table.filesystem.get_file_info(table.files))
-
-    def _group(self, fragment: Any, allowance: Allowance) -> pa.Table:
-        """Read a group of rows, cached because neighboring sweeps share groups."""
-        key = fragment.path, fragment.row_groups[0].id
-        if key not in self._held:
-            rows = read_group(fragment, number_columns(fragment.physical_schema), allowance)
-            self._held = dict([*self._held.items()][-1:]) | {key: rows}
-        return self._held[key]
-
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep, read from the groups of rows with its scans."""
-        first, stop = self.sweeps.scans[sweep : sweep + 2].tolist()
+        table = job.cached("table", lambda: _dataset(job.storage, cls.path_of_job(job.entry)))
+        first, stop = job.sweeps.scans[sweep : sweep + 2].tolist()
         scan = pyarrow.dataset.field("scan")
         in_range = (scan >= first) & (scan < stop)
-        files = self._table.get_fragments(in_range)
-        allowance = group_allowance(self._size)
+        allowance = group_allowance(job.cached("size", lambda: _size_of(table)))
+        cache = job.cached("groups", dict[tuple[str, int], Any])
         groups = [
-            self._group(group, allowance)
-            for file in files
+            _group(group, allowance, cache)
+            for file in table.get_fragments(in_range)
             for group in file.split_by_row_group(in_range)
         ]
-        rows = pa.concat_tables(groups or [self._table.schema.empty_table()])
+        rows = pa.concat_tables(groups or [table.schema.empty_table()])
         begin, end = np.searchsorted(rows["scan"].to_numpy(), (first, stop))
         rows = rows.slice(begin, end - begin)
         names = {column.in_files: column.name for column in TABLE.values()}
         columns = {names.get(name, name): rows[name].to_numpy() for name in rows.column_names}
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
-        return self.inside(sweep, Cloud(positions, columns))
+        return job.in_sensor(sweep, Cloud(positions, columns))
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a .parquet file or a folder of such files in their row groups."""
+        with reading(source.name):
+            return _parts(source)
 
 
-def open_file(source: RecordingSource) -> Recording:
-    """Open a .parquet file in its groups of rows."""
-    with reading(source.name):
-        return _parts(source)
+def _dataset(storage: Storage, folder: str) -> Any:
+    """Open the partition of a job."""
+    import pyarrow.dataset
+
+    if storage.is_local:
+        return pyarrow.dataset.dataset(storage.path(folder), format="parquet")
+    system, root = storage.file_system()
+    return pyarrow.dataset.dataset(f"{root}/{folder}", format="parquet", filesystem=system)
 
 
-def open_folder(source: RecordingSource) -> Recording:
-    """Open a folder of .parquet files in their groups of rows."""
-    return open_file(source)
+def _size_of(table: Any) -> int:
+    """Return the size of the files of a partition, bytes."""
+    return sum(info.size for info in table.filesystem.get_file_info(table.files))
+
+
+def _group(fragment: Any, allowance: Allowance, cache: dict[tuple[str, int], Any]) -> Any:
+    """Read a group of rows; two are cached, because neighboring sweeps share groups."""
+    key = fragment.path, fragment.row_groups[0].id
+    if key not in cache:
+        rows = read_group(fragment, number_columns(fragment.physical_schema), allowance)
+        for oldest in [*cache][:-1]:
+            del cache[oldest]
+        cache[key] = rows
+    return cache[key]
 
 
 def _parts(source: RecordingSource) -> Recording:
@@ -151,10 +156,12 @@ def _parts(source: RecordingSource) -> Recording:
 
     Only columns of numbers are read: the memory of others is not known before.
     """
+    import pyarrow.dataset
+
     path = source.path
     if path.is_file():
         input_size(path)
-    dataset = pa.dataset.dataset(str(path), format="parquet")
+    dataset = pyarrow.dataset.dataset(str(path), format="parquet")
     groups = []
     files = []  # names of columns of numbers, and size in bytes, for each group
     unread = set[str]()  # names of columns

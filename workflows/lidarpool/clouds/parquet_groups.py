@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-import pyarrow as pa
-
 from lidarsim.base.allowance import Allowance
 
 _ADVICE = "write fewer points, or smaller row groups"
 
 
-def number_columns(schema: pa.Schema) -> list[str]:
+def number_columns(schema: Any) -> list[str]:
     """Return the names of the columns of numbers and times, whose values have a fixed size."""
+    import pyarrow as pa
+
     return [field.name for field in schema if pa.types.is_primitive(field.type)]
 
 
@@ -49,7 +49,7 @@ def group_allowance(size: int) -> Allowance:
     return Allowance(size, _ADVICE)
 
 
-def read_group(group: Any, columns: Sequence[str], allowance: Allowance) -> pa.Table:
+def read_group(group: Any, columns: Sequence[str], allowance: Allowance) -> Any:
     """Read columns of a group of rows.
 
     Raises LidarError above the allowance.

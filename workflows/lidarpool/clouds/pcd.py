@@ -18,13 +18,13 @@ from lidarsim.scene.colors import as_float
 from lidarsim.scene.files.pcd import pcd_bytes, read_pcd
 from lidarsim.sweeps.sweeps import states_compensation
 
-from . import pieces
+from .multi_file_format import MultiFileFormat
 from .recording import Recording, RecordingSource
 
 _COMMENT_BYTES = 1000  # of the first line that is searched
 
 
-class Pieces(pieces.Pieces):
+class PCD(MultiFileFormat):
     """A file for each sweep, with all columns.
 
     Red, green and blue are a single field `rgb`.
@@ -35,6 +35,13 @@ class Pieces(pieces.Pieces):
     is the pose of the sensor in the world at the start of the sweep. Normals and origins of rays
     are in the frame of the points; normals have PCL's names.
     """
+
+    title = "PCD"
+    by_sweep = True
+    frame = "firing"
+    options = ("compensated",)
+    file_pattern = r"\d+\.pcd"
+    for_scenes = True
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
         """Return the file of a sweep."""
@@ -68,16 +75,14 @@ class Pieces(pieces.Pieces):
             fields.append((name, values))
         return fields
 
-
-def open_file(source: RecordingSource) -> Recording:
-    """Open a file as a sweep, with the pose of the sensor from VIEWPOINT."""
-    return _open_files(source, [source.path])
-
-
-def open_folder(source: RecordingSource) -> Recording:
-    """Open the .pcd files of a folder, a sweep each."""
-    files = [file for file in source.path.iterdir() if file.suffix.lower() == ".pcd"]
-    return _open_files(source, sort_by_number(files))
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a file, or the files of a folder, as sweeps with their VIEWPOINT as pose."""
+        files = [source.path]
+        if source.path.is_dir():
+            inside = source.path.iterdir()
+            files = sort_by_number(file for file in inside if file.suffix.lower() == ".pcd")
+        return _open_files(source, files)
 
 
 def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
@@ -96,11 +101,10 @@ def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
 
 
 def _stated_compensation(path: Path) -> bool | None:
-    """Return what the comment of a file of `Pieces` states, or None for other files."""
+    """Return what the comment of a file of `PCD` states, or None for other files."""
     try:
         with open_input(path) as file:
             comment = file.readline(_COMMENT_BYTES).decode(errors="replace")
     except OSError:  # which is raised again, with the name of the file, when points are read
         return None
     return states_compensation(comment)
-

@@ -7,7 +7,7 @@ import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input
 from lidarsim.base.validation import checked
 from lidarsim.base.words import printable
-from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.cloud_file import CloudFile
 from lidarsim.columns.ply_format import AXES, as_file_type, header, layout, mapped_rows, row_type
 from lidarsim.columns.sweep import Sweep
@@ -29,8 +29,10 @@ from lidarsim.scene.files.stated_system import StatedSystem
 from lidarsim.sweeps.sweeps import AS_FIRED, SWEEPS_FILE, Sweeps
 
 from ..base.open3d_module import load_open3d
-from . import sweep_reader
+from .cloud_format import CloudFormat, PointColumns
+from .job_reader import JobReader
 from .recording import Recording, RecordingSource, open_cloud, sweep_from_columns
+from .writing import ExportSpec
 
 # Positions are stored in single precision if the error is below this part of the precision.
 _ROUNDING_SHARE = 0.05
@@ -39,20 +41,47 @@ FIRST_POINTS = 65_536  # points that Open3D writes; it takes five times as long 
 _BLOCK_BYTES = 1 << 23  # moved at a time
 
 
-def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
+class PLY(CloudFormat):
+    """A binary PLY file, which Open3D writes.
 
     About a million points are in memory at a time. float64 positions are stored in single precision
     if the error is below a twentieth of the precision of the sweeps, else in double. Names of
     classes and materials are comments: `class 40 road`, `material 0 Brick`. A comment says if
     points are not in the world frame, and which coordinate system the world has: `crs: EPSG:25832`.
     """
-    position_type = real_type(cloud.bounds, sweeps.precision_m)
-    with GrowingPly(path, cloud.table, position_type, sweeps, len(cloud)) as file:
-        file.check_room(len(cloud))
-        for chunk in cloud.chunks():
-            file.append(len(chunk), chunk.by_name.items())
-        file.finish()
+
+    title = "PLY"
+    job_path = "jobs/{name}/cloud.ply"
+    for_scenes = True
+
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the file."""
+        cloud = self.cloud
+        position_type = real_type(cloud.bounds, self.sweeps.precision_m)
+        with GrowingPly(path, cloud.table, position_type, self.sweeps, len(cloud)) as file:
+            file.check_room(len(cloud))
+            for chunk in cloud.chunks():
+                file.append(len(chunk), chunk.by_name.items())
+            file.finish()
+
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return the points of a sweep in a data set, with all columns."""
+        name = cls.path_of_job(job.entry)
+        file = job.cached("cloud", lambda: CloudFile(job.local(name)))
+        first, stop = (file.row_of(scan) for scan in job.sweeps.scans[sweep : sweep + 2])
+        cloud = next(file.chunks(max(1, stop - first), first), None)
+        if cloud is None or first == stop:
+            kinds = {column.name: np.empty(0, column.dtype) for column in file.table}
+            cloud = Cloud(np.empty((0, 3)), kinds)
+        return job.in_sensor(sweep, cloud)
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a .ply, or the cloud of a result with its sweeps."""
+        if source.path.is_dir():
+            source = replace(source, path=source.path / FILE)
+        return _open_file(source)
 
 
 class GrowingPly:
@@ -293,27 +322,6 @@ def _comment(name: str) -> str:
     return printable(name).encode("ascii", "backslashreplace").decode()
 
 
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: all columns of each point."""
-
-    def files(self, sweep: int) -> list[str]:
-        """Return the name of the job's cloud."""
-        return [self.entry.path_of("ply")]
-
-    @cached_property
-    def _cloud(self) -> CloudFile:
-        return CloudFile(self.local(self.files(0)[0]))
-
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep."""
-        first, stop = (self._cloud.row_of(scan) for scan in self.sweeps.scans[sweep : sweep + 2])
-        cloud = next(self._cloud.chunks(max(1, stop - first), first), None)
-        if cloud is None or first == stop:
-            kinds = {column.name: np.empty(0, column.dtype) for column in self._cloud.table}
-            cloud = Cloud(np.empty((0, 3)), kinds)
-        return self.inside(sweep, cloud)
-
-
 def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
     """Return the smallest type that is precise enough for positions between these bounds."""
     if bounds.dtype == np.float32:
@@ -374,7 +382,7 @@ def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]
 # -- reading ---------------------------------------------------------------------------------
 
 
-def open_file(source: RecordingSource) -> Recording:
+def _open_file(source: RecordingSource) -> Recording:
     """Open a .ply, with the file of sweeps beside the .ply of a result."""
     if source.as_stored:
         return _open_foreign(source)
@@ -383,12 +391,6 @@ def open_file(source: RecordingSource) -> Recording:
     except LidarError:  # text, or of another program
         return _open_foreign(source)
     return replace(_open_own(source, cloud), meters=source.chosen_meters())
-
-
-def open_folder(source: RecordingSource) -> Recording:
-    """Open the cloud of a result."""
-    path = source.path / FILE
-    return open_file(replace(source, path=path))
 
 
 def _open_foreign(source: RecordingSource) -> Recording:
@@ -429,4 +431,3 @@ def _open_own(source: RecordingSource, cloud: CloudFile) -> Recording:
     fields = {"notes": (note,), "thinned": True} if keep_every > 1 else {}
     load = partial(Sweeps.load, sweeps_path)
     return open_cloud(source.name, cloud, load, source.sensor, source.intensity, **fields)
-

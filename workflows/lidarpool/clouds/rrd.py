@@ -6,23 +6,22 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
-import rerun as rr
 
 from lidarsim.base.arrays import AnyArray, Bytes, Floats, Floats32
-from lidarsim.columns.cloud import CloudLike
 from lidarsim.columns.table import COLORS
 from lidarsim.packets.encoders import START_NS
-from lidarsim.sweeps.sweeps import Sweeps
-from lidarview.picture_file import PictureContent
 from lidarview.render.coloring import TURBO
 
+from .cloud_format import CloudFormat
 from .frame_names import CARRIER, WORLD
 from .shown_sweeps import ActorBoxes, ShownSweep, Surroundings, SweepSequence
+from .writing import ExportSpec
 
 APPLICATION = "lidarpool"
 SURVEY_TIME = "survey"  # timeline: since the survey's start
@@ -41,10 +40,8 @@ _INTENSITY_LIMITS = (-3.0, 0.0)
 _HEIGHT_LIMITS_M = (-3.0, 7.0)
 
 
-def write_rrd(
-    path: Path, cloud: CloudLike, sweeps: Sweeps, content: PictureContent | None = None
-) -> None:
-    """Write a recording of Rerun, with scene and planned path of the pictures' content.
+class Rerun(CloudFormat):
+    """A recording of Rerun, with scene and planned path of the pictures' content.
 
     Points are at `map/base_link/NAME/points`, in the sensor frame at the start of their sweep, with
     all columns; `map/base_link` and its sensors have their poses over time. The boxes of actors are
@@ -52,16 +49,26 @@ def write_rrd(
     float32 in Rerun, so those in the world are relative to the scene's local origin, which the
     recording's property `origin` holds. Rerun's own identifiers make the bytes of each file unique.
     """
-    with _recording_to(path) as recording:
-        log = RerunLog(recording)
-        log.show_surroundings(Surroundings.from_sweeps(sweeps, content))
-        sequence = SweepSequence(sweeps)
-        for sweep, points in enumerate(sweeps.points(cloud)):
-            log.show_sweep(sequence.show(sweep, points))
+
+    title = "RRD"
+    by_sweep = True
+    frame = "sweep"
+    required = ("object",)
+    actor_boxes = True
+
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the recording."""
+        surroundings = Surroundings.from_sweeps(self.sweeps, self.content())
+        with _recording_to(path) as recording:
+            log = RerunLog(recording)
+            log.show_surroundings(surroundings)
+            sequence = SweepSequence(self.sweeps)
+            for sweep, points in enumerate(self.sweeps.points(self.cloud)):
+                log.show_sweep(sequence.show(sweep, points))
 
 
 @contextmanager
-def _recording_to(path: Path) -> Iterator[rr.RecordingStream]:
+def _recording_to(path: Path) -> Iterator[Any]:
     """Yield a recording that is written to a file.
 
     Raises OSError if the file cannot be written.
@@ -69,7 +76,7 @@ def _recording_to(path: Path) -> Iterator[rr.RecordingStream]:
     Rerun's own writer logs the error of a full disk, and waits for ever. So it writes to a pipe,
     and a thread copies the pipe to the file.
     """
-    recording = rr.RecordingStream(APPLICATION)
+    recording = import_module("rerun").RecordingStream(APPLICATION)  # an extra
     if not hasattr(os, "mkfifo"):  # Windows
         recording.save(path)
         yield recording
@@ -114,29 +121,30 @@ def _copy(source: int, file: BinaryIO) -> None:
 class RerunLog:
     """Logs surroundings and sweeps to a recording of Rerun."""
 
-    def __init__(self, recording: rr.RecordingStream) -> None:
+    def __init__(self, recording: Any) -> None:
+        self._rr: Any = import_module("rerun")
         self._recording = recording
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
         self._origin = np.zeros(3)
         self._start_ns = START_NS  # start of the survey
         self._has_classes = False
-        self._log_static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._log_static(WORLD, self._rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
     def show_surroundings(self, surroundings: Surroundings) -> None:
         """Log scene, trajectories and path, and take the origin and the start of the survey."""
         self._origin = surroundings.origin
         self._start_ns = surroundings.start_ns
         x, y, z = self._origin.tolist()
-        self._recording.send_property("origin", rr.AnyValues(x=x, y=y, z=z))
+        self._recording.send_property("origin", self._rr.AnyValues(x=x, y=y, z=z))
         if surroundings.classes:
             self._has_classes = True
-            names = [rr.AnnotationInfo(*item) for item in surroundings.classes.items()]
-            self._log_static(WORLD, rr.AnnotationContext(names))
+            names = [self._rr.AnnotationInfo(*item) for item in surroundings.classes.items()]
+            self._log_static(WORLD, self._rr.AnnotationContext(names))
         if (surface := surroundings.surface) is not None:
             corners = surface.vertices[surface.faces]  # Rerun shades by the normals of vertices
             colors = surface.colors
-            mesh = rr.Mesh3D(
+            mesh = self._rr.Mesh3D(
                 vertex_positions=corners.reshape(-1, 3),
                 vertex_normals=_normals(corners).repeat(3, axis=0),
                 vertex_colors=None if colors is None else colors.repeat(3, axis=0),
@@ -165,33 +173,33 @@ class RerunLog:
             path = paths[transform.name] = f"{paths[transform.parent]}/{transform.name}"
             in_world = transform.parent == WORLD
             position = transform.position - self._origin if in_world else transform.position
-            pose = rr.Transform3D(
-                translation=position, quaternion=rr.Quaternion(xyzw=transform.quaternion)
+            pose = self._rr.Transform3D(
+                translation=position, quaternion=self._rr.Quaternion(xyzw=transform.quaternion)
             )
             self._recording.log(path, pose)
         columns = dict(shown.columns)
         has_labels = self._has_classes and "class" in columns
-        cloud = rr.Points3D(
+        cloud = self._rr.Points3D(
             shown.positions,
             colors=_colors(shown.positions, columns),
-            radii=rr.Radius.ui_points(_POINT_PIXELS),
+            radii=self._rr.Radius.ui_points(_POINT_PIXELS),
             class_ids=columns["class"] if has_labels else None,  # names, since there are colors
         )
-        self._recording.log(f"{paths[shown.frame]}/points", cloud, rr.AnyValues(**columns))
+        self._recording.log(f"{paths[shown.frame]}/points", cloud, self._rr.AnyValues(**columns))
         if shown.boxes is not None:
             self._recording.log(f"{WORLD}/actors", self._boxes(shown.boxes))
 
-    def _log_static(self, path: str, archetype: rr.AsComponents) -> None:
+    def _log_static(self, path: str, archetype: Any) -> None:
         self._recording.log(path, archetype, static=True)
 
-    def _line(self, positions: Floats, color: tuple[int, int, int]) -> rr.LineStrips3D:
-        width = rr.Radius.ui_points(_LINE_PIXELS)
-        return rr.LineStrips3D([positions - self._origin], colors=color, radii=width)
+    def _line(self, positions: Floats, color: tuple[int, int, int]) -> Any:
+        width = self._rr.Radius.ui_points(_LINE_PIXELS)
+        return self._rr.LineStrips3D([positions - self._origin], colors=color, radii=width)
 
-    def _boxes(self, boxes: ActorBoxes) -> rr.Boxes3D:
+    def _boxes(self, boxes: ActorBoxes) -> Any:
         """Return the boxes of the actors that are present."""
         rows = np.flatnonzero(boxes.present)
-        return rr.Boxes3D(
+        return self._rr.Boxes3D(
             centers=boxes.centers[rows] - self._origin,
             half_sizes=boxes.sizes[rows] / 2,
             quaternions=boxes.quaternions[rows],

@@ -7,7 +7,7 @@ import json
 import tarfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +23,17 @@ from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps, plain_names
 
-from . import pieces, sweep_reader
 from .boxes import Boxes, SweepBoxes
-from .pieces import Entry, PieceRange, WrittenRange
+from .cloud_format import Entry, PointColumns
+from .job_reader import JobReader
+from .multi_file_format import MultiFileFormat, PieceRange, WrittenRange
 from .recording import Recording, RecordingSource
 
 MAX_SHARD_BYTES = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
 _RESERVED = ("points", "pose", "boxes")  # arrays that are not columns
 
 
-class Pieces(pieces.Pieces):
+class WebDataset(MultiFileFormat):
     """A tar file for a hundred sweeps or a million points each, such as `shards/000000.tar`.
 
     A sweep is a sample SENSOR-000000: `points.npy` (float32 n x 3, meters in the sensor frame at
@@ -44,6 +45,13 @@ class Pieces(pieces.Pieces):
 
     Aizman et al., High performance I/O for large scale deep learning, 2019.
     """
+
+    title = "WebDataset"
+    by_sweep = True
+    required = ("object", "intensity", "class")
+    actor_boxes = True
+    file_pattern = r"shards/([^/]+/)?[^/]+\.tar|offsets/[^/]+\.npz"
+    separate_sweeps = True
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
@@ -59,7 +67,7 @@ class Pieces(pieces.Pieces):
         """Divide all sweeps into ranges with separate tar files, wherever they are written."""
         return super().spans()
 
-    def write(self, storage: Storage, first: int, stop: int) -> WrittenRange:
+    def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
         """Write the tar files of ranges, a single file in memory at a time.
 
         Raises OSError on failure.
@@ -134,24 +142,16 @@ class Pieces(pieces.Pieces):
             head.size = len(data)
             yield head.tobuf() + data + bytes(-len(data) % tarfile.BLOCKSIZE)
 
-
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: all columns of each point."""
-
-    @cached_property
-    def _offsets(self) -> Ints:
-        name = f"offsets/{self.entry.name}.npz"
-        with open_archive(self.storage.path(name), partial(self.storage.read, name)) as arrays:
-            return arrays["at"]
-
-    def files(self, sweep: int) -> list[str]:
+    @classmethod
+    def sweep_files(cls, job: JobReader, sweep: int) -> list[str]:
         """Return the name of the tar file."""
-        return [_shard(self.entry, int(self._offsets[sweep, 0]))]
+        return [_shard(job.entry, int(_offsets(job)[sweep, 0]))]
 
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep, and read only the bytes of the sweep."""
-        _, first, stop = self._offsets[sweep].tolist()
-        sample = self.storage.read(self.files(sweep)[0], first, stop)
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return points with all columns, and read only the bytes of the sweep."""
+        _, first, stop = _offsets(job)[sweep].tolist()
+        sample = job.storage.read(cls.sweep_files(job, sweep)[0], first, stop)
         if len(sample) < stop - first:
             raise ValueError(
                 f"it ends {stop - first - len(sample)} bytes before the end of the sweep"
@@ -165,6 +165,26 @@ class Reader(sweep_reader.Reader):
                     data.seek(member.offset_data)
                     arrays[name] = read_npy(data.read(member.size), name)
         return arrays.pop("points"), arrays
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open the samples of a tar file, or of the tar files in a folder."""
+        path = source.path
+        files = sort_by_number(path.rglob("*.tar")) if path.is_dir() else [path]
+        with reading(source.name):
+            sensors = _sensors(source, files)
+        return source.of_sensors(sensors)
+
+
+def _offsets(job: JobReader) -> Ints:
+    """Return the offsets of the sweeps of a job (`WebDataset`)."""
+
+    def read() -> Ints:
+        name = f"offsets/{job.entry.name}.npz"
+        with open_archive(job.storage.path(name), partial(job.storage.read, name)) as arrays:
+            return arrays["at"]
+
+    return job.cached("offsets", read)
 
 
 def _npy(array: AnyArray) -> bytes:
@@ -181,23 +201,6 @@ def _shard(entry: Entry | None, start: int) -> str:
 
 
 # -- reading ---------------------------------------------------------------------------------
-
-
-def open_file(source: RecordingSource) -> Recording:
-    """Open the samples of a tar file."""
-    return _open_files(source, [source.path])
-
-
-def open_folder(source: RecordingSource) -> Recording:
-    """Open the samples of the tar files in a folder."""
-    files = sort_by_number(source.path.rglob("*.tar"))
-    return _open_files(source, files)
-
-
-def _open_files(source: RecordingSource, files: list[Path]) -> Recording:
-    with reading(source.name):
-        sensors = _sensors(source, files)
-    return source.of_sensors(sensors)
 
 
 def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]:

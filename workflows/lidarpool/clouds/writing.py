@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,29 +18,32 @@ from lidarsim.base.storage import Storage, flush
 from lidarsim.base.validation import checked, checked_fields
 from lidarsim.base.words import alternatives, joined
 from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
 from ..columns.parts import StoredCloud
+from .cloud_format import CloudFormat
 from .folder import staging
-from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow, row_of
-from .intensity_full_scale import full_scale_of
-from .laser_scan import COLUMNS as LASER_SCAN_COLUMNS
-from .laser_scan import has_laser_scans
-from .pieces import RangeWorkers, RangeWriter
+from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow, format_named, row_of
+from .multi_file_format import MultiFileFormat, RangeWorkers
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = ", ".join(f"{name} ({FORMATS[name].file})" for name in EXPORTS)
 # Columns of every cloud that users miss, and columns that store the strength of a return.
 _ALWAYS = ("channel", "object")
 _STRENGTHS = {"intensity", "reflectivity", "signal"}
+# Options that only some formats support.
+_OPTIONS = (
+    "compensated", "compensated_actors", "pose_rate_hz", "intensity_full_scale", "organized",
+)  # fmt: skip
 _NAMES: dict[str, Any] = {"anyOf": [{"enum": [*FORMATS]}, {"type": "string"}]}  # schema for editors
 
 
 @dataclass(frozen=True)
 @checked_fields
-class Format:
-    """A format to which a cloud is exported.
+class ExportSpec:
+    """A format to which a cloud is exported, with its options.
 
     In YAML, the format alone is sufficient.
     """
@@ -101,51 +104,19 @@ class Format:
     ] = None
 
     def __post_init__(self) -> None:
-        row = self.row  # LidarError for an unknown format
-        if self.compensated and not row.raw_or_compensated:
-            choices = [name for name, row in FORMATS.items() if row.raw_or_compensated]
-            raise LidarError(
-                f"The format {self.format} does not support `compensated`. It can only be set "
-                f"for {joined(choices)}."
-            )
-        if self.compensated_actors and not row.positions_of_sweeps:
-            choices = [name for name, row in FORMATS.items() if row.positions_of_sweeps]
-            raise LidarError(
-                f"The format {self.format} does not support `compensated_actors`. It can only be "
-                f"set for formats that store single sweeps: {joined(choices)}."
-            )
-        if self.pose_rate_hz is not None and not row.layouts:
-            choices = [name for name, row in FORMATS.items() if row.layouts]
-            raise LidarError(
-                f"The format {self.format} does not support `pose_rate_hz`. It can only be set "
-                f"for {joined(choices)}."
-            )
-        if self.intensity_full_scale is not None and not row.integer_intensities:
-            choices = [name for name, row in FORMATS.items() if row.integer_intensities]
-            raise LidarError(
-                f"The format {self.format} does not support `intensity_full_scale`. It can only "
-                f"be set for {joined(choices)}."
-            )
-        if self.organized and self.layout not in row.organized_layouts:
-            self._refuse_organized(row)
-
-    def _refuse_organized(self, row: FormatRow) -> None:
-        """Raise LidarError: the format or layout has no organized clouds."""
-        layouts = row.organized_layouts
-        if not layouts:
-            choices = [name for name, row in FORMATS.items() if row.organized_layouts]
-            raise LidarError(
-                f"The format {self.format} does not support `organized`. It can only be set for "
-                f"{joined(choices)}."
-            )
-        raise LidarError(
-            f"The layout {self.layout} does not support `organized`, because its driver does not "
-            "publish organized clouds. Remove `organized`, or use one of the layouts "
-            f"{joined(layouts)}."
-        )
+        for option in _OPTIONS:  # LidarError for an unknown format
+            is_set = getattr(self, option) not in (False, None)
+            if is_set and not self.cloud_format.supports(option):
+                choices = [name for name in FORMATS if format_named(name).supports(option)]
+                such = " formats that store single sweeps:" * (option == "compensated_actors")
+                raise LidarError(
+                    f"The format {self.format} does not support `{option}`. It can only be set "
+                    f"for{such} {joined(choices)}."
+                )
+        self.cloud_format.check_options(self)
 
     @classmethod
-    def from_entry(cls, entry: str | Mapping[str, Any]) -> Format:
+    def from_entry(cls, entry: str | Mapping[str, Any]) -> ExportSpec:
         """Return the format of an entry of a scenario's `output.write`."""
         try:
             return cls(entry) if isinstance(entry, str) else cls(**entry)
@@ -161,22 +132,24 @@ class Format:
         return row_of(self.format)
 
     @property
-    def title(self) -> str:
-        """Proper name of the format in sentences."""
-        return self.row.title or self.format
+    def cloud_format(self) -> type[CloudFormat]:
+        """The class of the format."""
+        return format_named(self.format)
 
     @property
-    def _laid_out(self) -> tuple[str, ...]:
-        columns = self.row.layouts.get(self.layout, ())
-        if self.organized and "ray" not in columns:
-            columns = (*columns, "ray")
-        return tuple(name for name in columns if name != "time" or not self.compensated)
+    def has_many_files(self) -> bool:
+        """True if the format has many files, which workers can write."""
+        return issubclass(self.cloud_format, MultiFileFormat)
+
+    @property
+    def title(self) -> str:
+        """Proper name of the format in sentences."""
+        return self.cloud_format.title or self.format
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that a cloud must have."""
-        needs = self.row.needs + self._laid_out
-        return (*needs, "time") if self.compensated_actors and "time" not in needs else needs
+        return self.cloud_format.required_columns(self)
 
     def prepared(self, sweeps: Sweeps) -> Sweeps:
         """Return sweeps that yield points as the options of the format state."""
@@ -184,14 +157,12 @@ class Format:
 
     def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return the names of the cloud's columns that the format cannot hold."""
-        held_columns = self.row.holds
+        stored = self.cloud_format.stored
         names = (column.name for column in cloud.table)
-        optional_columns = self._laid_out + (self.row.named if sweeps.classes else ())
-        if self.row.laser_scans and has_laser_scans(sweeps):
-            optional_columns += LASER_SCAN_COLUMNS
-        if held_columns is None:
+        if stored is None:
             return [name for name in names if name == "time" and self.compensated]
-        return [name for name in names if name not in held_columns + optional_columns]
+        stored += self.cloud_format.optional_columns(self, sweeps)
+        return [name for name in names if name not in stored]
 
     def notes(
         self, cloud: CloudLike, sweeps: Sweeps, requested: Collection[str] | None = None
@@ -204,7 +175,7 @@ class Format:
         left_out = [
             name for name in self.left_out(cloud, sweeps) if self._is_missed(name, requested)
         ]
-        unnamed = [name for name in left_out if name in self.row.named]
+        unnamed = [name for name in left_out if name in self.cloud_format.named]
         strengths = [name for name in self.needs if name in _STRENGTHS]
         replaced = [name for name in left_out if strengths and name in _STRENGTHS]
         never_held = ", ".join(name for name in left_out if name not in unnamed + replaced)
@@ -218,7 +189,8 @@ class Format:
             )
             for name in unnamed
         ]
-        return [*notes, *self.contradictions(sweeps.coordinates), *self.renamed(sweeps.sensors)]
+        notes += self.contradictions(sweeps.coordinates)
+        return notes + self.cloud_format.renamed(sweeps.sensors)
 
     def _is_missed(self, name: str, requested: Collection[str] | None) -> bool:
         """Return whether a user misses a column that the format cannot hold."""
@@ -228,24 +200,12 @@ class Format:
             return name in (*_ALWAYS, "class") or name in requested
         return name != "ray" and name not in _STRENGTHS
 
-    def renamed(self, sensors: Sequence[str]) -> list[str]:
-        """Return a note if sensors of these names, "" without one, have others in the format."""
-        expected = self.row.first_sensor
-        if not expected or not sensors or sensors[0] in ("", expected):
-            return []
-        note = (
-            f"{self.title} expects the first sensor to be named {expected!r}, so {sensors[0]!r} "
-            f"is renamed to {expected!r}"
-        )
-        if expected in sensors[1:]:
-            note += f" and {expected!r} to '{expected}_2'"
-        return [note]
-
     def contradictions(self, coordinates: str) -> list[str]:
         """Return a note if readers of the format expect different coordinates than the cloud's."""
         if coordinates != "sensor":
             return []
-        if self.row.one_system:
+        frame = self.cloud_format.frame
+        if frame == "world":
             return [
                 (
                     f"readers of {self.format} expect all points in a single coordinate system, "
@@ -253,7 +213,7 @@ class Format:
                     "firing. Set `cloud.coordinates: world`"
                 )
             ]
-        if self.compensated or self.row.compensates:
+        if self.compensated or frame == "sweep":
             return [
                 (
                     f"{self.title} stores motion-compensated points, so all points are "
@@ -274,8 +234,6 @@ class Format:
             needs = [f"lidarpool[{self.row.extra}]"] if self.row.extra else missing
             command = install_command(*needs)
             raise LidarError(f"The format {self.format} requires {joined(missing)}. Run {command}.")
-        if self.row.plugin is not None:
-            self.row.provides(self.row.write)
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
         """Raise LidarError unless all requirements of `write` are met, before a file is written."""
@@ -285,14 +243,15 @@ class Format:
         if path.exists() and not overwrite:
             raise LidarError(f"{path} already exists. Use another path, or pass `--overwrite`.")
         if path.name == self.row.file:
-            refuse_strangers(Storage.at(path.parent), [self.row])
+            refuse_strangers(Storage.at(path.parent), [self.format])
         self.check_columns(cloud)
 
     def check_columns(self, cloud: CloudLike) -> None:
         """Raise LidarError if a cloud lacks columns that the format needs."""
         cloud_columns = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in cloud_columns]:
-            laid_out = f" with the layout {self.layout}" if self.row.layouts else ""
+            has_layouts = self.cloud_format.supports("layout")
+            laid_out = f" with the layout {self.layout}" if has_layouts else ""
             entry = f"`output: {{write: [{self._entry}]}}`"
             lacks = joined(missing)
             columns = "column" if len(missing) == 1 else "columns"
@@ -305,8 +264,9 @@ class Format:
     @property
     def _entry(self) -> str:
         """The entry of `output.write` with the columns of the format, as YAML."""
+        has_layouts = self.cloud_format.supports("layout")
         options = {
-            "layout": self.layout if self.row.layouts and self.layout != "velodyne" else "",
+            "layout": self.layout if has_layouts and self.layout != "velodyne" else "",
             "organized": self.organized,
             "compensated": self.compensated,
             "compensated_actors": self.compensated_actors,
@@ -340,39 +300,23 @@ class Format:
         LidarError
             If a package or column is missing, the file exists, or it cannot be written.
         """
-        options: dict[str, Any] = {}
-        if self.row.layouts:
-            options = {
-                "layout": self.layout,
-                "compensated": self.compensated,
-                "organized": self.organized,
-                "pose_rate_hz": self.pose_rate_hz,
-            }
-        if self.row.with_scene:
-            options["content"] = content()
         full_scale: float | None = None
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
-            if self.row.integer_intensities and (full_scale := full_scale_of(cloud)) is not None:
-                full_scale = self.intensity_full_scale or full_scale
-                options["intensity_full_scale"] = full_scale
             with staging(path.parent) as staging_folder:
                 staged = staging_folder / path.name  # bags contain the name of their file
-                if self.row.in_pieces:
-                    storage = Storage(str(staged), durable=False)
-                    self._range_writer(cloud, sweeps, storage).write(workers)
+                output = self.cloud_format(cloud, self.prepared(sweeps))
+                if isinstance(output, MultiFileFormat):
+                    output.write(staged, self, workers)
                 else:
-                    write = self.row.provides(self.row.write)
-                    write(staged, cloud, self.prepared(sweeps), **options)
+                    output.content = content
+                    full_scale = output.write(staged, self)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
                     Storage.at(path.parent).discard(path.name)
                 staged.replace(path)
                 flush(path.parent)
         return full_scale
-
-    def _range_writer(self, cloud: CloudLike, sweeps: Sweeps, storage: Storage) -> RangeWriter:
-        return RangeWriter(self.format, cloud, self.prepared(sweeps), storage, self.compensated)
 
     def write_to_storage(
         self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
@@ -381,27 +325,43 @@ class Format:
 
         After a LidarError, no file is left.
         """
-        folder = Storage(storage.path(self.row.file))
+        file = self.row.file
+        folder = Storage(storage.path(file))
         with explained(f"{folder} cannot be written"):
             try:
-                self._range_writer(cloud, sweeps, folder).write(workers)
+                output = self.cloud_format(cloud, self.prepared(sweeps))
+                assert isinstance(output, MultiFileFormat)
+                output.write_to(folder, self, workers)
             except BaseException:
                 with suppress(OSError):
-                    storage.discard(self.row.file)
+                    storage.discard(file)
                 raise
 
 
-def refuse_strangers(storage: Storage, rows: Iterable[FormatRow]) -> None:
+def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
+    """Return a survey with the columns that its sensors need in the formats of its cloud.
+
+    LidarError if a format cannot store the data of a sensor.
+    """
+    names = dict.fromkeys(
+        name for spec in specs for name in spec.cloud_format.survey_columns(survey)
+    )
+    return replace(survey, columns=(*survey.columns, *names)) if names else survey
+
+
+def refuse_strangers(storage: Storage, formats: Iterable[str]) -> None:
     """Raise LidarError if folders of formats, which would be replaced, hold foreign files."""
-    for row in rows:
-        if not row.inside:
+    for format_name in formats:
+        file = row_of(format_name).file
+        pattern = format_named(format_name).file_pattern
+        if not pattern:
             continue
-        own_names = re.compile(rf"{row.file}/(?:{row.inside}|(?:.*/)?\.(?:lidarpool-|writing).*)")
-        for name in storage.tree(row.file):
+        own_names = re.compile(rf"{file}/(?:{pattern}|(?:.*/)?\.(?:lidarpool-|writing).*)")
+        for name in storage.tree(file):
             if not own_names.fullmatch(name):
                 raise LidarError(
                     f"{storage.path(name)} was not written by lidarpool and would be lost, "
-                    f"because {row.file} is replaced. Move it elsewhere, or specify another "
+                    f"because {file} is replaced. Move it elsewhere, or specify another "
                     "folder with `--out`."
                 )
 
@@ -483,7 +443,7 @@ def save_cloud(
         )
     if precision_m is not None and not 0 < precision_m < np.inf:
         raise LidarError(f"`precision_m` is {precision_m}; it must be a positive length in meters.")
-    file_format = Format(
+    spec = ExportSpec(
         name,
         layout,
         compensated,
@@ -497,10 +457,10 @@ def save_cloud(
     with explained(f"{path} cannot be written"):
         if path.is_dir():
             raise LidarError(f"{path} is a folder. Remove it, or use another path.")
-    if cloud.sweeps is None and "scan" in file_format.needs:
+    if cloud.sweeps is None and spec.cloud_format.by_sweep:
         raise LidarError(
             f"{name} stores single sweeps, but the cloud has no sweeps. Save the cloud of a "
             "`Result`, or a cloud that was read from a result folder."
         )
-    file_format.write(path, cloud, sweeps, overwrite=True)
-    return file_format.left_out(cloud, sweeps)
+    spec.write(path, cloud, sweeps, overwrite=True)
+    return spec.left_out(cloud, sweeps)

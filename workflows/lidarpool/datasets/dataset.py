@@ -28,12 +28,13 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import SealedWriter
 from ..clouds.boxes import Boxes
+from ..clouds.cloud_format import CloudFormat, Entry
 from ..clouds.folder import local_folder
-from ..clouds.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
+from ..clouds.format_table import DATA_SETS, LAYOUTS, format_named
 from ..clouds.kitti import NAMES_FILE, labels_file
+from ..clouds.multi_file_format import MultiFileFormat
 from ..clouds.nuscenes import LABELS, merge, relabeled
-from ..clouds.pieces import Entry, Pieces, pieces_of
-from ..clouds.writing import Format
+from ..clouds.writing import ExportSpec
 from .job_table import TABLE_FILE, JobRow, Tally
 
 T = TypeVar("T")
@@ -48,16 +49,18 @@ _AHEAD = 16  # jobs that are checked ahead
 _MAX_LISTED_FOLDERS = 32  # folders whose listings are cached; all jobs share some folders
 
 
-def _name_pattern(row: FormatRow) -> str:
+def _name_pattern(cloud_format: type[CloudFormat]) -> str:
     """Return a pattern of the names of files of jobs in a format."""
-    folder = re.escape(row.of_job).replace(r"\{name\}", "[^/]+").replace(r"\{number\}", r"\d+")
-    return "/".join(filter(None, (folder, row.inside and f"({row.inside})")))
+    folder = re.escape(cloud_format.job_path)
+    folder = folder.replace(r"\{name\}", "[^/]+").replace(r"\{number\}", r"\d+")
+    files = cloud_format.file_pattern
+    return "/".join(filter(None, (folder, files and f"({files})")))
 
 
 # Names of files of jobs, in all formats.
 JOB_FILES = re.compile(
     r"\.jobs/[^/]+\.json|jobs/[^/]+/(sweeps|boxes)\.npz|(sweeps|boxes)/[^/]+\.npz|"
-    + "|".join(_name_pattern(FORMATS[name]) for name in DATA_SETS.values())
+    + "|".join(_name_pattern(format_named(name)) for name in DATA_SETS.values())
 )
 
 
@@ -123,8 +126,9 @@ class DataSet:
     made_with: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def _job_format(self) -> Format:
-        return Format(
+    def spec(self) -> ExportSpec:
+        """Format of the files of a job, with its options."""
+        return ExportSpec(
             DATA_SETS[self.format],
             self.layout,
             self.compensated,
@@ -135,11 +139,11 @@ class DataSet:
     @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns that clouds of jobs must have."""
-        return self._job_format.needs
+        return self.spec.needs
 
     def check_installed(self) -> None:
         """Raise LidarError if a package that writes the format is missing in this environment."""
-        self._job_format.check_installed()
+        self.spec.check_installed()
 
     def write_job(
         self,
@@ -165,28 +169,27 @@ class DataSet:
             cannot be written to.
         """
         name = row.name
-        file_format = self._job_format
+        spec = self.spec
         entry = Entry(row.number, name, row.split, row.values)
-        file_format.check_installed()
+        spec.check_installed()
         tally = Tally.from_cloud(cloud)
         row = replace(row, points=tally.points, sha256=tally.sha256, classes=tally.classes)
-        file_format.check_columns(cloud)
+        spec.check_columns(cloud)
         storage = listing or Listing.from_storage(self.storage)
         boxes: list[Boxes] = []
         with explained(f"Job {name} cannot be written to {storage}"):
-            if file_format.row.in_pieces:
-                prepared = file_format.prepared(sweeps)
-                pieces = pieces_of(file_format.format, cloud, prepared, entry)
-                details = _write_pieces(pieces, storage)
-                manifest = pieces.summary(details)
-                boxes = details if file_format.row.boxes else []
+            output = spec.cloud_format(cloud, spec.prepared(sweeps), entry)
+            if isinstance(output, MultiFileFormat):
+                details = _write_pieces(output, storage)
+                manifest = output.summary(details)
+                boxes = [detail for detail in details if isinstance(detail, Boxes)]
             else:
                 manifest = {}
-                path = entry.path_of(file_format.format)
+                path = output.path_of_job(entry)
                 storage.prepare(Path(path).parent)
                 with local_folder(storage.local() if storage.is_local else storage) as folder:
                     (folder / path).parent.mkdir(parents=True, exist_ok=True)
-                    file_format.write(folder / path, cloud, sweeps, overwrite=True)
+                    spec.write(folder / path, cloud, sweeps, overwrite=True)
                     storage.files[path] = Storage(str(folder)).checksum(path)
                     if not storage.is_local:
                         storage.put(folder / path, path)
@@ -421,12 +424,13 @@ def _crc(manifest: Mapping[str, Any]) -> int:
     return zlib.crc32(json.dumps(manifest).encode())
 
 
-def _write_pieces(pieces: Pieces, storage: Storage) -> list[Any]:
+def _write_pieces(output: MultiFileFormat, storage: Storage) -> list[Any]:
     """Write all pieces of a job, and return their details."""
     # In an object store each file takes a request.
-    spans = [(0, len(pieces))] if storage.is_local else pieces.spans(_REQUESTS)
+    spans = [(0, len(output))] if storage.is_local else output.spans(_REQUESTS)
     with ThreadPoolExecutor(_REQUESTS, "write") as pool:
-        return pieces.finish(storage, [*pool.map(lambda span: pieces.write(storage, *span), spans)])
+        written = pool.map(lambda span: output.write_range(storage, *span), spans)
+        return output.finish(storage, [*written])
 
 
 def _packed(boxes: Sequence[Boxes]) -> bytes:

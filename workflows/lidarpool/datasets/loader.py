@@ -31,12 +31,11 @@ from lidarsim.sweeps.sweeps import SWEEPS_FILE, Sweeps
 
 from ..base.sealed import unsealed
 from ..clouds.boxes import Boxes
+from ..clouds.cloud_format import Entry
 from ..clouds.folder import refuse_missing
 from ..clouds.format_table import DATA_SETS
-from ..clouds.pieces import Entry
-from ..clouds.sweep_reader import Reader
-from ..clouds.writing import Format
-from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
+from ..clouds.job_reader import JobReader
+from .dataset import BOXES_FILE, INDEX_FILE, VERSION, DataSet, job_file
 from .job_table import TABLE_FILE, WRITE_AGAIN, JobRow, read_table
 from .sweep_data import sweep_of_job
 
@@ -63,11 +62,8 @@ class SavedSweeps:
 
     classes: Mapping[int, str]
 
-    def __init__(
-        self, storage: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
-    ) -> None:
-        self._storage = storage
-        self._written = written
+    def __init__(self, dataset: DataSet, runs: Sequence[_Run], shuffle: int | None) -> None:
+        self._dataset = dataset
         self._runs = runs
         self._run_stops = np.cumsum([run.count for run in runs], dtype=np.int64)
         self._order = None  # int64 (n,): 8 bytes for each sweep
@@ -82,7 +78,7 @@ class SavedSweeps:
         self.__dict__ |= state | {"_local": threading.local()}
 
     def __repr__(self) -> str:
-        return f"<{len(self):,} sweeps of {self._storage} ({self._written.row.data_set})>"
+        return f"<{len(self):,} sweeps of {self._dataset.storage} ({self._dataset.format})>"
 
     def __len__(self) -> int:
         return int(self._run_stops[-1]) if len(self._run_stops) else 0
@@ -92,18 +88,20 @@ class SavedSweeps:
 
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
         """Yield the sweeps with these indices in order, and read the next ones in advance."""
-        if self._storage.is_local and self._written.row.raw:
+        cloud_format = self._dataset.spec.cloud_format
+        is_local = self._dataset.storage.is_local
+        if is_local and cloud_format.raw_sweeps:
             # Handing such a sweep from thread to thread takes as long as reading it.
             upcoming, current = tee(map(self._locate, indices))
             for job, number in islice(upcoming, _REQUESTS):
-                job.reader.expect(number)
+                job.expect(number)
             for job, number in current:
                 for next_job, sweep in islice(upcoming, 1):
-                    next_job.reader.expect(sweep)
+                    next_job.expect(sweep)
                 yield job.read(number)
             return
         # At a URL each request takes long. A job with one file for all sweeps is opened once.
-        threads = 1 if self._storage.is_local or not self._written.row.boxes else _REQUESTS
+        threads = _REQUESTS if cloud_format.separate_sweeps and not is_local else 1
         coming: deque[Future[Sweep]] = deque()
         with ThreadPoolExecutor(threads, "sweeps") as pool:
             try:
@@ -186,7 +184,7 @@ class SavedSweeps:
             local.jobs = OrderedDict()
         jobs: OrderedDict[int, _OpenJob] = local.jobs
         if job.number not in jobs:
-            jobs[job.number] = _OpenJob(self._storage, self._written, job, self.classes)
+            jobs[job.number] = _OpenJob(self._dataset, job, self.classes)
             if len(jobs) > _OPEN_JOBS:
                 jobs.popitem(last=False)[1].reader.close()
         jobs.move_to_end(job.number)
@@ -196,17 +194,15 @@ class SavedSweeps:
 class _OpenJob:
     """Poses, boxes and reader of a job whose sweeps are read."""
 
-    def __init__(
-        self, storage: Storage, written: Format, job: JobRow, classes: Mapping[int, str]
-    ) -> None:
-        self.storage = storage
+    def __init__(self, dataset: DataSet, job: JobRow, classes: Mapping[int, str]) -> None:
+        self.storage = storage = dataset.storage
         self.job = job
-        row = written.row
-        name = job_file(row.data_set, job.name, SWEEPS_FILE)
+        self.cloud_format = dataset.spec.cloud_format
+        name = job_file(dataset.format, job.name, SWEEPS_FILE)
         self.sweeps = Sweeps.load(storage.path(name), partial(storage.read, name))
         self.boxes: Boxes | None = None
         if self.sweeps.actors:
-            name = job_file(row.data_set, job.name, BOXES_FILE)
+            name = job_file(dataset.format, job.name, BOXES_FILE)
             with open_archive(storage.path(name), partial(storage.read, name)) as arrays:
                 sizes = np.broadcast_to(
                     np.ptp(self.sweeps.actor_bounds, axis=1), arrays["centers"].shape
@@ -220,15 +216,19 @@ class _OpenJob:
                 )
                 self.boxes = boxes.inward(self.sweeps.pose, slice(None))
         entry = Entry(job.number, job.name, job.split)
-        reader = row.provides("Reader")
-        self.reader: Reader = reader(storage, self.sweeps, entry, written.layout, classes)
+        self.reader = JobReader(storage, self.sweeps, entry, dataset.layout, classes)
+
+    def expect(self, sweep: int) -> None:
+        """Have the system load the files of a sweep into its memory."""
+        self.reader.expect(self.cloud_format.sweep_files(self.reader, sweep))
 
     def read(self, sweep: int) -> Sweep:
         """Read a sweep."""
         try:
-            points = self.reader.read(sweep)
+            points = self.cloud_format.read_sweep(self.reader, sweep)
         except Exception as error:  # libraries of five formats raise many kinds of errors
-            file = self.storage.path(self.reader.last or self.reader.files(sweep)[0])
+            file = self.reader.last or self.cloud_format.sweep_files(self.reader, sweep)[0]
+            file = self.storage.path(file)
             raise _unreadable(file, error) from error
         return sweep_of_job(self.job, self.sweeps, sweep, points, self.boxes, sweep)
 
@@ -273,8 +273,8 @@ def sweeps(
     """
     storage = replace(Storage.at(location), named="")  # the user's own links may be followed
     head = read_index(storage)
-    written = Format(DATA_SETS[head["format"]], head["layout"], head["compensated"])
-    written.check_installed()
+    dataset = DataSet(storage, head["format"], head["layout"], head["compensated"])
+    dataset.check_installed()
     sweep_counts = head["jobs"]
     table = read_table(storage, head["table"])
     rows = [job for job in table if job.number in sweep_counts]
@@ -294,7 +294,7 @@ def sweeps(
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
-    saved = SavedSweeps(storage, written, runs, shuffle)
+    saved = SavedSweeps(dataset, runs, shuffle)
     saved.classes = {int(number): name for number, name in head.get("classes", {}).items()}
     return saved
 

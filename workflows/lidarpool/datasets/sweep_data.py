@@ -9,7 +9,7 @@ from lidarsim.columns.sweep import Sweep
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.boxes import Boxes, SweepBoxes
-from ..clouds.sweep_reader import PointColumns
+from ..clouds.cloud_format import PointColumns
 from .job_table import JobRow
 
 

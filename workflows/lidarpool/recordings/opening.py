@@ -135,9 +135,8 @@ def _open_path(source: RecordingSource) -> Recording:
         raise LidarError(f"{source.name} is empty (0 bytes). Specify {KINDS}.")
     if (path / INDEX_FILE).exists():
         return _open_data_set(source)
-    if (open_source := reader_of(path, source.name)) is not None:
-        recording: Recording = open_source(source)
-        return recording
+    if (cloud_format := reader_of(path, source.name)) is not None:
+        return cloud_format.open(source)
     suffix = path.suffix.lower()
     raise UnknownFormatError(source.name, _CONVERSIONS.get(suffix, ""))
 
@@ -145,6 +144,4 @@ def _open_path(source: RecordingSource) -> Recording:
 def _open_data_set(source: RecordingSource) -> Recording:
     """Open the sweeps of a data set."""
     saved = sweeps(source.path, sensors=None if source.sensor is None else [source.sensor])
-    return source.recording(
-        len(saved), saved.__getitem__, compensated=True, noise_classes=None
-    )
+    return source.recording(len(saved), saved.__getitem__, compensated=True, noise_classes=None)

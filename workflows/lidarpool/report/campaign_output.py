@@ -21,8 +21,7 @@ from ..base.sealed import sealed, unsealed
 from ..base.shard import ALL, Shard, shard_in_words
 from ..base.software import difference, software
 from ..clouds.folder import LAST_FILE, refuse_missing, result_folder
-from ..clouds.format_table import DATA_SETS
-from ..clouds.writing import Format
+from ..clouds.format_table import DATA_SETS, format_named
 from ..datasets.dataset import INDEX_FILE, JOB_FILES, DataSet, manifest_file
 from ..datasets.job_seconds import known_seconds
 from ..datasets.job_table import TABLE_FILE, JobRow, read_table, write_table
@@ -335,11 +334,9 @@ def write_shared(
 
 def _renamed_sensors(dataset: DataSet) -> list[str]:
     """Return notes on the sensors of finished jobs that have other names in the data set."""
-    file_format = Format(DATA_SETS[dataset.format])
-    if not file_format.row.first_sensor:
-        return []
+    cloud_format = format_named(DATA_SETS[dataset.format])
     sensors_of_jobs = read_index(dataset.storage)["jobs"].values()
-    notes = (note for sensors in sensors_of_jobs for note in file_format.renamed([*sensors]))
+    notes = (note for sensors in sensors_of_jobs for note in cloud_format.renamed([*sensors]))
     return list(dict.fromkeys(notes))
 
 

@@ -26,9 +26,9 @@ from ..base import timeline
 from ..base.field_words import differences
 from ..base.open3d_module import load_open3d
 from ..clouds.folder import LAST_FILE, result_folder, staging
-from ..clouds.format_table import FORMATS, FormatRow, plugin_rows
+from ..clouds.format_table import FORMATS, plugin_formats, row_of
 from ..clouds.navigation_files import write_instruments
-from ..clouds.writing import Format, refuse_strangers
+from ..clouds.writing import ExportSpec, refuse_strangers
 from ..columns.parts import StoredCloud
 from ..run.pipeline.stage_messages import Receipt
 from ..run.run_result import RunResult
@@ -46,7 +46,7 @@ REPORT = LAST_FILE
 _DRAWN = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_DRAWN, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # entries of the identity that distinguish surveys
-_OF_FORMATS = {row.file: row for row in FORMATS.values() if row.file != CLOUD}
+_OF_FORMATS = {row.file: name for name, row in FORMATS.items() if row.file != CLOUD}
 
 
 @dataclass(eq=False)
@@ -61,7 +61,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
     target: Path | Storage
     survey: Survey
-    formats: Sequence[Format]
+    formats: Sequence[ExportSpec]
     extent: str = "page"
     scenario: Scenario | None = None
     judge: Callable[[RunResult], str] = lambda result: ""
@@ -144,7 +144,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 "belong to a result."
             )
             raise LidarError(f"{lists} {advice}")
-        refuse_strangers(storage, _rows({*further, *listed}))
+        refuse_strangers(storage, _formats({*further, *listed}))
 
     def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Begin the cloud, with the points of an earlier run."""
@@ -168,7 +168,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         result is written.
         """
         result = run.result()
-        in_pieces = any(output_format.row.in_pieces for output_format in self.formats)
+        in_pieces = any(output_format.has_many_files for output_format in self.formats)
         workers = None
         if not in_pieces:
             run.cluster_stack.close()
@@ -224,7 +224,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             ),
             staging(folder, self.target) as staged,
         ):
-            refuse_strangers(destination, _rows({*further, *earlier}))
+            refuse_strangers(destination, _formats({*further, *earlier}))
             clear = cache(partial(_clear, destination, further, earlier))  # at most once
             sweeps = _write_sweeps(staged, result, sweeps)
             counts = self._write_cloud(staged / CLOUD, result, sweeps, show)
@@ -282,10 +282,10 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         """
         storage = self.target if isinstance(self.target, Storage) else None
         full_scales: dict[str, float] = {}
-        for output_format in sorted(self.formats, key=lambda entry: entry.row.in_pieces):
+        for output_format in sorted(self.formats, key=lambda entry: entry.has_many_files):
             file = output_format.row.file
             points = _shown_points(result, file, show)
-            if storage and workers and output_format.row.in_pieces:
+            if storage and workers and output_format.has_many_files:
                 clear()
                 output_format.write_to_storage(storage, points, sweeps, workers)
                 continue
@@ -359,23 +359,23 @@ def _put(staged: Path, storage: Storage, further: Collection[str]) -> None:
             storage.put(staged / name, name)
 
 
-def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
+def _further_files(survey: Survey, formats: Sequence[ExportSpec]) -> list[str]:
     """Name the files of a result beyond the files that all results have."""
     instruments = Instruments.from_survey(survey)
     measured = [] if instruments is None else instruments.files
     return [*(output_format.row.file for output_format in formats), *measured]
 
 
-def _rows(names: Collection[str]) -> list[FormatRow]:
-    """Return the rows of the formats whose file or folder is among the names of a result."""
+def _formats(names: Collection[str]) -> list[str]:
+    """Return the formats whose file or folder is among the names of a result."""
     unknown = {*names} - {*FILES, *INSTRUMENT_FILES, *_OF_FORMATS}
-    return [row for file, row in _OF_FORMATS.items() if file in names] + plugin_rows(unknown)
+    return [name for file, name in _OF_FORMATS.items() if file in names] + plugin_formats(unknown)
 
 
 def _known_further(names: Collection[str]) -> list[str]:
     """Return the names that are files or folders of formats or instruments, in order."""
     measured = [name for name in INSTRUMENT_FILES if name in names]
-    return [row.file for row in _rows(names)] + measured
+    return [row_of(name).file for name in _formats(names)] + measured
 
 
 class _Earlier(NamedTuple):

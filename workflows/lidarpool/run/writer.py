@@ -20,8 +20,8 @@ from poolpart.fetch import fetch_available
 from poolpart.task_context import own_client
 
 from ..base.software import plugin_versions
-from ..clouds.pieces import PieceRange, RangeWriter
-from ..clouds.pieces import WrittenRange as Range
+from ..clouds.multi_file_format import PieceRange, RangeWriter
+from ..clouds.multi_file_format import WrittenRange as Range
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import DataSet, Listing
 from ..datasets.job_table import JobRow

@@ -24,7 +24,6 @@ from lidarsim.simulator.steps.particles import WeatherStep
 from lidarsim.simulator.steps.step_list import setup_of
 from lidarsim.survey.survey import START_FROM, Survey
 
-from ..clouds.laser_scan import has_planar_sensors
 from .build import Built
 from .georeference import missing_system
 from .scenario import Scenario, survey_of
@@ -59,14 +58,6 @@ def advice(built: Built) -> list[str]:
     origin = built.scenario.world.origin
     system = missing_system(built.scene.georeferenced(origin), built.survey.epsg)
     likely = filter(None, (_size_note(built, side), system, *placed, _color_note(built)))
-    scanners = [
-        "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
-        "`cloud.keep_every: 1`"
-    ] * (
-        _writes_bags(built.scenario)
-        and built.survey.keep_every > 1
-        and has_planar_sensors(built.survey)
-    )
     coarse = [
         f"points are rounded to {step:g} m, but the scene is only {side:.3g} m long. Set a smaller "
         "`cloud.precision_m` in a scenario"
@@ -74,7 +65,7 @@ def advice(built: Built) -> list[str]:
     labels = _unnamed_classes(built.survey)
     if any(column.name == "class" for column in built.survey.stored_columns):
         labels = chain(unlabeled(built.scene, built.survey), labels)
-    settings = (*coarse, *scanners, *labels, *_without_effect(built.scenario))
+    settings = (*coarse, *_notes_of_formats(built), *labels, *_without_effect(built.scenario))
     light = (*_single_returns(built), *_dark_fog(built.survey))
     groups = (
         *(notes, axes, likely, _heading_notes(built.findings.without_angles)),
@@ -141,9 +132,11 @@ def _unnamed_classes(survey: Survey) -> Iterator[str]:
         )
 
 
-def _writes_bags(scenario: Scenario) -> bool:
-    """Return whether the output has a bag with messages of 2D scanners."""
-    return any(entry.row.laser_scans for entry in scenario.output.write)
+def _notes_of_formats(built: Built) -> list[str]:
+    """Return notes on what the formats of the output cannot store."""
+    specs = built.scenario.output.write
+    notes = (note for spec in specs for note in spec.cloud_format.survey_notes(built.survey))
+    return [*dict.fromkeys(notes)]
 
 
 def _size_note(built: Built, side: float) -> str:
@@ -209,7 +202,7 @@ def _without_effect(scenario: Scenario) -> Iterator[str]:
     """Yield notes on settings without effect, and on contradictions between settings."""
     for entry in scenario.output.write:
         yield from entry.contradictions(scenario.cloud.coordinates)
-        yield from entry.renamed([*scenario.sensors])
+        yield from entry.cloud_format.renamed([*scenario.sensors])
     written = {entry.format for entry in scenario.output.write}
     if scenario.cloud.waveform_samples and not {"las", "laz"} & written:
         yield (

@@ -38,9 +38,7 @@ from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
 from ..clouds.format_table import check_whole
-from ..clouds.laser_scan import with_laser_scans
-from ..clouds.packets import with_packet_columns
-from ..clouds.writing import Format
+from ..clouds.writing import ExportSpec, with_format_columns
 from ..plan import Planning
 from ..plan.planning import Search
 from .actor_motion import ActorSection, MountSection
@@ -115,7 +113,7 @@ class Job:
     number: int = 0
     name: str = ""
     split: str = ""
-    outputs: Sequence[Format] = ()
+    outputs: Sequence[ExportSpec] = ()
     made_of: Sequence[tuple[str, str]] = ()
 
     def __post_init__(self) -> None:
@@ -671,8 +669,7 @@ def _build_survey(
         **declared(scenario.weather, Weather),
         **cloud,
     )
-    formats = [entry.format for entry in scenario.output.write]
-    return with_packet_columns(with_laser_scans(survey, formats), formats)
+    return with_format_columns(survey, scenario.output.write)
 
 
 def _class_names(

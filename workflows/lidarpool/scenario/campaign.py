@@ -26,7 +26,7 @@ from lidarsim.base.yamlfile import read_yaml
 from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint
 from ..base.shard import ALL, Shard
-from ..clouds.laser_scan import with_laser_scans
+from ..clouds.writing import with_format_columns
 from ..datasets.job_table import Value
 from .build import Job
 from .campaign_jobs import FunctionJobs, JobSource, ScenarioJobs, VariedJobs
@@ -254,7 +254,7 @@ class CampaignSpec:
                 "`navigation` is not supported in campaigns, because data sets have no files for "
                 "it. Remove `navigation` from the base of the campaign."
             )
-        survey = with_laser_scans(job.survey, [self.keep.format])
+        survey = with_format_columns(job.survey, [self.keep.of_jobs])
         return job if survey is job.survey else replace(job, survey=survey)
 
     def without_folders(self, message: str) -> str:

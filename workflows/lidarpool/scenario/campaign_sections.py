@@ -54,7 +54,7 @@ from lidarsim.base.words import did_you_mean_each, in_yaml, joined, printable
 from lidarsim.base.yamlfile import load_yaml, read_yaml
 
 from ..clouds.format_table import DATA_SETS, LAYOUTS
-from ..clouds.writing import Format
+from ..clouds.writing import ExportSpec
 from ..datasets.job_table import Value
 from .sections import IgnoredColumns, Section, may_be_empty
 
@@ -448,9 +448,9 @@ class Keep:
         _ = self.of_jobs  # LidarError if its fields do not fit together
 
     @property
-    def of_jobs(self) -> Format:
+    def of_jobs(self) -> ExportSpec:
         """Format of the files of a job."""
-        return Format(
+        return ExportSpec(
             DATA_SETS[self.format],
             self.layout,
             self.compensated,

@@ -28,7 +28,7 @@ from lidarsim.scene.files.stated_system import (
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
-from ..clouds.format_table import point_suffixes, points_reader
+from ..clouds.format_table import point_suffixes, reader_of
 from ..clouds.recording import METERS, Recording, RecordingSource
 
 MIN_POINTS = 12  # least points of a scene: a surfel lies in the plane of as many
@@ -78,8 +78,8 @@ def read_points(
         If the file cannot be read, is too large, has fewer than `MIN_POINTS` points, or lengths
         that are not true; see `stated_meters` and `Reprojection`.
     """
-    open_file = points_reader(path)
-    if open_file is None:
+    cloud_format = None if path.is_dir() else reader_of(path, str(path))
+    if cloud_format is None or not cloud_format.for_scenes:
         if advice := advice_on(path):
             raise LidarError(f"{path} cannot be read. {as_sentence(advice)}")
         raise LidarError(
@@ -89,7 +89,7 @@ def read_points(
     with explained(f"{path} cannot be read"), prefixed(path):
         if not check_input(path):
             raise LidarError("it is empty (0 bytes).")
-    recording: Recording = open_file(RecordingSource(path, str(path), as_stored=True))
+    recording = cloud_format.open(RecordingSource(path, str(path), as_stored=True))
     with reading(str(path)):
         content = _read(recording, keep_noise)
         if note := content.left_out.note():

@@ -59,7 +59,7 @@ from lidarsim.sensor.packet_settings import Identifier
 from lidarsim.sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution, Sector
 from lidarsim.survey.survey import EpsgCode, Mounted
 
-from ..clouds.writing import Format
+from ..clouds.writing import ExportSpec
 from ..plan.planning import Search
 
 MAX_COPIES = 1_000_000  # limit for an entry
@@ -682,7 +682,7 @@ class OutputSection(Section):
     """
 
     write: Annotated[
-        Several[Annotated[Format, by_text("format", Format)]],
+        Several[Annotated[ExportSpec, by_text("format", ExportSpec)]],
         about("additional formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
     ] = ()
 

@@ -6,26 +6,18 @@ import re
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import StoragePlugin, Writer
 
 from lidarsim.base.arrays import AnyArray, Floats, Floats32
 from lidarsim.base.errors import LidarError
 from lidarsim.base.extras import reading
 from lidarsim.base.input_files import read_input_text
+from lidarsim.base.words import joined
 from lidarsim.columns.bags import (
     LIVOX_CLOUDS,
     POINT_CLOUD,
@@ -34,73 +26,29 @@ from lidarsim.columns.bags import (
     open_bag,
     point_columns,
 )
-from lidarsim.columns.closing_bag import ClosingBag
-from lidarsim.columns.cloud import Cloud, CloudLike
+from lidarsim.columns.cloud import Cloud
 from lidarsim.columns.mcap_chunks import read_metadata
 from lidarsim.columns.sweep import Sweep
+from lidarsim.columns.table import COLORS, SURFACE_COLUMNS
 from lidarsim.motion.bag_trajectories import read_bag
 from lidarsim.motion.trajectory import Track
+from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps, states_compensation
 
-from .. import sweep_reader
+from .. import laser_scan
+from ..cloud_format import CloudFormat, PointColumns
 from ..frame_names import survey_start_ns
+from ..job_reader import JobReader
 from ..recording import Recording, RecordingSource, sweep_from_columns
+from ..writing import ExportSpec
 from .layouts import EXTRA_FIELDS, LAYOUTS, LaidOut, message_stamp_ns, sensor_traits
-from .messages import LATCHED_TOPICS, message_store, survey_messages, sweep_topic
 
-# Profile that `ros2 bag play` must offer, so that late listeners get the frames, too.
-_LATCHED = Qos(
-    history=QosHistory.KEEP_LAST,
-    depth=1,
-    reliability=QosReliability.RELIABLE,
-    durability=QosDurability.TRANSIENT_LOCAL,
-    deadline=QosTime(0, 0),
-    lifespan=QosTime(0, 0),
-    liveliness=QosLiveliness.AUTOMATIC,
-    liveliness_lease_duration=QosTime(0, 0),
-    avoid_ros_namespace_conventions=False,
-)
 _UNSTAMPED = "has no timestamps, so the recording times are used instead"
 _MAX_DISTANCE_NS = 2e8  # limit between a sweep and the first or last pose
 
 
-def write_rosbag2(
-    path: Path,
-    cloud: CloudLike,
-    sweeps: Sweeps,
-    layout: str,
-    compensated: bool = False,
-    organized: bool = False,
-    pose_rate_hz: float | None = None,
-) -> None:
-    """Write a bag, a folder for `ros2 bag play`, with the parameters of `write_mcap`."""
-    laid_out = LaidOut(layout, compensated, organized)
-    # Readers of Humble accept no later version: from 9 on, profiles are lists.
-    with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
-        bag.set_custom_data("lidarpool", sweeps.frame_text(compensated=compensated))
-        topics: dict[str, Any] = {}
-        for message in survey_messages(cloud, sweeps, laid_out, pose_rate_hz):
-            if message.topic not in topics:
-                latched = (_LATCHED,) if message.topic in LATCHED_TOPICS else ()
-                topics[message.topic] = bag.add_connection(
-                    message.topic,
-                    message.kind,
-                    typestore=message_store(),
-                    offered_qos_profiles=latched,
-                )
-            bag.write(topics[message.topic], message.time_ns, message.cdr)
-
-
-def write_mcap(
-    path: Path,
-    cloud: CloudLike,
-    sweeps: Sweeps,
-    layout: str,
-    compensated: bool = False,
-    organized: bool = False,
-    pose_rate_hz: float | None = None,
-) -> None:
-    """Write an MCAP file.
+class Rosbag2(CloudFormat):
+    """A folder for `ros2 bag play`.
 
     Each sweep is a PointCloud2 on `/NAME/points`, NAME from its sensor, or on `/points`. Points are
     in the sensor frame at their own firing, as drivers publish them, and have times; or
@@ -134,85 +82,185 @@ def write_mcap(
     Organized clouds have a point for each ray, NaN without a return (`organized_rows`). Second
     returns of `ouster` are then on `/NAME/points2`.
     """
-    folder = path.with_name(f"{path.name}.bag")
-    try:
-        write_rosbag2(folder, cloud, sweeps, layout, compensated, organized, pose_rate_hz)
-        (written,) = folder.glob("*.mcap")
-        written.replace(path)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+
+    title = "rosbag2"
+    by_sweep = True
+    frame = "firing"
+    required = ("object", "channel")
+    stored = ("channel", *COLORS, "radial_velocity", *SURFACE_COLUMNS, "material")
+    named = ("class",)
+    options = ("layout", "compensated", "pose_rate_hz", "organized")
+    actor_boxes = True
+    file_pattern = r"metadata\.yaml|rosbag2\w*\.mcap"
+
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the folder."""
+        from rosbags.rosbag2 import StoragePlugin, Writer
+
+        from .messages import LATCHED_TOPICS, message_store, survey_messages
+
+        laid_out = LaidOut(spec.layout, spec.compensated, spec.organized)
+        # Readers of Humble accept no later version: from 9 on, profiles are lists.
+        with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+            bag.set_custom_data("lidarpool", self.sweeps.frame_text(compensated=spec.compensated))
+            topics: dict[str, Any] = {}
+            for message in survey_messages(self.cloud, self.sweeps, laid_out, spec.pose_rate_hz):
+                if message.topic not in topics:
+                    latched = (_latched_profile(),) if message.topic in LATCHED_TOPICS else ()
+                    topics[message.topic] = bag.add_connection(
+                        message.topic,
+                        message.kind,
+                        typestore=message_store(),
+                        offered_qos_profiles=latched,
+                    )
+                bag.write(topics[message.topic], message.time_ns, message.cdr)
+
+    @classmethod
+    def check_options(cls, spec: ExportSpec) -> None:
+        """Raise LidarError if clouds of the layout cannot be organized."""
+        if spec.organized and not LAYOUTS[spec.layout].lines:
+            organized = [name for name, layout in LAYOUTS.items() if layout.lines]
+            raise LidarError(
+                f"The layout {spec.layout} does not support `organized`, because its driver does "
+                "not publish organized clouds. Remove `organized`, or use one of the layouts "
+                f"{joined(organized)}."
+            )
+
+    @classmethod
+    def option_columns(cls, spec: ExportSpec) -> tuple[str, ...]:
+        """Return the names of the columns that the layout requires."""
+        columns = LAYOUTS[spec.layout].columns
+        if spec.organized and "ray" not in columns:
+            columns = (*columns, "ray")
+        return tuple(name for name in columns if name != "time" or not spec.compensated)
+
+    @classmethod
+    def optional_columns(cls, spec: ExportSpec, sweeps: Sweeps) -> tuple[str, ...]:
+        """Return the names of further columns, with those of the messages of 2D scanners."""
+        columns = super().optional_columns(spec, sweeps)
+        return columns + (laser_scan.COLUMNS if laser_scan.has_laser_scans(sweeps) else ())
+
+    @classmethod
+    def survey_columns(cls, survey: Survey) -> tuple[str, ...]:
+        """Return the columns of LaserScan messages, which surveys that keep every return have."""
+        has_scans = survey.keep_every == 1 and laser_scan.has_planar_sensors(survey)
+        return laser_scan.COLUMNS if has_scans else ()
+
+    @classmethod
+    def survey_notes(cls, survey: Survey) -> list[str]:
+        """Return a note if 2D scanners have no LaserScan messages."""
+        note = "bags contain LaserScan messages of 2D scanners only if every return is kept. Set "
+        note += "`cloud.keep_every: 1`"
+        return [note] if survey.keep_every > 1 and laser_scan.has_planar_sensors(survey) else []
+
+    @classmethod
+    def open(cls, source: RecordingSource) -> Recording:
+        """Open a topic of PointCloud2, or CustomMsg of Livox, in a bag."""
+        return _open_bag(source)
 
 
-class Reader(sweep_reader.Reader):
-    """Reads sweeps of a data set: intensity, limited by the layout, channel and named class."""
+class MCAP(Rosbag2):
+    """The messages of a bag as an MCAP file."""
 
-    def files(self, sweep: int) -> list[str]:
-        """Return the name of the job's bag."""
-        return [self.entry.path_of("mcap")]
+    title = "MCAP"
+    file_pattern = ""
+    job_path = "bags/{name}.mcap"
 
-    @cached_property
-    def _bag(self) -> ClosingBag:
-        # AnyReader would parse the definitions of messages, which takes longer than a sweep.
-        bag = ClosingBag(self.local(self.files(0)[0]))
-        bag.open()
-        return bag
+    def write(self, path: Path, spec: ExportSpec) -> None:
+        """Write the file."""
+        folder = path.with_name(f"{path.name}.bag")
+        try:
+            super().write(folder, spec)
+            (written,) = folder.glob("*.mcap")
+            written.replace(path)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
 
-    def read(self, sweep: int) -> sweep_reader.PointColumns:
-        """Return the points of a sweep."""
-        layout = LAYOUTS[self.layout]
-        message = self._point_cloud(sweep)
+    @classmethod
+    def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
+        """Return points with intensity, limited by the layout, channel and named class."""
+        layout = LAYOUTS[job.layout]
+        message = _point_cloud(job, sweep, cls.path_of_job(job.entry))
         names = {field.name for field in message.fields}
         compensated = layout.time_field not in names
         extra = [name for name in EXTRA_FIELDS if name in names]
         rows = message.data.view(layout.row(extra, compensated=compensated))
         intensity = rows["intensity"].astype(np.float32) / layout.full_intensity
         rings = rows[layout.ring_field].astype(np.int64)
-        channels = layout.channels(rings, sensor_traits(self.sweeps, sweep)).astype(np.uint16)
+        channels = layout.channels(rings, sensor_traits(job.sweeps, sweep)).astype(np.uint16)
         columns = {"intensity": intensity, "channel": channels}
         if "label" in names:
             columns["class"] = rows["label"].astype(np.uint16)
         points = np.stack([rows[axis] for axis in "xyz"], axis=1)
-        if not compensated and self.sweeps.coordinates == "world":
-            points = self._at_start(sweep, points, rows[layout.time_field])
+        if not compensated and job.sweeps.coordinates == "world":
+            points = _at_start(job, sweep, points, rows[layout.time_field])
         return points, columns
 
-    def _point_cloud(self, sweep: int) -> Any:
-        """Return the PointCloud2 of a sweep.
 
-        Raises ValueError if the bag lacks the message.
-        """
-        topic = sweep_topic(self.sweeps, sweep)
-        connections = [opened for opened in self._bag.connections if opened.topic == topic]
-        time_ns = survey_start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
-        record = next(self._bag.messages(connections, time_ns, time_ns + 1), None)
-        if record is None:  # rosbags 0.11.2 misses some messages by their time
-            records = self._bag.messages(connections)
-            record = next((candidate for candidate in records if candidate[1] == time_ns), None)
-        if record is None:
-            raise ValueError(f"it contains no message on {topic} at {time_ns} ns")
-        connection, _, data = record
-        return message_types().deserialize_cdr(data, connection.msgtype)
+def _latched_profile() -> Any:
+    """Return the profile that `ros2 bag play` must offer, so that late listeners get the frames."""
+    from rosbags import interfaces as ros
 
-    def _at_start(self, sweep: int, points: Floats32, times: AnyArray) -> Floats32:
-        """Return points (n, 3) as fired in the sensor frame at the start of the sweep.
-
-        `times` (n,) are the times of the layout.
-        """
-        since_ns = LAYOUTS[self.layout].since_ns(times, message_stamp_ns(self.sweeps, sweep))
-        stamps = np.rint(since_ns + self.sweeps.stamp_ns(sweep)).astype(np.int64)
-        scans = np.full(len(points), self.sweeps.scans[sweep])
-        sensor_cloud = Cloud(points, {"scan": scans, "time": stamps})
-        fired_in_sensor = replace(self.sweeps, coordinates="sensor")
-        return fired_in_sensor.compensated(sweep, sensor_cloud).astype(np.float32)
-
-    def close(self) -> None:
-        """Close the bag."""
-        if "_bag" in self.__dict__:
-            self._bag.close()
-        super().close()
+    return ros.Qos(
+        history=ros.QosHistory.KEEP_LAST,
+        depth=1,
+        reliability=ros.QosReliability.RELIABLE,
+        durability=ros.QosDurability.TRANSIENT_LOCAL,
+        deadline=ros.QosTime(0, 0),
+        lifespan=ros.QosTime(0, 0),
+        liveliness=ros.QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=ros.QosTime(0, 0),
+        avoid_ros_namespace_conventions=False,
+    )
 
 
-def open_file(source: RecordingSource) -> Recording:
+def _open_job(job: JobReader, file: str) -> Any:
+    """Open the bag of a job in a data set."""
+    from lidarsim.columns.closing_bag import ClosingBag
+
+    # AnyReader would parse the definitions of messages, which takes longer than a sweep.
+    bag = ClosingBag(job.local(file))
+    bag.open()
+    job.opened.callback(bag.close)
+    return bag
+
+
+def _point_cloud(job: JobReader, sweep: int, file: str) -> Any:
+    """Return the PointCloud2 of a sweep.
+
+    Raises ValueError if the bag lacks the message.
+    """
+    from .messages import sweep_topic
+
+    bag = job.cached("bag", lambda: _open_job(job, file))
+    topic = sweep_topic(job.sweeps, sweep)
+    connections = [opened for opened in bag.connections if opened.topic == topic]
+    time_ns = survey_start_ns(job.sweeps) + round(job.sweeps.begins_ns[sweep])
+    record = next(bag.messages(connections, time_ns, time_ns + 1), None)
+    if record is None:  # rosbags 0.11.2 misses some messages by their time
+        records = bag.messages(connections)
+        record = next((candidate for candidate in records if candidate[1] == time_ns), None)
+    if record is None:
+        raise ValueError(f"it contains no message on {topic} at {time_ns} ns")
+    connection, _, data = record
+    return message_types().deserialize_cdr(data, connection.msgtype)
+
+
+def _at_start(job: JobReader, sweep: int, points: Floats32, times: AnyArray) -> Floats32:
+    """Return points (n, 3) as fired in the sensor frame at the start of the sweep.
+
+    `times` (n,) are the times of the layout.
+    """
+    sweeps = job.sweeps
+    since_ns = LAYOUTS[job.layout].since_ns(times, message_stamp_ns(sweeps, sweep))
+    stamps = np.rint(since_ns + sweeps.stamp_ns(sweep)).astype(np.int64)
+    scans = np.full(len(points), sweeps.scans[sweep])
+    sensor_cloud = Cloud(points, {"scan": scans, "time": stamps})
+    fired_in_sensor = replace(sweeps, coordinates="sensor")
+    return fired_in_sensor.compensated(sweep, sensor_cloud).astype(np.float32)
+
+
+def _open_bag(source: RecordingSource) -> Recording:
     """Open a topic of PointCloud2: each message is a sweep in the frame of the message.
 
     CustomMsg of Livox is read where a bag has no PointCloud2, or its topic is chosen.
@@ -266,7 +314,7 @@ def open_file(source: RecordingSource) -> Recording:
 
 
 def _stated_compensation(path: Path) -> bool | None:
-    """Return what the custom data of a bag of `write_rosbag2` state, or None for other bags.
+    """Return what the custom data of a bag of `Rosbag2` state, or None for other bags.
 
     rosbags reads custom data from folders only.
     """
@@ -275,11 +323,6 @@ def _stated_compensation(path: Path) -> bool | None:
     else:
         text = read_metadata(path).get("rosbag2", {}).get("serialized_metadata", "")
     return states_compensation(re.sub(r"[\s\\]+", " ", text))  # YAML breaks long lines
-
-
-def open_folder(source: RecordingSource) -> Recording:
-    """Open the folder of a bag of ROS 2."""
-    return open_file(source)
 
 
 class _Header(NamedTuple):

@@ -60,12 +60,15 @@ class PointLayout(ABC):
         Name of the field of channels.
     full_intensity
         Value of the field `intensity` at an intensity of 1, or of a reflectivity at its maximum.
+    columns
+        Columns that the layout requires and stores, in addition to those of all bags.
     lines
         Lines of an organized cloud, "firings" or "channels"; empty if drivers publish none.
     """
 
     fields: ClassVar[np.dtype[np.void]]
     compensated_fields: ClassVar[np.dtype[np.void]]
+    columns: ClassVar[tuple[str, ...]]
     time_field: ClassVar[str]
     ring_field: ClassVar[str] = "ring"
     full_intensity: ClassVar[float] = 1
@@ -122,6 +125,7 @@ class VelodyneLayout(PointLayout):
     Times are seconds since the stamp.
     """
 
+    columns: ClassVar[tuple[str, ...]] = ("intensity", "time")
     fields = np.dtype([*_XYZI, ("ring", "<u2"), ("time", "<f4")])
     compensated_fields = np.dtype(fields.descr[:-1])
     time_field = "time"
@@ -143,6 +147,12 @@ class VelodyneLayout(PointLayout):
         return times.astype(np.float64) * 1e9
 
 
+class ImagesLayout(VelodyneLayout):
+    """Layout of velodyne_pointcloud with range images, which need all rays and every return."""
+
+    columns = ("intensity", "time", "ray", "range")
+
+
 class _CountedNanoseconds(PointLayout):
     """Layouts whose times are whole nanoseconds since the stamp, in 32 bits."""
 
@@ -160,6 +170,7 @@ class _CountedNanoseconds(PointLayout):
 class AutowareLayout(_CountedNanoseconds):
     """Layout of nebula, Autoware's driver: PointXYZIRCAEDT, or PointXYZIRC if compensated."""
 
+    columns = ("intensity", "time", "return_number", "returns")
     fields = np.dtype([
         *_XYZ, ("intensity", "u1"), ("return_type", "u1"), ("channel", "<u2"), ("azimuth", "<f4"),
         ("elevation", "<f4"), ("distance", "<f4"), ("time_stamp", "<u4"),
@@ -189,6 +200,7 @@ class OusterLayout(_CountedNanoseconds):
     Ring 0 is the highest beam.
     """
 
+    columns = ("signal", "time", "reflectivity", "range")
     fields = np.dtype({
         "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
         "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "<u2", "<u2", "<u4"],
@@ -223,6 +235,7 @@ class OusterLayout(_CountedNanoseconds):
 class _Reflectivities(PointLayout):
     """Layouts whose intensity is the maker's reflectivity, and whose times are absolute."""
 
+    columns = ("reflectivity", "time")
     full_intensity = 255
     unit_ns: ClassVar[float] = 1e9  # nanoseconds in a unit of the field of times
 
@@ -290,7 +303,7 @@ LAYOUTS: dict[str, PointLayout] = {
     "velodyne": VelodyneLayout(),
     "autoware": AutowareLayout(),
     "ouster": OusterLayout(),
-    "images": VelodyneLayout(),
+    "images": ImagesLayout(),
     "livox": LivoxLayout(),
     "hesai": HesaiLayout(),
     "robosense": RoboSenseLayout(),

@@ -22,7 +22,7 @@ from poolpart.workers import ask_workers, worker_identities
 from raybeam import available_backends
 
 from ...base.software import difference, software, software_query
-from ...clouds.writing import Format
+from ...clouds.writing import ExportSpec
 from ...scenario.build import Job
 from ...scenario.sections import TaskOptions
 from ..pipeline.failures import JobError
@@ -210,21 +210,15 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
             )
 
 
-def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None:
+def check_formats(client: Client, pool: Pool, formats: Iterable[ExportSpec]) -> None:
     """Check that the LIDAR workers can write the formats of plug-ins.
 
     LidarError if a worker has another version of a plug-in, or cannot import it.
     """
-    written = [
-        file_format
-        for file_format in formats
-        if file_format.row.in_pieces and file_format.row.plugin is not None
-    ]
+    written = [spec for spec in formats if spec.has_many_files and spec.row.plugin is not None]
     if not written:
         return
-    plugins = [
-        file_format.row.plugin for file_format in written if file_format.row.plugin is not None
-    ]
+    plugins = [spec.row.plugin for spec in written if spec.row.plugin is not None]
     required = software(plugins=plugins)
     writing = [worker.address for worker in pool if worker.resources.get(LIDAR)]
     for address, answer in _answers(client, software_query(plugins=plugins), writing).items():
@@ -241,7 +235,7 @@ def check_formats(client: Client, pool: Pool, formats: Iterable[Format]) -> None
             ) from answer
 
 
-def _check_installed(formats: Iterable[Format]) -> None:
+def _check_installed(formats: Iterable[ExportSpec]) -> None:
     for file_format in formats:
         file_format.check_installed()
 

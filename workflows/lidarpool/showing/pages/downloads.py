@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from lidarview.viewer.view import Downloads
 
-from ...clouds.writing import Format, save_cloud
+from ...clouds.writing import ExportSpec, save_cloud
 
 DOWNLOADS = ("ply", "las", "parquet")  # formats that a page offers
 
 
 def downloads() -> Downloads:
     """Return the formats of a download whose packages are installed, and their writer."""
-    return Downloads([name for name in DOWNLOADS if Format(name).installed], save_cloud)
+    return Downloads([name for name in DOWNLOADS if ExportSpec(name).installed], save_cloud)

@@ -15,7 +15,7 @@ from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 from lidarview.picture_file import PictureContent
 
-from ...clouds.writing import Format
+from ...clouds.writing import ExportSpec
 from .bridge_table import BRIDGES
 from .schedule import Schedule
 
@@ -47,7 +47,7 @@ class Bridge(ABC):
         Prints a note for the user.
     """
 
-    format: ClassVar[Format | None] = None  # clouds of it have the columns that are sent
+    format: ClassVar[ExportSpec | None] = None  # clouds of it have the columns that are sent
     settings: ClassVar[tuple[str, ...]] = ()  # options of the command beside `to`
     lead_ns: ClassVar[float] = 0.0  # how long before `due_ns` the bridge gets a sweep
 
@@ -64,7 +64,7 @@ class Bridge(ABC):
         self.note = note
 
     @classmethod
-    def format_of(cls, settings: Mapping[str, Any]) -> Format | None:
+    def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec | None:
         """Return `format`, or the format of `settings`.
 
         Raises LidarError if these do not fit together.

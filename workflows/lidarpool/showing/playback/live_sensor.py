@@ -12,7 +12,7 @@ from lidarsim.packets.shots import Shots, check_columns
 from lidarsim.sweeps.instruments import IMU_FILE, Instruments
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ...clouds.writing import Format
+from ...clouds.writing import ExportSpec
 from .bridge import Bridge, BridgeOptions
 from .schedule import Schedule
 from .transmitter import Transmitter, sensor_streams
@@ -27,7 +27,7 @@ class PacketsBridge(Bridge):
     `lateness`, a file for how late packets were.
     """
 
-    format = Format("pcap")
+    format = ExportSpec("pcap")
     settings = ("api", "lateness")
     lead_ns = _LEAD_NS
 

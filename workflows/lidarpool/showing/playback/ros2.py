@@ -16,7 +16,7 @@ from lidarsim.sweeps.sweeps import Sweeps
 from ...clouds.frame_names import survey_start_ns
 from ...clouds.ros.layouts import LaidOut
 from ...clouds.ros.messages import RosMessage, SurveyMessages
-from ...clouds.writing import Format
+from ...clouds.writing import ExportSpec
 from .bridge import Bridge, BridgeOptions
 from .dds import Network, RosPublisher
 from .schedule import Schedule
@@ -27,7 +27,7 @@ _CLOCK_NS = 10_000_000  # between messages of the clock, of the survey's time
 class Ros2Bridge(Bridge):
     """Publishes sweeps as drivers do, each at its end, and IMU, GNSS receiver and clock between.
 
-    Topics, types and layouts are as in bags (`write_mcap`). Nodes take the time of the survey
+    Topics, types and layouts are as in bags (`Rosbag2`). Nodes take the time of the survey
     from `/clock` (`use_sim_time`), unless it is played at today's time.
     """
 
@@ -51,10 +51,10 @@ class Ros2Bridge(Bridge):
         self._stopped = threading.Event()
 
     @classmethod
-    def format_of(cls, settings: Mapping[str, Any]) -> Format:
+    def format_of(cls, settings: Mapping[str, Any]) -> ExportSpec:
         """Return the format of bags with the same messages."""
         organized = bool(settings.get("organized"))
-        return Format(
+        return ExportSpec(
             "mcap",
             settings.get("layout", "velodyne"),
             organized=organized,

@@ -26,7 +26,7 @@ from lidarview.picture_file import PICTURE_FILE, PictureContent
 
 from ...clouds.folder import local_result
 from ...clouds.navigation_files import write_instruments
-from ...clouds.writing import Format
+from ...clouds.writing import ExportSpec
 from ...scenario.advice import advice
 from ...scenario.build import Job, build
 from ...scenario.campaign import CampaignSpec
@@ -80,7 +80,7 @@ class Played:
 @contextmanager
 def open_source(
     source: Path | Storage,
-    needs: Format | None = None,
+    needs: ExportSpec | None = None,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
     tell: Callable[[str], None] = lambda note: None,
 ) -> Iterator[Played]:
@@ -145,7 +145,7 @@ def _recorded(folder: Path, source: Path | Storage) -> Played:
 
 def scenario_job(
     path: Path,
-    needs: Format | None = None,
+    needs: ExportSpec | None = None,
     of_mesh: Mapping[str, Any] = MappingProxyType({}),
     tell: Callable[[str], None] = lambda note: None,
 ) -> Job:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lidarsim.base.arrays import AnyArray
 from lidarsim.base.errors import LidarError
@@ -17,7 +17,11 @@ from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud, CloudLike
 from lidarsim.sweeps.sweeps import MIXED_UP, Sweeps
 
-from .format_table import row_of
+from .cloud_format import CloudFormat
+from .format_table import format_named, row_of
+
+if TYPE_CHECKING:
+    from .writing import ExportSpec
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
 THREADS = min(4, os.cpu_count() or 1)
@@ -33,39 +37,14 @@ PieceRange = tuple[int, int]  # a range of pieces
 WrittenRange = tuple[int, list[Any]]
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A job in a data set.
+class MultiFileFormat(CloudFormat):
+    """A cloud in a format with many files: files of each piece, often a sweep, and shared files.
 
-    Number and name distinguish its files from files of further jobs.
-
-    `values` are the varied values, by name.
-    """
-
-    number: int
-    name: str
-    split: str = ""
-    values: Mapping[str, Any] = field(default_factory=dict)
-
-    def path_of(self, format: str) -> str:  # noqa: A002
-        """Return the path of the job's file or folder in data sets of a format."""
-        return row_of(format).of_job.format(number=self.number, name=self.name)
-
-
-class Pieces:
-    """Output of a multi-file format: files of each piece, often a sweep, and shared files.
-
-    `folders` are the folders of the files of the pieces. With an `entry` the files belong to a job
-    in a data set.
+    `folders` are the folders of the files of the pieces.
     """
 
     folders: Sequence[str] = ()
-    compensated = False  # requested where a format also holds points as they were fired
-
-    def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
-        self.cloud = cloud
-        self.sweeps = sweeps
-        self.entry = entry
+    compensated = False  # the option of `ExportSpec`
 
     def __len__(self) -> int:
         return len(self.sweeps)
@@ -86,7 +65,40 @@ class Pieces:
         """Return a summary of this job for the data set's own files, as plain data for JSON."""
         return {}
 
-    def write(self, storage: Storage, first: int, stop: int) -> WrittenRange:
+    def write(
+        self, path: Path, spec: ExportSpec, workers: RangeWorkers | None = None
+    ) -> float | None:
+        """Write all files to a new folder, as `write_to`."""
+        self.write_to(Storage(str(path), durable=False), spec, workers)
+        return None
+
+    def write_to(
+        self, storage: Storage, spec: ExportSpec, workers: RangeWorkers | None = None
+    ) -> None:
+        """Write all files, in threads the ranges that workers have not written.
+
+        Raises OSError on failure.
+
+        Raises
+        ------
+        LidarError
+            If the cloud is not of these sweeps, or not in order; or as `workers`.
+        """
+        writer = RangeWriter(spec.format, self.cloud, self.sweeps, storage, spec.compensated)
+        for folder in ("", *self.folders):
+            storage.prepare(folder)
+        spans = self.spans()
+        writer.start()
+        written = workers(writer, spans) if workers else {}
+        remaining = [span for span in spans if span not in written]
+        with ThreadPoolExecutor(THREADS, "write") as pool:  # waits for its threads
+            results = zip(remaining, pool.map(writer, remaining), strict=True)
+            written |= {span: result for span, result in results if result}
+        writer.stop()
+        self.finish(storage, (written.get(span, (0, [])) for span in spans))
+        storage.tidy()
+
+    def write_range(self, storage: Storage, first: int, stop: int) -> WrittenRange:
         """Write the files of pieces, a piece in memory at a time.
 
         Raises OSError on failure.
@@ -125,10 +137,7 @@ class Pieces:
 
 @dataclass(frozen=True)
 class RangeWriter:
-    """Writes ranges of the pieces of a cloud, in any process that sees the folder `storage`.
-
-    The class `Pieces` of the `format` defines the content of each file.
-    """
+    """Writes ranges of a cloud in a multi-file format, in any process that sees `storage`."""
 
     format: str
     cloud: CloudLike
@@ -147,17 +156,14 @@ class RangeWriter:
         None if this process does not see the folder, lacks the format's package, or after `stop`.
         """
         try:
-            pieces = self._pieces()
+            output = format_named(self.format)(self.cloud, self.sweeps)
         except ImportError:
             return None
         if not self.storage.sees(_MARK, self._mark):
             return None
-        return pieces.write(self.storage, *span)
-
-    def _pieces(self) -> Pieces:
-        pieces = pieces_of(self.format, self.cloud, self.sweeps)
-        pieces.compensated = self.compensated
-        return pieces
+        assert isinstance(output, MultiFileFormat)
+        output.compensated = self.compensated
+        return output.write_range(self.storage, *span)
 
     @property
     def plugins(self) -> tuple[Plugin, ...]:
@@ -165,45 +171,13 @@ class RangeWriter:
         plugin = row_of(self.format).plugin
         return () if plugin is None else (plugin,)
 
+    def start(self) -> None:
+        """Allow ranges to be written."""
+        self.storage.write(_MARK, self._mark)
+
     def stop(self) -> None:
         """Prevent further ranges from being written."""
         self.storage.remove([_MARK])
-
-    def write(self, workers: RangeWorkers | None = None) -> None:
-        """Write all files, in threads the ranges that workers have not written.
-
-        Raises OSError on failure.
-
-        Raises
-        ------
-        LidarError
-            If the cloud is not of these sweeps, or not in order; or as `workers`.
-        """
-        pieces = self._pieces()
-        for folder in ("", *pieces.folders):
-            self.storage.prepare(folder)
-        spans = pieces.spans()
-        self.storage.write(_MARK, self._mark)
-        written = workers(self, spans) if workers else {}
-        remaining = [span for span in spans if span not in written]
-        with ThreadPoolExecutor(THREADS, "write") as pool:  # waits for its threads
-            results = zip(remaining, pool.map(self, remaining), strict=True)
-            written |= {span: result for span, result in results if result}
-        self.stop()
-        pieces.finish(self.storage, (written.get(span, (0, [])) for span in spans))
-        self.storage.tidy()
-
-
-def pieces_of(
-    format: str,  # noqa: A002
-    cloud: CloudLike,
-    sweeps: Sweeps,
-    entry: Entry | None = None,
-) -> Pieces:
-    """Return the pieces of a cloud in a multi-file format, of a job with an `entry`."""
-    row = row_of(format)
-    pieces: Pieces = row.provides(row.write)(cloud, sweeps, entry)
-    return pieces
 
 
 def as_data(array: AnyArray) -> Data:

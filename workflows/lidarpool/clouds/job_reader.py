@@ -1,4 +1,4 @@
-"""Readers of single sweeps of a job in a data set, a class `Reader` for each format."""
+"""The files of a job in a data set, from which formats read single sweeps."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ import os
 import shutil
 import tempfile
 import weakref
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats32
+from lidarsim.base.arrays import AnyArray
 from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import Cloud
 from lidarsim.sweeps.sweeps import Sweeps
 
-from .pieces import Entry
+from .cloud_format import Entry, PointColumns
 
-# Points, float32 (n, 3), meters in the sensor's axes, and {column: (n,)}, as the format holds them.
-PointColumns = tuple[Floats32, dict[str, AnyArray]]
+T = TypeVar("T")
 
 
-class Reader:
-    """Reads the points of a job's sweeps in any order, in a single thread."""
+class JobReader:
+    """The files of a job in a data set, which are read in any order, in a single thread."""
 
     def __init__(
         self,
@@ -39,27 +38,25 @@ class Reader:
         self.storage = storage
         self.sweeps = sweeps
         self.entry = entry
-        self.layout = layout
+        self.layout = layout  # of points in mcap
         self.classes = classes  # names of the classes of all jobs
-        self._copies: Path | None = None
         self.last = ""  # name of the file of rows that was read last, for errors
+        self.opened = ExitStack()  # opened files, which `close` closes
+        self._cache: dict[str, Any] = {}
+        self._copies: Path | None = None
 
-    def files(self, sweep: int) -> list[str]:
-        """Return the names of the files of a sweep, the file of its points first."""
-        raise NotImplementedError
+    def cached(self, key: str, make: Callable[[], T]) -> T:
+        """Return the value of a key, which `make` makes once."""
+        if key not in self._cache:
+            self._cache[key] = make()
+        value: T = self._cache[key]
+        return value
 
-    def read(self, sweep: int) -> PointColumns:
-        """Return the points of a sweep.
-
-        Raises any exception if the points cannot be read.
-        """
-        raise NotImplementedError
-
-    def expect(self, sweep: int) -> None:
-        """Have the system load the files of a sweep into its memory, for `read` soon."""
-        # `read` will raise any OSError; only Linux has all of these functions.
+    def expect(self, names: Sequence[str]) -> None:
+        """Have the system load files into its memory, because they will be read soon."""
+        # Reading will raise any OSError; only Linux has all of these functions.
         with suppress(OSError, AttributeError):
-            for name in self.files(sweep):
+            for name in names:
                 with io.FileIO(self.storage.path(name)) as file:
                     try:
                         os.preadv(file.fileno(), [bytearray(1)], 0, os.RWF_NOWAIT)
@@ -69,6 +66,7 @@ class Reader:
 
     def close(self) -> None:
         """Close opened files, and remove local copies."""
+        self.opened.close()
         if self._copies is not None:
             _remove(self._copies, os.getpid())
 
@@ -106,7 +104,7 @@ class Reader:
             raise ValueError(f"it has {len(rows):,} points, but {points_file} has {count:,}")
         return rows  # PyTorch requires writable arrays
 
-    def inside(self, sweep: int, cloud: Cloud) -> PointColumns:
+    def in_sensor(self, sweep: int, cloud: Cloud) -> PointColumns:
         """Return the points of a cloud in the sensor frame, and all their columns."""
         positions = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
         columns = self.sweeps.columns_in_sensor(sweep, cloud)
