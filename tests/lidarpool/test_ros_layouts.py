@@ -33,6 +33,7 @@ from lidarpool.cli.result_commands import export
 from lidarpool.clouds.format_table import LAYOUTS
 from lidarpool.clouds.ros import layouts
 from lidarpool.clouds.ros.livox import CUSTOM_DEFINITION, CUSTOM_MSG
+from lidarpool.clouds.ros.organized import organized_rows
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.recordings.opening import open_recording
 from lidarsim.columns.bags import POINT_CLOUD, livox_columns, message_types, point_columns
@@ -377,6 +378,28 @@ def test_a_column_of_an_organized_ouster_looks_in_one_direction(tmp_path):
     returned = ~np.isnan(column)
     assert returned.sum() > 10_000
     assert (column[returned] == np.broadcast_to(np.arange(1024), column.shape)[returned]).all()
+
+
+def test_the_padding_of_organized_points_is_zero(tmp_path):
+    """NumPy copies the fields of a point, and leaves what is between them as it finds it."""
+    survey = Survey(
+        sensors=[Mounted(Sensor.grid(36, 4), name="roof")],
+        trajectory=Track([0, 1], [[0, 0, 0], [0.5, 0, 0]]),
+        steps=36,
+        columns=COLUMNS,
+    )
+    part = columns_of(list(Rig(SCENE, survey, "tiles").cast(0, survey.scan_count)))
+    points = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, SCENE.origin)
+    row = layouts.LAYOUTS["ouster"].fields
+    used = {b for kind, at, *_ in row.fields.values() for b in range(at, at + kind.itemsize)}
+    dirty = [np.full(size, 255, np.uint8) for size in range(1000, 20_000, 100) for _ in range(4)]
+    del dirty
+    laid_out = layouts.LaidOut("ouster", organized=True)
+    sweeps = Sweeps.from_survey(survey, SCENE)
+    rows = layouts.point_rows(laid_out, row, points, sweeps, 0)
+    (organized,) = organized_rows(laid_out, rows, points, sweeps, 0)
+    stored = np.frombuffer(organized.tobytes(), np.uint8).reshape(-1, row.itemsize)
+    assert not stored[:, sorted({*range(row.itemsize)} - used)].any()
 
 
 @pytest.mark.extended(every=2)

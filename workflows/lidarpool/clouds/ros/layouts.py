@@ -5,12 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
-from lidarsim.base.arrays import AnyArray, Floats, Floats32, Ints, Records
+from lidarsim.base.arrays import AnyArray, Floats, Ints, Records
 from lidarsim.columns.cloud import Cloud
+from lidarsim.columns.sweep import Sweep
 from lidarsim.columns.table import COLORS, SURFACE_COLUMNS, VELOCITY
 from lidarsim.scene.colors import as_float
 from lidarsim.sensor.optics import TWO_RETURNS
@@ -35,14 +36,6 @@ EXTRA_FIELDS = {
     **{name: ("<f4", {name}) for name in SURFACE_COLUMNS},
     "material": ("<i4", {"material"}),
 }
-
-
-class SweepPoints(NamedTuple):
-    """Points of a sweep in the sensor frame, for the rows of layouts."""
-
-    positions: Floats32  # (n, 3): meters
-    columns: Mapping[str, AnyArray]  # columns of the cloud
-    traits: LidarTraits  # traits of the sensor
 
 
 class PointLayout(ABC):
@@ -76,8 +69,11 @@ class PointLayout(ABC):
     no_intensity: ClassVar[float] = 0  # value of rays without return, in organized clouds
 
     @abstractmethod
-    def values(self, points: SweepPoints) -> dict[str, AnyArray]:
-        """Return values of fields, {name: (n,)}, beside position, ring and time."""
+    def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
+        """Return values of fields, {name: (n,)}, beside position, ring and time.
+
+        `traits` are those of the sensor.
+        """
 
     @abstractmethod
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
@@ -132,9 +128,10 @@ class VelodyneLayout(PointLayout):
     lines = "firings"
     no_intensity = np.nan
 
-    def values(self, points: SweepPoints) -> dict[str, AnyArray]:
+    def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
         """Return the energy."""
-        return {"intensity": points.columns["intensity"]}
+        del traits
+        return {"intensity": sweep.columns["intensity"]}
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
         """Return seconds since the stamp."""
@@ -180,14 +177,14 @@ class AutowareLayout(_CountedNanoseconds):
     ring_field = "channel"
     full_intensity = 255
 
-    def values(self, points: SweepPoints) -> dict[str, AnyArray]:
+    def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
         """Return energy, type of return, and polar coordinates of the positions."""
-        x, y, z = points.positions.astype(np.float64).T
+        x, y, z = sweep.points.astype(np.float64).T
         level = np.hypot(x, y)
-        zero = np.radians(points.traits.zero_deg)
+        zero = np.radians(traits.zero_deg)
         return {
-            "intensity": np.round(np.clip(points.columns["intensity"], 0, 1) * 255),
-            "return_type": _return_types(points.columns, points.traits.mode),
+            "intensity": np.round(np.clip(sweep.columns["intensity"], 0, 1) * 255),
+            "return_type": _return_types(sweep.columns, traits.mode),
             "azimuth": (zero - np.arctan2(y, x)) % (2 * np.pi),
             "elevation": np.arctan2(z, level),
             "distance": np.hypot(level, z),
@@ -217,10 +214,10 @@ class OusterLayout(_CountedNanoseconds):
     full_intensity = COUNTS
     lines = "channels"
 
-    def values(self, points: SweepPoints) -> dict[str, AnyArray]:
+    def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
         """Return the signal, the reflectivity, and the sensor's range in millimeters."""
-        columns = points.columns
-        range_m = columns["range"].astype(np.float64) + points.traits.range_offset_m
+        columns = sweep.columns
+        range_m = columns["range"].astype(np.float64) + traits.range_offset_m
         return {
             "intensity": columns["signal"],
             "reflectivity": columns["reflectivity"],
@@ -239,9 +236,10 @@ class _Reflectivities(PointLayout):
     full_intensity = 255
     unit_ns: ClassVar[float] = 1e9  # nanoseconds in a unit of the field of times
 
-    def values(self, points: SweepPoints) -> dict[str, AnyArray]:
+    def values(self, sweep: Sweep, traits: LidarTraits) -> dict[str, AnyArray]:
         """Return the reflectivity."""
-        return {"intensity": points.columns["reflectivity"]}
+        del traits
+        return {"intensity": sweep.columns["reflectivity"]}
 
     def times(self, since_ns: Floats, stamp_ns: int) -> AnyArray:
         """Return times since 1970."""
@@ -345,7 +343,7 @@ def point_rows(
         positions = sweeps.as_fired(sweep, points).astype(np.float32)
         columns = sweeps.columns_as_fired(sweep, points)
     values: dict[str, AnyArray] = dict(zip("xyz", positions.T, strict=True))
-    values |= layout.values(SweepPoints(positions, columns, traits))
+    values |= layout.values(Sweep(positions, columns), traits)
     values[layout.ring_field] = layout.rings(columns["channel"], traits)
     if not laid_out.compensated:
         since_ns = since_stamp_ns(points, sweeps, sweep)

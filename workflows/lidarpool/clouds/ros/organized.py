@@ -25,15 +25,19 @@ def organized_rows(
     LidarError if the points are not in order, or the rays of the survey are unknown.
     """
     image = Image.from_points(sweeps, sweep, points)
-    without_return = _rays(laid_out, image, rows.dtype, sweeps, sweep)
+    # Points are moved as bytes: NumPy leaves the padding of copied fields uninitialized.
+    point = np.dtype((np.void, rows.dtype.itemsize))
+    without_return = _rays(laid_out, image, rows.dtype, sweeps, sweep).view(point)
     planes = np.repeat(without_return[np.newaxis], image.planes, axis=0)
-    planes[image.plane, image.row, image.column] = rows
+    planes[image.plane, image.row, image.column] = rows.view(point)
     if laid_out.layout.lines == "firings":
         lines = planes.transpose(2, 0, 1)
-        return [np.ascontiguousarray(lines).reshape(-1, image.sensor.channels)]
-    columns = _looking_ahead(image)
-    in_direction = np.take_along_axis(planes, columns[np.newaxis], axis=2)
-    return [np.ascontiguousarray(plane[::-1]) for plane in in_direction]
+        organized = [np.ascontiguousarray(lines).reshape(-1, image.sensor.channels)]
+    else:
+        columns = _looking_ahead(image)
+        in_direction = np.take_along_axis(planes, columns[np.newaxis], axis=2)
+        organized = [np.ascontiguousarray(plane[::-1]) for plane in in_direction]
+    return [cloud.view(rows.dtype) for cloud in organized]
 
 
 def _rays(
