@@ -51,6 +51,7 @@ from lidarpool import (
     load_sensor,
     load_trajectory,
     merge,
+    open_recording,
     play,
     read_cloud,
     remove_run,
@@ -171,6 +172,10 @@ WRONG = {
     compare: [
         (3, "a.ply", "a must … but is 3"),
         ("a.ply", "b.ply", "a.ply does not exist. Specify the folder of a result"),
+    ],
+    open_recording: [
+        (3, "source must … but is 3"),
+        ("nowhere", "nowhere does not exist"),
     ],
     load_robot: [(3, "path must … but is 3"), (None, "path must … but is None")],
     Scene.load: [(3, "path must … but is 3"), (None, "path must … but is None")],
@@ -340,6 +345,7 @@ def test_nothing_public_is_left_out():
         "Robot",
         "ScanSpec",
         "LidarError",
+        "Recording",
         "Sweep",
         "__version__",
     }

@@ -258,7 +258,7 @@ def test_data_sets_give_them_back(scene, sweeps, tmp_path, name):
         told = yaml.safe_load((tmp_path / "semantic-kitti.yaml").read_text())
         assert told["labels"][3] == "road; lane"
     few = {"class": np.arange(len(found[2])) % 2 * 3}
-    (legend,) = draw_sweep(replace(found[2], columns=few), found.classes).figure.legends
+    (legend,) = draw_sweep(found[2].replace(columns=few), found.classes).figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["none", "road; lane", "sensor"]
 
 

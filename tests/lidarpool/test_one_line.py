@@ -94,10 +94,11 @@ def test_it_is_one_line(thing):
 
 
 def test_every_public_class_is_among_them():
-    # A result and a comparison are printed as tables; robot, scan and sweep have their tests. A
+    # A result and a comparison are printed as tables; robot, scan, sweep and recording have their
+    # tests. A
     # scanner of MuJoCo needs MuJoCo, and views of scanners need a viewer.
     elsewhere = {"Result", "Comparison", "Fit", "Twin", "Robot", "ScanSpec", "Sweep", "LidarError"}
-    elsewhere |= {"MujocoScanner", "Foxglove", "Rerun"}
+    elsewhere |= {"MujocoScanner", "Foxglove", "Rerun", "Recording"}
     public = {n for n in lidarpool.__all__ if isinstance(getattr(lidarpool, n), type)}
     parts = {"Imu", "Gnss"}  # of Navigation
     assert (

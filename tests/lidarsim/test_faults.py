@@ -23,7 +23,6 @@ from lidarpool import (
     Scene,
     Sensor,
     Survey,
-    Sweep,
     Track,
     load_sensor,
 )
@@ -33,6 +32,7 @@ from lidarpool.clouds.ros.bags import Rosbag2
 from lidarpool.clouds.webdataset import WebDataset
 from lidarpool.clouds.writing import ExportSpec
 from lidarpool.datasets.job_table import JobRow
+from lidarpool.datasets.sweep_data import sweep_of_job
 from lidarpool.scenario.build import build
 from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
@@ -255,7 +255,7 @@ def test_labels_list_the_faults_of_each_sweep(tmp_path):
     frozen = Sweeps.from_survey(replace(STANDING, faults=[FAULTS["frozen"]]), ROOM)
     assert [len(frozen.faults_in(k)) for k in range(3)] == [0, 0, 1]  # those that repeat another
     job = JobRow(0, "0", "", {}, {})
-    assert Sweep.from_points(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
+    assert sweep_of_job(job, again, 2, (None, {}), None).faults[0].by_s == -0.5
     output = WebDataset(cloud, sweeps)
     told = [
         b"".join(output.sample_files(k, points, None))

@@ -20,7 +20,8 @@ from lidarsim.base.arrays import Floats, Ints
 from lidarsim.base.errors import LidarError
 from lidarsim.base.even_samples import even_indices
 from lidarsim.base.extras import reading
-from lidarsim.base.words import did_you_mean, joined
+from lidarsim.base.signatures import ReadableSignature
+from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.columns.column_names import STRENGTHS, with_standard_names
 from lidarsim.columns.sweep import Columns, Sweep
@@ -49,7 +50,7 @@ class SeveralSensorsError(LidarError):
         self.names = names
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Recording:
     """A sequence of sweeps of one sensor, or of parts of a cloud without sweeps.
 
@@ -134,7 +135,15 @@ class Recording:
     firing_key: str = ""
     noise_classes: tuple[int, ...] | None = NOISE_CLASSES
     notes: tuple[str, ...] = ()
-    _omitted: dict[int, LeftOut] = field(default_factory=dict)  # {number of an item: points}
+    _omitted: dict[int, LeftOut] = field(default_factory=dict, init=False)  # {item: points}
+
+    __signature__ = ReadableSignature()
+
+    def __repr__(self) -> str:
+        if self.is_cloud:
+            return f"<Recording {self.name}: cloud in {plural(self.count, 'part')}>"
+        motion = {True: ", motion-compensated", False: ", as fired", None: ""}[self.compensated]
+        return f"<Recording {self.name}: {plural(self.count, 'sweep')}{motion}>"
 
     def __len__(self) -> int:
         return self.count

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from lidarsim.base.errors import LidarError, MissingFileError
+from lidarsim.base.validation import checked
+from lidarsim.base.vocabulary import UNITS_M
 from lidarsim.base.words import joined
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
@@ -66,12 +69,14 @@ def open_sensors(source: str | Path, *, keep_noise: bool = False) -> dict[str, R
     }
 
 
+@checked
 def open_recording(
     source: str | Path | Cloud | StoredCloud,
     sensor: str | None = None,
     intensity: str | None = None,
+    *,
     name: str = "the cloud",
-    unit: str | None = None,
+    unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
     keep_noise: bool = False,
 ) -> Recording:
     """Open a recording or cloud, whatever its format, to read it sweep by sweep.

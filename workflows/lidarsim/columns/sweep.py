@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Ints32
+from ..base.signatures import ReadableSignature
 from .column_names import STRENGTHS
 
 Columns = Mapping[str, AnyArray]
@@ -60,6 +61,8 @@ class Sweep:
         Recording to which the sweep belongs. It determines `rings` and `times_s` where the file
         does not state them.
     """
+
+    __signature__ = ReadableSignature()
 
     def __init__(
         self,
