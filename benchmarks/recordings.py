@@ -117,7 +117,7 @@ def write_data_set(folder, sweep_count):
 
 def write_inputs(folder, share=1.0):
     """Write all inputs with a share of the points or sweeps, unless they exist."""
-    from lidarpool.clouds.writing import Format
+    from lidarpool.clouds.writing import ExportSpec
 
     if folder.exists():
         return
@@ -126,7 +126,7 @@ def write_inputs(folder, share=1.0):
     staged.mkdir(parents=True)
     write_survey(staged / "survey.las", int(share * SURVEY_POINTS))
     write_survey(staged / "scene.las", int(share * SCENE_POINTS))
-    Format("mcap").write(staged / "drive.mcap", *make_drive(int(share * DRIVE_SWEEPS)))
+    ExportSpec("mcap").write(staged / "drive.mcap", *make_drive(int(share * DRIVE_SWEEPS)))
     write_kitti(staged / "kitti", int(share * KITTI_SWEEPS))
     write_data_set(staged / "dataset", int(share * JOB_SWEEPS))
     staged.rename(folder)

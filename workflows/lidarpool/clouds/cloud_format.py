@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from lidarsim.base.arrays import AnyArray, Floats32
 from lidarsim.base.errors import LidarError
+from lidarsim.base.storage import Storage
 from lidarsim.columns.cloud import CloudLike
 from lidarsim.survey.survey import Survey
 from lidarsim.sweeps.sweeps import Sweeps
@@ -163,6 +165,35 @@ class CloudFormat(ABC):
         Raises any exception if the points cannot be read.
         """
         raise NotImplementedError
+
+    @classmethod
+    def class_files(cls, classes: Mapping[int, str]) -> Mapping[str, bytes]:
+        """Return the files of a data set that contain the names of the classes of all jobs."""
+        return {}
+
+    @classmethod
+    def merge_jobs(
+        cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
+    ) -> dict[str, list[int]]:
+        """Write further files that the jobs of a data set share, from the manifests of the jobs.
+
+        Returns
+        -------
+        Class list to which the labels of a job must be renumbered (`renumbered`), by the name of
+        the job. Jobs can have different classes.
+        """
+        deque(manifests, maxlen=0)
+        return {}
+
+    @classmethod
+    def renumbered(
+        cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
+    ) -> bytes | None:
+        """Return the content of a file with labels for other classes, or None for other files.
+
+        `before` and `after` are the classes that the labels number.
+        """
+        return None
 
     @classmethod
     def open(cls, source: RecordingSource) -> Recording:

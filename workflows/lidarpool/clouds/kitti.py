@@ -36,7 +36,6 @@ from .recording import Recording, RecordingSource, sweep_from_columns
 
 _MATRIX_NUMBERS = [f"m{row}{column}" for row in range(3) for column in range(4)]
 MAX_INSTANCES = 65_535
-NAMES_FILE = "semantic-kitti.yaml"
 CALIBRATION_FILE = "calib.txt"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
@@ -135,7 +134,7 @@ class KITTI(MultiFileFormat):
                 tracks = self._tracks(np.flatnonzero(sweep_mask).tolist(), boxes)
                 files[f"label_02/{self.names[sensor]}.txt"] = tracks
         if sweeps.classes and self.entry is None:  # else all jobs share a file
-            files[NAMES_FILE] = labels_file(sweeps.classes)
+            files |= self.class_files(sweeps.classes)
         return files
 
     def _tracks(self, numbers: Sequence[int], boxes: Sequence[Boxes | None]) -> bytes:
@@ -175,17 +174,18 @@ class KITTI(MultiFileFormat):
         """Open a .bin file of KITTI or nuScenes, or a sequence of KITTI or SemanticKITTI."""
         return _open_sequence(source) if source.path.is_dir() else _open_sweep(source)
 
+    @classmethod
+    def class_files(cls, classes: Mapping[int, str]) -> dict[str, bytes]:
+        """Return the names and colors (blue, green, red) of classes, for semantic-kitti-api."""
+        labels = {0: "unlabeled", **classes}
+        colors = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
+        content = {"labels": labels, "color_map": colors}
+        return {"semantic-kitti.yaml": yaml.safe_dump(content, allow_unicode=True).encode()}
+
 
 def intensity_of(points: Cloud) -> Floats32:
     """Return the intensity of KITTI (n,): reflectivity from 0 to 1, independent of the range."""
     return np.asarray(points["reflectivity"] / np.float32(255), np.float32)
-
-
-def labels_file(classes: Mapping[int, str]) -> bytes:
-    """Return the names of classes, and colors (blue, green, red), for semantic-kitti-api."""
-    labels = {0: "unlabeled", **classes}
-    colors = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
-    return yaml.safe_dump({"labels": labels, "color_map": colors}, allow_unicode=True).encode()
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from hashlib import md5
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from PIL import Image
@@ -70,7 +70,7 @@ class NuScenes(MultiFileFormat):
     no gaps. They are numbered by class from 1 on; 0 is for points without a named class.
 
     In a data set each job is a scene with its name, on a separate day, its files are in folders
-    of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
+    of that name in `samples/NAME` and `sweeps/NAME`, and `merge_jobs` writes the tables.
 
     Caesar et al., nuScenes, 2020.
     """
@@ -121,7 +121,7 @@ class NuScenes(MultiFileFormat):
         return files | {_MAP: _no_map()}
 
     def summary(self, boxes: Sequence[Boxes]) -> dict[str, Any]:
-        """Return the tables of a job, and the classes that its labels number, for `merge`."""
+        """Return the tables of a job, and the classes that its labels number, for `merge_jobs`."""
         labeled = {"lidarseg": sorted(self.sweeps.classes)} if self.labels else {}
         return {"tables": self._tables(boxes), **labeled}
 
@@ -138,7 +138,7 @@ class NuScenes(MultiFileFormat):
                 {"token": token, "sample_data_token": token, "filename": file}
                 for token, file in zip(tokens, self.labels, strict=True)
             ]
-        if self.labels and self.entry is None:  # `merge` adds the classes of all jobs
+        if self.labels and self.entry is None:  # `merge_jobs` adds the classes of all jobs
             tables.rows["category"] = _categories(tables.rows["category"], self.sweeps.classes)
         return tables.rows
 
@@ -183,6 +183,57 @@ class NuScenes(MultiFileFormat):
     def open(cls, source: RecordingSource) -> Recording:
         """Open a lidar in a nuScenes data set."""
         return _open_data_set(source)
+
+    @classmethod
+    def merge_jobs(
+        cls, storage: Storage, manifests: Iterable[Mapping[str, Any]]
+    ) -> dict[str, list[int]]:
+        """Write the tables of a data set, and return the jobs whose labels must be renumbered."""
+        shared: set[str] = set()  # tokens of rows that several jobs have
+        with ExitStack() as stack:
+            files = {
+                name: stack.enter_context(storage.writing(f"{VERSION}/{name}.json"))
+                for name in _TABLES
+            }
+            separators: dict[str, bytes] = {}  # {table: bytes before its next row}
+            kinds = dict[str, dict[str, Any]]()
+            classes = _JobClasses()
+
+            def write(tables: Mapping[str, Iterable[dict[str, Any]]]) -> None:
+                for name, rows in tables.items():
+                    for row in rows:
+                        if name in _SHARED:
+                            if row["token"] in shared:
+                                continue
+                            shared.add(row["token"])
+                        if name not in files:  # lidarseg
+                            files[name] = stack.enter_context(
+                                storage.writing(f"{VERSION}/{name}.json")
+                            )
+                        files[name].write(separators.get(name, b"[\n") + json.dumps(row).encode())
+                        separators[name] = b",\n"
+
+            for job in manifests:
+                kinds |= {row["token"]: row for row in job["tables"].pop("category")}
+                classes.add(job)
+                write(job["tables"])
+            rows = kinds.values()
+            write({"category": _categories(rows, classes.names) if "lidarseg" in files else rows})
+            for name, file in files.items():
+                file.write(b"\n]\n" if name in separators else b"[]\n")
+        with storage.writing(_MAP) as file:
+            file.write(_no_map())
+        return classes.relabeled_jobs()
+
+    @classmethod
+    def renumbered(
+        cls, name: str, read: Callable[[str], bytes], before: Sequence[int], after: Sequence[int]
+    ) -> bytes | None:
+        """Return a file of nuScenes-lidarseg with labels that number the classes `after`."""
+        if not name.startswith(LABELS):
+            return None
+        table = _labels_of_classes(after)[[0, *before]]
+        return table[np.frombuffer(read(name), np.uint8)].tobytes()
 
 
 def _channels(sweeps: Sweeps) -> list[str]:
@@ -259,54 +310,6 @@ def _actor_categories(sweeps: Sweeps) -> list[str]:
 def _spelled_alike(name: str) -> str:
     """Return what names have in common that differ in case or in spaces alone."""
     return name.casefold().replace("_", " ")
-
-
-def relabeled(labels: bytes, before: Sequence[int], after: Sequence[int]) -> bytes:
-    """Return labels that number the classes `after` instead of the classes `before`."""
-    table = _labels_of_classes(after)[[0, *before]]
-    return table[np.frombuffer(labels, np.uint8)].tobytes()
-
-
-def merge(storage: Storage, jobs: Iterable[Mapping[str, Any]]) -> dict[str, list[int]]:
-    """Write the tables of a data set from the manifests of its jobs.
-
-    Returns
-    -------
-    Class list to which the labels must be renumbered, by the name of each job whose labels refer to
-    a different class list. Jobs can have different classes.
-    """
-    shared: set[str] = set()  # tokens of rows that several jobs have
-    with ExitStack() as stack:
-        files = {
-            name: stack.enter_context(storage.writing(f"{VERSION}/{name}.json")) for name in _TABLES
-        }
-        separators: dict[str, bytes] = {}  # {table: bytes before its next row}
-        kinds = dict[str, dict[str, Any]]()
-        classes = _JobClasses()
-
-        def write(tables: Mapping[str, Iterable[dict[str, Any]]]) -> None:
-            for name, rows in tables.items():
-                for row in rows:
-                    if name in _SHARED:
-                        if row["token"] in shared:
-                            continue
-                        shared.add(row["token"])
-                    if name not in files:  # lidarseg
-                        files[name] = stack.enter_context(storage.writing(f"{VERSION}/{name}.json"))
-                    files[name].write(separators.get(name, b"[\n") + json.dumps(row).encode())
-                    separators[name] = b",\n"
-
-        for job in jobs:
-            kinds |= {row["token"]: row for row in job["tables"].pop("category")}
-            classes.add(job)
-            write(job["tables"])
-        rows = kinds.values()
-        write({"category": _categories(rows, classes.names) if "lidarseg" in files else rows})
-        for name, file in files.items():
-            file.write(b"\n]\n" if name in separators else b"[]\n")
-    with storage.writing(_MAP) as file:
-        file.write(_no_map())
-    return classes.relabeled_jobs()
 
 
 class _JobClasses:

@@ -31,9 +31,7 @@ from ..clouds.boxes import Boxes
 from ..clouds.cloud_format import CloudFormat, Entry
 from ..clouds.folder import local_folder
 from ..clouds.format_table import DATA_SETS, LAYOUTS, format_named
-from ..clouds.kitti import NAMES_FILE, labels_file
 from ..clouds.multi_file_format import MultiFileFormat
-from ..clouds.nuscenes import LABELS, merge, relabeled
 from ..clouds.writing import ExportSpec
 from .job_table import TABLE_FILE, JobRow, Tally
 
@@ -252,15 +250,13 @@ class DataSet:
                     head["table"] = self.storage.checksum(TABLE_FILE)
                 index.write(f'{json.dumps(head)[:-1]}, "jobs": [')
                 manifests = self._indexed(jobs, index)
-                if self.format == "nuscenes":
-                    for job, classes in merge(self.storage, manifests).items():
-                        self._relabel(job, classes)
-                else:
-                    deque(manifests, maxlen=0)
+                merged = self.spec.cloud_format.merge_jobs(self.storage, manifests)
+                for job, classes in merged.items():
+                    self._renumber(job, classes)
                 index.seal()
 
-    def _relabel(self, job: str, classes: Sequence[int]) -> None:
-        """Write the labels of a job anew, in nuScenes, so that they number other classes.
+    def _renumber(self, job: str, classes: Sequence[int]) -> None:
+        """Write the labels of a job again, so that they number other classes.
 
         The manifest is removed first: if this is interrupted, the job is made again.
         """
@@ -268,9 +264,11 @@ class DataSet:
         self.storage.remove([manifest_file(job)])
         storage = Listing.from_storage(self.storage)
         for name in manifest["files"]:
-            if name.startswith(LABELS):
-                labels = self.storage.read(name)
-                storage.write(name, relabeled(labels, manifest["lidarseg"], classes))
+            labels = self.spec.cloud_format.renumbered(
+                name, self.storage.read, manifest["lidarseg"], classes
+            )
+            if labels is not None:
+                storage.write(name, labels)
         manifest |= {"lidarseg": classes, "files": manifest["files"] | storage.files}
         manifest["crc"] = _crc(manifest)
         self.storage.write(manifest_file(job), json.dumps(manifest).encode())
@@ -290,8 +288,8 @@ class DataSet:
                 named.setdefault(int(number), {})[name] = None
             yield manifest
         classes = {number: "; ".join(names) for number, names in named.items()}
-        if classes and self.format == "kitti":
-            self.storage.write(NAMES_FILE, labels_file(classes))
+        for name, content in self.spec.cloud_format.class_files(classes).items() if classes else ():
+            self.storage.write(name, content)
         classes_field = f', "classes": {json.dumps(classes)}' if classes else ""
         index.write(f"\n]{classes_field}")
 
