@@ -567,11 +567,6 @@ def _ply_colors(rows: _PlyRows, type_name: str, faces: Ints) -> Colors:
     return _vertex_colors(_color_shares(colors), faces)
 
 
-def read_ply_points(data: bytes) -> Floats:
-    """Read the vertices of a Stanford polygon file: (n, 3)."""
-    return _ply_vertices(_ply_rows(_ply_header(data)))
-
-
 def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
     """Read the properties of vertices of a Stanford polygon file, but lists: {name: (n,)}."""
     rows = _ply_rows(_ply_header(data)).get("vertex", {})
