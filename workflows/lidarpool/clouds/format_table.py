@@ -91,13 +91,6 @@ FORMATS = {
         packages=("pyarrow",),
         extra="parquet",
     ),
-    "feather": FormatRow(
-        "cloud.feather",
-        "lidarpool.clouds.feather:Feather",
-        (".feather",),
-        packages=("pyarrow",),
-        extra="parquet",
-    ),
     "pcd": FormatRow("pcd", "lidarpool.clouds.pcd:PCD", (".pcd",), ("*.[pP][cC][dD]",)),
     "e57": FormatRow(
         "cloud.e57",
