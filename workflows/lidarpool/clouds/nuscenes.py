@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from hashlib import md5
 from itertools import chain
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image

@@ -402,7 +402,9 @@ def sweep_from_columns(columns: dict[str, Any], **fields: Any) -> Sweep:
     columns = with_standard_names(columns, "xyz")
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its point coordinates are incomplete ({', '.join(missing)} missing)")
-    points = np.stack([np.asarray(columns.pop(axis), np.float64) for axis in "xyz"], axis=1)
+    points = np.empty((len(columns["x"]), 3))
+    for index, axis in enumerate("xyz"):
+        points[:, index] = columns.pop(axis)
     return Sweep(points, columns, **fields)
 
 

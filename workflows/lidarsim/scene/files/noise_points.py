@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +44,15 @@ class LeftOut(NamedTuple):
         return f"{' and '.join(kinds)} {verb} skipped. {keeps}" if kinds else ""
 
 
+@lru_cache(maxsize=64)
+def _marking_columns(names: tuple[str, ...]) -> tuple[str | None, str | None]:
+    """Return the names of the columns of classes and of withheld points, or None for each."""
+    letters = {name: re.sub("[^a-z]", "", name.lower().removeprefix("scalar_")) for name in names}
+    classes = (name for name in names if letters[name] == _CLASS_COLUMN)
+    withheld = (name for name in names if letters[name] in _WITHHELD_COLUMNS)
+    return next(classes, None), next(withheld, None)
+
+
 def usable_points(
     columns: Mapping[str, AnyArray], noise_classes: Collection[int] = NOISE_CLASSES
 ) -> tuple[Bools | None, LeftOut]:
@@ -55,14 +65,13 @@ def usable_points(
     noise_classes
         Classes of noise: `NOISE_CLASSES`, or `LEGACY_NOISE_CLASSES`.
     """
-    withheld: Bools | None = None
+    class_column, withheld_column = _marking_columns(tuple(columns))
     noise: Bools | None = None
-    for name, values in columns.items():
-        letters = re.sub("[^a-z]", "", name.lower().removeprefix("scalar_"))
-        if letters == _CLASS_COLUMN and noise is None:
-            noise = np.isin(np.asarray(values), list(noise_classes))
-        elif letters in _WITHHELD_COLUMNS and withheld is None:
-            withheld = np.asarray(values) != 0
+    withheld: Bools | None = None
+    if class_column is not None:
+        noise = np.isin(np.asarray(columns[class_column]), list(noise_classes))
+    if withheld_column is not None:
+        withheld = np.asarray(columns[withheld_column]) != 0
     marks = [marks for marks in (withheld, noise) if marks is not None and marks.any()]
     if not marks:
         return None, LeftOut()
