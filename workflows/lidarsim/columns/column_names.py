@@ -19,7 +19,7 @@ ORIGINS = ("origin_x", "origin_y", "origin_z")
 # {standard name: other names for the same quantity, the most specific name first}
 ALIASES: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(AXES, ()),
-    "channel": ("ring", "laser_id", "laser_number", "laser", "line", "beam", "scanline"),
+    "channel": ("ring", "laser_id", "laser_number", "laser", "line", "beam"),
     "intensity": ("i", "energy"),
     "reflectivity": (),
     "class": ("classification", "label"),
