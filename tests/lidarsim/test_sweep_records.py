@@ -70,8 +70,22 @@ def test_selected_points_keep_what_the_recording_found():
     assert chosen.rings.tolist() == [12] and chosen.times_s.tolist() == [0.2]
     assert calls == [4]
     again = pickle.loads(pickle.dumps(chosen))
-    assert again.rings.tolist() == [12] and again.times_s.tolist() == [0.2]
-    assert again._recording is None and again._whole is None
+    for copy in (again, again.returns(), again.select([0]), again.replace(pose=np.eye(4))):
+        assert copy.rings.tolist() == [12] and copy.times_s.tolist() == [0.2]
+
+
+def test_moved_points_keep_their_rings_and_times():
+    """Rings that follow from elevation angles would be wrong in another frame."""
+    recording = SimpleNamespace(
+        rings_of=lambda sweep: np.nan_to_num(sweep.points[:, 0]).astype(int),
+        times_of=lambda sweep: sweep.columns["t"],
+    )
+    recorded = Sweep(POINTS, {"t": np.arange(4)}, recording=recording)
+    moved = recorded.replace(points=POINTS + 5, columns={})
+    assert moved.rings.tolist() == [1, 0, 0, 0] and moved.times_s.tolist() == [0, 1, 2, 3]
+    assert moved.with_columns().rings is None
+    with pytest.raises(TypeError, match="no parameter 'channels'"):
+        recorded.replace(channels=np.arange(4))
 
 
 def test_poses_and_boxes_are_computed_when_they_are_requested():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -108,19 +108,18 @@ class Sweep:
         self._pose = pose
         self._boxes = boxes
         self._recording = recording
-        # The sweep of which these are selected rows, and the rows.
-        self._whole: tuple[Self, Bools | Indices | slice] | None = None
+        # The sweep from which these points were selected or moved, and their rows in it. The
+        # recording determines rings and times from that sweep.
+        self._origin: tuple[Self, Bools | Indices | slice] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # Values that the recording determines are computed before the sweep leaves the process.
-        state = dict(self.__dict__)
-        if self._recording is not None:
-            state |= {"rings": self.rings, "times_s": self.times_s}
-        return state | {
+        known = None if self._recording is None else _RingsAndTimes(self.rings, self.times_s)
+        return self.__dict__ | {
             "_pose": self.pose,
             "_boxes": self.boxes,
-            "_recording": None,
-            "_whole": None,
+            "_recording": known,
+            "_origin": None,
         }
 
     def __len__(self) -> int:
@@ -132,13 +131,23 @@ class Sweep:
         return f"<Sweep {self.number}{sensor}{job}: {len(self):,} points>"
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with other points, columns or further parameters of the constructor."""
+        """Return a copy with other values for some parameters of the constructor.
+
+        New points must be in the order of the old ones. They keep their rings and times, even if
+        these follow from the old positions.
+        """
         other = object.__new__(type(self))
         cached = ("pose", "boxes", "rings", "times_s")
         other.__dict__ |= {k: v for k, v in self.__dict__.items() if k not in cached}
+        if "recording" in changes:
+            other._origin = None
+        elif "points" in changes and self._recording is not None:
+            other._origin = self, slice(None)
         for name, value in changes.items():
-            hidden = f"_{name}"
-            other.__dict__[hidden if hidden in self.__dict__ else name] = value
+            attribute = name if name in other.__dict__ else f"_{name}"
+            if attribute not in other.__dict__:
+                raise TypeError(f"Sweep has no parameter {name!r}")
+            other.__dict__[attribute] = value
         return other
 
     @cached_property
@@ -162,16 +171,16 @@ class Sweep:
         """
         if "channel" in self.columns:
             return np.asarray(self.columns["channel"])
-        if self._whole is not None:
-            sweep, rows = self._whole
+        if self._origin is not None:
+            sweep, rows = self._origin
             return None if sweep.rings is None else sweep.rings[rows]
         return None if self._recording is None else self._recording.rings_of(self)
 
     @cached_property
     def times_s(self) -> Floats | None:
         """Time of each point relative to the timestamp of the sweep in seconds, (n,), or None."""
-        if self._whole is not None:
-            sweep, rows = self._whole
+        if self._origin is not None:
+            sweep, rows = self._origin
             return None if sweep.times_s is None else sweep.times_s[rows]
         return None if self._recording is None else self._recording.times_of(self)
 
@@ -207,10 +216,10 @@ class Sweep:
 
     def returns(self) -> Self:
         """Return the sweep without pulses that have no return, in double precision."""
-        points = np.asarray(self.points, np.float64)
-        sweep = self if points is self.points else self.replace(points=points)
-        mask = sweep.has_return
-        return sweep if mask.all() else sweep.select(mask)
+        mask = self.has_return
+        sweep = self if mask.all() else self.select(mask)
+        points = np.asarray(sweep.points, np.float64)
+        return sweep if points is sweep.points else sweep.replace(points=points)
 
     def select(self, rows: Bools | Indices | slice) -> Self:
         """Return selected points."""
@@ -222,11 +231,14 @@ class Sweep:
             firing_poses=None if poses is None else poses.select(rows),
         )
         if self._recording is not None:
-            selected._whole = self, rows  # the recording needs all points of the sweep
+            selected._origin = self, rows
         return selected
 
     def with_columns(self, **columns: AnyArray | None) -> Self:
-        """Return the same points with only the given columns, without those that are None."""
+        """Return the points with only the given columns, except those that are None.
+
+        The copy no longer has rings and times that its recording determines.
+        """
         return self.replace(
             columns={name: values for name, values in columns.items() if values is not None},
             recording=None,
@@ -260,3 +272,16 @@ class Sweep:
             for name in names
         }
         return cls(np.concatenate([sweep.points for sweep in filled]), columns)
+
+
+class _RingsAndTimes(NamedTuple):
+    """Rings and times of a sweep, which replace its recording in other processes."""
+
+    rings: AnyArray | None
+    times_s: Floats | None
+
+    def rings_of(self, _: Sweep) -> AnyArray | None:
+        return self.rings
+
+    def times_of(self, _: Sweep) -> Floats | None:
+        return self.times_s
