@@ -175,7 +175,7 @@ def drive(scene, height_m, step_m, yaw_deg=0.0, sweeps=6):
     def read(number):
         return Sweep(clouds[number].positions, clouds[number].columns)
 
-    return Recording("drive.pcap", sweeps, read, times=lambda: 5e7 * np.arange(sweeps))
+    return Recording("drive.pcap", sweeps, read, read_stamps=lambda: 5e7 * np.arange(sweeps))
 
 
 @pytest.fixture(scope="module")
@@ -265,8 +265,8 @@ def test_poses_of_sweeps_are_used(cluster_client, dropout):
     survey = survey_along(26, Noise(range_m=0.01, dropout=dropout, seed=2))
     result = open_recording(simulate(scene, survey, client=cluster_client).cloud)
     located = replace(result, fired=None)
-    unlocated = replace(located, frame_poses=None, read=lambda k: result.read(k).replace(pose=None))
-    for recording, pose in ((located, None), (unlocated, result.frame_poses())):
+    unlocated = replace(located, read_poses=None, read=lambda k: result.read(k).replace(pose=None))
+    for recording, pose in ((located, None), (unlocated, result.read_poses())):
         figures = fit(recording, scene=scene, pose=pose).figures["figures"]
         assert figures["dropout"]["value"] == pytest.approx(dropout, rel=0.15, abs=0.001)
         assert figures["range_m"]["value"] == pytest.approx(0.01, rel=0.1)

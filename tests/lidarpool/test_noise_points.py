@@ -10,7 +10,7 @@ from lidarpool.cli.scenario_commands import scene as scene_command
 from lidarpool.recordings.opening import open_recording
 from lidarpool.scenario.point_scene import scene_of_points
 from lidarpool.showing.pages.opened import open_view
-from lidarsim.scene.files.noise_points import LeftOut, usable_points
+from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 
 laspy = pytest.importorskip("laspy", reason="laspy is an extra")
 
@@ -160,17 +160,17 @@ def test_columns_of_converted_las_count_alike(tmp_path, name, value, is_left_out
     assert top_of(path, keep_noise=True)[0] == 500
     recording = open_recording(path)
     assert len(recording[0]) == (600 if is_left_out else 900)
-    assert bool(recording.left_out_notes) == is_left_out
+    assert bool(recording.omission_notes) == is_left_out
 
 
 def test_numbers_of_what_is_left_out():
     usable, left_out = usable_points({"classification": np.array([2, 7, 18, 7])}, (7,))
-    assert usable.tolist() == [True, False, True, False] and left_out == LeftOut(0, 2)
+    assert usable.tolist() == [True, False, True, False] and left_out == OmittedPoints(0, 2)
     columns = {"withheld": np.array([1, 0, 0, 1]), "classification": np.array([7, 18, 2, 2])}
     usable, left_out = usable_points(columns)
-    assert usable.tolist() == [False, False, True, False] and left_out == LeftOut(2, 1)
-    assert usable_points({"x": np.zeros(3)}) == (None, LeftOut())
-    assert LeftOut().note() == ""
-    assert LeftOut(1, 0).note() == (
+    assert usable.tolist() == [False, False, True, False] and left_out == OmittedPoints(2, 1)
+    assert usable_points({"x": np.zeros(3)}) == (None, OmittedPoints())
+    assert OmittedPoints().note() == ""
+    assert OmittedPoints(1, 0).note() == (
         "1 withheld point was skipped. To keep it, use --keep-noise (keep_noise=True in Python)"
     )

@@ -338,7 +338,7 @@ def test_samples_of_tar_files_have_times_if_all_of_them_state_one(tmp_path):
     assert first_x(recording) == [1, 2, 3]
     assert [*recording.stamps_ns] == [100, 200, 300]
     write_tar("shard-11.tar", {"e": (4, "{}")})
-    assert open_recording(tmp_path).times is None
+    assert open_recording(tmp_path).read_stamps is None
 
 
 # -- poses -----------------------------------------------------------------------------------

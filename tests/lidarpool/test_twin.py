@@ -515,7 +515,7 @@ def test_a_recording_without_a_place_is_refused(drive, tmp_path):
     unknown = np.tile(np.eye(4), (SWEEPS, 1, 1))
     unknown[7, 0, 3] = np.nan
     with pytest.raises(LidarError, match="contains an invalid pose for sweep 7"):
-        twin(replace(recording, frame_poses=lambda: unknown))
+        twin(replace(recording, read_poses=lambda: unknown))
     trajectory = tmp_path / "poses.csv"
     trajectory.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,1\n1,1,0,0,0,0,0,1\n")
     with pytest.raises(LidarError, match="contains 2 poses, but drive has 12 sweeps without times"):
@@ -698,7 +698,7 @@ def test_a_mirrored_recording_is_refused_and_a_sensor_that_stood_is_noted(drive)
     with pytest.raises(LidarError, match="fit its poses better with y inverted"):
         twin(replace(recording, read=mirrored, fired=None))
     first = opened[0]
-    stood = twin(replace(opened, read=lambda _: first, count=6, times=None, frame_poses=None))
+    stood = twin(replace(opened, read=lambda _: first, count=6, read_stamps=None, read_poses=None))
     assert any("the sensor was stationary" in note for note in stood.figures["notes"])
 
 
@@ -714,7 +714,7 @@ def test_sweeps_that_are_tilted_against_the_sensor_tell_no_noise(drive, tmp_path
         sweep = opened[number]
         return Sweep(sweep.points @ tilt[:3, :3].T, {"ring": sweep.rings})
 
-    found = twin(Recording("drive", SWEEPS, read, frame_poses=lambda: poses))
+    found = twin(Recording("drive", SWEEPS, read, read_poses=lambda: poses))
     assert found.model.performance is None
     assert found.model.firings_per_turn == pytest.approx(480, rel=0.02)
     assert any("the sensor noise is unknown: " in note for note in found.figures["notes"])

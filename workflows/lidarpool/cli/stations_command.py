@@ -300,7 +300,7 @@ def _show_coverage(
     figures = _coverage_figures(coverage, built) | {
         "stations": len(positions),
         "within_m": within_m,
-        "notes": [*notes, *recording.left_out_notes],
+        "notes": [*notes, *recording.omission_notes],
     }
     head = (
         f"{figures['reachable_m2']:,.0f} m²{_of_targets(targets)} are reachable from "
@@ -308,7 +308,7 @@ def _show_coverage(
         f"within {within_m:g} m of a point"
     )
     table = _object_lines(built.scene.names, coverage)
-    note_lines = map("note: {}".format, recording.left_out_notes)
+    note_lines = map("note: {}".format, recording.omission_notes)
     options.show(figures, chain([head], table, note_lines), as_json)
 
 

@@ -1,8 +1,8 @@
-"""The table of cloud formats: their names, files, packages, and where their classes are.
+"""Table of the cloud formats, with their files, required packages and classes.
 
-It is quick to import, because the command reads it for help and completion. `format_named` imports
-the class of a format. Packages add formats as plug-ins of the group `GROUP`, whose names are the
-names of the formats.
+The module is fast to import, because the command line reads it for help and completion. The class
+of a format is only imported by `FormatRow.load`. Other distributions add formats through entry
+points in the group `GROUP`, which are named after the format.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,25 +27,25 @@ GROUP = "lidarpool.clouds"
 
 @dataclass(frozen=True)
 class FormatRow:
-    """A cloud format in the table, or in the class of a plug-in.
+    """Files, required packages and class of a cloud format.
 
     Parameters
     ----------
     file
-        File or folder in the output folder of a result, whose extension selects the format. Empty
-        for a format that is only read.
+        Name of the file or folder in the output folder of a result. Its extension selects the
+        format. Empty for formats that can only be read.
     location
-        Where its class is, as «module:class». Not needed for plug-ins.
+        Class of the format as ``module:class``. Not needed for plug-ins.
     suffixes
-        Extensions of the files that the format opens, in lower case with their dots.
+        Extensions of the files that the format opens, in lower case and with a dot.
     folders
-        Name patterns of the files in the folders that the format opens.
+        Glob patterns. The format opens a folder that contains a match for any of them.
     packages
-        Import packages that write and read the format.
+        Import names of the packages that are required to write and read the format.
     extra
         Extra of lidarpool that installs the packages.
     plugin
-        The plug-in that provides the format. It is filled in when the plug-in is loaded.
+        The plug-in that provides the format, which is set when the plug-in is loaded.
     """
 
     file: str
@@ -59,13 +58,14 @@ class FormatRow:
 
     @property
     def missing_packages(self) -> list[str]:
-        """Packages of the format that are not installed in this environment."""
+        """Required packages that are not installed in this environment."""
         return [package for package in self.packages if find_spec(package) is None]
 
     def load(self, reading: str = "") -> type[CloudFormat]:
         """Import the class of the format.
 
-        `reading` is the name of a file to read. LidarError if its packages are not installed.
+        If `reading` is the name of a file to read, raises LidarError unless the required packages
+        are installed.
         """
         for package in self.packages if reading else ():
             need(package, self.extra, f"Reading {reading}")
@@ -140,8 +140,8 @@ DATA_SETS = {  # {format of a data set: format of its jobs}
     "images": "images",
     "mcap": "mcap",
 }
-EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has if it is asked for
-# Names of the layouts of points in mcap and rosbag2 (`ros/layouts.py`).
+EXPORTS = tuple(name for name in FORMATS if name != "ply")  # results always contain a .ply file
+# Point layouts in mcap and rosbag2 (`ros/layouts.py`).
 LAYOUTS = ("velodyne", "autoware", "ouster", "images", "livox", "hesai", "robosense")
 
 
@@ -176,12 +176,12 @@ _TABLE = PluginTable(GROUP, "cloud format", FORMATS, _row_of_plugin)
 
 
 def row_of(name: str) -> FormatRow:
-    """Return the row of a format that is written, of the table or of a plug-in.
+    """Return the row of a format that can be written, from the table or a plug-in.
 
     Raises
     ------
     LidarError
-        If the format is unknown, or is only read, or its plug-in cannot be used.
+        If the format is unknown or can only be read, or if its plug-in cannot be used.
     """
     row = _TABLE[name]
     if not row.file:
@@ -192,60 +192,53 @@ def row_of(name: str) -> FormatRow:
 
 
 def format_named(name: str) -> type[CloudFormat]:
-    """Import the class of a format that is written.
+    """Import the class of a format that can be written.
 
-    Raises
-    ------
-    LidarError
-        If the format is unknown, or is only read, or its plug-in cannot be used.
+    Raises LidarError as `row_of`.
     """
     return row_of(name).load()
 
 
-def _rows_of_all() -> Iterator[FormatRow]:
-    """Yield the rows of the table, then the rows of plug-ins that can be used."""
+def _all_rows() -> Iterator[FormatRow]:
+    """Yield the rows of the table, followed by the rows of usable plug-ins."""
     yield from (*FORMATS.values(), _READ_ONLY)
     for name in plugins_of(GROUP):
         with suppress(LidarError):
             yield _TABLE[name]
 
 
-def _row_of_file(path: Path) -> FormatRow | None:
-    """Return the row of the format that opens a file, or None."""
-    suffix = path.suffix.lower()
-    return next((row for row in _rows_of_all() if suffix in row.suffixes), None)
-
-
-def reader_of(path: Path, name: str) -> type[CloudFormat] | None:
+def format_of_path(path: Path, name: str) -> type[CloudFormat] | None:
     """Return the format that opens a file or folder as a recording, or None if there is none.
+
+    `name` is the name of the file in messages.
 
     Raises
     ------
     LidarError
-        If a package that reads it is not installed; `name` is the name of the file in messages.
+        If a package that is required to read the file is not installed.
     """
-    if path.is_dir():
-        rows = (row for row in _rows_of_all() if any(map(partial(_contains, path), row.folders)))
-        row = next(rows, None)
-    else:
-        row = _row_of_file(path)
-    return None if row is None else row.load(name)
-
-
-def _contains(folder: Path, pattern: str) -> bool:
-    return next(folder.glob(pattern), None) is not None
+    suffix = path.suffix.lower()
+    is_folder = path.is_dir()
+    for row in _all_rows():
+        if is_folder:
+            opens = any(any(path.glob(pattern)) for pattern in row.folders)
+        else:
+            opens = suffix in row.suffixes
+        if opens:
+            return row.load(name)
+    return None
 
 
 def point_suffixes() -> tuple[str, ...]:
-    """Return the extensions of files of which scenes can be made."""
-    rows = [row for row in _rows_of_all() if row.suffixes and row.load().for_scenes]
+    """Return the extensions of the files from which scenes can be created."""
+    rows = [row for row in _all_rows() if row.suffixes and row.load().for_scenes]
     return tuple(suffix for row in rows for suffix in row.suffixes)
 
 
 def plugin_formats(files: Collection[str]) -> list[str]:
-    """Return the names of the plug-ins whose file or folder is in `files`.
+    """Return the formats of plug-ins whose file or folder is in `files`.
 
-    Plug-ins that cannot be used are left out.
+    Plug-ins that cannot be used are skipped.
     """
     names: list[str] = []
     for name in plugins_of(GROUP) if files else ():
@@ -254,9 +247,9 @@ def plugin_formats(files: Collection[str]) -> list[str]:
     return names
 
 
-def check_whole(needs: Iterable[str], keep_every: int) -> None:
-    """Raise LidarError if returns are thinned out for a format of all rays."""
-    if "ray" in needs and keep_every > 1:
+def check_all_returns(columns: Iterable[str], keep_every: int) -> None:
+    """Raise LidarError if `keep_every` discards returns although the column `ray` is required."""
+    if "ray" in columns and keep_every > 1:
         raise LidarError(
             "Range images and organized clouds require all returns, but `keep_every` is "
             f"{keep_every}. Set `cloud.keep_every: 1`."

@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class JobReader:
-    """The files of a job in a data set, which are read in any order, in a single thread."""
+    """Reads the files of one job of a data set, in any order, in a single thread."""
 
     def __init__(
         self,
@@ -38,23 +38,26 @@ class JobReader:
         self.storage = storage
         self.sweeps = sweeps
         self.entry = entry
-        self.layout = layout  # of points in mcap
+        self.layout = layout  # point layout in mcap
         self.classes = classes  # names of the classes of all jobs
-        self.last = ""  # name of the file of rows that was read last, for errors
-        self.opened = ExitStack()  # opened files, which `close` closes
+        self.last_file = ""  # the file that `read_rows` read last, for error messages
+        self.opened = ExitStack()  # open files, which `close` closes
         self._cache: dict[str, Any] = {}
         self._copies: Path | None = None
 
     def cached(self, key: str, make: Callable[[], T]) -> T:
-        """Return the value of a key, which `make` makes once."""
+        """Return the value for a key, which is computed by `make` on the first call."""
         if key not in self._cache:
             self._cache[key] = make()
         value: T = self._cache[key]
         return value
 
-    def expect(self, names: Sequence[str]) -> None:
-        """Have the system load files into its memory, because they will be read soon."""
-        # Reading will raise any OSError; only Linux has all of these functions.
+    def prefetch(self, names: Sequence[str]) -> None:
+        """Ask the operating system to load files into its page cache.
+
+        If one of the files is already cached, the others are assumed to be cached, too.
+        """
+        # Reading will raise any OSError. Only Linux has all of these functions.
         with suppress(OSError, AttributeError):
             for name in names:
                 with io.FileIO(self.storage.path(name)) as file:
@@ -65,13 +68,16 @@ class JobReader:
                         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_WILLNEED)
 
     def close(self) -> None:
-        """Close opened files, and remove local copies."""
+        """Close open files, and remove local copies."""
         self.opened.close()
         if self._copies is not None:
             _remove(self._copies, os.getpid())
 
     def local(self, name: str) -> Path:
-        """Return the path of a file: of a copy until `close`, if the storage is remote."""
+        """Return the local path of a file.
+
+        If the storage is remote, this is a copy that exists until `close` is called.
+        """
         if self.storage.is_local:
             return Path(self.storage.path(name))
         if self._copies is None:
@@ -81,13 +87,13 @@ class JobReader:
         self.storage.get(name, path)
         return path
 
-    def rows(self, name: str, row: np.dtype[Any], count: int | None = None) -> AnyArray:
-        """Read a file of rows.
+    def read_rows(self, name: str, row: np.dtype[Any], count: int | None = None) -> AnyArray:
+        """Read a file that consists of rows, as a writable array.
 
-        Raises ValueError for a partial row, or another number than `count`.
+        Raises ValueError if the last row is incomplete, or if the number of rows is not `count`.
         """
-        points_file = self.last
-        self.last = name
+        points_file = self.last_file
+        self.last_file = name
         if self.storage.is_local:
             with io.FileIO(self.storage.path(name)) as file:
                 data = np.empty(os.fstat(file.fileno()).st_size, np.uint8)

@@ -162,8 +162,8 @@ class KITTI(MultiFileFormat):
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
         """Return points with intensity (reflectivity, 0 to 1), class and object."""
         file, labels_file = cls.sweep_files(job, sweep)
-        rows = job.rows(file, np.dtype("<f4")).reshape(-1, 4)
-        labels = job.rows(labels_file, np.dtype("<u4"), len(rows))
+        rows = job.read_rows(file, np.dtype("<f4")).reshape(-1, 4)
+        labels = job.read_rows(labels_file, np.dtype("<u4"), len(rows))
         instances = (labels >> 16).view("<i4")
         instances -= 1
         classes = labels.view("<u2")[::2]
@@ -309,7 +309,7 @@ def _sequence(source: RecordingSource, folder: Path, inner: str, name: str = "")
     return source.recording(
         len(files),
         read,
-        times=None if times_ns is None else times_ns.tolist,
+        read_stamps=None if times_ns is None else times_ns.tolist,
         notes=source.named(notes),
         sequence=name,
         calibration=calibration,

@@ -170,12 +170,12 @@ class NuScenes(MultiFileFormat):
     def read_sweep(cls, job: JobReader, sweep: int) -> PointColumns:
         """Return points with intensity, channel and, with names, class."""
         file, *labels = cls.sweep_files(job, sweep)
-        rows = job.rows(file, np.dtype("<f4")).reshape(-1, 5)
+        rows = job.read_rows(file, np.dtype("<f4")).reshape(-1, 5)
         intensity, channel = np.ascontiguousarray(rows[:, 3:].T)
         intensity /= 255
         columns = {"intensity": intensity, "channel": channel.astype("u2")}
         if labels:
-            labels_of_points = job.rows(labels[0], np.dtype("u1"), len(rows))
+            labels_of_points = job.read_rows(labels[0], np.dtype("u1"), len(rows))
             columns["class"] = np.array([0, *sorted(job.classes)], "u2")[labels_of_points]
         return rows[:, :3], columns
 
@@ -564,7 +564,7 @@ class _DataSet:
         return self._source.recording(
             len(rows),
             lambda number: self._read(rows[number]),
-            times=times_ns.tolist,
+            read_stamps=times_ns.tolist,
             sequence=sequence,
         )
 

@@ -99,6 +99,6 @@ def _open_capture(source: RecordingSource) -> Recording:
         sweeps,
         convert,
         white=white,
-        times=lambda: map(decoder.time_ns, sweeps()),
+        read_stamps=lambda: map(decoder.time_ns, sweeps()),
         notes=source.named(decoder.notes),
     )

@@ -1,4 +1,4 @@
-"""Unit and zero of the point times in a recording, found from the times of several sweeps."""
+"""Unit and clock of the point times in a recording, found from the times of several sweeps."""
 
 from __future__ import annotations
 
@@ -20,34 +20,36 @@ _MIN_TIMES = 8  # distinct times of a sweep; fewer are packet times, or lack pre
 
 
 class Clock(StrEnum):
-    """Zero of the point times."""
+    """Clock of the point times."""
 
-    STAMP = "the stamp of the sweep"
-    SHARED = "the zero of the stamps"
-    OTHER = "another zero"
+    RELATIVE = "relative to the timestamp of the sweep"
+    ABSOLUTE = "clock of the timestamps"
+    OTHER = "different clock"
 
 
 class PointTimes(NamedTuple):
-    """Unit and zero of the column of point times, which are the same for all sweeps.
+    """Unit and clock of the point times, which are the same for all sweeps of a recording.
 
-    A sweep lasts 0.01 to 2 s, so the range of its times determines their unit: s, ms, µs or ns.
+    A sweep takes 0.01 to 2 s, so the range of its times determines whether their unit is s, ms, µs
+    or ns.
 
-    Drivers stamp a sweep with the time of its first or of its last point. The times are relative to
-    the stamp if zero lies within or close to the times of most sweeps, and absolute if their stamps
-    do. Otherwise they come from another clock, and the first point of a sweep is assumed to be
-    fired at the stamp.
+    The timestamp of a sweep is the time of its first or last point, depending on the driver. In
+    most sweeps, the range of the point times therefore contains zero, or almost does, if they are
+    relative to the timestamp. If they are absolute, the range contains the timestamp. Otherwise
+    they come from a different clock, and the first point of a sweep is assumed to be fired at the
+    timestamp.
     """
 
-    unit_s: float
-    sweep_s: float  # median duration of a sweep
+    unit_s: float  # length of the unit of the stored times in seconds
+    sweep_s: float  # median duration of a sweep in seconds
     clock: Clock = Clock.OTHER
-    first_s: float = 0.0  # median time of the first point of a sweep, relative to the stamp
+    first_s: float = 0.0  # median time of the first point relative to the timestamp, in seconds
 
     @classmethod
     def from_sweeps(
         cls, sweeps: Sequence[Columns], stamps_s: Sequence[float] | Floats | None = None
     ) -> PointTimes | None:
-        """Find the unit and the zero of the times in the columns of several sweeps.
+        """Find the unit and the clock of the times in the columns of several sweeps.
 
         `stamps_s` are the timestamps of these sweeps in seconds, or None if they are unknown.
         Returns None if the sweeps have no times.
@@ -66,9 +68,9 @@ class PointTimes(NamedTuple):
         known = [row for row, part in enumerate(parts) if len(part.since)]
         firsts_s = np.array([parts[row].first for row in known]) * unit_s
         lasts_s = firsts_s + [parts[row].since.max() * unit_s for row in known]
-        zeros_s = {Clock.STAMP: np.zeros(len(known))}
+        zeros_s = {Clock.RELATIVE: np.zeros(len(known))}
         if stamps_s is not None:
-            zeros_s[Clock.SHARED] = np.asarray(stamps_s)[known]
+            zeros_s[Clock.ABSOLUTE] = np.asarray(stamps_s)[known]
         for clock, zero_s in zeros_s.items():
             outside_s = np.maximum(firsts_s - zero_s, zero_s - lasts_s)
             if np.median(outside_s) <= _MAX_OUTSIDE * sweep_s:
@@ -78,7 +80,8 @@ class PointTimes(NamedTuple):
     def of_points(self, columns: Columns, stamp_s: float | None = None) -> Floats | None:
         """Return the times (n,) of the points of a sweep relative to its timestamp, in seconds.
 
-        Returns None if a time is missing, or if the times span no sweep or are far from the stamp.
+        Returns None if times are missing, or if they are too far from each other or from the
+        timestamp.
         """
         times = _stored_times(columns)
         since_s = times.since * self.unit_s
@@ -88,14 +91,14 @@ class PointTimes(NamedTuple):
             return since_s
         first_s = 0.0
         if self.clock is not Clock.OTHER:
-            zero_s = stamp_s if self.clock is Clock.SHARED and stamp_s is not None else 0.0
+            zero_s = stamp_s if self.clock is Clock.ABSOLUTE and stamp_s is not None else 0.0
             first_s = times.first * self.unit_s - zero_s
         if since_s.max() > _MAX_SWEEP_S or abs(first_s) > _MAX_SWEEP_S:
             return None
         return since_s + first_s
 
     def note(self, name: str) -> str:
-        """Return a note for the user if the times come from another clock, or an empty string."""
+        """Return a note if the times come from a different clock, otherwise an empty string."""
         if self.clock is not Clock.OTHER:
             return ""
         return (
@@ -105,10 +108,10 @@ class PointTimes(NamedTuple):
 
 
 class _StoredTimes(NamedTuple):
-    """Point times of a sweep in the unit of their column; empty without times."""
+    """Point times of a sweep in the unit of their column, which are empty if there are none."""
 
-    since: Floats  # (n,): since the first, without loss of precision
-    first: float = 0.0
+    since: Floats  # (n,), times since the first point, without loss of precision
+    first: float = 0.0  # time of the first point
 
 
 def _stored_times(columns: Columns) -> _StoredTimes:

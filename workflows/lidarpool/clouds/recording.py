@@ -1,8 +1,8 @@
-"""Recordings: sequences of sweeps, or of parts of a large cloud, whatever their file format.
+"""Recordings, which are sequences of sweeps or of parts of a large cloud in any file format.
 
-Names and units are resolved here, when an item is read: standard column names, meters, the column
-chosen as intensity, and points that the file withholds. Rings and point times that a file does not
-state are determined from a few sweeps when they are first requested.
+When an item is read, its columns get standard names, its positions are converted to meters, the
+chosen column becomes the intensity, and withheld points are omitted. Rings and point times that a
+file does not state are determined from a few sweeps when they are first requested.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lidarsim.base.words import did_you_mean, joined, plural
 from lidarsim.columns.cloud import CHUNK_POINTS, CloudLike
 from lidarsim.columns.column_names import STRENGTHS, with_standard_names
 from lidarsim.columns.sweep import Columns, Sweep
-from lidarsim.scene.files.noise_points import NOISE_CLASSES, LeftOut, usable_points
+from lidarsim.scene.files.noise_points import NOISE_CLASSES, OmittedPoints, usable_points
 from lidarsim.scene.files.pcd import unpacked_colors
 from lidarsim.scene.files.stated_system import Meters, StatedSystem, stated_meters
 from lidarsim.sweeps.sweeps import Sweeps
@@ -39,9 +39,9 @@ _REFERENCE_SWEEPS = 5  # sweeps that determine rings and point times
 
 
 class SeveralSensorsError(LidarError):
-    """The recording has several sensors or topics, and none is chosen.
+    """The recording has several sensors or topics, and none was chosen.
 
-    `contents` is a sentence that names them, and `option` is the option that chooses one.
+    `contents` is a sentence that lists them, and `option` is the option that chooses one of them.
     """
 
     def __init__(self, contents: str, names: Sequence[str], option: str = "--sensor") -> None:
@@ -63,42 +63,46 @@ class Recording:
     count
         Number of sweeps or parts.
     read
-        Function that returns the sweep of a number as the file stores it: in units of the file, and
-        with its column names.
+        Function that returns a sweep, given its number, with the units and column names of the
+        file.
     is_cloud
         Whether the items are parts of a cloud without sweeps.
     point_count
         Number of points of a cloud, or None if it is not known before the points are read.
     intensity_column
         Column that the user chose as intensity, or None.
-    times
+    read_stamps
         Function that returns the timestamps of all sweeps in nanoseconds, or None.
-    frame_poses
+    read_poses
         Function that returns the poses of all sweeps in the world, of shape (count, 4, 4), or None
         if some are unknown. It is faster than reading every sweep.
     fired
-        Function that reads a sweep as fired, with `firing_poses`, or None if this is unknown.
+        Function that returns a sweep as fired, with its `firing_poses`, given its number. None if
+        the firing poses are unknown, as in most recordings of real sensors.
     sample
-        Function that reads about a number of points that are evenly distributed in the file.
+        Function that returns approximately the given number of points, evenly distributed in the
+        file.
     compensated
         Whether the file states that the points are compensated for the motion of the sensor. None
-        if it states nothing, or if the sensor does not move.
+        if it does not state this, or if the sensor does not move.
     meters
-        Lengths of the units of x, y and z in meters.
+        Units of x, y and z in meters.
     system
         Coordinate system that the file states.
     epsg
         EPSG code of the coordinates, or None if they are in no known system in meters.
     is_metric
-        Whether coordinates are true meters by definition of the format, whatever the system.
+        Whether the format defines coordinates as true meters, regardless of the coordinate system.
     sequence
-        Name of a drive with its own frame, or an empty string for the only drive.
+        Name of the drive in files with several drives, each of which has its own world frame.
+        Otherwise an empty string.
     calibration
-        KITTI's calib.txt, which may not exist.
+        Path of KITTI's calib.txt, which may not exist.
     stations
-        Name of each sweep if each sweep is from a scan station; an empty string if unnamed.
+        Names of the sweeps if each sweep was recorded at a scan station. Unnamed sweeps have an
+        empty string.
     thinned
-        Whether some returns were omitted, so that gaps are not lost returns.
+        Whether some returns were discarded, so that gaps are not necessarily lost returns.
     white
         Intensity of a white surface, if it does not depend on the range.
     energies
@@ -106,7 +110,8 @@ class Recording:
     firing_key
         Recordings with the same key have the same rays. An empty string if this is unknown.
     noise_classes
-        Classes of noise, which are omitted together with withheld points; None to keep all points.
+        Classes of noise, which is omitted together with withheld points, or None to keep all
+        points.
     notes
         Sentences for the user.
     """
@@ -117,8 +122,8 @@ class Recording:
     is_cloud: bool = False
     point_count: int | None = None
     intensity_column: str | None = None
-    times: Callable[[], Iterable[float]] | None = None
-    frame_poses: Callable[[], Floats | None] | None = None
+    read_stamps: Callable[[], Iterable[float]] | None = None
+    read_poses: Callable[[], Floats | None] | None = None
     fired: Callable[[int], Sweep] | None = None
     sample: Callable[[int], Sweep] | None = None
     compensated: bool | None = None
@@ -135,7 +140,8 @@ class Recording:
     firing_key: str = ""
     noise_classes: tuple[int, ...] | None = NOISE_CLASSES
     notes: tuple[str, ...] = ()
-    _omitted: dict[int, LeftOut] = field(default_factory=dict, init=False)  # {item: points}
+    # {number of an item: points omitted from it}
+    _omitted: dict[int, OmittedPoints] = field(default_factory=dict, init=False)
 
     __signature__ = ReadableSignature()
 
@@ -151,32 +157,36 @@ class Recording:
     def __getitem__(self, number: int) -> Sweep:
         """Read a sweep, or a part of a cloud.
 
-        Raises LidarError if the recording cannot be read, and IndexError for an unknown item.
+        Raises LidarError if the recording cannot be read, and IndexError if there is no such item.
         """
         if not -self.count <= number < self.count:
-            raise IndexError(f"{self.name} has no item {number}, but {self.count:,} items")
+            items = plural(self.count, "part" if self.is_cloud else "sweep")
+            raise IndexError(f"{self.name} has {items}, so {number} is out of range")
         number %= self.count
         with reading(self.name):
             return self._resolved(number, self.read(number))
 
     def read_fired(self, number: int) -> Sweep:
-        """Read the returns of a sweep as fired, if this is known, otherwise as they are stored."""
+        """Read the returns of a sweep as fired if possible, otherwise as they are stored."""
         if self.fired is None:
             return self[number].returns()
         with reading(self.name):
             return self._resolved(number, self.fired(number)).returns()
 
     def read_sample(self, max_points: int) -> Sweep:
-        """Read a sample of a cloud that has the function `sample`."""
+        """Read approximately `max_points` points of a cloud that has the function `sample`."""
         assert self.sample is not None
         with reading(self.name):
-            return self._resolved(-1, self.sample(max_points))
+            return self._resolved(None, self.sample(max_points))
 
-    def _resolved(self, number: int, sweep: Sweep) -> Sweep:
-        """Return a stored sweep with standard names and in meters, without withheld points."""
+    def _resolved(self, number: int | None, sweep: Sweep) -> Sweep:
+        """Return a stored sweep with standard names and in meters, without withheld points.
+
+        `number` is None for a sample, whose omitted points are not counted.
+        """
         if self.noise_classes is not None:
             usable, omitted = usable_points(sweep.columns, self.noise_classes)
-            if number >= 0:
+            if number is not None:
                 self._omitted[number] = omitted
             if usable is not None:
                 sweep = sweep.select(usable)
@@ -191,13 +201,16 @@ class Recording:
             pose[:3, 3] *= self.meters
         changes: dict[str, Any] = {}
         if not self.is_cloud:
-            changes = {"recording": self, "number": max(number, 0)}
+            changes = {"recording": self, "number": number or 0}
         if sweep.compensated is None:
             changes["compensated"] = self.compensated
         return sweep.replace(points=points, columns=columns, pose=pose, **changes)
 
     def _chosen_intensity(self, stored: Columns, standard: Columns) -> Columns:
-        """Return columns with the chosen column as intensity; raise ValueError without it."""
+        """Return columns with the chosen column as intensity.
+
+        Raises ValueError if there is no such column.
+        """
         name = self.intensity_column
         if name is None or name == "intensity":
             return standard
@@ -211,26 +224,39 @@ class Recording:
 
     @property
     def intensity_name(self) -> str:
-        """Name of the column that was chosen as intensity, by default «intensity»."""
+        """Name of the column that was chosen as intensity, which is "intensity" by default."""
         return self.intensity_column or STRENGTHS[0]
 
     @property
-    def left_out_notes(self) -> list[str]:
-        """Notes on points that were omitted from the items that have been read."""
+    def omission_notes(self) -> list[str]:
+        """Notes on points that were omitted from the items read so far."""
         totals = np.sum([(0, 0), *self._omitted.values()], axis=0).tolist()
-        note = LeftOut(*totals).note()
+        note = OmittedPoints(*totals).note()
         return [f"{self.name}: {note}"] if note else []
 
     def poses(self, numbers: Iterable[int]) -> Floats | None:
-        """Return the poses (n, 4, 4) of sweeps in the world, or None if a pose is unknown.
+        """Return the poses of sweeps in the world frame, or None if a pose is unknown.
 
-        Raises LidarError if the recording cannot be read.
+        Parameters
+        ----------
+        numbers
+            Numbers of the sweeps.
+
+        Returns
+        -------
+        Transformations from the sensor frame to the world frame, of shape (n, 4, 4). They may be
+        known even if sweeps have no `pose`, as in bags.
+
+        Raises
+        ------
+        LidarError
+            If the recording cannot be read.
         """
-        if self.frame_poses is not None:
+        if self.read_poses is not None:
             with reading(self.name):
-                frame_poses = self.frame_poses()
-            if frame_poses is not None:
-                matrices = np.array(frame_poses[list(numbers)], np.float64).reshape(-1, 4, 4)
+                all_poses = self.read_poses()
+            if all_poses is not None:
+                matrices = np.array(all_poses[list(numbers)], np.float64).reshape(-1, 4, 4)
                 matrices[:, :3, 3] *= self.meters
                 return matrices
         poses = []
@@ -243,26 +269,26 @@ class Recording:
 
     @cached_property
     def stamps_ns(self) -> Floats | None:
-        """Timestamps of the sweeps in nanoseconds, float64 (s,), or None if there are none."""
-        if self.times is None:
+        """Timestamps of the sweeps in nanoseconds, float64 of shape (count,), or None."""
+        if self.read_stamps is None:
             return None
         with reading(self.name):
-            return np.fromiter(self.times(), np.float64)
+            return np.fromiter(self.read_stamps(), np.float64)
 
     @property
     def rings(self) -> Rings:
-        """The rings of the sensor."""
+        """Rings of the sensor, which are empty if they are unknown."""
         return self._rings_and_times[0]
 
     @property
     def point_times(self) -> PointTimes | None:
-        """Unit and zero of the point times, or None if the recording has none."""
+        """Unit and clock of the point times, or None if the points have no times."""
         return self._rings_and_times[1]
 
     @cached_property
     def _rings_and_times(self) -> tuple[Rings, PointTimes | None]:
         numbers = even_indices(self.count, _REFERENCE_SWEEPS).tolist()
-        # Compensation for motion changes elevations.
+        # Points are read as fired, because motion compensation changes their elevation angles.
         sweeps = {number: self.read_fired(number) for number in numbers}
         sweeps = {number: sweep for number, sweep in sweeps.items() if len(sweep)}
         stamps_s = self.stamps_ns
@@ -275,9 +301,9 @@ class Recording:
         return Rings.from_sweeps(self.name, [*sweeps.values()]), times
 
     def rings_of(self, sweep: Sweep) -> Ints | None:
-        """Return the rings (n,) of points without a ring column, counted from the lowest.
+        """Return the rings (n,) of points without a ring column, counted from the lowest ring.
 
-        Points without a ring, or without a return, have the value -1. Returns None if the rings are
+        Points without a ring or without a return have the value -1. Returns None if the rings are
         unknown.
         """
         if not len(self.rings) or self.rings.numbers is not None:
@@ -306,52 +332,48 @@ class Recording:
 
 @dataclass(frozen=True)
 class RecordingSource:
-    """A file or folder to open, and the user's choices."""
+    """A file or folder to open, with the options that the user chose."""
 
     path: Path
     name: str  # name in messages
-    sensor: str | None = None  # or topic
-    intensity: str | None = None  # column, if it has another name than `intensity`
-    unit: str | None = None  # replaces the unit that the file states
-    # Whether positions stay in the units and system of the file, unchecked, and all scans in the
-    # file are separate items.
+    sensor: str | None = None  # sensor or topic to read, if there are several
+    intensity: str | None = None  # column to use as intensity, if it is not `intensity`
+    unit: str | None = None  # unit of the positions, which overrides the file
+    # Whether positions remain in the units and coordinate system of the file, without checks, and
+    # each scan in the file is an item.
     as_stored: bool = False
 
     def recording(self, count: int, read: Callable[[int], Sweep], **fields: Any) -> Recording:
-        """Return a recording of `count` sweeps or parts, with further fields of `Recording`."""
+        """Return a recording with `count` sweeps or parts, and further fields of `Recording`."""
         fields.setdefault("intensity_column", self.intensity)
         return Recording(self.name, count, read, **fields)
 
     def choose(self, kind: str, names: Iterable[str]) -> str:
-        """Return the chosen sensor or topic, or the only one.
-
-        `kind` is the plural, such as "sensors".
-        Raises LidarError if several are present and none was chosen, or for an unknown name.
-        """
+        """Return the chosen sensor or topic, as the function `choose`."""
         return choose(self.name, kind, names, self.sensor)
 
     def of_sensors(self, sensors: Mapping[str, Recording]) -> Recording:
-        """Return the recording of the chosen sensor in {name: recording}.
+        """Return the recording of the chosen sensor.
 
-        The only sensor of a recording may have the name "".
+        A single sensor may have an empty name.
         """
         return sensors[self.choose("sensors", sensors)]
 
     def named(self, clauses: Iterable[str]) -> tuple[str, ...]:
-        """Return notes: the name of the recording before each clause."""
+        """Return notes, which are clauses preceded by the name of the recording."""
         return tuple(f"{self.name} {clause}" for clause in clauses)
 
     def chosen_meters(self) -> Meters:
-        """Return the lengths of the chosen unit, for a format that states none."""
+        """Return the units of x, y and z for a format that does not state them."""
         return stated_meters(None, np.zeros((0, 3)), self.unit)[0]
 
     def stated_meters(
         self, system: StatedSystem | None, positions: Floats
     ) -> tuple[Meters, tuple[str, ...]]:
-        """Return the lengths of the units of x, y and z, and notes.
+        """Return the units of x, y and z in meters, and notes for the user.
 
-        `positions` (n, 3) are points of the file, or a sample, in its units. Raises LidarError as
-        `lidarsim.scene.files.stated_system.stated_meters`.
+        `positions` are points of the file or a sample of them, of shape (n, 3), in its units.
+        Raises LidarError as `lidarsim.scene.files.stated_system.stated_meters`.
         """
         if self.as_stored:
             return METERS, ()
@@ -359,7 +381,7 @@ class RecordingSource:
         return meters, self.named(clauses)
 
     def epsg_in_meters(self, system: StatedSystem | None, meters: Meters) -> int | None:
-        """Return the code of a stated system in meters, or None if a unit was chosen instead."""
+        """Return the EPSG code of a coordinate system in meters, or None for other units."""
         if system is None or self.unit is not None or meters != METERS:
             return None
         return system.epsg
@@ -371,10 +393,11 @@ class RecordingSource:
         count: int | None = None,
         **fields: Any,
     ) -> Recording:
-        """Return a recording whose `sweeps()` can only be iterated from the first sweep.
+        """Return a recording that can only be read from its start.
 
-        `convert` returns the `Sweep` of an item. `count` is the number of sweeps, which are counted
-        if it is None. `fields` are fields of `Recording`.
+        `sweeps` returns an iterator over the stored sweeps, and `convert` converts each of them to
+        a `Sweep`. If `count` is None, the sweeps are counted. `fields` are further fields of
+        `Recording`.
         """
         if count is None:
             with reading(self.name):
@@ -387,17 +410,17 @@ class RecordingSource:
             if not 0 < next_number <= number:
                 next_number = 0
                 remaining = iter(sweeps())
-            sweep = next(islice(remaining, number - next_number, None))
+            stored = next(islice(remaining, number - next_number, None))
             next_number = number + 1
-            return convert(sweep)
+            return convert(stored)
 
         return self.recording(count, read, **fields)
 
 
 def sweep_from_columns(columns: dict[str, Any], **fields: Any) -> Sweep:
-    """Return a sweep with the points in the columns x, y and z, which are removed.
+    """Return a sweep whose points are the columns x, y and z.
 
-    Raises ValueError if an axis is missing.
+    Raises ValueError if one of these columns is missing.
     """
     columns = with_standard_names(columns, "xyz")
     if missing := [axis for axis in "xyz" if axis not in columns]:
@@ -416,13 +439,22 @@ def open_cloud(
     intensity: str | None,
     **fields: Any,
 ) -> Recording:
-    """Open a cloud of lidarpool, in parts of `CHUNK_POINTS` points or as the sweeps of a sensor.
-
-    `name` is the name in messages, `sensor` the chosen sensor, and `intensity` the column of
-    intensities if chosen. `load_sweeps` is None for a cloud without sweeps; `fields` are further
-    fields of `Recording`.
+    """Open a cloud of lidarpool as the sweeps of a sensor, or in parts if it has no sweeps.
 
     Raises LidarError if several sensors are present and none was chosen, or for an unknown sensor.
+
+    Parameters
+    ----------
+    name
+        Name in messages.
+    cloud
+        The cloud.
+    load_sweeps
+        Function that returns the sweeps of the cloud, or None for a cloud without sweeps.
+    sensor, intensity
+        Sensor and intensity column that the user chose.
+    fields
+        Further fields of `Recording`.
     """
     fields |= {"intensity_column": intensity, "noise_classes": None}
     if load_sweeps is None:
@@ -459,29 +491,31 @@ def open_cloud(
             firing_poses=saved.firing_poses(index, points),
         )
 
-    def frame_poses() -> Floats:
+    def read_poses() -> Floats:
         return np.array([saved.pose.matrix(index) for index in indices])
 
-    times = saved.begins_ns[indices] + (saved.start_ns or 0)
-    # Results have energies in their column `intensity`, and may have other columns of intensities.
+    stamps_ns = saved.begins_ns[indices] + (saved.start_ns or 0)
+    # The column `intensity` of a result contains energies. Another column may be chosen.
     fields["energies"] = intensity in (None, "intensity")
     columns = {column.name for column in cloud.table}
     if ray_columns := columns & {"time", "ray"}:
         poses = saved.pose.positions[indices], saved.pose.quaternions[indices]
-        key = max(ray_columns), "return_number" in columns  # time rather than ray, as in ray keys
+        # `compared_sweep` identifies rays by their time if possible, otherwise by their number.
+        key = max(ray_columns), "return_number" in columns
         fields["firing_key"] = fingerprint(
             key, saved.scans[indices], saved.begins_ns[indices], poses
         )
     if len(saved.knots):
         fields["compensated"] = saved.coordinates == "world"
-    fields |= {"times": lambda: times, "frame_poses": frame_poses, "fired": read_fired}
+    fields |= {"read_stamps": lambda: stamps_ns, "read_poses": read_poses, "fired": read_fired}
     return Recording(name, len(indices), read_sweep, **fields)
 
 
 def choose(name: str, kind: str, names: Iterable[str], chosen: str | None) -> str:
     """Return the chosen sensor or topic, or the only sensor or topic.
 
-    `kind` is the plural, such as "sensors"; `name` is the recording's name.
+    `kind` is a plural such as "sensors", and `name` is the name of the recording.
+
     Raises LidarError if several are present and none was chosen, or for an unknown name.
     """
     available = list(names)

@@ -238,7 +238,7 @@ def _sensors(source: RecordingSource, files: list[Path]) -> dict[str, Recording]
         times = [time for time, _, _ in samples]
         times_ns = None if None in times else np.array(times, np.float64)
         return source.recording(
-            len(samples), read, times=None if times_ns is None else times_ns.tolist
+            len(samples), read, read_stamps=None if times_ns is None else times_ns.tolist
         )
 
     return {sensor: recording(samples) for sensor, samples in samples_of_sensor.items()}

@@ -243,7 +243,7 @@ class ExportSpec:
         if path.exists() and not overwrite:
             raise LidarError(f"{path} already exists. Use another path, or pass `--overwrite`.")
         if path.name == self.row.file:
-            refuse_strangers(Storage.at(path.parent), [self.format])
+            check_foreign_files(Storage.at(path.parent), [self.format])
         self.check_columns(cloud)
 
     def check_columns(self, cloud: CloudLike) -> None:
@@ -349,7 +349,7 @@ def with_format_columns(survey: Survey, specs: Iterable[ExportSpec]) -> Survey:
     return replace(survey, columns=(*survey.columns, *names)) if names else survey
 
 
-def refuse_strangers(storage: Storage, formats: Iterable[str]) -> None:
+def check_foreign_files(storage: Storage, formats: Iterable[str]) -> None:
     """Raise LidarError if folders of formats, which would be replaced, hold foreign files."""
     for format_name in formats:
         file = row_of(format_name).file

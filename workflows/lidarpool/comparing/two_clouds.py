@@ -393,7 +393,7 @@ class _Comparing:
         counts = self.point_counts.tolist()
         for recording, count in zip(self.recordings, counts, strict=True):
             if not count:
-                listed = "".join(f" {note}." for note in recording.left_out_notes)
+                listed = "".join(f" {note}." for note in recording.omission_notes)
                 raise LidarError(
                     f"{recording.name} contains no points, so there is nothing to compare.{listed}"
                 )
@@ -425,7 +425,7 @@ class _Comparing:
             "notes": self.notes
             + self._empty_notes()
             + self._image_notes()
-            + [note for r in self.recordings for note in r.left_out_notes],
+            + [note for r in self.recordings for note in r.omission_notes],
             "ranges": range_figures,
             "intensity": self._intensity_figures(*intensities, paired_by),
             "distances": self._distance_figures(from_a.distance, from_b.distance),

@@ -94,10 +94,10 @@ class SavedSweeps:
             # Handing such a sweep from thread to thread takes as long as reading it.
             upcoming, current = tee(map(self._locate, indices))
             for job, number in islice(upcoming, _REQUESTS):
-                job.expect(number)
+                job.prefetch(number)
             for job, number in current:
                 for next_job, sweep in islice(upcoming, 1):
-                    next_job.expect(sweep)
+                    next_job.prefetch(sweep)
                 yield job.read(number)
             return
         # At a URL each request takes long. A job with one file for all sweeps is opened once.
@@ -218,16 +218,16 @@ class _OpenJob:
         entry = Entry(job.number, job.name, job.split)
         self.reader = JobReader(storage, self.sweeps, entry, dataset.layout, classes)
 
-    def expect(self, sweep: int) -> None:
-        """Have the system load the files of a sweep into its memory."""
-        self.reader.expect(self.cloud_format.sweep_files(self.reader, sweep))
+    def prefetch(self, sweep: int) -> None:
+        """Ask the operating system to load the files of a sweep into its page cache."""
+        self.reader.prefetch(self.cloud_format.sweep_files(self.reader, sweep))
 
     def read(self, sweep: int) -> Sweep:
         """Read a sweep."""
         try:
             points = self.cloud_format.read_sweep(self.reader, sweep)
         except Exception as error:  # libraries of five formats raise many kinds of errors
-            file = self.reader.last or self.cloud_format.sweep_files(self.reader, sweep)[0]
+            file = self.reader.last_file or self.cloud_format.sweep_files(self.reader, sweep)[0]
             file = self.storage.path(file)
             raise _unreadable(file, error) from error
         return sweep_of_job(self.job, self.sweeps, sweep, points, self.boxes, sweep)

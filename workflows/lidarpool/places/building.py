@@ -589,7 +589,7 @@ class SweepTiming(NamedTuple):
         steps = max(round(span_s / alignment.sweep_s), 1)
         rate_hz = round(steps / span_s, _RATE_DECIMALS)
         period_s = 1 / rate_hz
-        first_s = 0.0 if recorded.times is None else recorded.times.first_s
+        first_s = 0.0 if recorded.point_times is None else recorded.point_times.first_s
         first_s = first_s if first_s < -_MIN_LEAD * period_s else 0.0
         rotation = recorded.rotation(period_s, first_s)
         if rotation is None and alignment.motion.is_turning:
@@ -727,7 +727,7 @@ def _fitted(sweeps: AlignedSweeps, chosen: Ints, scene: Scene, response: Respons
         len(chosen),
         compensated if is_compensated else fired,
         energies=are_energies,
-        frame_poses=lambda: poses,
+        read_poses=lambda: poses,
         fired=None if is_compensated else fired,
         noise_classes=None,
     )

@@ -81,7 +81,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
     """
     times_s = sweeps.stamps_s
     if times_s is None:
-        period_s = DEFAULT_PERIOD_S if sweeps.times is None else sweeps.times.sweep_s
+        period_s = DEFAULT_PERIOD_S if sweeps.point_times is None else sweeps.point_times.sweep_s
         times_s = period_s * np.arange(sweeps.count, dtype=np.float64)
     if trajectory is not None:
         poses, times_s = _of_file(sweeps, trajectory, times_s)
@@ -104,7 +104,7 @@ def find_poses(sweeps: RecordedSweeps, trajectory: Path | None) -> RecordedPoses
         poses = _registered(sweeps)
         source = "from registration"
         share = 0.5
-        first_s = 0.0 if sweeps.times is None else sweeps.times.first_s
+        first_s = 0.0 if sweeps.point_times is None else sweeps.point_times.first_s
         steps_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
         if len(steps_m) and steps_m.max() > _MAX_STEP_M:
             number = int(steps_m.argmax()) + 1

@@ -62,7 +62,7 @@ class RecordedSweeps:
         recording in memory, which stays in this process.
     rings
         Rings of the sensor, without elements for a sensor without rings.
-    times
+    point_times
         Unit and zero of the point times, or None if the recording has none.
     stamps_s
         Timestamps of the sweeps in seconds, float64 of shape (s,), or None if there are none.
@@ -70,7 +70,7 @@ class RecordedSweeps:
 
     source: RecordingFile | Recording
     rings: Rings
-    times: PointTimes | None
+    point_times: PointTimes | None
     stamps_s: Floats | None
     _kept: dict[int, Sweep] = field(default_factory=dict)
 
@@ -105,8 +105,8 @@ class RecordedSweeps:
     def notes(self) -> list[str]:
         """Sentences on what the recording lacks."""
         notes = [self.rings.note]
-        if self.times is not None and self.stamps_s is not None and not self.is_compensated:
-            notes.append(self.times.note(self.recording.name))
+        if self.point_times is not None and self.stamps_s is not None and not self.is_compensated:
+            notes.append(self.point_times.note(self.recording.name))
         return [note for note in notes if note]
 
     @property
@@ -178,12 +178,12 @@ class RecordedSweeps:
 
     def _times_s(self, number: int, returns: Sweep) -> Floats | None:
         """Return the times (n,) of the points of a sweep relative to its timestamp, or None."""
-        if self.times is None:
+        if self.point_times is None:
             return None
         stamp_s = None if self.stamps_s is None else float(self.stamps_s[number])
         if len(returns) and not returns.columns:
             return None  # `of_points` cannot count the points
-        return self.times.of_points(returns.columns, stamp_s)
+        return self.point_times.of_points(returns.columns, stamp_s)
 
     def rotation(self, period_s: float, first_s: float) -> Rotation | None:
         """Find the rotation from the times and azimuths of points, or return None.

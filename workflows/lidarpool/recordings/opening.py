@@ -14,7 +14,7 @@ from lidarsim.base.words import joined
 from lidarsim.columns.cloud import Cloud
 from lidarsim.scene.files.cloud_formats import SCAN_READERS
 
-from ..clouds.format_table import reader_of
+from ..clouds.format_table import format_of_path
 from ..clouds.recording import Recording, RecordingSource, SeveralSensorsError, open_cloud
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
@@ -140,7 +140,7 @@ def _open_path(source: RecordingSource) -> Recording:
         raise LidarError(f"{source.name} is empty (0 bytes). Specify {KINDS}.")
     if (path / INDEX_FILE).exists():
         return _open_data_set(source)
-    if (cloud_format := reader_of(path, source.name)) is not None:
+    if (cloud_format := format_of_path(path, source.name)) is not None:
         return cloud_format.open(source)
     suffix = path.suffix.lower()
     raise UnknownFormatError(source.name, _CONVERSIONS.get(suffix, ""))

@@ -28,7 +28,7 @@ from ..base.open3d_module import load_open3d
 from ..clouds.folder import LAST_FILE, result_folder, staging
 from ..clouds.format_table import FORMATS, plugin_formats, row_of
 from ..clouds.navigation_files import write_instruments
-from ..clouds.writing import ExportSpec, refuse_strangers
+from ..clouds.writing import ExportSpec, check_foreign_files
 from ..columns.parts import StoredCloud
 from ..run.pipeline.stage_messages import Receipt
 from ..run.run_result import RunResult
@@ -144,7 +144,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 "belong to a result."
             )
             raise LidarError(f"{lists} {advice}")
-        refuse_strangers(storage, _formats({*further, *listed}))
+        check_foreign_files(storage, _formats({*further, *listed}))
 
     def look(self, run: Run[tuple[RunResult, dict[str, Any]]]) -> None:
         """Begin the cloud, with the points of an earlier run."""
@@ -224,7 +224,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             ),
             staging(folder, self.target) as staged,
         ):
-            refuse_strangers(destination, _formats({*further, *earlier}))
+            check_foreign_files(destination, _formats({*further, *earlier}))
             clear = cache(partial(_clear, destination, further, earlier))  # at most once
             sweeps = _write_sweeps(staged, result, sweeps)
             counts = self._write_cloud(staged / CLOUD, result, sweeps, show)

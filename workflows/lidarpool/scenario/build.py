@@ -37,7 +37,7 @@ from lidarsim.simulator.casting.visibility import unseen_objects
 from lidarsim.survey.survey import CloudOptions, Mounted, Survey
 from lidarsim.sweeps.sweeps import Sweeps
 
-from ..clouds.format_table import check_whole
+from ..clouds.format_table import check_all_returns
 from ..clouds.writing import ExportSpec, with_format_columns
 from ..plan import Planning
 from ..plan.planning import Search
@@ -645,7 +645,7 @@ def _build_survey(
     cloud["columns"] = (*scenario.cloud.columns, *format_columns, *columns)
     if not any(mounted.sensor.optics.resolution_m for mounted in sensors):
         cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
-    check_whole((*format_columns, *columns), cloud["keep_every"] or 1)
+    check_all_returns((*format_columns, *columns), cloud["keep_every"] or 1)
     track_or_poses = survey_parts.track_or_poses
     track = track_or_poses if isinstance(track_or_poses, Track) else None
     poses = () if isinstance(track_or_poses, Track) else track_or_poses

@@ -28,7 +28,7 @@ from lidarsim.scene.files.mesh_formats import plugin_of
 from ..base.field_words import fields_in_words
 from ..base.fingerprint import fingerprint
 from ..base.software import plugin_versions
-from ..clouds.format_table import check_whole
+from ..clouds.format_table import check_all_returns
 from ..datasets.job_table import Value
 from .build import Job, build
 from .campaign_sections import (
@@ -140,7 +140,7 @@ class FunctionJobs(JobSource):
             values[name] = plain
         survey = job.survey
         seed = _noise_seed(self._seed, number)
-        check_whole(columns, survey.keep_every)
+        check_all_returns(columns, survey.keep_every)
         survey = replace(
             survey,
             noise=_seeded(survey.noise, seed),

@@ -1,8 +1,8 @@
-"""Point clouds in files: positions, where they were seen from, classes, intensities and colors."""
+"""Reads the points of files from which scenes are created, with their quantities."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -16,10 +16,10 @@ from lidarsim.base.extras import reading
 from lidarsim.base.input_files import check_input
 from lidarsim.base.words import plural, printable
 from lidarsim.columns.column_names import COLORS, NORMALS, ORIGINS, STRENGTHS, columns_for
-from lidarsim.columns.sweep import Sweep
+from lidarsim.columns.sweep import Columns, Sweep
 from lidarsim.scene.files.intensity_scales import from_zero
 from lidarsim.scene.files.mesh_formats import advice_on
-from lidarsim.scene.files.noise_points import LeftOut, usable_points
+from lidarsim.scene.files.noise_points import OmittedPoints, usable_points
 from lidarsim.scene.files.pcd import unpacked_colors
 from lidarsim.scene.files.stated_system import (
     Reprojection,
@@ -28,18 +28,16 @@ from lidarsim.scene.files.stated_system import (
 )
 from lidarsim.scene.scene_instances import MAX_COORDINATE_M
 
-from ..clouds.format_table import point_suffixes, reader_of
+from ..clouds.format_table import format_of_path, point_suffixes
 from ..clouds.recording import METERS, Recording, RecordingSource
 
-MIN_POINTS = 12  # least points of a scene: a surfel lies in the plane of as many
+MIN_POINTS = 12  # minimum for a scene, because each surfel is fitted to as many points
 POINT_BYTES = 700  # peak memory per point while surfels are computed and written
 NO_CLASS = np.iinfo(np.int64).min  # class of a point without a class
-_SAMPLE = 1000  # points that tell whether another system has true meters there
+_SAMPLE = 1000  # points at which the lengths in another coordinate system are checked
 _CLASS = ("class",)
 _INTENSITIES = tuple((name,) for name in STRENGTHS)
 _QUANTITIES = (_CLASS, *_INTENSITIES, COLORS, NORMALS, ORIGINS)  # standard names of components
-
-Columns = Mapping[str, AnyArray]  # {name: (n,)}
 
 
 def read_points(
@@ -50,35 +48,41 @@ def read_points(
     epsg: int | None = None,
     keep_noise: bool = False,
 ) -> tuple[Sweep, int | None]:
-    """Return the finite points of a file, in true meters, and their EPSG code if it is known.
+    """Read the finite points of a file in true meters, and their EPSG code if it is known.
 
-    Scans are joined in the frame of the file. The columns are those of the following that the file
-    has: `class` (int64, `NO_CLASS` for points without a class), `intensity` (float64, from 0, in
-    the scale of the file), `red`, `green` and `blue` (float32, sRGB from 0 to 255), and `origin_x`,
-    `origin_y` and `origin_z` (float64, position of the scanner of each point, meters) or, if the
-    file has no positions of scanners, `normal_x`, `normal_y` and `normal_z` (float64). Unknown
-    values are NaN; unknown normals are zero.
+    Scans are joined in the frame of the file. The sweep contains those of the following columns
+    that the file has:
+
+    - `class`: int64, `NO_CLASS` for points without a class.
+    - `intensity`: float64, not negative, on the scale of the file.
+    - `red`, `green` and `blue`: float32, sRGB from 0 to 255.
+    - `origin_x`, `origin_y` and `origin_z`: float64, position of the scanner for each point in
+      meters.
+    - `normal_x`, `normal_y` and `normal_z`: float64, only if the scanner positions are unknown.
+
+    Unknown values are NaN, except normals, which are zero.
 
     Parameters
     ----------
     path
-        A file with one of `point_suffixes()`.
+        A file with an extension in `point_suffixes()`.
     unit
-        Unit of x, y and z, in place of meters or of the units that a .las or .laz states.
+        Unit of x, y and z, which overrides the unit that the file states.
     tell
-        Called with lines on converted units, and on points and columns that are left out.
+        Function that is called with notes on converted units, and on skipped points and columns.
     epsg
-        Code of the system that points are brought to; by default coordinates are kept.
+        Code of the coordinate system to which the points are transformed. By default, the
+        coordinates are not transformed.
     keep_noise
-        Whether points are kept that the file withholds or classifies as noise.
+        Whether to include points that the file withholds or classifies as noise.
 
     Raises
     ------
     LidarError
-        If the file cannot be read, is too large, has fewer than `MIN_POINTS` points, or lengths
-        that are not true; see `stated_meters` and `Reprojection`.
+        If the file cannot be read, is too large, or has fewer than `MIN_POINTS` points, or if its
+        coordinate system distorts lengths (`stated_meters`, `Reprojection`).
     """
-    cloud_format = None if path.is_dir() else reader_of(path, str(path))
+    cloud_format = None if path.is_dir() else format_of_path(path, str(path))
     if cloud_format is None or not cloud_format.for_scenes:
         if advice := advice_on(path):
             raise LidarError(f"{path} cannot be read. {as_sentence(advice)}")
@@ -92,11 +96,11 @@ def read_points(
     recording = cloud_format.open(RecordingSource(path, str(path), as_stored=True))
     with reading(str(path)):
         content = _read(recording, keep_noise)
-        if note := content.left_out.note():
+        if note := content.omitted.note():
             tell(f"{path}: {note}")
         to_meters, placed_epsg = _to_meters(path, recording, content.points, unit, epsg, tell)
         points = _converted(content.points, to_meters)
-    _check_points(path, points, content.left_out)
+    _check_points(path, points, content.omitted)
     for line in (*recording.notes, *(f"{path} {note}" for note in points.notes)):
         tell(line)
     if content.no_returns:
@@ -111,15 +115,15 @@ def read_points(
 
 
 def vectors(points: Sweep, names: Sequence[str]) -> AnyArray | None:
-    """Return columns as the components of vectors (n, k), or None without the first column."""
+    """Return columns as the components of vectors (n, k), or None if the first is missing."""
     if names[0] not in points.columns:
         return None
     return np.stack([points.columns[name] for name in names], axis=1)
 
 
-def _check_points(path: Path, points: Sweep, left_out: LeftOut) -> None:
-    """Raise LidarError if there are too few points, or a point is farther than any on Earth."""
-    if len(points) < MIN_POINTS and (note := left_out.note()):
+def _check_points(path: Path, points: Sweep, omitted: OmittedPoints) -> None:
+    """Raise LidarError if there are too few points, or if a coordinate is implausibly large."""
+    if len(points) < MIN_POINTS and (note := omitted.note()):
         raise LidarError(
             f"{path} must have at least {MIN_POINTS} usable points, but has {len(points)}: {note}."
         )
@@ -135,27 +139,27 @@ def _check_points(path: Path, points: Sweep, left_out: LeftOut) -> None:
 class _Content(NamedTuple):
     """Content of a file."""
 
-    # Points in the units and the frame of the file. Columns that are used keep their names in the
-    # file. `skipped` has the names of all columns that are not zero throughout.
+    # Points in the units and the frame of the file. Columns that are used have the names of the
+    # file, and `skipped` lists all columns with values other than zero.
     points: Sweep
-    left_out: LeftOut  # withheld points and noise
-    no_returns: int  # points at zero that are left out
+    omitted: OmittedPoints  # withheld points and noise
+    no_returns: int  # number of points at the origin that were skipped
 
 
 def _read(recording: Recording, keep_noise: bool) -> _Content:
     """Read the scans or parts of a file, and join them in the frame of the file.
 
-    Raises LidarError if the points would exceed the memory.
+    Raises LidarError if there is not enough memory for the points.
     """
     if not len(recording) and not recording.is_cloud:
         raise ValueError("it contains no scans")
     _check_count(recording.point_count or 0)
     missing_if_zero: list[Sequence[str]] = [ORIGINS]
     if len(recording) > 1 and not recording.is_cloud:
-        # Some programs write zeros for quantities that a scan does not have.
+        # Some programs write zeros for quantities that were not measured in a scan.
         missing_if_zero += [*_INTENSITIES, COLORS]
     scans = []
-    left_out = LeftOut()
+    omitted = OmittedPoints()
     no_returns = 0
     for number in range(len(recording)):
         scan = recording.read(number)
@@ -165,9 +169,9 @@ def _read(recording: Recording, keep_noise: bool) -> _Content:
             scan = _without_zeros(scan)
             no_returns += count - len(scan)
         if recording.noise_classes is not None and not keep_noise:
-            usable, omitted = usable_points(scan.columns, recording.noise_classes)
+            usable, omitted_here = usable_points(scan.columns, recording.noise_classes)
             scan = scan if usable is None else scan.select(usable)
-            left_out = LeftOut(*np.add(left_out, omitted).tolist())
+            omitted = OmittedPoints(*np.add(omitted, omitted_here).tolist())
         scans.append(_placed(_with_used_columns(scan, missing_if_zero)))
     joined = scans[0] if len(scans) == 1 else Sweep.joined(scans)
     joined = joined.replace(
@@ -175,11 +179,11 @@ def _read(recording: Recording, keep_noise: bool) -> _Content:
         skipped=[*dict.fromkeys(name for scan in scans for name in scan.skipped)],
         notes=[*dict.fromkeys(note for scan in scans for note in scan.notes)],
     )
-    return _Content(joined, left_out, no_returns)
+    return _Content(joined, omitted, no_returns)
 
 
 def _check_count(count: int) -> None:
-    """Raise LidarError if points would exceed the memory."""
+    """Raise LidarError if there is not enough memory for a number of points."""
     if (size := count * POINT_BYTES) > memory():
         raise LidarError(
             f"it has {count:,} points, which require {bytes_of(size)} of memory. Downsample "
@@ -188,9 +192,10 @@ def _check_count(count: int) -> None:
 
 
 def _without_zeros(scan: Sweep) -> Sweep:
-    """Return a scan without the pulses that had no return.
+    """Return a scan without pulses that have no return, for which drivers write zeros.
 
-    Drivers write zeros for these pulses. Fewer than `MIN_POINTS` points at zero may be points.
+    If there are fewer than `MIN_POINTS` points at the origin, they are kept, because they may have
+    been measured.
     """
     is_return: Bools = np.asarray(scan.points.any(axis=1))
     zero_count = len(scan) - int(is_return.sum())
@@ -198,9 +203,9 @@ def _without_zeros(scan: Sweep) -> Sweep:
 
 
 def _with_used_columns(scan: Sweep, missing_if_zero: Iterable[Sequence[str]]) -> Sweep:
-    """Return a scan with the columns of `_QUANTITIES` only, under their names in the file.
+    """Return a scan with only the columns of `_QUANTITIES`, which keep their names.
 
-    Columns of some quantities are removed if they are zero throughout.
+    The quantities in `missing_if_zero` are removed if all of their values are zero.
     """
     stored = {name: values for name, values in scan.columns.items() if values.ndim == 1}
     columns = unpacked_colors(stored)
@@ -231,7 +236,7 @@ def _placed(scan: Sweep) -> Sweep:
                 placed = _stacked(group).astype(np.float64) @ rotation.T + shift
                 columns |= zip(group, placed.T, strict=True)
     if scan.scanner is not None and not _groups(columns, ORIGINS):
-        # The origin of each ray would be more exact.
+        # Ray origins in the file are more accurate than the position of the scanner.
         columns |= {
             name: np.full(len(scan), position)
             for name, position in zip(ORIGINS, scan.scanner, strict=True)
@@ -247,10 +252,10 @@ def _to_meters(
     epsg: int | None,
     tell: Callable[[str], None],
 ) -> tuple[Callable[[Floats], Floats], int | None]:
-    """Return a function from positions (n, 3) of a file to true meters, and their EPSG code.
+    """Return a function that converts positions (n, 3) to true meters, and their EPSG code.
 
-    The code is None if the coordinates are in no known system afterwards. `tell` gets a message
-    that says how positions are converted.
+    The code is None if the coordinate system of the converted positions is unknown. `tell` is
+    called with notes on the conversion.
     """
     finite = points.points[np.isfinite(points.points).all(axis=1)]
     if epsg is not None:
@@ -286,7 +291,7 @@ def _to_meters(
 def _converted(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
     """Return the finite points of a file in meters, with the columns of `read_points`.
 
-    `notes` are clauses that follow the name of the file, and `skipped` has the names of columns.
+    `notes` are clauses that follow the name of the file, and `skipped` lists unused columns.
     """
     points = to_meters(stored.points)
     classes = _first(stored.columns, _CLASS)
@@ -309,7 +314,7 @@ def _converted(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
         try:
             scanners = to_meters(_stacked(origins).astype(np.float64))
             columns |= zip(ORIGINS, scanners.T, strict=True)
-        except LidarError:  # an E57 may have a pose of zeros, which has no place in some systems
+        except LidarError:  # E57 poses may be zero, which some coordinate systems do not contain
             skipped.append("scanner positions that cannot be converted to that system")
     elif normals:
         columns |= zip(NORMALS, np.nan_to_num(_stacked(normals).astype(np.float64)).T, strict=True)
@@ -320,25 +325,25 @@ def _converted(stored: Sweep, to_meters: Callable[[Floats], Floats]) -> Sweep:
 
 
 def _unused(stored: Sweep, used: Collection[str]) -> list[str]:
-    """Return the names in `skipped` that are not used, without columns that are zero throughout."""
+    """Return the names in `skipped` that are not used, except columns that contain only zeros."""
     names = [name for name in stored.skipped if name not in used]
     columns = stored.columns
     return [name for name in names if name not in columns or _has_values(columns[name])]
 
 
 def _groups(columns: Columns, names: Sequence[str]) -> list[Columns]:
-    """Return the columns that contain the components of a quantity, {name in the file: (n,)}.
+    """Return groups of columns, each of which contains the components of a quantity.
 
-    Several groups are possible; the group with the standard names is the first.
+    If there are several groups, the group with the standard names is the first.
     """
     found = [columns_for(columns, name).items() for name in names]
     return [dict(group) for group in zip(*found, strict=False)]
 
 
 def _first(columns: Columns, *quantities: Sequence[str]) -> Columns:
-    """Return the first columns of quantities that are not zero throughout, or no columns.
+    """Return the columns of the first quantity that has values other than zero, if any.
 
-    LAS has a column for each quantity, zero where the quantity was not measured.
+    LAS files contain columns of zeros for quantities that were not measured.
     """
     groups = (group for names in quantities for group in _groups(columns, names))
     return next((group for group in groups if any(map(_has_values, group.values()))), {})
@@ -350,14 +355,14 @@ def _stacked(group: Columns) -> AnyArray:
 
 
 def _has_values(values: AnyArray) -> bool:
-    """Return True if a value is neither 0 nor NaN."""
+    """Return whether any value is neither 0 nor NaN."""
     return bool(np.any((values != 0) & (values == values)))
 
 
 def _as_integers(classes: AnyArray) -> Ints:
-    """Return classes as integers, `NO_CLASS` for NaN.
+    """Return classes as integers, with `NO_CLASS` for NaN.
 
-    ValueError if a class is not a whole number.
+    Raises ValueError if a class is not an integer.
     """
     if classes.dtype.kind == "f":
         classes = np.where(np.isnan(classes), float(NO_CLASS), classes)
@@ -368,7 +373,10 @@ def _as_integers(classes: AnyArray) -> Ints:
 
 
 def _as_srgb(colors: AnyArray) -> Floats32:
-    """Return colors (n, 3) from 0 to 255: of 8 or 16 bits, or real numbers from 0 to 1 or 255."""
+    """Return colors (n, 3) from 0 to 255.
+
+    The input has 8 or 16 bits, or consists of floats from 0 to 1 or from 0 to 255.
+    """
     if colors.dtype == np.uint8:
         return colors.astype(np.float32)
     values = colors.astype(np.float64)
@@ -377,5 +385,5 @@ def _as_srgb(colors: AnyArray) -> Floats32:
     if highest <= 1 and colors.dtype.kind == "f":
         values = 255 * values
     elif highest > 255:
-        values = values / 257  # 16 bits; several programs write 8 bits into the 16 of LAS
+        values = values / 257  # 16 bits, unless a program wrote 8-bit colors to a LAS file
     return np.rint(np.clip(values, 0, 255)).astype(np.float32)

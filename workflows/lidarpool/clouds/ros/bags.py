@@ -295,10 +295,10 @@ def _open_bag(source: RecordingSource) -> Recording:
             header = _header_of(data)
             yield header if is_stamped else header._replace(stamp_ns=recorded_ns)
 
-    def times() -> Iterator[float]:
+    def read_stamps() -> Iterator[float]:
         return (float(header.stamp_ns) for header in headers())
 
-    def frame_poses() -> Floats | None:
+    def read_poses() -> Floats | None:
         return _sweep_poses(source.path, [*headers()])
 
     unstamped = () if is_stamped or not connection.msgcount else (_UNSTAMPED,)
@@ -306,8 +306,8 @@ def _open_bag(source: RecordingSource) -> Recording:
         messages,
         convert,
         connection.msgcount,
-        times=times,
-        frame_poses=frame_poses,
+        read_stamps=read_stamps,
+        read_poses=read_poses,
         notes=source.named(unstamped),
         compensated=_stated_compensation(source.path),
     )

@@ -111,12 +111,12 @@ def recorded_view(
     if first.is_cloud:
         cloud = _cloud_of(first, on_part)
         sweeps = None
-        notes += first.left_out_notes
+        notes += first.omission_notes
     else:
         cloud, sweeps, further_notes = _sweeps_of(sensors)
         notes += further_notes
     if not len(cloud):
-        left_out = "".join(f" {note}." for note in first.left_out_notes)
+        left_out = "".join(f" {note}." for note in first.omission_notes)
         raise LidarError(f"{first.name} contains no points.{left_out}")
     names: dict[str, Sequence[str]] = {}
     if first.name.lower().endswith((".las", ".laz")):
@@ -253,7 +253,7 @@ def _sweeps_of(sensors: Mapping[str, Recording]) -> tuple[Cloud, Sweeps, list[st
 
 def _frame_poses(recording: Recording) -> Floats | None:
     """Return the poses (n, 4, 4) of sweeps by the frames of a bag, or None."""
-    has_frames = recording.frame_poses is not None
+    has_frames = recording.read_poses is not None
     return recording.poses(range(len(recording))) if has_frames else None
 
 

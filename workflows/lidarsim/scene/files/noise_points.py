@@ -1,8 +1,8 @@
-"""Points that a file marks as not to be used, as LAS does: withheld points, and noise.
+"""Withheld points and noise, which LAS files mark as points that should not be used.
 
-ASPRS LAS 1.4 R15 withholds points that are not to be included in processing, as if they were
-deleted. Its class 7 is low noise; class 18 is high noise in point formats 6 to 10 alone. Programs
-that convert LAS keep these columns under other names.
+In ASPRS LAS 1.4 R15, withheld points should not be included in processing, as if they were deleted.
+Class 7 is low noise, and class 18 is high noise, but only in point formats 6 to 10. Programs that
+convert LAS files keep these columns under different names.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ _CLASS_COLUMN = "classification"
 _WITHHELD_COLUMNS = ("withheld", "withheldflag", "classifwithheldflag")
 
 
-class LeftOut(NamedTuple):
-    """Numbers of points that are left out."""
+class OmittedPoints(NamedTuple):
+    """Numbers of points that are omitted."""
 
     withheld: int = 0
     noise: int = 0
 
     def note(self) -> str:
-        """Return a sentence with the numbers, empty if no points are left out."""
+        """Return a sentence that states the numbers, or an empty string if they are zero."""
         kinds = []
         if self.withheld:
             kinds.append(f"{plural(self.withheld, 'withheld point')}")
@@ -55,8 +55,10 @@ def _marking_columns(names: tuple[str, ...]) -> tuple[str | None, str | None]:
 
 def usable_points(
     columns: Mapping[str, AnyArray], noise_classes: Collection[int] = NOISE_CLASSES
-) -> tuple[Bools | None, LeftOut]:
-    """Return which points (n,) are neither withheld nor noise, None for all, and the others' count.
+) -> tuple[Bools | None, OmittedPoints]:
+    """Return a mask of the points that are neither withheld nor noise, and the omitted points.
+
+    The mask has the shape (n,). It is None if all points are usable.
 
     Parameters
     ----------
@@ -74,8 +76,8 @@ def usable_points(
         withheld = np.asarray(columns[withheld_column]) != 0
     marks = [marks for marks in (withheld, noise) if marks is not None and marks.any()]
     if not marks:
-        return None, LeftOut()
+        return None, OmittedPoints()
     withheld_count = 0 if withheld is None else int(np.count_nonzero(withheld))
     unusable = np.logical_or.reduce(marks)
     noise_count = int(np.count_nonzero(unusable)) - withheld_count
-    return ~unusable, LeftOut(withheld_count, noise_count)
+    return ~unusable, OmittedPoints(withheld_count, noise_count)
