@@ -260,7 +260,7 @@ def _show_coverage(
     targets: Sequence[str],
 ) -> None:
     """Print what the stations of a scenario see, and what a cloud covers of it."""
-    from ..comparing.compared_sweep import compared_sweep
+    from ..comparing.compared_sweep import compared_in_world
     from ..plan.stations import survey_coverage
     from ..recordings.opening import open_recording
     from .terminal import Terminal
@@ -279,9 +279,7 @@ def _show_coverage(
             "`--cloud` requires a scenario with a single sensor, but the scenario has several."
         )
     positions = _station_positions(built)
-    clouds = (
-        compared_sweep(recording, number, in_world=True).points for number in range(recording.count)
-    )
+    clouds = (compared_in_world(recording, number).points for number in range(recording.count))
     with terminal.status("finding points near the reachable surfaces"):
         coverage = survey_coverage(
             built.scene,

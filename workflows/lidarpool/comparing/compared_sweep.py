@@ -10,22 +10,28 @@ from lidarsim.columns.sweep import Columns, Sweep
 
 from ..clouds.recording import Recording
 
-RAY_KEY = "ray_key"  # column that numbers the rays of a sweep, and the returns of each ray
+RAY_KEY = "ray_key"  # column that identifies the ray and the return
 
 
-def compared_sweep(
-    recording: Recording, number: int, *, in_world: bool = False, with_rays: bool = False
-) -> Sweep:
-    """Read the returns of a sweep or of a part of a cloud, in the sensor frame or the world frame.
+def compared_sweep(recording: Recording, number: int, *, with_rays: bool = False) -> Sweep:
+    """Read the returns of a sweep in the sensor frame.
 
-    The columns are `channel` and `intensity` where the recording has these, and `RAY_KEY` if
-    `with_rays`. In the world frame, the only column is `intensity`.
+    The columns are `channel` and `intensity` if the recording has them, and `RAY_KEY` if
+    `with_rays` is true.
 
-    Raises LidarError if the recording cannot be read, or if the pose is required but unknown.
+    Raises LidarError if the recording cannot be read.
     """
-    sweep = with_compared_columns(recording[number], with_rays=with_rays)
-    if not in_world:
-        return sweep.returns()
+    return with_compared_columns(recording[number], with_rays=with_rays).returns()
+
+
+def compared_in_world(recording: Recording, number: int) -> Sweep:
+    """Read the returns of a sweep or of a part of a cloud in the world frame.
+
+    The only column is `intensity`, if the recording has it.
+
+    Raises LidarError if the recording cannot be read, or if the pose of the sweep is unknown.
+    """
+    sweep = with_compared_columns(recording[number])
     sweep = sweep.with_columns(intensity=sweep.intensity).returns()
     if recording.is_cloud:
         return sweep
@@ -38,9 +44,9 @@ def compared_sweep(
 
 
 def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
-    """Return a sweep with only the columns that are described in `compared_sweep`.
+    """Return a sweep with only the columns described in `compared_sweep`.
 
-    Without the column `channel`, the rings are determined when they are first requested.
+    If it has no column `channel`, its rings are determined when they are first requested.
     """
     columns = {}
     if "channel" in sweep.columns:
@@ -53,17 +59,20 @@ def with_compared_columns(sweep: Sweep, *, with_rays: bool = False) -> Sweep:
 
 
 def rings_note(recording: Recording, sweep: Sweep) -> list[str]:
-    """Return a note on how the rings of a sweep were found, unless they are in a column."""
+    """Return a note on how the rings of a sweep were determined, if they were.
+
+    The list is empty if the rings are stored in a column or unknown.
+    """
     is_stated = "channel" in sweep.columns or sweep.rings is None
     return [] if is_stated else [recording.rings.note.removesuffix(".")]
 
 
 def _ray_keys(columns: Columns) -> Ints:
-    """Return keys (n,) that differ for all rays of a sweep, and for all returns of a ray."""
+    """Return a unique key for each return of each ray, of shape (n,)."""
     if "time" in columns:
         rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
     else:
         rays = columns["scan"].astype(np.int64) << 32 | columns["ray"]
     _, first, ray = np.unique(rays, return_index=True, return_inverse=True)
-    order: Ints = np.arange(len(rays)) - first[ray]  # returns of a ray are together
+    order: Ints = np.arange(len(rays)) - first[ray]  # returns of a ray are adjacent
     return rays << 8 | columns.get("return_number", order)

@@ -27,7 +27,7 @@ from ..clouds.recording import Recording, SeveralSensorsError
 from ..columns.parts import StoredCloud
 from ..datasets.figures import rank_correlation
 from ..recordings.opening import open_recording
-from .compared_sweep import compared_sweep, rings_note
+from .compared_sweep import compared_in_world, compared_sweep, rings_note
 from .comparison import CELLS, RESIDUALS, Comparison
 from .range_image import RangeImages, RayPairs, images_of_rays, pair_rays, range_images
 
@@ -274,7 +274,7 @@ class _Comparing:
         share = 1.0 if count is None else min(1.0, max_points / max(count, 1))
         parts = []
         for number in range(recording.count):
-            part = compared_sweep(recording, number, in_world=True)
+            part = compared_in_world(recording, number)
             if share < 1:
                 part = part.select(even_indices(len(part), round(share * len(part))))
             parts.append(part)
